@@ -1,0 +1,1 @@
+"""A PyBullet navigation task for gymnasium and TorchRL."""
