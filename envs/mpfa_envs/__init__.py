@@ -1,1 +1,62 @@
 """A PyBullet navigation task for gymnasium and TorchRL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from mpfa_envs.lidar import Lidar
+from mpfa_envs.maps import WORLDS
+from mpfa_envs.navigation import INFO_TYPES, OBSERVATION, NavigationEnv, observation_slices
+from mpfa_envs.path import PathPlanner
+from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
+from mpfa_envs.robot import ROBOTS, RobotModel
+from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
+from mpfa_envs.worlds import Box, Cylinder, World
+
+if TYPE_CHECKING:
+    from mpfa_envs.tensordict import NavigationTorchEnv, make_navigation_env
+
+ENV_IDS = tuple(f"mpfa/Navigation-{name}-v0" for name in WORLDS)
+"""The ids that ``gymnasium.make`` knows once this package is imported."""
+
+__all__ = [
+    "ENV_IDS",
+    "INFO_TYPES",
+    "OBSERVATION",
+    "ROBOTS",
+    "WORLDS",
+    "Box",
+    "Cylinder",
+    "Lidar",
+    "NavigationEnv",
+    "NavigationTorchEnv",
+    "PathPlanner",
+    "RewardTerms",
+    "RobotModel",
+    "StepOutcome",
+    "Task",
+    "World",
+    "evaluation_pairs",
+    "make_navigation_env",
+    "navigation_reward",
+    "observation_slices",
+    "sample_task",
+]
+
+for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
+    # A second import, as after a reload, must not warn about an id that is known.
+    if _id not in gymnasium.registry:
+        gymnasium.register(
+            _id, entry_point="mpfa_envs.navigation:NavigationEnv", kwargs={"world": _name}
+        )
+
+
+def __getattr__(name: str) -> Any:
+    """Import the TorchRL part when it is first asked for: the rest needs no torch."""
+    if name in ("NavigationTorchEnv", "make_navigation_env"):
+        from mpfa_envs import tensordict
+
+        return getattr(tensordict, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,118 @@
+"""The built-in worlds: the training maps A to D, and two that training never sees."""
+
+from __future__ import annotations
+
+import os
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from mpfa_envs.worlds import Box, World
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+def _world(name: str, *boxes: tuple[float, float, float, float]) -> World:
+    """Build a 10 x 10 m world from boxes given as (x_min, x_max, y_min, y_max) [m]."""
+    return World(name=name, boxes=tuple(Box(x0, y0, x1, y1) for x0, x1, y0, y1 in boxes))
+
+
+WORLDS: Final[Mapping[str, World]] = {
+    world.name: world
+    for world in (
+        _world("A"),
+        _world(
+            "B",
+            (-3.0, 3.0, 3.5, 4.0),
+            (-3.0, 3.0, -4.0, -3.5),
+            (-3.25, -2.75, -2.0, 2.0),
+            (2.75, 3.25, -2.0, 2.0),
+        ),
+        _world(
+            "C",
+            (-1.5, 1.5, 1.5, 2.0),
+            (-1.5, 1.5, -2.0, -1.5),
+            (2.75, 3.25, -1.5, 1.5),
+            (-3.25, -2.75, -1.5, 1.5),
+        ),
+        _world(
+            "D",
+            (-1.0, 2.0, 1.0, 1.5),
+            (-2.0, 2.0, -1.5, -1.0),
+            (0.0, 4.0, 3.5, 4.0),
+            (-4.0, -3.5, 1.0, 4.0),
+            (3.75, 4.25, -4.0, -1.0),
+            (-4.0, 0.0, -4.0, -3.5),
+        ),
+        _world(
+            "validation",
+            (-3.9, -3.4, -3.6, -1.6),
+            (-2.2, -0.2, -3.7, -3.2),
+            (1.2, 1.7, -5.0, -3.0),
+            (2.9, 3.8, -3.4, -2.5),
+            (-2.1, -1.6, -1.9, 0.3),
+            (-0.3, 1.9, -1.5, -1.0),
+            (3.1, 3.6, -1.2, 1.2),
+            (-5.0, -3.3, 0.3, 0.8),
+            (0.2, 1.2, 0.6, 1.6),
+            (-2.6, -0.9, 1.8, 2.3),
+            (-4.0, -3.5, 2.2, 3.8),
+            (2.3, 4.0, 2.5, 3.0),
+            (0.4, 0.9, 2.9, 5.0),
+            (-1.9, -1.0, 3.5, 4.0),
+        ),
+        _world(
+            "test",
+            (-4.0, -2.6, 3.3, 3.8),
+            (-1.4, -0.9, 2.6, 4.0),
+            (0.4, 2.2, 3.5, 4.0),
+            (3.4, 3.9, 2.6, 4.0),
+            (-3.9, -3.4, 0.7, 2.2),
+            (-2.3, -0.7, 0.9, 1.4),
+            (0.5, 1.0, 0.7, 2.3),
+            (2.1, 3.7, 1.0, 1.5),
+            (-4.0, -2.4, -0.9, -0.4),
+            (-1.2, -0.7, -1.6, -0.2),
+            (0.4, 2.0, -0.7, -0.2),
+            (3.2, 3.7, -1.5, -0.1),
+            (-3.7, -3.2, -3.6, -2.0),
+            (-2.1, -0.5, -3.1, -2.6),
+            (0.7, 1.2, -3.0, -1.7),
+            (2.3, 3.9, -2.9, -2.4),
+            (-1.6, -1.1, -5.0, -4.1),
+            (1.5, 3.0, -4.2, -3.9),
+        ),
+    )
+}
+"""The built-in worlds by name. B, C and six boxes of D are as drawn in the figures of the paper."""
+
+
+def resolve_world(world: str | os.PathLike[str] | World) -> World:
+    """Find a world by name or read it from a file; a :class:`World` is returned as it is.
+
+    Args:
+        world: A name in :data:`WORLDS`, the path of a YAML file, or a world of your own.
+
+    Returns:
+        The world.
+
+    Raises:
+        ValueError: If nothing has that name.
+        WorldFileError: If the file cannot be read as a world.
+    """
+    if isinstance(world, World):
+        return world
+    if isinstance(world, str) and world in WORLDS:
+        return WORLDS[world]
+    if isinstance(world, (str, os.PathLike)) and Path(world).suffix.lower() in (".yaml", ".yml"):
+        # Imported here because most programs never read a world from a file.
+        from mpfa_envs.world_file import load_world
+
+        return load_world(world)
+    near = get_close_matches(str(world), WORLDS, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise ValueError(
+        f"world must be a World, the path of a .yaml file or one of {list(WORLDS)}, "
+        f"got {world!r}{hint}"
+    )

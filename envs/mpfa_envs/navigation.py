@@ -1,0 +1,490 @@
+"""The navigation task as a gymnasium environment."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box as BoxSpace
+
+from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
+from mpfa_envs.lidar import Lidar, Reduction
+from mpfa_envs.maps import resolve_world
+from mpfa_envs.path import planner_for
+from mpfa_envs.reward import RewardFunction, RewardTerms, StepOutcome, navigation_reward
+from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.tasks import Task, sample_task
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import World
+
+Physics = Literal["kinematic", "wheels"]
+"""How the robot moves."""
+
+CLOSENESS_DISTANCE: Final = 0.35
+"""A range of this or less has closeness one [m]."""
+GOAL_CLOSENESS_DISTANCE: Final = 0.3
+"""A goal at this distance or nearer has closeness one [m]."""
+DISTANCE_SCALE: Final = 10.0
+"""What the distance to the goal is divided by in the observation [m]."""
+SPEED_BOUND: Final = 2.0
+"""Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
+
+_FLAGS = ("success", "collision", "time_out")
+_NUMBERS = (
+    "reward_goal",
+    "reward_collision",
+    "reward_progress",
+    "reward_other",
+    "sim_time",
+    "path_length",
+    "shortest_path",
+    "min_clearance",
+    "distance",
+    "x",
+    "y",
+    "heading",
+)
+INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
+    **dict.fromkeys(_FLAGS, bool),
+    **dict.fromkeys(_NUMBERS, float),
+}
+"""Keys of the info dictionary of every reset and step, with the type of their value."""
+
+
+def observation_slices(sectors: int = 18) -> dict[str, slice]:
+    """Name the parts of the observation.
+
+    Args:
+        sectors: Number of sectors of the lidar.
+
+    Returns:
+        Where each part lies, in order.
+
+    Examples:
+        >>> from mpfa_envs import observation_slices
+        >>> observation_slices()["goal_direction"]
+        slice(18, 20, None)
+    """
+    widths = {
+        "lidar": sectors,
+        "goal_direction": 2,
+        "goal_closeness": 1,
+        "goal_distance": 1,
+        "linear_speed": 1,
+        "angular_speed": 1,
+    }
+    slices, first = {}, 0
+    for name, width in widths.items():
+        slices[name] = slice(first, first + width)
+        first += width
+    return slices
+
+
+OBSERVATION: Final = observation_slices()
+"""The parts of the observation with the default lidar."""
+
+
+class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
+    """A two-wheeled robot drives to a goal by lidar, without a map.
+
+    **Observation**, ``Box`` of shape ``[24]``, float32 (:data:`OBSERVATION` names the slices):
+
+    ====== ================ ==================================================== ==========
+    index  name             meaning                                              range
+    ====== ================ ==================================================== ==========
+    0-17   lidar            closeness ``clip(0.35 / range, 0, 1)`` of 18 sectors [0, 1]
+                            of 10 degrees over the front, left to right
+    18-19  goal_direction   cosine and sine of the goal's direction in the       [-1, 1]
+                            robot's frame: an angle would jump at ±π
+    20     goal_closeness   ``clip(0.3 / d, 0, 1)`` for the goal's distance d    [0, 1]
+    21     goal_distance    ``d / 10 m``                                         [0, 1.42]
+    22     linear_speed     forward speed over the robot's fastest               [-2, 2]
+    23     angular_speed    turning speed over the robot's fastest, left is      [-2, 2]
+                            positive
+    ====== ================ ==================================================== ==========
+
+    **Action**, ``Box(-1, 1)`` of shape ``[2]``, float32: speed of the left and the right wheel, from
+    the robot's slowest (0.05 m/s for the TurtleBot2) to its fastest (0.5 m/s). It neither stops nor
+    reverses. Actions are clipped to the box.
+
+    **Reward**: Eq. (25) of the paper, see :func:`~mpfa_envs.navigation_reward`.
+
+    **Episode end**: ``terminated`` at the goal or at a collision; ``truncated`` after ``max_steps``
+    steps. An episode that reaches the goal in the step of its collision counts as a success, as the
+    cases of Eq. (25) are ordered.
+
+    **Info**, the same keys after every reset and step (:data:`INFO_TYPES`): ``success``,
+    ``collision``, ``time_out``; ``sim_time`` [s]; ``path_length`` driven so far [m];
+    ``shortest_path`` [m], the shortest path that ends the episode: from the start to the goal's
+    center for a disc of the robot's radius, less the goal's radius, so that
+    ``success * shortest_path / max(path_length, shortest_path)`` is the SPL; ``min_clearance`` [m],
+    the least distance so far between the robot's rim and an obstacle or wall; ``distance`` to the
+    goal's center [m]; the pose ``x``, ``y`` [m], ``heading`` [rad]; and the terms of the reward,
+    ``reward_goal``, ``reward_collision``, ``reward_progress``, ``reward_other``.
+
+    Args:
+        world: ``"A"`` to ``"D"``, ``"validation"``, ``"test"``, the path of a YAML file or a
+            :class:`~mpfa_envs.World`.
+        robot: ``"turtlebot2"``, ``"burger"``, ``"waffle"`` or a :class:`~mpfa_envs.RobotModel`.
+        physics: ``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on
+            exact arcs, several times faster, and needs no PyBullet. Lidar, clearance and
+            collisions are computed from the same shapes in both.
+        max_steps: Time limit of an episode in steps.
+        time_step: Duration of a step [s].
+        goal_radius: Distance of the robot's center from the goal that reaches it [m].
+        collision_distance: Distance of the robot's center from an obstacle or wall that is a
+            collision [m]. None: the robot's training margin, its radius and 0.17 m, which is 0.35 m
+            for the TurtleBot2. ``"contact"``: the robot's radius.
+        progress_scale: The paper's ε_p in Eq. (25), reward per meter of approach [1/m].
+        goal_reward: Reward for the goal.
+        collision_reward: Reward for a collision.
+        reward: Computes the reward instead of Eq. (25); the three arguments above do not reach it.
+        sectors: Sectors of the lidar.
+        rays_per_sector: Rays in a sector. One ray each, as the paper may have it, leaves gaps of
+            10 degrees, 17 cm at 1 m, that hide a table leg.
+        reduction: How the rays of a sector become one range, see :class:`~mpfa_envs.Lidar`.
+        max_range: Longest range of the lidar [m]. The default is a side of the room; farther
+            away the closeness is below 0.035 and changes by less than 0.01.
+        lidar_noise: Standard deviation of the noise of a ray [m].
+        min_goal_distance: Least distance between a drawn start and goal [m].
+        render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
+
+    Raises:
+        ValueError: If an argument is out of its range; nothing is built then.
+
+    Examples:
+        >>> from mpfa_envs import NavigationEnv
+        >>> env = NavigationEnv(world="B", physics="kinematic")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step([1.0, 1.0])
+        >>> observation.shape, info["sim_time"]
+        ((24,), 0.1)
+        >>> env.close()
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        *,
+        world: str | os.PathLike[str] | World = "A",
+        robot: str | RobotModel = "turtlebot2",
+        physics: Physics = "wheels",
+        max_steps: int = 500,
+        time_step: float = 0.1,
+        goal_radius: float = 0.5,
+        collision_distance: float | Literal["contact"] | None = None,
+        progress_scale: float = 15.0,
+        goal_reward: float = 10.0,
+        collision_reward: float = -5.0,
+        reward: RewardFunction | None = None,
+        sectors: int = 18,
+        rays_per_sector: int = 3,
+        reduction: Reduction = "min",
+        max_range: float = 10.0,
+        lidar_noise: float = 0.0,
+        min_goal_distance: float = 2.0,
+        render_mode: Literal["rgb_array"] | None = None,
+    ) -> None:
+        self.world = resolve_world(world)
+        self.robot = resolve_robot(robot)
+        if physics not in get_args(Physics):
+            raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
+        if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+            raise ValueError(f"max_steps must be a positive integer, got {max_steps!r}")
+        for name, value in (("time_step", time_step), ("goal_radius", goal_radius)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be positive, got {value}")
+        if not min_goal_distance > goal_radius:
+            raise ValueError(
+                f"min_goal_distance must be above goal_radius = {goal_radius}, "
+                f"got {min_goal_distance}"
+            )
+        for name, value in (
+            ("progress_scale", progress_scale),
+            ("goal_reward", goal_reward),
+            ("collision_reward", collision_reward),
+        ):
+            if not math.isfinite(value):
+                raise ValueError(f"{name} must be finite, got {value}")
+        if reward is not None and not callable(reward):
+            raise ValueError(f"reward must be callable or None, got {reward!r}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.collision_distance = _collision_distance(collision_distance, self.robot)
+        self.lidar = Lidar(
+            self.world,
+            sectors=sectors,
+            rays_per_sector=rays_per_sector,
+            reduction=reduction,
+            max_range=max_range,
+            noise=lidar_noise,
+        )
+        self.physics = physics
+        self.max_steps = max_steps
+        self.time_step = float(time_step)
+        self.goal_radius = float(goal_radius)
+        self.min_goal_distance = float(min_goal_distance)
+        self.render_mode = render_mode
+        self._reward = reward
+        self._reward_scales = {
+            "progress_scale": float(progress_scale),
+            "goal_reward": float(goal_reward),
+            "collision_reward": float(collision_reward),
+        }
+        self.observation_slices = observation_slices(sectors)
+        low = np.array([0.0] * sectors + [-1, -1, 0, 0, -SPEED_BOUND, -SPEED_BOUND], np.float32)
+        high = np.array([1.0] * sectors + [1, 1, 1, 0, SPEED_BOUND, SPEED_BOUND], np.float32)
+        high[sectors + 3] = self.world.diagonal / DISTANCE_SCALE
+        self.observation_space = BoxSpace(low, high)
+        self.action_space = BoxSpace(-1.0, 1.0, (2,), np.float32)
+        slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
+        self._middle_speed, self._speed_span = (fast + slow) / 2, (fast - slow) / 2
+        self._task: Task | None = None
+        self._running = False
+        self._trail: list[tuple[float, float]] = []
+        self._drive: Drive = (
+            KinematicDrive(self.robot, time_step=self.time_step)
+            if physics == "kinematic"
+            else WheelDrive(self.robot, self.world, time_step=self.time_step)
+        )
+
+    @property
+    def task(self) -> Task | None:
+        """Start and goal of the current episode; None before the first."""
+        return self._task
+
+    @property
+    def trail(self) -> list[tuple[float, float]]:
+        """Positions (x, y) of the current episode so far [m]."""
+        return list(self._trail)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of this and all following draws.
+            options: ``{"start": (x, y, heading), "goal": (x, y)}`` [m, m, rad] fixes the task; None
+                draws one.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ValueError: If the options are not a task that can be driven; the episode goes on then.
+        """
+        task = self.check_task(options) if options else None
+        super().reset(seed=seed)
+        if task is None:
+            task = sample_task(
+                self.world,
+                self.np_random,
+                collision_distance=self.collision_distance,
+                min_goal_distance=self.min_goal_distance,
+            )
+        self._task = task
+        self._goal_x, self._goal_y = task.goal
+        length = planner_for(self.world, self.robot.radius).length(task.start[:2], task.goal)
+        self._shortest_path = max(length - self.goal_radius, 0.0)
+        self._steps = 0
+        self._path_length = 0.0
+        self._motion = self._drive.place(*task.start)
+        self._distance = math.dist(task.start[:2], task.goal)
+        clearance = self.world.clearance(*task.start[:2]) - self.robot.radius
+        self._min_clearance = clearance
+        self._trail = [task.start[:2]]
+        self._running = True
+        return self._observe(self._motion), self._info(False, False, False, RewardTerms())
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Drive for one time step.
+
+        Args:
+            action: Speeds of the left and the right wheel, shape ``[2]``, in [-1, 1].
+
+        Returns:
+            Observation, reward, terminated, truncated and info.
+
+        Raises:
+            ValueError: If the action is not two numbers; nothing has moved then.
+            ResetNeeded: If no episode is running.
+        """
+        if not self._running:
+            raise ResetNeeded("no episode is running: call reset() before step()")
+        left, right = self._wheel_speeds(action)
+        motion = self._drive.move(left, right)
+        self._steps += 1
+        before = self._motion
+        self._path_length += math.hypot(motion.x - before.x, motion.y - before.y)
+        self._motion = motion
+        self._trail.append((motion.x, motion.y))
+        previous = self._distance
+        self._distance = math.hypot(self._goal_x - motion.x, self._goal_y - motion.y)
+        to_obstacle = self.world.clearance(motion.x, motion.y)
+        clearance = to_obstacle - self.robot.radius
+        self._min_clearance = min(self._min_clearance, clearance)
+        success = self._distance <= self.goal_radius
+        collision = not success and to_obstacle <= self.collision_distance
+        outcome = StepOutcome(
+            previous,
+            self._distance,
+            success,
+            collision,
+            clearance,
+            motion.linear_speed,
+            motion.angular_speed,
+        )
+        terms = (
+            navigation_reward(outcome, **self._reward_scales)
+            if self._reward is None
+            else self._reward(outcome)
+        )
+        terminated = success or collision
+        truncated = not terminated and self._steps >= self.max_steps
+        self._running = not (terminated or truncated)
+        info = self._info(success, collision, truncated, terms)
+        return self._observe(motion), float(terms.total), terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw the room from above.
+
+        Returns:
+            Picture of shape ``[480, 480, 3]``, or None without a render mode.
+
+        Raises:
+            ResetNeeded: If no episode has started.
+        """
+        if self.render_mode is None:
+            return None
+        if self._task is None:
+            raise ResetNeeded("there is nothing to draw: call reset() before render()")
+        # Imported here because training does not draw.
+        from mpfa_envs.render import draw_scene
+
+        motion = self._motion
+        return draw_scene(
+            self.world,
+            robot=self.robot,
+            pose=motion[:3],
+            goal=self._task.goal,
+            goal_radius=self.goal_radius,
+            trail=self._trail,
+            rays=(self.lidar.angles, self.lidar.cast(*motion[:3])),
+        )
+
+    def close(self) -> None:
+        """Release the physics server; a second call does nothing."""
+        self._running = False
+        self._drive.close()
+
+    def _wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
+        """Speeds of the left and the right wheel [m/s]."""
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != (2,):
+            raise ValueError(f"action must have shape (2,), got {values.shape}")
+        left, right = values.tolist()
+        if math.isnan(left) or math.isnan(right):
+            raise ValueError(f"action must not hold NaN, got {action!r}")
+        left, right = min(max(left, -1.0), 1.0), min(max(right, -1.0), 1.0)
+        middle, span = self._middle_speed, self._speed_span
+        return middle + span * left, middle + span * right
+
+    def _observe(self, motion: Motion) -> NDArray[np.float32]:
+        """Build the observation, shape ``[sectors + 6]``."""
+        x, y, heading, linear_speed, angular_speed = motion
+        ranges = self.lidar.scan(x, y, heading, rng=self.np_random if self.lidar.noise else None)
+        sectors = ranges.size
+        observation = np.empty(sectors + 6, dtype=np.float32)
+        np.maximum(ranges, CLOSENESS_DISTANCE, out=ranges)
+        observation[:sectors] = CLOSENESS_DISTANCE / ranges
+        distance = self._distance
+        # A robot on the goal sees it ahead.
+        bearing = math.atan2(self._goal_y - y, self._goal_x - x) - heading if distance else 0.0
+        bound = SPEED_BOUND
+        observation[sectors:] = (
+            math.cos(bearing),
+            math.sin(bearing),
+            min(GOAL_CLOSENESS_DISTANCE / distance, 1.0) if distance else 1.0,
+            distance / DISTANCE_SCALE,
+            min(max(linear_speed / self.robot.max_wheel_speed, -bound), bound),
+            min(max(angular_speed / self.robot.max_angular_speed, -bound), bound),
+        )
+        return observation
+
+    def _info(
+        self, success: bool, collision: bool, time_out: bool, terms: RewardTerms
+    ) -> dict[str, Any]:
+        """Build the info dictionary; its keys are those of :data:`INFO_TYPES`."""
+        motion = self._motion
+        return {
+            "success": success,
+            "collision": collision,
+            "time_out": time_out,
+            "reward_goal": terms.goal,
+            "reward_collision": terms.collision,
+            "reward_progress": terms.progress,
+            "reward_other": terms.other,
+            "sim_time": self._steps * self.time_step,
+            "path_length": self._path_length,
+            "shortest_path": self._shortest_path,
+            "min_clearance": self._min_clearance,
+            "distance": self._distance,
+            "x": motion.x,
+            "y": motion.y,
+            "heading": motion.heading,
+        }
+
+    def check_task(self, options: dict[str, Any]) -> Task:
+        """Read a task from the options of a reset."""
+        unknown = sorted(set(options) - {"start", "goal"})
+        if unknown or len(options) != 2:
+            raise ValueError(
+                f"options must have the keys 'start' and 'goal', got {sorted(options)}"
+            )
+        numbers: dict[str, list[float]] = {}
+        for name, size in (("start", 3), ("goal", 2)):
+            values = np.asarray(options[name], dtype=np.float64)
+            if values.shape != (size,) or not np.isfinite(values).all():
+                raise ValueError(f"{name} must be {size} finite numbers, got {options[name]!r}")
+            numbers[name] = values.tolist()
+        x, y, heading = numbers["start"]
+        goal = (numbers["goal"][0], numbers["goal"][1])
+        clearance = self.world.clearance(x, y)
+        if clearance <= self.collision_distance:
+            raise ValueError(
+                f"start must be farther than collision_distance = {self.collision_distance} m from "
+                f"obstacles and walls, got {(x, y)} with {clearance:.3f} m"
+            )
+        if math.dist((x, y), goal) <= self.goal_radius:
+            raise ValueError(
+                f"goal must be farther than goal_radius = {self.goal_radius} m from the start, "
+                f"got {goal} for the start {(x, y)}"
+            )
+        if planner_for(self.world, self.robot.radius).find((x, y), goal) is None:
+            raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
+        return Task((x, y, heading), goal)
+
+
+def _collision_distance(value: float | Literal["contact"] | None, robot: RobotModel) -> float:
+    """Turn the argument into a distance [m]."""
+    if value is None:
+        return robot.margin
+    if value == "contact":
+        return robot.radius
+    if isinstance(value, str) or not (math.isfinite(value) and value >= robot.radius):
+        raise ValueError(
+            "collision_distance must be 'contact', None or at least the robot's radius "
+            f"{robot.radius}, got {value!r}"
+        )
+    return float(value)

@@ -1,0 +1,225 @@
+"""Shortest paths of a disc-shaped robot among the obstacles of a world.
+
+Obstacles are grown by a margin, and A* searches the graph of lines of sight between their corners.
+Where a path bends around a corner the true optimum is an arc; ours follows a polygon around it, at
+most 3 % longer on that arc: 7 mm per right angle at a margin of 0.18 m. All else is exact, so there
+is no grid and no resolution, and where the straight line is free it is the answer.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import World
+
+Point = tuple[float, float]
+"""A position (x, y) [m]."""
+
+_TOUCH = 1e-9
+"""What grazes a grown obstacle by less than this does not cross it [m]."""
+_CORNER_ANGLES = np.radians([15.0, 45.0, 75.0])
+"""Three tangents to the quarter circle around a corner meet its polygon at these angles [rad]."""
+_CIRCLE_CORNERS = 16
+"""Corners of the polygon around a cylinder."""
+
+
+class PathPlanner:
+    """Finds shortest paths that keep a margin to every obstacle and wall.
+
+    Lines of sight are found when a search first needs them and kept, so the first paths in a world
+    take milliseconds and later ones less.
+
+    Args:
+        world: The room and its obstacles.
+        margin: Distance to keep [m].
+
+    Raises:
+        ValueError: If the margin is not a positive length.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, PathPlanner
+        >>> planner = PathPlanner(WORLDS["B"], margin=0.18)
+        >>> planner.is_straight((0.0, 0.0), (2.0, 3.0)), planner.is_straight((0.0, 0.0), (4.0, 0.0))
+        (True, False)
+        >>> round(planner.length((0.0, 0.0), (4.0, 0.0)), 2)  # [m]
+        5.74
+    """
+
+    def __init__(self, world: World, *, margin: float) -> None:
+        if not (math.isfinite(margin) and margin > 0):
+            raise ValueError(f"margin must be a positive length, got {margin}")
+        self.world = world
+        self.margin = float(margin)
+        reach = self.margin - _TOUCH
+        rectangles: list[tuple[float, float, float, float]] = []
+        circles: list[tuple[float, float, float]] = []
+        corners: list[NDArray[np.float64]] = []
+        for box in world.boxes:
+            # A box grown by a disc is two rectangles and a circle at each corner.
+            rectangles += [
+                (box.x_min - reach, box.y_min + _TOUCH, box.x_max + reach, box.y_max - _TOUCH),
+                (box.x_min + _TOUCH, box.y_min - reach, box.x_max - _TOUCH, box.y_max + reach),
+            ]
+            for quarter, (x, y) in enumerate(
+                (
+                    (box.x_max, box.y_max),
+                    (box.x_min, box.y_max),
+                    (box.x_min, box.y_min),
+                    (box.x_max, box.y_min),
+                )
+            ):
+                circles.append((x, y, reach))
+                angles = _CORNER_ANGLES + quarter * math.pi / 2
+                corners.append(_polygon(x, y, self.margin / math.cos(math.radians(15)), angles))
+        for cylinder in world.cylinders:
+            radius = cylinder.radius + self.margin
+            circles.append((cylinder.x, cylinder.y, radius - _TOUCH))
+            angles = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
+            outer = radius / math.cos(math.pi / _CIRCLE_CORNERS)
+            corners.append(_polygon(cylinder.x, cylinder.y, outer, angles))
+        self._rectangles = np.array(rectangles).reshape(-1, 4)
+        self._circles = np.array(circles).reshape(-1, 3)
+        nodes = np.concatenate([np.empty((0, 2)), *corners])
+        free = [world.clearance(x, y) >= self.margin - _TOUCH for x, y in nodes]
+        self._nodes = nodes[np.array(free, dtype=np.bool_)]
+        self._neighbors: dict[int, list[tuple[int, float]]] = {}
+
+    def is_straight(self, start: Point, goal: Point) -> bool:
+        """Tell whether the straight line keeps the margin.
+
+        Args:
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Whether nothing is in the way.
+        """
+        return bool(self._visible(start, np.array([goal]))[0])
+
+    def find(self, start: Point, goal: Point) -> list[Point] | None:
+        """Find the shortest path.
+
+        Args:
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Corners of the path from start to goal [m], or None if there is none.
+        """
+        for point in (start, goal):
+            if self.world.clearance(*point) < self.margin - _TOUCH:
+                return None
+        if self.is_straight(start, goal):
+            return [start, goal]
+        return self._search(start, goal)
+
+    def length(self, start: Point, goal: Point) -> float:
+        """Measure the shortest path.
+
+        Args:
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Length [m]; infinite if there is no path.
+        """
+        path = self.find(start, goal)
+        if path is None:
+            return math.inf
+        return sum(math.dist(path[i], path[i + 1]) for i in range(len(path) - 1))
+
+    def _search(self, start: Point, goal: Point) -> list[Point] | None:
+        """A* over the corners, with the distance to the goal as the estimate."""
+        nodes = self._nodes
+        to_goal = np.hypot(*(nodes - goal).T)
+        sees_goal = self._visible(goal, nodes)
+        from_start = np.hypot(*(nodes - start).T)
+        best = np.full(len(nodes), math.inf)
+        parents: dict[int, int] = {}
+        queue: list[tuple[float, int]] = []
+        for node in np.flatnonzero(self._visible(start, nodes)).tolist():
+            best[node] = from_start[node]
+            heapq.heappush(queue, (float(best[node] + to_goal[node]), node))
+        closed: set[int] = set()
+        last, shortest = -1, math.inf
+        while queue and queue[0][0] < shortest:
+            _, node = heapq.heappop(queue)
+            if node in closed:
+                continue
+            closed.add(node)
+            reached = float(best[node])
+            if sees_goal[node] and reached + to_goal[node] < shortest:
+                last, shortest = node, float(reached + to_goal[node])
+            for neighbor, step in self._neighbors_of(node):
+                if reached + step < best[neighbor]:
+                    best[neighbor] = reached + step
+                    parents[neighbor] = node
+                    heapq.heappush(queue, (float(best[neighbor] + to_goal[neighbor]), neighbor))
+        if last < 0:
+            return None
+        path = [goal]
+        while last >= 0:
+            path.append((float(nodes[last, 0]), float(nodes[last, 1])))
+            last = parents.get(last, -1)
+        return [start, *reversed(path)]
+
+    def _neighbors_of(self, node: int) -> list[tuple[int, float]]:
+        """Corners in sight of a corner and their distances [m]."""
+        if node not in self._neighbors:
+            position = self._nodes[node]
+            seen = self._visible((position[0], position[1]), self._nodes)
+            seen[node] = False
+            distances = np.hypot(*(self._nodes - position).T)
+            index = np.flatnonzero(seen)
+            self._neighbors[node] = list(
+                zip(index.tolist(), distances[index].tolist(), strict=True)
+            )
+        return self._neighbors[node]
+
+    def _visible(self, origin: Point, targets: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which targets ``[N, 2]`` are joined to the origin by a free line, shape ``[N]``."""
+        free = np.ones(len(targets), dtype=np.bool_)
+        steps = targets - origin
+        if len(self._rectangles):
+            # The line is origin + t * step with t in [0, 1]; [N, rectangles] from here on.
+            safe = np.where(steps == 0.0, 1e-300, steps)[:, :, None]
+            low = (self._rectangles[:, :2].T - np.array(origin)[:, None]) / safe
+            high = (self._rectangles[:, 2:].T - np.array(origin)[:, None]) / safe
+            enter = np.minimum(low, high).max(axis=1)
+            leave = np.maximum(low, high).min(axis=1)
+            free &= ~((enter < leave) & (leave > 0.0) & (enter < 1.0)).any(axis=1)
+        if len(self._circles):
+            offsets = self._circles[:, :2] - origin
+            squares = (steps * steps).sum(axis=1)[:, None]
+            nearest = np.clip(steps @ offsets.T / np.maximum(squares, 1e-300), 0.0, 1.0)
+            x = offsets[:, 0] - nearest * steps[:, :1]
+            y = offsets[:, 1] - nearest * steps[:, 1:]
+            free &= (x * x + y * y >= self._circles[:, 2] ** 2).all(axis=1)
+        return free
+
+
+def _polygon(x: float, y: float, radius: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points at the angles around a center [m], shape ``[angles, 2]``."""
+    return np.stack((x + radius * np.cos(angles), y + radius * np.sin(angles)), axis=1)
+
+
+@lru_cache(maxsize=64)
+def planner_for(world: World, margin: float) -> PathPlanner:
+    """Share one planner, and the lines of sight it has found, among the users of a world.
+
+    Args:
+        world: The room and its obstacles.
+        margin: Distance to keep [m].
+
+    Returns:
+        The planner.
+    """
+    return PathPlanner(world, margin=margin)

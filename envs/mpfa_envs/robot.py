@@ -1,0 +1,209 @@
+"""Two-wheeled robots: their measures, their speeds and their URDF."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotModel:
+    """A disc-shaped robot with two driven wheels on one axle through its center.
+
+    Args:
+        name: What error messages and bodies are called.
+        radius: Radius of the footprint [m].
+        height: Height of the body [m].
+        mass: Mass of the whole robot [kg].
+        wheel_base: Distance between the two wheels [m].
+        wheel_radius: Radius of a wheel [m].
+        min_wheel_speed: Slowest speed of a wheel over the ground [m/s].
+        max_wheel_speed: Fastest speed of a wheel over the ground [m/s].
+
+    Raises:
+        ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the
+            speeds are not ordered.
+
+    Examples:
+        >>> from mpfa_envs import RobotModel
+        >>> robot = RobotModel(
+        ...     name="cart", radius=0.2, height=0.1, mass=3.0, wheel_base=0.3, wheel_radius=0.04,
+        ...     min_wheel_speed=0.0, max_wheel_speed=0.4,
+        ... )
+        >>> round(robot.max_angular_speed, 3)
+        1.333
+    """
+
+    name: str
+    radius: float
+    height: float
+    mass: float
+    wheel_base: float
+    wheel_radius: float
+    min_wheel_speed: float
+    max_wheel_speed: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "name":
+                if not isinstance(value, str) or not value:
+                    raise ValueError(f"name must be a non-empty string, got {value!r}")
+            elif isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError(f"{field.name} must be a number, got {value!r}")
+            elif not math.isfinite(value):
+                raise ValueError(f"{field.name} must be finite, got {value}")
+            elif field.name != "min_wheel_speed" and value <= 0:
+                raise ValueError(f"{field.name} must be positive, got {value}")
+        if self.wheel_base > 2 * self.radius:
+            raise ValueError(
+                f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"
+            )
+        if 2 * self.wheel_radius > self.height:
+            raise ValueError(
+                f"wheel_radius must be at most half the height {self.height}, "
+                f"got {self.wheel_radius}"
+            )
+        if self.min_wheel_speed >= self.max_wheel_speed:
+            raise ValueError(
+                f"min_wheel_speed must be below max_wheel_speed = {self.max_wheel_speed}, "
+                f"got {self.min_wheel_speed}"
+            )
+
+    @property
+    def max_angular_speed(self) -> float:
+        """Fastest turn: one wheel at its fastest, the other at its slowest [rad/s]."""
+        return (self.max_wheel_speed - self.min_wheel_speed) / self.wheel_base
+
+    @property
+    def margin(self) -> float:
+        """Distance of the center from an obstacle that training counts as a collision [m].
+
+        The TurtleBot2's 0.35 m are its radius and 0.17 m; the other robots keep the 0.17 m.
+        """
+        return round(self.radius + 0.17, 9)
+
+    def urdf(self) -> str:
+        """Write the robot as URDF text made of primitives.
+
+        A wheel *looks* like a cylinder and *touches* the ground as a sphere: PyBullet surrounds a
+        cylinder with a collision margin, so that a cylinder of the same radius drives 2.6 % too
+        fast, while a sphere is exact. Two frictionless spheres in front and behind carry the body.
+
+        Returns:
+            An URDF document with the links ``base``, ``left_wheel``, ``right_wheel``,
+            ``front_caster`` and ``rear_caster``.
+        """
+        clearance = 0.4 * self.wheel_radius
+        body = self.height - clearance
+        caster = 0.5 * self.wheel_radius
+        wheel_mass = 0.02 * self.mass
+        base_mass = self.mass - 2 * wheel_mass
+        side = base_mass * (3 * self.radius**2 + body**2) / 12
+        upright = base_mass * self.radius**2 / 2
+        spin = 0.4 * wheel_mass * self.wheel_radius**2
+        reach = 0.8 * self.radius
+        parts = [
+            f'<robot name="{_escape(self.name)}">',
+            '<material name="black"><color rgba="0.08 0.08 0.09 1"/></material>',
+            '<material name="gray"><color rgba="0.35 0.35 0.38 1"/></material>',
+            '<link name="base">',
+            f'<inertial><origin xyz="0 0 {clearance + body / 3}"/><mass value="{base_mass}"/>'
+            f'<inertia ixx="{side}" iyy="{side}" izz="{upright}" ixy="0" ixz="0" iyz="0"/>'
+            "</inertial>",
+            *(
+                f'<{use}><origin xyz="0 0 {clearance + body / 2}"/><geometry>'
+                f'<cylinder radius="{self.radius}" length="{body}"/></geometry>{look}</{use}>'
+                for use, look in (("visual", '<material name="black"/>'), ("collision", ""))
+            ),
+            "</link>",
+        ]
+        for name, y in (("left_wheel", self.wheel_base / 2), ("right_wheel", -self.wheel_base / 2)):
+            parts.append(
+                f'<link name="{name}"><inertial><mass value="{wheel_mass}"/>'
+                f'<inertia ixx="{spin}" iyy="{spin}" izz="{spin}" ixy="0" ixz="0" iyz="0"/>'
+                f'</inertial><visual><geometry><cylinder radius="{self.wheel_radius}" '
+                'length="0.02"/></geometry><material name="gray"/></visual><collision>'
+                f'<geometry><sphere radius="{self.wheel_radius}"/></geometry></collision></link>'
+                f'<joint name="{name}_joint" type="continuous"><parent link="base"/>'
+                f'<child link="{name}"/><origin xyz="0 {y} {self.wheel_radius}" '
+                f'rpy="{-math.pi / 2} 0 0"/><axis xyz="0 0 1"/></joint>'
+            )
+        for name, x in (("front_caster", reach), ("rear_caster", -reach)):
+            parts.append(
+                f'<link name="{name}"><inertial><mass value="{wheel_mass / 10}"/>'
+                f'<inertia ixx="{spin}" iyy="{spin}" izz="{spin}" ixy="0" ixz="0" iyz="0"/>'
+                f'</inertial><collision><geometry><sphere radius="{caster}"/></geometry>'
+                f'</collision></link><joint name="{name}_joint" type="fixed">'
+                f'<parent link="base"/><child link="{name}"/><origin xyz="{x} 0 {caster}"/></joint>'
+            )
+        return "\n".join([*parts, "</robot>"])
+
+
+def _escape(text: str) -> str:
+    """Make a name fit for an XML attribute."""
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+
+
+ROBOTS: Final[Mapping[str, RobotModel]] = {
+    robot.name: robot
+    for robot in (
+        RobotModel(
+            name="turtlebot2",
+            radius=0.18,
+            height=0.42,
+            mass=6.3,
+            wheel_base=0.23,
+            wheel_radius=0.035,
+            min_wheel_speed=0.05,
+            max_wheel_speed=0.5,
+        ),
+        RobotModel(
+            name="burger",
+            radius=0.105,
+            height=0.192,
+            mass=1.0,
+            wheel_base=0.16,
+            wheel_radius=0.033,
+            min_wheel_speed=0.022,
+            max_wheel_speed=0.22,
+        ),
+        RobotModel(
+            name="waffle",
+            radius=0.22,
+            height=0.141,
+            mass=1.8,
+            wheel_base=0.287,
+            wheel_radius=0.033,
+            min_wheel_speed=0.026,
+            max_wheel_speed=0.26,
+        ),
+    )
+}
+"""The robots that have a name. As for the TurtleBot2, no wheel stops or turns backwards."""
+
+
+def resolve_robot(robot: str | RobotModel) -> RobotModel:
+    """Look a robot up by name; a :class:`RobotModel` is returned as it is.
+
+    Args:
+        robot: ``"turtlebot2"``, ``"burger"``, ``"waffle"`` or a model of your own.
+
+    Returns:
+        The model.
+
+    Raises:
+        ValueError: If no robot has that name.
+    """
+    if isinstance(robot, RobotModel):
+        return robot
+    if isinstance(robot, str) and robot in ROBOTS:
+        return ROBOTS[robot]
+    near = get_close_matches(str(robot), ROBOTS, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise ValueError(f"robot must be a RobotModel or one of {sorted(ROBOTS)}, got {robot!r}{hint}")

@@ -1,0 +1,148 @@
+"""Tasks: where an episode starts and where its goal lies."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.maps import resolve_world
+from mpfa_envs.path import planner_for
+from mpfa_envs.robot import RobotModel, resolve_robot
+
+if TYPE_CHECKING:
+    from mpfa_envs.worlds import Box, World
+
+GOAL_CLEARANCE = 0.5
+"""No goal lies nearer to an obstacle or a wall than this [m]."""
+START_SLACK = 0.15
+"""A start is at least this much farther from an obstacle than a collision is [m]."""
+_STARTS = 200
+_GOALS_PER_START = 50
+_DRAWS = 1000
+
+
+class Task(NamedTuple):
+    """One episode to drive; ``task._asdict()`` is what ``reset(options=...)`` takes."""
+
+    start: tuple[float, float, float]
+    """Pose (x, y, heading) [m, m, rad]."""
+    goal: tuple[float, float]
+    """Position (x, y) [m]."""
+
+
+def sample_task(
+    world: World,
+    rng: np.random.Generator,
+    *,
+    collision_distance: float,
+    min_goal_distance: float = 2.0,
+) -> Task:
+    """Draw a start and a goal uniformly over the free space of their regions.
+
+    The two are joined by a path that keeps the collision distance, so every task can be solved.
+
+    Args:
+        world: The room, its obstacles and its regions.
+        rng: Source of the draw.
+        collision_distance: Distance of the center from an obstacle that is a collision [m].
+        min_goal_distance: Least distance between start and goal [m].
+
+    Returns:
+        The task; its heading is uniform.
+
+    Raises:
+        ValueError: If a region has no free space, or no start and goal fit together.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import WORLDS, sample_task
+        >>> task = sample_task(WORLDS["A"], np.random.default_rng(0), collision_distance=0.35)
+        >>> len(task.start), len(task.goal)
+        (3, 2)
+    """
+    planner = planner_for(world, collision_distance)
+    start_clearance = collision_distance + START_SLACK
+    goal_clearance = max(GOAL_CLEARANCE, collision_distance)
+    for _ in range(_STARTS):
+        start = _draw_point(world, rng, world.start_regions, start_clearance, "start")
+        for _ in range(_GOALS_PER_START):
+            goal = _draw_point(world, rng, world.goal_regions, goal_clearance, "goal")
+            if math.dist(start, goal) >= min_goal_distance and planner.find(start, goal):
+                heading = float(rng.uniform(-math.pi, math.pi))
+                return Task((*start, heading), goal)
+    raise ValueError(
+        f"world {world.name!r} has no start and goal at least min_goal_distance = "
+        f"{min_goal_distance} m apart with a path between them"
+    )
+
+
+def _draw_point(
+    world: World,
+    rng: np.random.Generator,
+    regions: tuple[Box, ...],
+    clearance: float,
+    what: str,
+) -> tuple[float, float]:
+    """Draw a point with the clearance [m] from the union of the regions."""
+    regions = regions or (world.room,)
+    shares = np.cumsum([region.area for region in regions])
+    for _ in range(_DRAWS):
+        pick, across, up = rng.random(3).tolist()
+        index = int(np.searchsorted(shares, pick * shares[-1], side="right"))
+        region = regions[min(index, len(regions) - 1)]
+        x = region.x_min + across * (region.x_max - region.x_min)
+        y = region.y_min + up * (region.y_max - region.y_min)
+        if world.clearance(x, y) >= clearance:
+            return x, y
+    raise ValueError(
+        f"world {world.name!r} has no free {what}: {_DRAWS} draws found no point "
+        f"{clearance:.2f} m from every obstacle and wall"
+    )
+
+
+def evaluation_pairs(
+    world: str | os.PathLike[str] | World,
+    n: int,
+    seed: int,
+    *,
+    robot: str | RobotModel = "turtlebot2",
+    collision_distance: float | None = None,
+    min_goal_distance: float = 2.0,
+) -> list[Task]:
+    """Draw a fixed list of tasks, the same for everyone who asks with the same arguments.
+
+    Args:
+        world: A name, the path of a YAML file or a world.
+        n: Number of tasks.
+        seed: Seed of the draw; the first tasks of a longer list are those of a shorter one.
+        robot: Whose margin counts.
+        collision_distance: Margin that the start, the goal and a path between them keep [m];
+            None: the robot's own, for the TurtleBot2 0.35 m.
+        min_goal_distance: Least distance between start and goal [m].
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: If n is not a positive integer, or the world has no room for a task.
+
+    Examples:
+        >>> from mpfa_envs import NavigationEnv, evaluation_pairs
+        >>> env = NavigationEnv(world="test", physics="kinematic")
+        >>> task = evaluation_pairs("test", 2, seed=0)[1]
+        >>> observation, info = env.reset(options=task._asdict())
+        >>> (info["x"], info["y"]) == task.start[:2]
+        True
+    """
+    if isinstance(n, bool) or not isinstance(n, int) or n < 1:
+        raise ValueError(f"n must be a positive integer, got {n!r}")
+    world = resolve_world(world)
+    margin = resolve_robot(robot).margin if collision_distance is None else collision_distance
+    rng = np.random.default_rng(seed)
+    return [
+        sample_task(world, rng, collision_distance=margin, min_goal_distance=min_goal_distance)
+        for _ in range(n)
+    ]

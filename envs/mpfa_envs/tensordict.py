@@ -1,0 +1,266 @@
+"""The navigation task as a TorchRL environment."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
+
+from mpfa_envs.navigation import INFO_TYPES, NavigationEnv
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Sequence
+
+    from torchrl.data import TensorSpec
+
+    from mpfa_envs.worlds import World
+
+_FLAGS = tuple(name for name, kind in INFO_TYPES.items() if kind is bool)
+_NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
+
+
+class NavigationTorchEnv(EnvBase):
+    """One or several :class:`~mpfa_envs.NavigationEnv` behind TorchRL's interface.
+
+    It speaks TensorDict itself instead of wrapping each environment, so the cost of a TensorDict is
+    paid once a step, not once an environment.
+
+    ============================ ========= =============================================
+    key                          shape     meaning
+    ============================ ========= =============================================
+    ``"observation"``            ``[24]``  float32, as :class:`~mpfa_envs.NavigationEnv`
+    ``"action"``                 ``[2]``   float32 in [-1, 1]
+    ``"reward"``                 ``[1]``   float32
+    ``"done"``, ``"terminated"`` ``[1]``   bool
+    and ``"truncated"``
+    ``("info", name)``           ``[1]``   every entry of
+                                           :data:`~mpfa_envs.INFO_TYPES`, bool or float32
+    ============================ ========= =============================================
+
+    All shapes follow the batch size: ``[]`` for one environment, else ``[num_envs]``.
+
+    Args:
+        num_envs: Number of environments in this process; None: one, without a batch dimension.
+        device: Where the tensors live; the simulation runs on the CPU.
+        **kwargs: Arguments of :class:`~mpfa_envs.NavigationEnv`.
+
+    Raises:
+        ValueError: If num_envs is not a positive integer, or an argument is out of its range.
+
+    Examples:
+        >>> from mpfa_envs import NavigationTorchEnv
+        >>> env = NavigationTorchEnv(num_envs=2, world="B", physics="kinematic")
+        >>> env.rollout(5)["next", "info", "distance"].shape
+        torch.Size([2, 5, 1])
+        >>> env.close()
+
+    See Also:
+        :func:`make_navigation_env`, which also runs environments in processes of their own.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_envs: int | None = None,
+        device: torch.device | str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        _check_num_envs(num_envs)
+        batch_size = torch.Size([] if num_envs is None else [num_envs])
+        super().__init__(device=device, batch_size=batch_size)
+        self.envs = [NavigationEnv(**kwargs) for _ in range(num_envs or 1)]
+        """The environments, in the order of the batch."""
+        self._seeds: list[int | None] = [None] * len(self.envs)
+        self._tasks: list[dict[str, Any] | None] = [None] * len(self.envs)
+        self._observations = np.zeros(
+            (len(self.envs), *self.envs[0].observation_space.shape), dtype=np.float32
+        )
+        self._numbers = [[0.0] * len(_NUMBERS) for _ in self.envs]
+        self._flags = [[False] * len(_FLAGS) for _ in self.envs]
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        space = self.envs[0].observation_space
+        one = (*self.batch_size, 1)
+        low, high = (
+            torch.as_tensor(bound).expand(*self.batch_size, -1).contiguous()
+            for bound in (space.low, space.high)
+        )
+        entries: dict[str, TensorSpec] = {
+            name: Binary(shape=one, dtype=torch.bool) for name in _FLAGS
+        }
+        entries.update({name: Unbounded(shape=one, dtype=torch.float32) for name in _NUMBERS})
+        self.observation_spec = Composite(
+            observation=Bounded(low=low, high=high, dtype=torch.float32),
+            info=Composite(entries, shape=self.batch_size),
+            shape=self.batch_size,
+        )
+        self.action_spec = Bounded(
+            low=-1.0, high=1.0, shape=(*self.batch_size, 2), dtype=torch.float32
+        )
+        self.reward_spec = Unbounded(shape=one, dtype=torch.float32)
+        self.done_spec = Composite(
+            {
+                name: Binary(shape=one, dtype=torch.bool)
+                for name in ("done", "terminated", "truncated")
+            },
+            shape=self.batch_size,
+        )
+
+    def set_task(
+        self,
+        start: Sequence[float],
+        goal: Sequence[float],
+        *,
+        index: int = 0,
+    ) -> None:
+        """Fix the start and the goal of the next episode, and of no later one.
+
+        Args:
+            start: Pose (x, y, heading) [m, m, rad].
+            goal: Position (x, y) [m].
+            index: Which environment of the batch.
+
+        Raises:
+            IndexError: If there is no such environment.
+            ValueError: If the task cannot be driven.
+        """
+        if not 0 <= index < len(self.envs):
+            raise IndexError(f"index must be in [0, {len(self.envs)}), got {index}")
+        options = {"start": start, "goal": goal}
+        self.envs[index].check_task(options)
+        self._tasks[index] = options
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seeds = [None if seed is None else seed + i for i in range(len(self.envs))]
+
+    def _keep(self, index: int, observation: np.ndarray[Any, Any], info: dict[str, Any]) -> None:
+        self._observations[index] = observation
+        self._numbers[index] = [info[name] for name in _NUMBERS]
+        self._flags[index] = [info[name] for name in _FLAGS]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        chosen = [True] * len(self.envs) if mask is None else mask.reshape(-1).tolist()
+        for index, env in enumerate(self.envs):
+            if not chosen[index]:
+                continue
+            seed, task = self._seeds[index], self._tasks[index]
+            self._seeds[index] = self._tasks[index] = None
+            self._keep(index, *env.reset(seed=seed, options=task))
+        return self._pack({})
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict.get("action").detach().cpu().numpy().reshape(len(self.envs), 2)
+        # A rollout that waits for the last episode of a batch masks those that are over.
+        mask = tensordict.get("_step", None)
+        chosen = [True] * len(self.envs) if mask is None else mask.reshape(-1).tolist()
+        rewards = [0.0] * len(self.envs)
+        ends = [[False] * 3 for _ in self.envs]
+        for index, env in enumerate(self.envs):
+            if chosen[index]:
+                observation, reward, terminated, truncated, info = env.step(actions[index])
+                self._keep(index, observation, info)
+                rewards[index] = reward
+                ends[index] = [terminated or truncated, terminated, truncated]
+        done, terminated_, truncated_ = self._columns(ends, torch.bool)
+        return self._pack(
+            {
+                "reward": self._columns([[reward] for reward in rewards], torch.float32)[0],
+                "done": done,
+                "terminated": terminated_,
+                "truncated": truncated_,
+            }
+        )
+
+    def _columns(
+        self, rows: list[list[float]] | list[list[bool]], dtype: torch.dtype
+    ) -> tuple[torch.Tensor, ...]:
+        """Turn one row per environment into tensors of shape ``[*batch, 1]``, one per column."""
+        table = torch.tensor(rows, dtype=dtype, device=self.device)
+        return table.view(*self.batch_size, table.shape[-1], 1).unbind(-2)
+
+    def _pack(self, entries: dict[str, Any]) -> TensorDictBase:
+        """Add the observation and the info to the entries of a step."""
+        # A copy: what a rollout has collected must not change with the next step.
+        observation = torch.tensor(self._observations, device=self.device)
+        info = dict(zip(_NUMBERS, self._columns(self._numbers, torch.float32), strict=True))
+        info.update(zip(_FLAGS, self._columns(self._flags, torch.bool), strict=True))
+        entries["observation"] = observation.view(*self.batch_size, -1)
+        entries["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Release the physics servers; a second call does nothing.
+
+        Args:
+            raise_if_closed: Accepted for TorchRL's sake.
+        """
+        for env in self.envs:
+            env.close()
+        if not self.is_closed:
+            super().close(raise_if_closed=raise_if_closed)
+
+
+def make_navigation_env(
+    world: str | os.PathLike[str] | World = "A",
+    *,
+    num_envs: int | None = None,
+    parallel: bool = False,
+    device: torch.device | str | None = None,
+    seed: int | None = None,
+    **kwargs: Any,
+) -> EnvBase:
+    """Build the navigation task for TorchRL.
+
+    Args:
+        world: As in :class:`~mpfa_envs.NavigationEnv`.
+        num_envs: Number of environments; None: one, without a batch dimension.
+        parallel: Run each environment in a process of its own.
+        device: Where the tensors live.
+        seed: Seed of the environments; None leaves them to chance.
+        **kwargs: Further arguments of :class:`~mpfa_envs.NavigationEnv`.
+
+    Returns:
+        A :class:`NavigationTorchEnv`, or a ``ParallelEnv`` of them, of batch size ``[num_envs]`` or
+        ``[]``.
+
+    Raises:
+        ValueError: If num_envs is not a positive integer, parallel environments have no number, or
+            another argument is out of its range.
+
+    Examples:
+        >>> from mpfa_envs import make_navigation_env
+        >>> env = make_navigation_env("C", physics="kinematic", seed=0)
+        >>> rollout = env.rollout(3)
+        >>> rollout["observation"].shape, rollout["next", "info", "success"].shape
+        (torch.Size([3, 24]), torch.Size([3, 1]))
+        >>> env.close()
+    """
+    _check_num_envs(num_envs)
+    if parallel:
+        if num_envs is None:
+            raise ValueError("num_envs must be a positive integer with parallel=True, got None")
+        env: EnvBase = ParallelEnv(
+            num_envs,
+            EnvCreator(partial(NavigationTorchEnv, world=world, **kwargs)),
+            device=device,
+        )
+    else:
+        env = NavigationTorchEnv(num_envs=num_envs, device=device, world=world, **kwargs)
+    if seed is not None:
+        env.set_seed(seed)
+    return env
+
+
+def _check_num_envs(num_envs: int | None) -> None:
+    if num_envs is not None and (
+        isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1
+    ):
+        raise ValueError(f"num_envs must be a positive integer or None, got {num_envs!r}")
