@@ -110,9 +110,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
                             positive
     ====== ================ ==================================================== ==========
 
-    **Action**, ``Box(-1, 1)`` of shape ``[2]``, float32: speed of the left and the right wheel, from
-    the robot's slowest (0.05 m/s for the TurtleBot2) to its fastest (0.5 m/s). It neither stops nor
-    reverses. Actions are clipped to the box.
+    **Action**, ``Box(-1, 1)`` of shape ``[2]``, float32: speed of the left and the right wheel,
+    from the robot's slowest (0.05 m/s for the TurtleBot2) to its fastest (0.5 m/s). It neither
+    stops nor reverses. Actions are clipped to the box.
 
     **Reward**: Eq. (25) of the paper, see :func:`~mpfa_envs.navigation_reward`.
 

@@ -15,14 +15,11 @@ from mpfa_envs.navigation import INFO_TYPES, NavigationEnv
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from torchrl.data import TensorSpec
 
     from mpfa_envs.worlds import World
-
-_FLAGS = tuple(name for name, kind in INFO_TYPES.items() if kind is bool)
-_NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
 
 
 class NavigationTorchEnv(EnvBase):
@@ -48,6 +45,8 @@ class NavigationTorchEnv(EnvBase):
     Args:
         num_envs: Number of environments in this process; None: one, without a batch dimension.
         device: Where the tensors live; the simulation runs on the CPU.
+        info_keys: Which entries of the info to hand on; None: all. Each costs TorchRL some 20 µs a
+            step, which is more than it costs to compute.
         **kwargs: Arguments of :class:`~mpfa_envs.NavigationEnv`.
 
     Raises:
@@ -69,9 +68,14 @@ class NavigationTorchEnv(EnvBase):
         *,
         num_envs: int | None = None,
         device: torch.device | str | None = None,
+        info_keys: Iterable[str] | None = None,
         **kwargs: Any,
     ) -> None:
         _check_num_envs(num_envs)
+        keys = list(INFO_TYPES if info_keys is None else info_keys)
+        for key in keys:
+            if key not in INFO_TYPES:
+                raise ValueError(f"info_keys must be among {list(INFO_TYPES)}, got {key!r}")
         batch_size = torch.Size([] if num_envs is None else [num_envs])
         super().__init__(device=device, batch_size=batch_size)
         self.envs = [NavigationEnv(**kwargs) for _ in range(num_envs or 1)]
@@ -81,8 +85,10 @@ class NavigationTorchEnv(EnvBase):
         self._observations = np.zeros(
             (len(self.envs), *self.envs[0].observation_space.shape), dtype=np.float32
         )
-        self._numbers = [[0.0] * len(_NUMBERS) for _ in self.envs]
-        self._flags = [[False] * len(_FLAGS) for _ in self.envs]
+        self._number_names = [name for name in keys if INFO_TYPES[name] is float]
+        self._flag_names = [name for name in keys if INFO_TYPES[name] is bool]
+        self._numbers: list[list[float]] = [[] for _ in self.envs]
+        self._flags: list[list[bool]] = [[] for _ in self.envs]
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -93,14 +99,16 @@ class NavigationTorchEnv(EnvBase):
             for bound in (space.low, space.high)
         )
         entries: dict[str, TensorSpec] = {
-            name: Binary(shape=one, dtype=torch.bool) for name in _FLAGS
+            name: Binary(shape=one, dtype=torch.bool) for name in self._flag_names
         }
-        entries.update({name: Unbounded(shape=one, dtype=torch.float32) for name in _NUMBERS})
-        self.observation_spec = Composite(
-            observation=Bounded(low=low, high=high, dtype=torch.float32),
-            info=Composite(entries, shape=self.batch_size),
-            shape=self.batch_size,
+        entries.update(
+            {name: Unbounded(shape=one, dtype=torch.float32) for name in self._number_names}
         )
+        self.observation_spec = Composite(
+            observation=Bounded(low=low, high=high, dtype=torch.float32), shape=self.batch_size
+        )
+        if entries:
+            self.observation_spec["info"] = Composite(entries, shape=self.batch_size)
         self.action_spec = Bounded(
             low=-1.0, high=1.0, shape=(*self.batch_size, 2), dtype=torch.float32
         )
@@ -142,8 +150,8 @@ class NavigationTorchEnv(EnvBase):
 
     def _keep(self, index: int, observation: np.ndarray[Any, Any], info: dict[str, Any]) -> None:
         self._observations[index] = observation
-        self._numbers[index] = [info[name] for name in _NUMBERS]
-        self._flags[index] = [info[name] for name in _FLAGS]
+        self._numbers[index] = [info[name] for name in self._number_names]
+        self._flags[index] = [info[name] for name in self._flag_names]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -154,7 +162,7 @@ class NavigationTorchEnv(EnvBase):
             seed, task = self._seeds[index], self._tasks[index]
             self._seeds[index] = self._tasks[index] = None
             self._keep(index, *env.reset(seed=seed, options=task))
-        return self._pack({})
+        return self._pack()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach().cpu().numpy().reshape(len(self.envs), 2)
@@ -162,39 +170,46 @@ class NavigationTorchEnv(EnvBase):
         mask = tensordict.get("_step", None)
         chosen = [True] * len(self.envs) if mask is None else mask.reshape(-1).tolist()
         rewards = [0.0] * len(self.envs)
-        ends = [[False] * 3 for _ in self.envs]
+        ends = [(False, False)] * len(self.envs)
         for index, env in enumerate(self.envs):
             if chosen[index]:
-                observation, reward, terminated, truncated, info = env.step(actions[index])
+                observation, rewards[index], terminated, truncated, info = env.step(actions[index])
                 self._keep(index, observation, info)
-                rewards[index] = reward
-                ends[index] = [terminated or truncated, terminated, truncated]
-        done, terminated_, truncated_ = self._columns(ends, torch.bool)
-        return self._pack(
-            {
-                "reward": self._columns([[reward] for reward in rewards], torch.float32)[0],
-                "done": done,
-                "terminated": terminated_,
-                "truncated": truncated_,
-            }
-        )
+                ends[index] = terminated, truncated
+        return self._pack(rewards, ends)
+
+    def _pack(
+        self, rewards: list[float] | None = None, ends: list[tuple[bool, bool]] | None = None
+    ) -> TensorDictBase:
+        """Build what a reset gives, or with rewards and (terminated, truncated) what a step gives.
+
+        Few tensors are made and then cut, as making one costs more than all that is done with it.
+        """
+        names, flags = self._number_names, self._flag_names
+        numbers, bits = self._numbers, self._flags
+        if rewards is not None and ends is not None:
+            numbers = [[*row, reward] for row, reward in zip(numbers, rewards, strict=True)]
+            bits = [[*row, *end, any(end)] for row, end in zip(bits, ends, strict=True)]
+        columns = self._columns(numbers, torch.float32)
+        bit_columns = self._columns(bits, torch.bool)
+        # A copy: what a rollout has collected must not change with the next step.
+        observation = torch.tensor(self._observations, device=self.device)
+        entries: dict[str, Any] = {"observation": observation.view(*self.batch_size, -1)}
+        if names or flags:
+            info = dict(zip(names, columns, strict=False))
+            info.update(zip(flags, bit_columns, strict=False))
+            entries["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
+        if rewards is not None:
+            entries["reward"] = columns[-1]
+            entries["terminated"], entries["truncated"], entries["done"] = bit_columns[-3:]
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _columns(
         self, rows: list[list[float]] | list[list[bool]], dtype: torch.dtype
     ) -> tuple[torch.Tensor, ...]:
         """Turn one row per environment into tensors of shape ``[*batch, 1]``, one per column."""
         table = torch.tensor(rows, dtype=dtype, device=self.device)
-        return table.view(*self.batch_size, table.shape[-1], 1).unbind(-2)
-
-    def _pack(self, entries: dict[str, Any]) -> TensorDictBase:
-        """Add the observation and the info to the entries of a step."""
-        # A copy: what a rollout has collected must not change with the next step.
-        observation = torch.tensor(self._observations, device=self.device)
-        info = dict(zip(_NUMBERS, self._columns(self._numbers, torch.float32), strict=True))
-        info.update(zip(_FLAGS, self._columns(self._flags, torch.bool), strict=True))
-        entries["observation"] = observation.view(*self.batch_size, -1)
-        entries["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
-        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+        return table.view(*self.batch_size, -1, 1).unbind(-2) if table.numel() else ()
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Release the physics servers; a second call does nothing.
