@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.maps import WORLDS
-from mpfa_envs.navigation import INFO_TYPES, OBSERVATION, NavigationEnv, observation_slices
+from mpfa_envs.navigation import NavigationEnv
+from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
+from mpfa_envs.render import draw_trajectories
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
 from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
+from mpfa_envs.world_file import WorldFileError, load_world, save_world
 from mpfa_envs.worlds import Box, Cylinder, World
 
 if TYPE_CHECKING:
@@ -20,9 +24,12 @@ if TYPE_CHECKING:
 
 ENV_IDS = tuple(f"mpfa/Navigation-{name}-v0" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
+EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
+"""A world file to start one's own from."""
 
 __all__ = [
     "ENV_IDS",
+    "EXAMPLE_WORLD",
     "INFO_TYPES",
     "OBSERVATION",
     "ROBOTS",
@@ -38,11 +45,15 @@ __all__ = [
     "StepOutcome",
     "Task",
     "World",
+    "WorldFileError",
+    "draw_trajectories",
     "evaluation_pairs",
+    "load_world",
     "make_navigation_env",
     "navigation_reward",
     "observation_slices",
     "sample_task",
+    "save_world",
 ]
 
 for _id, _name in zip(ENV_IDS, WORLDS, strict=True):

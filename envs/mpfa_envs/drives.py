@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:
     from mpfa_envs.robot import RobotModel
-    from mpfa_envs.simulation import Simulation
     from mpfa_envs.worlds import World
 
 
@@ -118,7 +117,7 @@ class WheelDrive:
 
         self._substeps = max(1, round(time_step / substep))
         self._wheel_radius = robot.wheel_radius
-        self.simulation: Simulation = Simulation(time_step=time_step / self._substeps)
+        self.simulation = Simulation(time_step=time_step / self._substeps)
         self.simulation.add_world(world)
         self.simulation.add_robot(robot)
 

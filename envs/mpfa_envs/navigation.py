@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box as BoxSpace
 
-from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
+from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.lidar import Lidar, Reduction
 from mpfa_envs.maps import resolve_world
+from mpfa_envs.observation import observation_bounds, observation_slices, observe
 from mpfa_envs.path import planner_for
 from mpfa_envs.reward import RewardFunction, RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import RobotModel, resolve_robot
-from mpfa_envs.tasks import Task, sample_task
+from mpfa_envs.tasks import Task, check_task, sample_task
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,69 +27,6 @@ if TYPE_CHECKING:
 
 Physics = Literal["kinematic", "wheels"]
 """How the robot moves."""
-
-CLOSENESS_DISTANCE: Final = 0.35
-"""A range of this or less has closeness one [m]."""
-GOAL_CLOSENESS_DISTANCE: Final = 0.3
-"""A goal at this distance or nearer has closeness one [m]."""
-DISTANCE_SCALE: Final = 10.0
-"""What the distance to the goal is divided by in the observation [m]."""
-SPEED_BOUND: Final = 2.0
-"""Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
-
-_FLAGS = ("success", "collision", "time_out")
-_NUMBERS = (
-    "reward_goal",
-    "reward_collision",
-    "reward_progress",
-    "reward_other",
-    "sim_time",
-    "path_length",
-    "shortest_path",
-    "min_clearance",
-    "distance",
-    "x",
-    "y",
-    "heading",
-)
-INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
-    **dict.fromkeys(_FLAGS, bool),
-    **dict.fromkeys(_NUMBERS, float),
-}
-"""Keys of the info dictionary of every reset and step, with the type of their value."""
-
-
-def observation_slices(sectors: int = 18) -> dict[str, slice]:
-    """Name the parts of the observation.
-
-    Args:
-        sectors: Number of sectors of the lidar.
-
-    Returns:
-        Where each part lies, in order.
-
-    Examples:
-        >>> from mpfa_envs import observation_slices
-        >>> observation_slices()["goal_direction"]
-        slice(18, 20, None)
-    """
-    widths = {
-        "lidar": sectors,
-        "goal_direction": 2,
-        "goal_closeness": 1,
-        "goal_distance": 1,
-        "linear_speed": 1,
-        "angular_speed": 1,
-    }
-    slices, first = {}, 0
-    for name, width in widths.items():
-        slices[name] = slice(first, first + width)
-        first += width
-    return slices
-
-
-OBSERVATION: Final = observation_slices()
-"""The parts of the observation with the default lidar."""
 
 
 class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
@@ -169,7 +107,11 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         >>> env.close()
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    # Gymnasium declares it as an instance variable.
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(
         self,
@@ -240,10 +182,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             "collision_reward": float(collision_reward),
         }
         self.observation_slices = observation_slices(sectors)
-        low = np.array([0.0] * sectors + [-1, -1, 0, 0, -SPEED_BOUND, -SPEED_BOUND], np.float32)
-        high = np.array([1.0] * sectors + [1, 1, 1, 0, SPEED_BOUND, SPEED_BOUND], np.float32)
-        high[sectors + 3] = self.world.diagonal / DISTANCE_SCALE
-        self.observation_space = BoxSpace(low, high)
+        low, high = observation_bounds(sectors, self.world.diagonal)
+        self.observation_space = BoxSpace(low, high, dtype=np.float32)
         self.action_space = BoxSpace(-1.0, 1.0, (2,), np.float32)
         slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
         self._middle_speed, self._speed_span = (fast + slow) / 2, (fast - slow) / 2
@@ -292,7 +232,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
                 min_goal_distance=self.min_goal_distance,
             )
         self._task = task
-        self._goal_x, self._goal_y = task.goal
+        self._goal = task.goal
         length = planner_for(self.world, self.robot.radius).length(task.start[:2], task.goal)
         self._shortest_path = max(length - self.goal_radius, 0.0)
         self._steps = 0
@@ -303,7 +243,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self._min_clearance = clearance
         self._trail = [task.start[:2]]
         self._running = True
-        return self._observe(self._motion), self._info(False, False, False, RewardTerms())
+        return self._observe(), self._info(False, False, False, RewardTerms())
 
     def step(
         self, action: NDArray[np.float32]
@@ -330,7 +270,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self._motion = motion
         self._trail.append((motion.x, motion.y))
         previous = self._distance
-        self._distance = math.hypot(self._goal_x - motion.x, self._goal_y - motion.y)
+        self._distance = math.dist(self._goal, motion[:2])
         to_obstacle = self.world.clearance(motion.x, motion.y)
         clearance = to_obstacle - self.robot.radius
         self._min_clearance = min(self._min_clearance, clearance)
@@ -354,9 +294,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         truncated = not terminated and self._steps >= self.max_steps
         self._running = not (terminated or truncated)
         info = self._info(success, collision, truncated, terms)
-        return self._observe(motion), float(terms.total), terminated, truncated, info
+        return self._observe(), float(terms.total), terminated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the room from above.
 
         Returns:
@@ -400,27 +340,12 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         middle, span = self._middle_speed, self._speed_span
         return middle + span * left, middle + span * right
 
-    def _observe(self, motion: Motion) -> NDArray[np.float32]:
-        """Build the observation, shape ``[sectors + 6]``."""
-        x, y, heading, linear_speed, angular_speed = motion
+    def _observe(self) -> NDArray[np.float32]:
+        """Sense the world and build the observation."""
+        motion = self._motion
+        x, y, heading = motion[:3]
         ranges = self.lidar.scan(x, y, heading, rng=self.np_random if self.lidar.noise else None)
-        sectors = ranges.size
-        observation = np.empty(sectors + 6, dtype=np.float32)
-        np.maximum(ranges, CLOSENESS_DISTANCE, out=ranges)
-        observation[:sectors] = CLOSENESS_DISTANCE / ranges
-        distance = self._distance
-        # A robot on the goal sees it ahead.
-        bearing = math.atan2(self._goal_y - y, self._goal_x - x) - heading if distance else 0.0
-        bound = SPEED_BOUND
-        observation[sectors:] = (
-            math.cos(bearing),
-            math.sin(bearing),
-            min(GOAL_CLOSENESS_DISTANCE / distance, 1.0) if distance else 1.0,
-            distance / DISTANCE_SCALE,
-            min(max(linear_speed / self.robot.max_wheel_speed, -bound), bound),
-            min(max(angular_speed / self.robot.max_angular_speed, -bound), bound),
-        )
-        return observation
+        return observe(ranges, motion, self._goal, self._distance, self.robot)
 
     def _info(
         self, success: bool, collision: bool, time_out: bool, terms: RewardTerms
@@ -446,34 +371,24 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         }
 
     def check_task(self, options: dict[str, Any]) -> Task:
-        """Read a task from the options of a reset."""
-        unknown = sorted(set(options) - {"start", "goal"})
-        if unknown or len(options) != 2:
-            raise ValueError(
-                f"options must have the keys 'start' and 'goal', got {sorted(options)}"
-            )
-        numbers: dict[str, list[float]] = {}
-        for name, size in (("start", 3), ("goal", 2)):
-            values = np.asarray(options[name], dtype=np.float64)
-            if values.shape != (size,) or not np.isfinite(values).all():
-                raise ValueError(f"{name} must be {size} finite numbers, got {options[name]!r}")
-            numbers[name] = values.tolist()
-        x, y, heading = numbers["start"]
-        goal = (numbers["goal"][0], numbers["goal"][1])
-        clearance = self.world.clearance(x, y)
-        if clearance <= self.collision_distance:
-            raise ValueError(
-                f"start must be farther than collision_distance = {self.collision_distance} m from "
-                f"obstacles and walls, got {(x, y)} with {clearance:.3f} m"
-            )
-        if math.dist((x, y), goal) <= self.goal_radius:
-            raise ValueError(
-                f"goal must be farther than goal_radius = {self.goal_radius} m from the start, "
-                f"got {goal} for the start {(x, y)}"
-            )
-        if planner_for(self.world, self.robot.radius).find((x, y), goal) is None:
-            raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
-        return Task((x, y, heading), goal)
+        """Read a task from the options of a reset.
+
+        Args:
+            options: ``{"start": (x, y, heading), "goal": (x, y)}`` [m, m, rad].
+
+        Returns:
+            The task.
+
+        Raises:
+            ValueError: If it cannot be driven in this world by this robot.
+        """
+        return check_task(
+            self.world,
+            options,
+            collision_distance=self.collision_distance,
+            goal_radius=self.goal_radius,
+            radius=self.robot.radius,
+        )
 
 
 def _collision_distance(value: float | Literal["contact"] | None, robot: RobotModel) -> float:

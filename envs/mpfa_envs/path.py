@@ -82,9 +82,9 @@ class PathPlanner:
         for cylinder in world.cylinders:
             radius = cylinder.radius + self.margin
             circles.append((cylinder.x, cylinder.y, radius - _TOUCH))
-            angles = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
+            around = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
             outer = radius / math.cos(math.pi / _CIRCLE_CORNERS)
-            corners.append(_polygon(cylinder.x, cylinder.y, outer, angles))
+            corners.append(_polygon(cylinder.x, cylinder.y, outer, around))
         self._rectangles = np.array(rectangles).reshape(-1, 4)
         self._circles = np.array(circles).reshape(-1, 3)
         nodes = np.concatenate([np.empty((0, 2)), *corners])
@@ -206,7 +206,9 @@ class PathPlanner:
         return free
 
 
-def _polygon(x: float, y: float, radius: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _polygon(
+    x: float, y: float, radius: float, angles: NDArray[np.floating]
+) -> NDArray[np.float64]:
     """Points at the angles around a center [m], shape ``[angles, 2]``."""
     return np.stack((x + radius * np.cos(angles), y + radius * np.sin(angles)), axis=1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from mpfa_envs.path import planner_for
 from mpfa_envs.robot import RobotModel, resolve_robot
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mpfa_envs.worlds import Box, World
 
 GOAL_CLEARANCE = 0.5
@@ -77,6 +79,59 @@ def sample_task(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
         f"{min_goal_distance} m apart with a path between them"
     )
+
+
+def check_task(
+    world: World,
+    options: Mapping[str, Any],
+    *,
+    collision_distance: float,
+    goal_radius: float,
+    radius: float,
+) -> Task:
+    """Read a task from the options of a reset.
+
+    Args:
+        world: The room and its obstacles.
+        options: ``{"start": (x, y, heading), "goal": (x, y)}`` [m, m, rad].
+        collision_distance: Distance of the center from an obstacle that is a collision [m].
+        goal_radius: Distance that reaches the goal [m].
+        radius: Radius of the robot [m].
+
+    Returns:
+        The task.
+
+    Raises:
+        ValueError: If the keys or the numbers are wrong, the start is a collision or at the goal,
+            or no path leads to the goal.
+    """
+    if set(options) != {"start", "goal"}:
+        raise ValueError(f"options must have the keys 'start' and 'goal', got {sorted(options)}")
+    numbers: dict[str, list[float]] = {}
+    for name, size in (("start", 3), ("goal", 2)):
+        try:
+            values = np.asarray(options[name], dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise ValueError(f"{name} must be {size} finite numbers, got {options[name]!r}")
+        numbers[name] = values.tolist()
+    x, y, heading = numbers["start"]
+    goal = (numbers["goal"][0], numbers["goal"][1])
+    clearance = world.clearance(x, y)
+    if clearance <= collision_distance:
+        raise ValueError(
+            f"start must be farther than collision_distance = {collision_distance} m from "
+            f"obstacles and walls, got {(x, y)} with {clearance:.3f} m"
+        )
+    if math.dist((x, y), goal) <= goal_radius:
+        raise ValueError(
+            f"goal must be farther than goal_radius = {goal_radius} m from the start {(x, y)}, "
+            f"got {goal}"
+        )
+    if planner_for(world, radius).find((x, y), goal) is None:
+        raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
+    return Task((x, y, heading), goal)
 
 
 def _draw_point(

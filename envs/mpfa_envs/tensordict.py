@@ -11,7 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 
-from mpfa_envs.navigation import INFO_TYPES, NavigationEnv
+from mpfa_envs.navigation import NavigationEnv
+from mpfa_envs.observation import INFO_TYPES, observation_bounds
 
 if TYPE_CHECKING:
     import os
@@ -83,7 +84,7 @@ class NavigationTorchEnv(EnvBase):
         self._seeds: list[int | None] = [None] * len(self.envs)
         self._tasks: list[dict[str, Any] | None] = [None] * len(self.envs)
         self._observations = np.zeros(
-            (len(self.envs), *self.envs[0].observation_space.shape), dtype=np.float32
+            (len(self.envs), self.envs[0].lidar.sectors + 6), dtype=np.float32
         )
         self._number_names = [name for name in keys if INFO_TYPES[name] is float]
         self._flag_names = [name for name in keys if INFO_TYPES[name] is bool]
@@ -92,11 +93,11 @@ class NavigationTorchEnv(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        space = self.envs[0].observation_space
+        env = self.envs[0]
         one = (*self.batch_size, 1)
         low, high = (
-            torch.as_tensor(bound).expand(*self.batch_size, -1).contiguous()
-            for bound in (space.low, space.high)
+            torch.as_tensor(bound).expand((*self.batch_size, -1)).contiguous()
+            for bound in observation_bounds(env.lidar.sectors, env.world.diagonal)
         )
         entries: dict[str, TensorSpec] = {
             name: Binary(shape=one, dtype=torch.bool) for name in self._flag_names

@@ -127,7 +127,8 @@ class World:
     @property
     def covered_area(self) -> float:
         """Area under obstacles, overlaps counted twice [m²]."""
-        return sum(obstacle.area for obstacle in (*self.boxes, *self.cylinders))
+        boxes = sum(box.area for box in self.boxes)
+        return boxes + sum(cylinder.area for cylinder in self.cylinders)
 
     def holds(self, shape: Box | Cylinder) -> bool:
         """Tell whether a shape lies in the room; it may touch the walls."""

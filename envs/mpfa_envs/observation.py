@@ -1,0 +1,132 @@
+"""What the robot senses and what the info dictionary holds: names, order and scales."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.drives import Motion
+    from mpfa_envs.robot import RobotModel
+
+CLOSENESS_DISTANCE: Final = 0.35
+"""A range of this or less has closeness one [m]."""
+GOAL_CLOSENESS_DISTANCE: Final = 0.3
+"""A goal at this distance or nearer has closeness one [m]."""
+DISTANCE_SCALE: Final = 10.0
+"""What the distance to the goal is divided by in the observation [m]."""
+SPEED_BOUND: Final = 2.0
+"""Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
+
+_FLAGS = ("success", "collision", "time_out")
+_NUMBERS = (
+    "reward_goal",
+    "reward_collision",
+    "reward_progress",
+    "reward_other",
+    "sim_time",
+    "path_length",
+    "shortest_path",
+    "min_clearance",
+    "distance",
+    "x",
+    "y",
+    "heading",
+)
+INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
+    **dict.fromkeys(_FLAGS, bool),
+    **dict.fromkeys(_NUMBERS, float),
+}
+"""Keys of the info dictionary of every reset and step, with the type of their value."""
+
+
+def observation_slices(sectors: int = 18) -> dict[str, slice]:
+    """Name the parts of the observation.
+
+    Args:
+        sectors: Number of sectors of the lidar.
+
+    Returns:
+        Where each part lies, in order.
+
+    Examples:
+        >>> from mpfa_envs import observation_slices
+        >>> observation_slices()["goal_direction"]
+        slice(18, 20, None)
+    """
+    widths = {
+        "lidar": sectors,
+        "goal_direction": 2,
+        "goal_closeness": 1,
+        "goal_distance": 1,
+        "linear_speed": 1,
+        "angular_speed": 1,
+    }
+    slices, first = {}, 0
+    for name, width in widths.items():
+        slices[name] = slice(first, first + width)
+        first += width
+    return slices
+
+
+OBSERVATION: Final = observation_slices()
+"""The parts of the observation with the default lidar."""
+
+
+def observation_bounds(
+    sectors: int, diagonal: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Give the least and the greatest observation.
+
+    Args:
+        sectors: Number of sectors of the lidar.
+        diagonal: Longest distance in the room [m].
+
+    Returns:
+        Two arrays of shape ``[sectors + 6]``.
+    """
+    far = diagonal / DISTANCE_SCALE
+    low = [0.0] * sectors + [-1.0, -1.0, 0.0, 0.0, -SPEED_BOUND, -SPEED_BOUND]
+    high = [1.0] * sectors + [1.0, 1.0, 1.0, far, SPEED_BOUND, SPEED_BOUND]
+    return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
+
+
+def observe(
+    ranges: NDArray[np.float64],
+    motion: Motion,
+    goal: tuple[float, float],
+    distance: float,
+    robot: RobotModel,
+) -> NDArray[np.float32]:
+    """Build an observation.
+
+    Args:
+        ranges: Range of each sector [m], shape ``[sectors]``.
+        motion: Where the robot is and how it moves.
+        goal: Where it should go (x, y) [m].
+        distance: Distance between the two [m].
+        robot: Whose greatest speeds scale the speeds.
+
+    Returns:
+        The observation, shape ``[sectors + 6]``; :func:`observation_slices` names its parts.
+    """
+    x, y, heading, linear_speed, angular_speed = motion
+    sectors = ranges.size
+    observation = np.empty(sectors + 6, dtype=np.float32)
+    np.divide(CLOSENESS_DISTANCE, np.maximum(ranges, CLOSENESS_DISTANCE), out=observation[:sectors])
+    # A robot on the goal sees it ahead.
+    bearing = math.atan2(goal[1] - y, goal[0] - x) - heading if distance else 0.0
+    bound = SPEED_BOUND
+    observation[sectors:] = (
+        math.cos(bearing),
+        math.sin(bearing),
+        min(GOAL_CLOSENESS_DISTANCE / distance, 1.0) if distance else 1.0,
+        distance / DISTANCE_SCALE,
+        min(max(linear_speed / robot.max_wheel_speed, -bound), bound),
+        min(max(angular_speed / robot.max_angular_speed, -bound), bound),
+    )
+    return observation

@@ -1,0 +1,240 @@
+"""Worlds in YAML files: reading with errors that name the line, and writing."""
+
+from __future__ import annotations
+
+import math
+import os
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import yaml
+
+from mpfa_envs.worlds import Box, Cylinder, World
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
+    "boxes": ("x_min", "x_max", "y_min", "y_max"),
+    "cylinders": ("x", "y", "radius"),
+    "start": ("x_min", "x_max", "y_min", "y_max"),
+    "goal": ("x_min", "x_max", "y_min", "y_max"),
+}
+"""Keys of a file that hold lists, and the keys of an entry."""
+_KEYS: Final = ("name", "size", *_SHAPES)
+_REGION_CLEARANCE: Final = 0.5
+"""A region must hold a point this far from every obstacle: what the TurtleBot2 asks for [m]."""
+_GRID: Final = 0.05
+"""Spacing of the points that are tried in a region [m]."""
+
+
+class WorldFileError(ValueError):
+    """A file does not describe a world; the message names the file and the line."""
+
+
+def load_world(path: str | os.PathLike[str]) -> World:
+    """Read a world from a YAML file; ``docs/worlds.md`` describes the format.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The world; without a name in the file it is called as the file.
+
+    Raises:
+        WorldFileError: If the file cannot be read, is not YAML, or does not describe a world.
+
+    Examples:
+        >>> from mpfa_envs import EXAMPLE_WORLD, load_world
+        >>> world = load_world(EXAMPLE_WORLD)
+        >>> world.name, len(world.boxes), len(world.cylinders)
+        ('example', 4, 3)
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise WorldFileError(f"{path}: cannot be read: {error}") from error
+    try:
+        # Nodes instead of objects: they carry line numbers, and no tag can run anything.
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
+    return _Reader(path).world(root)
+
+
+class _Reader:
+    """Turns the nodes of one file into a world."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def error(self, node: yaml.Node | None, text: str) -> WorldFileError:
+        """An error at the line of a node."""
+        line = node.start_mark.line + 1 if node else 1
+        return WorldFileError(f"{self._path}:{line}: {text}")
+
+    def world(self, root: yaml.Node | None) -> World:
+        """Read the whole file."""
+        entries = self.mapping(root, "the file", _KEYS)
+        name = self._path.stem
+        if "name" in entries:
+            node = entries["name"]
+            if not isinstance(node, yaml.ScalarNode) or not node.value.strip():
+                raise self.error(node, "name must be text")
+            name = node.value
+        if "size" not in entries:
+            raise self.error(root, "size is missing; it is a list [width, depth] in meters")
+        size = self.size(entries["size"])
+        room = World(name=name, size=size)
+        boxes = self.shapes(entries, "boxes", room)
+        cylinders = self.shapes(entries, "cylinders", room)
+        world = World(
+            name=name,
+            size=size,
+            boxes=tuple(box for box, _ in boxes if isinstance(box, Box)),
+            cylinders=tuple(shape for shape, _ in cylinders if isinstance(shape, Cylinder)),
+        )
+        starts = self.regions(entries, "start", world)
+        goals = self.regions(entries, "goal", world)
+        return World(
+            name=name,
+            size=size,
+            boxes=world.boxes,
+            cylinders=world.cylinders,
+            start_regions=starts,
+            goal_regions=goals,
+        )
+
+    def mapping(
+        self, node: yaml.Node | None, what: str, keys: tuple[str, ...]
+    ) -> dict[str, yaml.Node]:
+        """Read a mapping that has no other keys, and none twice."""
+        if not isinstance(node, yaml.MappingNode):
+            raise self.error(node, f"{what} must be a mapping with the keys {', '.join(keys)}")
+        entries: dict[str, yaml.Node] = {}
+        for key, value in node.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else None
+            if name not in keys:
+                near = get_close_matches(str(name), keys, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(keys)}"
+                raise self.error(key, f"unknown key {name!r} in {what}; {hint}")
+            if name in entries:
+                raise self.error(key, f"key {name!r} appears twice in {what}")
+            entries[name] = value
+        return entries
+
+    def items(self, node: yaml.Node, what: str) -> list[yaml.Node]:
+        """Read a list."""
+        if not isinstance(node, yaml.SequenceNode):
+            raise self.error(node, f"{what} must be a list")
+        return list(node.value)
+
+    def number(self, node: yaml.Node, what: str) -> float:
+        """Read a finite number."""
+        try:
+            value = float(node.value) if isinstance(node, yaml.ScalarNode) else math.nan
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            got = node.value if isinstance(node, yaml.ScalarNode) else "something else"
+            raise self.error(node, f"{what} must be a number in meters, got {got!r}")
+        return value
+
+    def size(self, node: yaml.Node) -> tuple[float, float]:
+        """Read the size of the room [m]."""
+        sides = self.items(node, "size")
+        if len(sides) != 2:
+            raise self.error(node, f"size must be [width, depth], got {len(sides)} entries")
+        width, depth = (self.number(side, "size") for side in sides)
+        if width <= 0 or depth <= 0:
+            raise self.error(node, f"size must be positive, got {[width, depth]}")
+        return width, depth
+
+    def shapes(
+        self, entries: dict[str, yaml.Node], key: str, room: World
+    ) -> list[tuple[Box | Cylinder, yaml.Node]]:
+        """Read a list of shapes that lie in the room, each with its node."""
+        if key not in entries:
+            return []
+        shapes: list[tuple[Box | Cylinder, yaml.Node]] = []
+        for node in self.items(entries[key], key):
+            what = f"an entry of {key}"
+            values = self.mapping(node, what, _SHAPES[key])
+            for name in _SHAPES[key]:
+                if name not in values:
+                    raise self.error(node, f"{what} lacks the key {name!r}")
+            numbers = {name: self.number(value, name) for name, value in values.items()}
+            try:
+                shape = Cylinder(**numbers) if key == "cylinders" else Box(**numbers)
+            except ValueError as error:
+                raise self.error(node, str(error)) from error
+            if not room.holds(shape):
+                raise self.error(node, f"{what} lies outside the room {room.room}, got {shape}")
+            shapes.append((shape, node))
+        return shapes
+
+    def regions(self, entries: dict[str, yaml.Node], key: str, world: World) -> tuple[Box, ...]:
+        """Read regions in which a robot has room."""
+        regions: list[Box] = []
+        for region, node in self.shapes(entries, key, world):
+            if not isinstance(region, Box):
+                continue
+            if not _has_room(world, region):
+                raise self.error(
+                    node,
+                    f"an entry of {key} has no point {_REGION_CLEARANCE} m from every obstacle "
+                    f"and wall, got {region}",
+                )
+            regions.append(region)
+        return tuple(regions)
+
+
+def _has_room(world: World, region: Box) -> bool:
+    """Tell whether a point of a grid over the region is clear."""
+    columns = max(2, math.ceil((region.x_max - region.x_min) / _GRID) + 1)
+    rows = max(2, math.ceil((region.y_max - region.y_min) / _GRID) + 1)
+    return any(
+        world.clearance(x, y) >= _REGION_CLEARANCE
+        for x in np.linspace(region.x_min, region.x_max, columns).tolist()
+        for y in np.linspace(region.y_min, region.y_max, rows).tolist()
+    )
+
+
+def save_world(world: World, path: str | os.PathLike[str]) -> None:
+    """Write a world to a YAML file that :func:`load_world` reads back as an equal world.
+
+    Args:
+        world: The world.
+        path: The file; an existing one is overwritten.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from mpfa_envs import WORLDS, load_world, save_world
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save_world(WORLDS["B"], Path(folder) / "b.yaml")
+        ...     load_world(Path(folder) / "b.yaml") == WORLDS["B"]
+        True
+    """
+    content: dict[str, object] = {
+        "name": world.name,
+        "size": [float(side) for side in world.size],
+    }
+    lists = {
+        "boxes": world.boxes,
+        "cylinders": world.cylinders,
+        "start": world.start_regions,
+        "goal": world.goal_regions,
+    }
+    for key, shapes in lists.items():
+        if shapes:
+            content[key] = [
+                {name: float(getattr(shape, name)) for name in _SHAPES[key]} for shape in shapes
+            ]
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
+    Path(path).write_text(text, encoding="utf-8")
