@@ -1,3 +1,52 @@
 """Replay whose priority is fused from several signals, as TorchRL parts."""
 
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
+from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
+from torchrl_mpfa.learner import DDPGLearner, Learner
+from torchrl_mpfa.loss import SignalDDPGLoss, make_ddpg_loss
+from torchrl_mpfa.networks import make_actor, make_critic
+from torchrl_mpfa.replay import SignalReplayBuffer
+from torchrl_mpfa.sampler import MPFASampler, SignalSampler
+from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.signals import (
+    ACTION_GRADIENT,
+    MPFA_SIGNALS,
+    REWARD,
+    TD_ERROR,
+    Signal,
+    SignalTable,
+)
+from torchrl_mpfa.storage import SignalMemmapStorage, SignalTensorStorage
+from torchrl_mpfa.tree import TreeSampler
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "ACTION_GRADIENT",
+    "MPFA_SIGNALS",
+    "REWARD",
+    "TD_ERROR",
+    "Adjustment",
+    "BatchFacts",
+    "DDPGLearner",
+    "EntropyFusion",
+    "FixedFusion",
+    "Fusion",
+    "Learner",
+    "MPFASampler",
+    "PositiveBoost",
+    "PositiveDecay",
+    "Signal",
+    "SignalDDPGLoss",
+    "SignalMemmapStorage",
+    "SignalReplayBuffer",
+    "SignalSampler",
+    "SignalTable",
+    "SignalTensorStorage",
+    "TreeSampler",
+    "load_safely",
+    "make_actor",
+    "make_critic",
+    "make_ddpg_loss",
+    "save_atomically",
+]

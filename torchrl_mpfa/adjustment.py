@@ -1,0 +1,196 @@
+r"""Change of a priority by what the transition is: Eqs. (22)-(24).
+
+An adjustment takes the fused priorities of a batch and gives new ones. The paper has two, both
+for *positive* transitions (reward above zero): they are boosted, then those above the average of
+their batch decay. Equation numbers: Cheng et al. (2023),
+https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+Bound = Literal["floor", "cap", "none"]
+Position = Literal["batch", "rank", "count"]
+
+
+def boost_positive(priority: Tensor, *, boost: float = 3.0, bound: Bound = "floor") -> Tensor:
+    r"""Raised priority of a positive transition, :math:`p' = \max(\varphi p, 1)` (Eq. 22).
+
+    Args:
+        priority: Priorities of positive transitions, shape ``[B]``.
+        boost: Factor :math:`\varphi`; the paper chose 3 out of 2, 3 and 4.
+        bound: What the 1 is: a ``"floor"`` (the letter of Eq. 22), a ``"cap"`` (``min`` in place
+            of ``max``), or ``"none"``.
+
+    Returns:
+        Priorities, shape ``[B]``.
+
+    Examples:
+        >>> boost_positive(torch.tensor([0.1, 2.0])).tolist()
+        [1.0, 6.0]
+    """
+    raised = priority * boost
+    if bound == "floor":
+        return raised.clamp_min(1.0)
+    return raised.clamp_max(1.0) if bound == "cap" else raised
+
+
+def decay_factor(position: Tensor, *, sharpness: float = 0.01) -> Tensor:
+    r"""Factor by which a priority decays, :math:`1 / (1 + e^{-\sigma j})` (Eq. 23).
+
+    Args:
+        position: The number :math:`j` of each transition, shape ``[B]``.
+        sharpness: :math:`\sigma`, which the paper does not give.
+
+    Returns:
+        Factors in [1/2, 1), shape ``[B]``: the *first* positions decay most.
+
+    Examples:
+        >>> decay_factor(torch.tensor([0.0])).tolist()
+        [0.5]
+    """
+    return torch.sigmoid(position * sharpness)
+
+
+def decay_threshold(priority: Tensor) -> Tensor:
+    r"""Priority below which nothing decays, the batch mean :math:`p_{th}` (Eq. 24).
+
+    Args:
+        priority: Priorities of the whole batch, shape ``[B]``.
+
+    Returns:
+        Their mean, shape ``[]``.
+
+    Examples:
+        >>> float(decay_threshold(torch.tensor([1.0, 3.0])))
+        2.0
+    """
+    return priority.mean()
+
+
+@dataclass(frozen=True)
+class BatchFacts:
+    """What an adjustment may ask of the transitions of a batch.
+
+    Attributes:
+        reward: Signed rewards, shape ``[B]``.
+        replay_count: How often each was sampled so far, this batch included, shape ``[B]``.
+        index: Slots in the storage, shape ``[B]``.
+    """
+
+    reward: Tensor
+    replay_count: Tensor
+    index: Tensor
+
+
+@runtime_checkable
+class Adjustment(Protocol):
+    """A change of the priorities of a batch; any callable of this form will do."""
+
+    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Adjust priorities, shape ``[B]`` to ``[B]``, not negative."""
+        ...
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {value}")
+
+
+@dataclass(frozen=True)
+class PositiveBoost:
+    r"""Eq. (22) for positive transitions, all others unchanged.
+
+    Args:
+        boost: Factor :math:`\varphi`.
+        bound: See :func:`boost_positive`.
+        positive_above: A transition is positive when its reward is above this. With 0 (the paper)
+            every step towards the goal is; a value just under the goal reward leaves only goals.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> facts = BatchFacts(torch.tensor([1.0, -1.0]), torch.ones(2), torch.arange(2))
+        >>> PositiveBoost()(torch.tensor([2.0, 2.0]), facts).tolist()
+        [6.0, 2.0]
+    """
+
+    boost: float = 3.0
+    bound: Bound = "floor"
+    positive_above: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_positive("boost", self.boost)
+        if self.bound not in ("floor", "cap", "none"):
+            raise ValueError(f"bound must be 'floor', 'cap' or 'none', got {self.bound!r}")
+
+    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Boost the positive transitions, shape ``[B]``."""
+        raised = boost_positive(priority, boost=self.boost, bound=self.bound)
+        return torch.where(batch.reward > self.positive_above, raised, priority)
+
+
+@dataclass(frozen=True)
+class PositiveDecay:
+    r"""Eqs. (23)-(24): positive transitions above the batch mean decay once trained on.
+
+    Args:
+        sharpness: :math:`\sigma`.
+        position: The reading of :math:`j`. ``"batch"`` (default, the letter of the paper): place
+            in the batch, counted from 1, an arbitrary order; ``"rank"``: place when sorted by
+            falling priority, so that the highest decays most; ``"count"``: how often the
+            transition was replayed.
+        clamp: Stop a decayed priority at the threshold in place of letting it fall below.
+        positive_above: As in :class:`PositiveBoost`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> facts = BatchFacts(torch.tensor([1.0, 1.0]), torch.ones(2), torch.arange(2))
+        >>> PositiveDecay()(torch.tensor([4.0, 2.0]), facts)
+        tensor([2.0100, 2.0000])
+    """
+
+    sharpness: float = 0.01
+    position: Position = "batch"
+    clamp: bool = False
+    positive_above: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_positive("sharpness", self.sharpness)
+        if self.position not in ("batch", "rank", "count"):
+            raise ValueError(f"position must be 'batch', 'rank' or 'count', got {self.position!r}")
+
+    def factors(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Factor of Eq. (23) for each transition, by the chosen reading of j, shape ``[B]``."""
+        if self.position == "count":
+            return decay_factor(batch.replay_count, sharpness=self.sharpness)
+        by_place = _factors_by_place(priority.numel(), self.sharpness, priority.dtype)
+        if self.position == "batch":
+            return by_place
+        order = priority.argsort(descending=True, stable=True)
+        return torch.empty_like(by_place).index_copy_(0, order, by_place)
+
+    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Decay the positive transitions above the threshold, shape ``[B]``."""
+        threshold = decay_threshold(priority)
+        decayed = priority * self.factors(priority, batch)
+        if self.clamp:
+            decayed = torch.maximum(decayed, threshold)
+        gate = (batch.reward > self.positive_above) & (priority > threshold)
+        return torch.where(gate, decayed, priority)
+
+
+@lru_cache(maxsize=64)
+def _factors_by_place(count: int, sharpness: float, dtype: torch.dtype) -> Tensor:
+    """Factors of places 1 to ``count``: the same for every batch of that size."""
+    return decay_factor(torch.arange(1, count + 1, dtype=dtype), sharpness=sharpness)

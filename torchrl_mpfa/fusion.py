@@ -1,0 +1,263 @@
+r"""From several signals to one priority: Eqs. (15)-(21).
+
+Notation of Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166, and the names here.
+The paper uses some letters twice; the right-hand column has one name for each meaning.
+
+====================  ==========  ================================================================
+paper                 equation    here
+====================  ==========  ================================================================
+gamma                 2, 5        ``gamma``: discount
+tau                   6, 7        ``tau``: step of the target networks
+delta_i               4, 13       ``td_error``: y_i - Q(s_i, a_i)
+alpha                 8           ``alpha``: priority exponent
+beta                  10          ``beta``: importance exponent (not the beta of Eq. 19)
+w_i                   10, 11      ``priority_weight``: TorchRL's key for importance weights
+p_i^r, p_i^TD,        12-14       the signals ``reward``, ``td_error``, ``action_gradient``
+p_i^loss
+H(X)                  15          :func:`binary_entropy`
+H(r)                  16          :func:`reward_entropy`
+H(TD) = H(loss)       17          :func:`positive_entropy`
+a, beta, nu           18-20       :func:`entropy_weights` (one weight a signal, summing to one)
+epsilon               9, 21       ``eps``: added once, before the boost
+p_i                   21          :func:`fuse`
+phi                   22          ``boost``: factor of positive transitions
+sigma, j, p_th        23, 24      ``sharpness``, ``position``, :func:`decay_threshold`
+eps_p                 25          ``progress_scale`` of the navigation reward
+====================  ==========  ================================================================
+
+Shapes: ``N`` transitions in the buffer, ``B`` in a batch, ``K`` signals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.signals import SignalTable
+
+Ties = Literal["complement", "strict"]
+
+
+def binary_entropy(first: Tensor, second: Tensor) -> Tensor:
+    r"""Entropy of two outcomes, :math:`H = -\sum_i p_i \log_2 p_i` (Eq. 15).
+
+    Args:
+        first: Probability of one outcome, shape ``[]``.
+        second: Probability of the other, shape ``[]``.
+
+    Returns:
+        Entropy in bits, shape ``[]``; an impossible outcome adds nothing (0 log 0 = 0).
+
+    Examples:
+        >>> float(binary_entropy(torch.tensor(0.5), torch.tensor(0.5)))
+        1.0
+    """
+    # xlogy has the limit 0 log 0 = 0 built in; dividing by log 2 makes it bits. The entropy of a
+    # certain event is -(1 log 1) = -0.0, and adding 0.0 takes that sign away.
+    shares = torch.stack((first, second))
+    return -torch.special.xlogy(shares, shares).sum() / torch.log(shares.new_tensor(2.0)) + 0.0
+
+
+def _split_entropy(reward: Tensor, level: Tensor, ties: Ties) -> Tensor:
+    """Entropy of lying above or below a level, with ties as the reading has them."""
+    if ties not in ("complement", "strict"):
+        raise ValueError(f"ties must be 'complement' or 'strict', got {ties!r}")
+    if reward.numel() == 0:
+        raise ValueError(f"reward must hold at least one transition, got shape {[*reward.shape]}")
+    above = (reward > level).double().mean()
+    below = (reward < level).double().mean() if ties == "strict" else 1.0 - above
+    return binary_entropy(above, below)
+
+
+def reward_entropy(reward: Tensor, *, ties: Ties = "complement") -> Tensor:
+    r"""Entropy of the immediate reward, H(r) of Eq. (16).
+
+    Args:
+        reward: Signed rewards of the population, shape ``[N]``.
+        ties: What a reward equal to the average counts as. ``"complement"`` (default): not above,
+            so that both shares add to one; ``"strict"``: neither, which is the letter of Eq. (16).
+
+    Returns:
+        Entropy in bits of being above or below the average reward, shape ``[]``.
+
+    Raises:
+        ValueError: If ``reward`` is empty or ``ties`` unknown.
+
+    Examples:
+        >>> float(reward_entropy(torch.tensor([0.0, 0.0, 1.0, 1.0])))
+        1.0
+    """
+    return _split_entropy(reward, reward.double().mean(), ties)
+
+
+def positive_entropy(reward: Tensor, *, ties: Ties = "complement") -> Tensor:
+    r"""Entropy of positive training, H(TD) = H(loss) of Eq. (17).
+
+    Neither the TD error nor the gradient enters: by the paper both entropies are those of the
+    sign of the reward, hence equal.
+
+    Args:
+        reward: Signed rewards of the population, shape ``[N]``.
+        ties: As for :func:`reward_entropy`, for rewards of exactly zero.
+
+    Returns:
+        Entropy in bits of the reward being positive, shape ``[]``.
+
+    Raises:
+        ValueError: If ``reward`` is empty or ``ties`` unknown.
+
+    Examples:
+        >>> float(positive_entropy(torch.tensor([-1.0, 2.0])))
+        1.0
+    """
+    return _split_entropy(reward, torch.zeros((), dtype=torch.double, device=reward.device), ties)
+
+
+def entropy_weights(entropies: Tensor) -> Tensor:
+    r"""Weights a, beta and nu of the signals: each entropy's share of their sum (Eqs. 18-20).
+
+    Eq. (20) writes the last weight as one minus the others, which is the same.
+
+    Args:
+        entropies: One entropy a signal, shape ``[K]``.
+
+    Returns:
+        Weights that sum to one, shape ``[K]``; equal ones if every entropy is zero, where
+        Eqs. (18)-(20) would divide by zero.
+
+    Raises:
+        ValueError: If an entropy is negative or not finite.
+
+    Examples:
+        >>> entropy_weights(torch.tensor([1.0, 0.5, 0.5])).tolist()
+        [0.5, 0.25, 0.25]
+    """
+    if not bool(((entropies >= 0) & entropies.isfinite()).all()):
+        raise ValueError(f"entropies must be finite and not negative, got {entropies.tolist()}")
+    total = entropies.sum()
+    if total <= 0:
+        return torch.full_like(entropies, 1.0 / entropies.numel())
+    return entropies / total
+
+
+def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
+    r"""One priority from K signals, :math:`p_i = \sum_k w_k p_i^k + \epsilon` (Eq. 21).
+
+    Args:
+        signals: Non-negative signals, shape ``[B, K]``.
+        weights: One weight a signal, shape ``[K]``.
+        eps: The constant :math:`\epsilon` that keeps every transition drawable.
+
+    Returns:
+        Priorities, shape ``[B]``.
+
+    Examples:
+        >>> fuse(torch.tensor([[1.0, 3.0]]), torch.tensor([0.5, 0.5]), eps=0.0).tolist()
+        [2.0]
+    """
+    return torch.mv(signals, weights) + eps
+
+
+@runtime_checkable
+class Fusion(Protocol):
+    """How the signals are weighted: one weight a signal, out of what the buffer holds.
+
+    A user's own fusion is any object with this method; it may keep state.
+    """
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """Weigh the signals.
+
+        Args:
+            names: The K signals that the sampler fuses.
+            table: Signals and rewards of every slot; ``table.rewards`` has shape ``[N]``.
+            index: Slots of the batch at hand, shape ``[B]``.
+
+        Returns:
+            One weight a signal, in the order of ``names``, shape ``[K]``.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class EntropyFusion:
+    r"""Weights by information entropy, Eqs. (16)-(20).
+
+    Args:
+        reward_signals: Signals weighted by the entropy of the reward (Eq. 16); every other one
+            gets that of positive training (Eq. 17), a user's own too.
+        population: Transitions that the probabilities are counted over: the whole ``"buffer"``
+            (default), or the ``"batch"``, which prioritized sampling biases.
+        ties: See :func:`reward_entropy`.
+        floor: Smallest weight a signal may get before the weights are normalized again; 0 is the
+            paper, whose TD weight vanishes once all rewards are positive.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> EntropyFusion().population
+        'buffer'
+    """
+
+    reward_signals: Sequence[str] = ("reward",)
+    population: Literal["buffer", "batch"] = "buffer"
+    ties: Ties = "complement"
+    floor: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.population not in ("buffer", "batch"):
+            raise ValueError(f"population must be 'buffer' or 'batch', got {self.population!r}")
+        if self.ties not in ("complement", "strict"):
+            raise ValueError(f"ties must be 'complement' or 'strict', got {self.ties!r}")
+        if not 0.0 <= self.floor < 1.0:
+            raise ValueError(f"floor must be in [0, 1), got {self.floor}")
+
+    def entropies(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """Entropy of each signal in bits, Eqs. (16)-(17), shape ``[K]``."""
+        rewards = table.rewards if self.population == "buffer" else table.rewards[index]
+        of_reward = reward_entropy(rewards, ties=self.ties)
+        of_positive = positive_entropy(rewards, ties=self.ties)
+        return torch.stack([of_reward if n in self.reward_signals else of_positive for n in names])
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """Weights a, beta, nu of Eqs. (18)-(20), shape ``[K]``."""
+        weights = entropy_weights(self.entropies(names, table, index))
+        if self.floor > 0:
+            weights = weights.clamp_min(self.floor)
+            weights = weights / weights.sum()
+        return weights
+
+
+@dataclass(frozen=True)
+class FixedFusion:
+    """Weights that never change; one signal of weight one is plain PER.
+
+    Args:
+        values: Weight of each signal by name; a signal without one is not counted.
+
+    Raises:
+        ValueError: If a weight is negative or not finite, or all are zero.
+
+    Examples:
+        >>> FixedFusion({"td_error": 1.0}).values
+        {'td_error': 1.0}
+    """
+
+    values: dict[str, float] = field(default_factory=lambda: {"td_error": 1.0})
+
+    def __post_init__(self) -> None:
+        for name, value in self.values.items():
+            if not 0.0 <= value < float("inf"):
+                raise ValueError(f"weight of {name!r} must be finite and not negative, got {value}")
+        if not any(self.values.values()):
+            raise ValueError(f"values must have a positive weight, got {self.values}")
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """The fixed weights in the order of ``names``, shape ``[K]``."""
+        return torch.tensor([self.values.get(name, 0.0) for name in names])

@@ -1,0 +1,115 @@
+"""The learner: networks, loss, optimizers and target networks behind one ``update``.
+
+It knows nothing of replay or environment: a batch goes in, signals come back in it. Another
+learner has the same methods and takes its place.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.objectives import SoftUpdate
+
+from torchrl_mpfa.loss import SignalDDPGLoss
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """What a training loop needs of a learner."""
+
+    policy: TensorDictModule
+
+    def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
+        """Train on a batch, write the signals in it, and give values for the log."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next update depends on."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        ...
+
+
+class DDPGLearner:
+    r"""DDPG with target networks, Eqs. (4)-(7), and the actor's sampled policy gradient.
+
+    Args:
+        loss: The loss with both networks in it.
+        actor_lr: Learning rate of the actor, Table 1.
+        critic_lr: Learning rate of the critic, Table 1.
+        critic_weight_decay: L2 decay of the critic's weights, as in the original DDPG paper; it
+            keeps Q and its slope from growing without bound.
+        tau: :math:`\tau` of Eqs. (6)-(7), Table 1.
+
+    Raises:
+        ValueError: If a rate is not positive, the decay negative, or ``tau`` not in (0, 1].
+
+    Examples:
+        >>> from torchrl_mpfa.loss import make_ddpg_loss
+        >>> from torchrl_mpfa.networks import make_actor, make_critic
+        >>> learner = DDPGLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
+        >>> learner.policy.out_keys
+        ['preactivation', 'action']
+    """
+
+    def __init__(
+        self,
+        loss: SignalDDPGLoss,
+        *,
+        actor_lr: float = 1e-4,
+        critic_lr: float = 1e-4,
+        critic_weight_decay: float = 1e-2,
+        tau: float = 0.01,
+    ) -> None:
+        for name, rate in (("actor_lr", actor_lr), ("critic_lr", critic_lr)):
+            if not rate > 0:
+                raise ValueError(f"{name} must be positive, got {rate}")
+        if critic_weight_decay < 0:
+            raise ValueError(f"critic_weight_decay must not be negative, got {critic_weight_decay}")
+        if not 0 < tau <= 1:
+            raise ValueError(f"tau must be in (0, 1], got {tau}")
+        self.loss = loss
+        self.policy = loss.actor_network
+        # TorchRL empties the modules it makes functional; the policy acts with the trained ones.
+        loss.actor_network_params.to_module(self.policy)
+        self.targets = SoftUpdate(loss, tau=tau)
+        actor = list(loss.actor_network_params.flatten_keys().values())
+        critic = list(loss.value_network_params.flatten_keys().values())
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": actor, "lr": actor_lr},
+                {"params": critic, "lr": critic_lr, "weight_decay": critic_weight_decay},
+            ],
+            fused=True,
+        )
+
+    def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
+        """One step of both optimizers and of the target networks.
+
+        Args:
+            batch: Transitions, batch size ``[B]``; the loss writes their signals.
+
+        Returns:
+            Detached values for the log.
+        """
+        losses = self.loss(batch)
+        self.optimizer.zero_grad(set_to_none=True)
+        # Only the losses: TorchRL's output holds values beside them.
+        (losses["loss_value"] + losses["loss_actor"]).backward()
+        self.optimizer.step()
+        self.targets.step()
+        return {key: value.detach() for key, value in losses.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, target networks and optimizers; tensors and plain values only."""
+        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.loss.load_state_dict(state_dict["loss"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])

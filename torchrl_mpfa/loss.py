@@ -1,0 +1,289 @@
+"""DDPG loss that writes the signals of each transition, out of one forward pass of the critic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import DDPGLoss, ValueEstimators
+from torchrl.objectives.utils import distance_loss
+
+from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
+from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+
+Importance = Literal["critic", "torchrl", "none"]
+_WRITTEN = (TD_ERROR.name, ACTION_GRADIENT.name)
+
+
+class SignalDDPGLoss(DDPGLoss):
+    r""":class:`~torchrl.objectives.DDPGLoss` that also writes the signals of Eqs. (13)-(14).
+
+    The critic's loss is Eq. (11), :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2` with the
+    target of Eq. (5), :math:`y_i = r_i + \gamma Q'(s_{i+1}, \mu'(s_{i+1}))`; the actor's is
+    :math:`-\frac{1}{N} \sum_i Q(s_i, \mu(s_i))`. The batch gets
+    ``("signals", "td_error")`` :math:`= |\delta_i|` and ``("signals", "action_gradient")``
+    :math:`= \lVert \nabla_a Q(s_i, a_i) \rVert`, each of shape ``[B]``. TorchRL's own
+    ``"td_error"`` is written as well, squared as ever.
+
+    Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
+
+    Args:
+        actor_network: Policy; reads observations, writes ``"action"``.
+        value_network: Critic; reads observations and action, writes ``"state_action_value"``.
+        signals: Which of ``"td_error"`` and ``"action_gradient"`` to write.
+        gradient_order: Order of the norm in Eq. (14).
+        gradient_at: Where the gradient is taken: at the ``"stored"`` action (Eq. 14), or at that
+            of the current ``"policy"``, for one more forward pass.
+        importance: Use of ``"priority_weight"``: on the ``"critic"`` alone, divided by the batch
+            size (Eq. 11); ``"torchrl"``: on both losses, divided by the sum of the weights;
+            ``"none"``.
+        reward_scale: Factor of the rewards in the loss. The signals are divided by it again, so
+            that they stay in the units of the environment's reward, as Eq. (12) is.
+        saturation_penalty: Factor of the mean of :math:`\max(0, |u| - l)^2`, added to the actor's
+            loss, where :math:`u` is the action before its tanh (``"preactivation"``).
+        saturation_limit: The limit :math:`l`.
+        delay_actor: Whether the target has a target actor, as Eq. (5) has; TorchRL's default is
+            not to.
+        **kwargs: Passed to :class:`~torchrl.objectives.DDPGLoss`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mpfa.networks import make_actor, make_critic
+        >>> loss = SignalDDPGLoss(make_actor(24, 2), make_critic(24, 2))
+        >>> end = torch.zeros(8, 1, dtype=torch.bool)
+        >>> after = {"observation": torch.rand(8, 24), "reward": torch.rand(8, 1)}
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.rand(8, 24),
+        ...         "action": torch.rand(8, 2),
+        ...         "next": {**after, "done": end, "terminated": end},
+        ...     },
+        ...     [8],
+        ... )
+        >>> losses = loss(batch)
+        >>> batch["signals"]["action_gradient"].shape
+        torch.Size([8])
+    """
+
+    @dataclass
+    class _AcceptedKeys(DDPGLoss._AcceptedKeys):
+        """Keys of TorchRL's loss, and those that this one reads or writes beside them."""
+
+        action: NestedKey = "action"
+        preactivation: NestedKey = "preactivation"
+        td_error_signal: NestedKey = TD_ERROR.key
+        action_gradient_signal: NestedKey = ACTION_GRADIENT.key
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        signals: Sequence[str] = _WRITTEN,
+        gradient_order: float = 2.0,
+        gradient_at: Literal["stored", "policy"] = "stored",
+        importance: Importance = "critic",
+        reward_scale: float = 1.0,
+        saturation_penalty: float = 0.0,
+        saturation_limit: float = 1.5,
+        delay_actor: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        unknown = [name for name in signals if name not in _WRITTEN]
+        if unknown:
+            raise ValueError(f"signals must be among {_WRITTEN}, got {unknown}")
+        for name, value, allowed in (
+            ("gradient_at", gradient_at, ("stored", "policy")),
+            ("importance", importance, ("critic", "torchrl", "none")),
+        ):
+            if value not in allowed:
+                raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
+        if not (gradient_order > 0 and reward_scale > 0):
+            raise ValueError(
+                "gradient_order and reward_scale must be positive, got "
+                f"{gradient_order} and {reward_scale}"
+            )
+        if saturation_penalty < 0 or saturation_limit < 0:
+            raise ValueError(
+                "saturation_penalty and saturation_limit must not be negative, got "
+                f"{saturation_penalty} and {saturation_limit}"
+            )
+        super().__init__(
+            actor_network,
+            value_network,
+            delay_actor=delay_actor,
+            use_prioritized_weights="auto" if importance == "torchrl" else False,
+            **kwargs,
+        )
+        self.signals = tuple(signals)
+        self.gradient_order = gradient_order
+        self.gradient_at = gradient_at
+        self.importance = importance
+        self.reward_scale = reward_scale
+        self.saturation_penalty = saturation_penalty
+        self.saturation_limit = saturation_limit
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Critic's loss (Eq. 11); writes the signals (Eqs. 13-14) in ``tensordict``.
+
+        Args:
+            tensordict: A batch of transitions, batch size ``[B]``.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        keys = self.tensor_keys
+        inputs = tensordict.select(*self.value_network.in_keys, strict=False).detach()
+        with_gradient = ACTION_GRADIENT.name in self.signals
+        at_stored = with_gradient and self.gradient_at == "stored"
+        action = inputs.get(keys.action)
+        # The gradient is wanted under no_grad as well, when a loss is only looked at.
+        with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
+            if at_stored:
+                action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
+            value = self._critic(inputs)
+        if with_gradient:
+            gradient = (
+                _action_gradient(value, action) if at_stored else self._policy_gradient(inputs)
+            )
+            size = action_gradient_priority(gradient, order=self.gradient_order)
+            tensordict.set(keys.action_gradient_signal, size / self.reward_scale)
+        if not torch.is_grad_enabled():
+            value = value.detach()
+
+        target = self._target(tensordict)
+        td_error = (target - value).detach()
+        if TD_ERROR.name in self.signals:
+            tensordict.set(keys.td_error_signal, td_error_priority(td_error) / self.reward_scale)
+        squared = td_error.square()
+        tensordict.set(keys.priority, squared, inplace=True)
+        loss = distance_loss(value, target, loss_function=self.loss_function)
+        loss = self._reduce(loss, tensordict)
+        seen = value.detach()
+        metadata = {
+            "td_error": squared,
+            "pred_value": seen,
+            "target_value": target,
+            "target_value_max": target.max(),
+            "pred_value_max": seen.max(),
+        }
+        return loss, metadata
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Actor's loss, with the penalty on saturation if there is one.
+
+        Args:
+            tensordict: A batch of transitions, batch size ``[B]``.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        inputs = tensordict.select(
+            *self.actor_in_keys, *self.value_exclusive_keys, strict=False
+        ).detach()
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            inputs = self.actor_network(inputs)
+        with self._cached_detached_value_params.to_module(
+            self.value_network, preserve_module_state=False
+        ):
+            inputs = self.value_network(inputs)
+        value = inputs.get(self.tensor_keys.state_action_value).squeeze(-1)
+        weights = self._maybe_get_priority_weight(tensordict)
+        loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
+        before = inputs.get(self.tensor_keys.preactivation, None)
+        if before is None:
+            if self.saturation_penalty > 0:
+                raise KeyError(
+                    f"saturation_penalty is {self.saturation_penalty}, but the actor writes no "
+                    f"{self.tensor_keys.preactivation!r}"
+                )
+            return loss, {}
+        size = before.abs()
+        if self.saturation_penalty > 0:
+            excess = (size - self.saturation_limit).clamp_min(0)
+            loss = loss + self.saturation_penalty * excess.square().mean()
+        return loss, {"preactivation": size.detach()}
+
+    def _critic(self, inputs: TensorDictBase) -> Tensor:
+        """Q of the current critic, shape ``[B]``."""
+        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
+            out = self.value_network(inputs)
+        return out.get(self.tensor_keys.state_action_value).squeeze(-1)
+
+    def _policy_gradient(self, inputs: TensorDictBase) -> Tensor:
+        """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
+        inputs = inputs.copy()
+        with (
+            torch.no_grad(),
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            self.actor_network(inputs)
+        action = inputs.get(self.tensor_keys.action).requires_grad_(True)
+        with torch.enable_grad():
+            return _action_gradient(self._critic(inputs), action)
+
+    def _target(self, tensordict: TensorDictBase) -> Tensor:
+        """Targets y of Eq. (5), shape ``[B]``; a time limit bootstraps, an end does not."""
+        if self.reward_scale != 1.0:
+            tensordict = tensordict.copy()
+            key = ("next", self.tensor_keys.reward)
+            tensordict.set(key, tensordict.get(key) * self.reward_scale)
+        target: Tensor = self.value_estimator.value_estimate(
+            tensordict, target_params=self._cached_target_params
+        )
+        return target.squeeze(-1)
+
+    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        weights = self._maybe_get_priority_weight(tensordict)
+        if self.importance == "critic":
+            importance = tensordict.get(self.tensor_keys.priority_weight, None)
+            if importance is not None:
+                loss = loss * importance.reshape(loss.shape).to(loss.device)
+        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+
+def _action_gradient(value: Tensor, action: Tensor) -> Tensor:
+    """Gradient of each transition's Q by its own action, shape ``[B, A]``.
+
+    The gradient of the sum has them all at once, as no transition enters another one's value;
+    layers that mix a batch (batch normalization) would break that.
+    """
+    (gradient,) = torch.autograd.grad(value.sum(), action, retain_graph=True)
+    return gradient.detach()
+
+
+def make_ddpg_loss(
+    actor: TensorDictModule, critic: TensorDictModule, *, gamma: float = 0.99, **kwargs: Any
+) -> SignalDDPGLoss:
+    """A :class:`SignalDDPGLoss` with the one-step target of Eq. (5).
+
+    Args:
+        actor: Policy.
+        critic: Critic.
+        gamma: Discount.
+        **kwargs: Passed to :class:`SignalDDPGLoss`.
+
+    Returns:
+        The loss.
+
+    Examples:
+        >>> from torchrl_mpfa.networks import make_actor, make_critic
+        >>> make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)).importance
+        'critic'
+    """
+    loss = SignalDDPGLoss(actor, critic, **kwargs)
+    # One step only: longer targets would need time-ordered batches, which replay does not give.
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+    return loss

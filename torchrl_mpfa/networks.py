@@ -1,0 +1,188 @@
+"""Actor and critic for DDPG, with what keeps them from collapsing as arguments.
+
+Plain multi-layer perceptrons were seen to saturate the actor's tanh within some fifty episodes:
+the robot then circles. The defaults follow the original DDPG paper (Lillicrap et al. 2016,
+https://arxiv.org/abs/1509.02971: the action joins the critic at its second layer, last layers
+start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+
+def _layer(inputs: int, outputs: int, layer_norm: bool) -> nn.Sequential:
+    norm = [nn.LayerNorm(outputs)] if layer_norm else []
+    return nn.Sequential(nn.Linear(inputs, outputs), *norm, nn.ReLU())
+
+
+def _last(inputs: int, outputs: int, final_init: float | None) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    if final_init is not None:
+        nn.init.uniform_(layer.weight, -final_init, final_init)
+        nn.init.uniform_(layer.bias, -final_init, final_init)
+    return layer
+
+
+class Actor(nn.Module):
+    """Deterministic policy with actions in [-1, 1]; gives the action before its tanh as well."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        *,
+        width: int,
+        layers: int,
+        layer_norm: bool,
+        final_init: float | None,
+    ) -> None:
+        super().__init__()
+        sizes = [observation_size, *[width] * layers]
+        hidden = [_layer(a, b, layer_norm) for a, b in pairwise(sizes)]
+        self.body = nn.Sequential(*hidden)
+        self.head = _last(width, action_size, final_init)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """From ``[..., O]`` to the preactivation and the action, each ``[..., A]``."""
+        before = self.head(self.body(observation))
+        return before, torch.tanh(before)
+
+
+class Critic(nn.Module):
+    """Q function; the action joins at the first or the second layer."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        *,
+        width: int,
+        layers: int,
+        layer_norm: bool,
+        final_init: float | None,
+        late_action: bool,
+    ) -> None:
+        super().__init__()
+        self.late_action = late_action
+        first = observation_size if late_action else observation_size + action_size
+        second = width + action_size if late_action else width
+        self.first = _layer(first, width, layer_norm)
+        sizes = [second, *[width] * (layers - 1)]
+        rest = [_layer(a, b, layer_norm) for a, b in pairwise(sizes)]
+        self.rest = nn.Sequential(*rest, _last(sizes[-1], 1, final_init))
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        """From ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``."""
+        if self.late_action:
+            joined = torch.cat((self.first(observation), action), -1)
+        else:
+            joined = self.first(torch.cat((observation, action), -1))
+        value: Tensor = self.rest(joined)
+        return value
+
+
+def _check_sizes(**sizes: int) -> None:
+    for name, value in sizes.items():
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+
+
+def make_actor(
+    observation_size: int,
+    action_size: int,
+    *,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
+) -> TensorDictModule:
+    """Policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
+
+    Args:
+        observation_size: ``O``.
+        action_size: ``A``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers.
+        layer_norm: Normalize each hidden layer, so that no feature grows without bound.
+        final_init: The last layer starts uniformly within this, hence near the middle of the
+            tanh; None leaves PyTorch's start.
+
+    Returns:
+        A module for TorchRL's losses and collectors.
+
+    Raises:
+        ValueError: If a size is below one.
+
+    Examples:
+        >>> actor = make_actor(24, 2)
+        >>> from tensordict import TensorDict
+        >>> actor(TensorDict({"observation": torch.rand(5, 24)}, [5]))["action"].shape
+        torch.Size([5, 2])
+    """
+    _check_sizes(
+        observation_size=observation_size, action_size=action_size, width=width, layers=layers
+    )
+    actor = Actor(
+        observation_size,
+        action_size,
+        width=width,
+        layers=layers,
+        layer_norm=layer_norm,
+        final_init=final_init,
+    )
+    return TensorDictModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
+
+
+def make_critic(
+    observation_size: int,
+    action_size: int,
+    *,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
+    late_action: bool = True,
+) -> TensorDictModule:
+    """Critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
+
+    Args:
+        observation_size: ``O``.
+        action_size: ``A``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers; with ``late_action`` at least two.
+        layer_norm: As in :func:`make_actor`.
+        final_init: As in :func:`make_actor`.
+        late_action: Whether the action joins at the second layer in place of the first.
+
+    Returns:
+        A module for TorchRL's losses.
+
+    Raises:
+        ValueError: If a size is below one, or a late action has no second layer to join.
+
+    Examples:
+        >>> make_critic(24, 2).out_keys
+        ['state_action_value']
+    """
+    _check_sizes(
+        observation_size=observation_size, action_size=action_size, width=width, layers=layers
+    )
+    if late_action and layers < 2:
+        raise ValueError(f"layers must be at least 2 with late_action, got {layers}")
+    critic = Critic(
+        observation_size,
+        action_size,
+        width=width,
+        layers=layers,
+        layer_norm=layer_norm,
+        final_init=final_init,
+        late_action=late_action,
+    )
+    return TensorDictModule(
+        critic, in_keys=["observation", "action"], out_keys=["state_action_value"]
+    )

@@ -1,0 +1,260 @@
+"""Signals: what a priority is made of, and the table that keeps them for every slot of a buffer.
+
+A :class:`Signal` says where one number per transition comes from. Some are known when the
+transition is written (its reward); the others are learned, and come back with the batch after
+the loss (the TD error, the gradient). A user's own signal is one more :class:`Signal`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import is_tensor_collection
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_mpfa.priorities import reward_priority
+
+SIGNALS_KEY = "signals"
+"""The entry of a batch under which the loss writes the learned signals."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One number per transition that a priority can be made of.
+
+    Args:
+        name: Its name, for fusion, statistics and errors.
+        key: Where it is read; by default ``("signals", name)``.
+        known_at: ``"update"`` (default): it comes with the batch after the loss, and is unknown
+            for a fresh transition. ``"write"``: it is read when the transition is stored.
+        priority: Function from what is read, shape ``[B]``, to a non-negative number, shape
+            ``[B]``, for signals known at the write; a learned signal is stored as it comes.
+
+    Raises:
+        ValueError: If ``name`` is empty or ``known_at`` unknown.
+
+    Examples:
+        >>> Signal("novelty").key
+        ('signals', 'novelty')
+    """
+
+    name: str
+    key: NestedKey = ""
+    known_at: Literal["update", "write"] = "update"
+    priority: Callable[[Tensor], Tensor] = torch.abs
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError(f"name must not be empty, got {self.name!r}")
+        if self.known_at not in ("update", "write"):
+            raise ValueError(f"known_at must be 'update' or 'write', got {self.known_at!r}")
+        if not self.key:
+            object.__setattr__(self, "key", (SIGNALS_KEY, self.name))
+
+
+REWARD = Signal("reward", key=("next", "reward"), known_at="write", priority=reward_priority)
+TD_ERROR = Signal("td_error")
+ACTION_GRADIENT = Signal("action_gradient")
+
+MPFA_SIGNALS: tuple[Signal, ...] = (REWARD, TD_ERROR, ACTION_GRADIENT)
+"""The three signals of Eqs. (12)-(14)."""
+
+
+def as_signals(signals: Sequence[Signal | str]) -> tuple[Signal, ...]:
+    """Signals from signals or names; the paper's are known by name, any other name is learned.
+
+    Args:
+        signals: Signals, or their names.
+
+    Returns:
+        The signals, in the order given.
+
+    Raises:
+        ValueError: If there is none, or a name appears twice.
+
+    Examples:
+        >>> [signal.name for signal in as_signals(["td_error", "novelty"])]
+        ['td_error', 'novelty']
+    """
+    known = {signal.name: signal for signal in MPFA_SIGNALS}
+    made = tuple(known.get(s, Signal(s)) if isinstance(s, str) else s for s in signals)
+    names = [signal.name for signal in made]
+    if not names or len(set(names)) != len(names):
+        raise ValueError(f"signals must be one or more different signals, got {names}")
+    return made
+
+
+class SignalTable:
+    """Signals, reward, replay count and age of every slot: one contiguous tensor.
+
+    The columns are the learned signals, those known at the write, the signed reward, the replay
+    count and the time of writing. A value that is not known yet is NaN. Double precision keeps
+    counts and times exact.
+
+    Args:
+        capacity: Number of slots ``N``.
+        signals: The signals to keep.
+        reward_key: Where the signed reward of a transition is read.
+        file: Memory-map the table to this file in place of keeping it in memory.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        signals: Sequence[Signal | str],
+        *,
+        reward_key: NestedKey = ("next", "reward"),
+        file: Path | None = None,
+    ) -> None:
+        made = as_signals(signals)
+        self.capacity = capacity
+        self.learned = [s for s in made if s.known_at == "update"]
+        self.written = [s for s in made if s.known_at == "write"]
+        self.reward_key = reward_key
+        self.names = [s.name for s in (*self.learned, *self.written)]
+        self.column = {name: place for place, name in enumerate(self.names)}
+        self.reward_column = len(self.names)
+        self.count_column = self.reward_column + 1
+        self.time_column = self.reward_column + 2
+        width = self.reward_column + 3
+        if file is None:
+            self.rows = torch.empty(capacity, width, dtype=torch.double)
+        else:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            mapped = np.memmap(file, dtype=np.float64, mode="w+", shape=(capacity, width))
+            self.rows = torch.from_numpy(mapped)
+        self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
+        self._blank[0, self.count_column] = 0.0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every slot."""
+        self.rows.copy_(self._blank)
+        self.size = 0
+        self.writes = 0
+
+    @property
+    def rewards(self) -> Tensor:
+        """Signed rewards of the filled slots, shape ``[size]``."""
+        return self.rows[: self.size, self.reward_column]
+
+    def read(self, data: Any, count: int) -> Tensor:
+        """Rows for new transitions, checked and not yet written.
+
+        Args:
+            data: The transitions, batch size ``[count]``, or ``[]`` for one.
+            count: Their number.
+
+        Returns:
+            One row each; an entry that ``data`` does not have is NaN.
+
+        Raises:
+            ValueError: If a reward or a signal is not finite, a signal is negative, or either
+                has not one number a transition.
+        """
+        rows = self._blank.expand(count, -1).clone()
+        if not is_tensor_collection(data):
+            return rows
+        reward = _column(data, self.reward_key, "reward", count)
+        if reward is not None:
+            rows[:, self.reward_column] = reward
+        for signal in self.written:
+            same = signal.key == self.reward_key
+            value = reward if same else _column(data, signal.key, signal.name, count)
+            if value is not None:
+                rows[:, self.column[signal.name]] = _not_negative(signal, value)
+        return rows
+
+    def missing(self, rows: Tensor) -> str | None:
+        """Name of the first entry known at the write that some of the rows lack."""
+        # Of two rewards the signal counts first: it is the one that an error should name.
+        for name in [*(s.name for s in self.written), "reward"]:
+            column = self.column.get(name, self.reward_column)
+            if rows[:, column].isnan().any():
+                return name
+        return None
+
+    def write(self, index: Tensor, rows: Tensor) -> None:
+        """Put new transitions in their slots: nothing of what was there before stays."""
+        count = len(rows)
+        if count == 1:
+            rows[0, self.time_column] = self.writes
+        else:
+            rows[:, self.time_column] = torch.arange(self.writes, self.writes + count)
+        self.rows[index] = rows
+        self.writes += count
+
+    def count_replay(self, index: Tensor) -> None:
+        """Count one replay for each sampled slot, duplicates included."""
+        counts = self.rows[:, self.count_column]
+        counts.index_add_(0, index, torch.ones(index.shape, dtype=torch.double))
+
+    def written_at(self, index: Tensor) -> Tensor:
+        """When each slot was written, as a count of writes, shape ``[B]``."""
+        return self.rows[:, self.time_column].index_select(0, index)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is needed to restore the table; tensors and plain values only."""
+        return {
+            "capacity": self.capacity,
+            "names": list(self.names),
+            "size": self.size,
+            "writes": self.writes,
+            "rows": self.rows[: self.size].clone(),
+        }
+
+    def check_state(self, state: dict[str, Any]) -> None:
+        """Refuse a state that does not belong to this table, before anything changes.
+
+        Raises:
+            ValueError: If the capacity or the signals differ.
+        """
+        for word, mine in (("capacity", self.capacity), ("names", self.names)):
+            if state[word] != mine:
+                raise ValueError(
+                    f"{word} of the saved signals is {state[word]}, of this storage {mine}"
+                )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: See :meth:`check_state`.
+        """
+        self.check_state(state)
+        self.clear()
+        self.size, self.writes = state["size"], state["writes"]
+        self.rows[: self.size] = state["rows"]
+
+
+def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
+    """One finite number a transition, in double precision, shape ``[count]``; None if absent."""
+    value = data.get(key, None)
+    if value is None:
+        return None
+    if value.numel() != count:
+        raise ValueError(
+            f"{name} at {key!r} must have one number a transition, got shape {[*value.shape]} "
+            f"for {count} transitions"
+        )
+    flat = value.detach().reshape(count).to("cpu", torch.double)
+    low, high = flat.aminmax()
+    if not (low.item() > -math.inf and high.item() < math.inf):
+        bad = flat[~flat.isfinite()][0].item()
+        raise ValueError(f"{name} at {key!r} must be finite, got {bad}")
+    return flat
+
+
+def _not_negative(signal: Signal, value: Tensor) -> Tensor:
+    priority = signal.priority(value)
+    if not priority.min().item() >= 0:
+        bad = priority[~(priority >= 0)][0].item()
+        raise ValueError(f"signal {signal.name!r} must not be negative, got {bad}")
+    return priority
