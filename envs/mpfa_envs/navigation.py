@@ -17,7 +17,7 @@ from mpfa_envs.maps import resolve_world
 from mpfa_envs.observation import observation_bounds, observation_slices, observe
 from mpfa_envs.path import planner_for
 from mpfa_envs.reward import RewardFunction, RewardTerms, StepOutcome, navigation_reward
-from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.tasks import Task, check_task, sample_task
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             raise ValueError(f"reward must be callable or None, got {reward!r}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        self.collision_distance = _collision_distance(collision_distance, self.robot)
+        self.collision_distance = resolve_collision_distance(collision_distance, self.robot)
         self.lidar = Lidar(
             self.world,
             sectors=sectors,
@@ -389,17 +389,3 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             goal_radius=self.goal_radius,
             radius=self.robot.radius,
         )
-
-
-def _collision_distance(value: float | Literal["contact"] | None, robot: RobotModel) -> float:
-    """Turn the argument into a distance [m]."""
-    if value is None:
-        return robot.margin
-    if value == "contact":
-        return robot.radius
-    if isinstance(value, str) or not (math.isfinite(value) and value >= robot.radius):
-        raise ValueError(
-            "collision_distance must be 'contact', None or at least the robot's radius "
-            f"{robot.radius}, got {value!r}"
-        )
-    return float(value)

