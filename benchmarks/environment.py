@@ -18,6 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
 from mpfa_envs import (
     WORLDS,
     Lidar,
@@ -110,6 +111,7 @@ def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
     """
     # Imported here: the rest of the file needs no torch.
     import torch
+
     from mpfa_envs import make_navigation_env
 
     threads = torch.get_num_threads()

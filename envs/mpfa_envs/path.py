@@ -142,7 +142,7 @@ class PathPlanner:
 
     @cached_property
     def _groups(self) -> NDArray[np.int64]:
-        """Number of the connected part of the room that each corner lies in, shape ``[corners]``."""
+        """Connected part of the room in which each corner lies, shape ``[corners]``."""
         groups = np.full(len(self._nodes), -1, dtype=np.int64)
         for first in range(len(groups)):
             if groups[first] >= 0:
@@ -226,12 +226,16 @@ class PathPlanner:
         steps = targets - origin
         if len(self._rectangles):
             # The line is origin + t * step with t in [0, 1]; [N, rectangles] from here on.
-            safe = np.where(steps == 0.0, 1e-300, steps)[:, :, None]
-            low = (self._rectangles[:, :2].T - np.array(origin)[:, None]) / safe
-            high = (self._rectangles[:, 2:].T - np.array(origin)[:, None]) / safe
-            enter = np.minimum(low, high).max(axis=1)
-            leave = np.maximum(low, high).min(axis=1)
-            free &= ~((enter < leave) & (leave > 0.0) & (enter < 1.0)).any(axis=1)
+            inverse = 1.0 / np.where(steps == 0.0, 1e-300, steps)
+            enter, leave = np.zeros(()), np.ones(())
+            for axis in (0, 1):
+                low = np.multiply.outer(inverse[:, axis], self._rectangles[:, axis] - origin[axis])
+                high = np.multiply.outer(
+                    inverse[:, axis], self._rectangles[:, axis + 2] - origin[axis]
+                )
+                enter = np.maximum(enter, np.minimum(low, high))
+                leave = np.minimum(leave, np.maximum(low, high))
+            free &= ~(enter < leave).any(axis=1)
         if len(self._circles):
             offsets = self._circles[:, :2] - origin
             squares = (steps * steps).sum(axis=1)[:, None]

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mpfa_envs import EXAMPLE_WORLD, WORLDS, Box, Cylinder, Lidar, World, load_world
+from mpfa_envs.simulation import Simulation
+
+
+def test_the_rays_go_from_left_to_right_over_the_front() -> None:
+    lidar = Lidar(WORLDS["A"])
+    assert lidar.angles.size == 54
+    assert np.degrees(lidar.angles[[0, -1]]) == pytest.approx([90 - 5 / 3, -90 + 5 / 3])
+    single = Lidar(WORLDS["A"], reduction="single")
+    assert np.degrees(single.angles[[0, 1, -1]]) == pytest.approx([85, 75, -85])
+
+
+def test_a_wall_ahead_is_seen_at_its_distance() -> None:
+    lidar = Lidar(WORLDS["A"], sectors=3, reduction="single")
+    for heading, ahead in ((0.0, 4.0), (math.pi / 2, 3.0), (math.pi, 6.0), (-math.pi / 2, 7.0)):
+        ranges = lidar.scan(1.0, 2.0, heading)
+        assert ranges[1] == pytest.approx(ahead)
+    left, _, right = lidar.scan(1.0, 2.0, 0.0)
+    assert left == pytest.approx(3 / math.sin(math.radians(60)))
+    assert right == pytest.approx(4 / math.cos(math.radians(60)))
+
+
+def test_a_box_and_a_cylinder_are_seen_at_their_faces() -> None:
+    world = World(
+        name="two", boxes=(Box(2.0, -0.5, 3.0, 0.5),), cylinders=(Cylinder(-2.0, 0.0, 0.5),)
+    )
+    lidar = Lidar(world, sectors=1, reduction="single")
+    assert lidar.scan(0.0, 0.0, 0.0) == pytest.approx(2.0)
+    assert lidar.scan(0.0, 0.0, math.pi) == pytest.approx(1.5)
+    assert lidar.scan(-4.0, 0.3, 0.0) == pytest.approx(2.0 - 0.4)
+    assert lidar.scan(0.0, 0.6, 0.0) == pytest.approx(5.0)
+    assert lidar.scan(2.5, 0.0, 0.0) == pytest.approx(0.0)
+    assert lidar.scan(-2.0, 0.1, 0.0) == pytest.approx(0.0)
+
+
+def test_a_ray_along_the_face_of_a_box_is_no_number_problem() -> None:
+    world = World(name="edge", boxes=(Box(1.0, 0.0, 2.0, 1.0),))
+    with np.errstate(all="raise", under="ignore"):
+        ranges = Lidar(world, sectors=1, reduction="single").scan(0.0, 0.0, 0.0)
+    assert ranges == pytest.approx(1.0) or ranges == pytest.approx(5.0)
+
+
+def test_a_ray_that_meets_nothing_reports_the_longest_range() -> None:
+    lidar = Lidar(World(name="hall", size=(100.0, 100.0)), max_range=7.0)
+    np.testing.assert_array_equal(lidar.scan(0.0, 0.0, 0.3), 7.0)
+
+
+def test_the_reductions_differ_at_the_edge_of_a_box() -> None:
+    world = World(name="leg", boxes=(Box(2.0, -0.02, 2.04, 0.02),))
+    near = Lidar(world, sectors=1, rays_per_sector=5, reduction="min").scan(0.0, 0.0, 0.0)
+    median = Lidar(world, sectors=1, rays_per_sector=5, reduction="median").scan(0.0, 0.0, 0.0)
+    even = Lidar(world, sectors=1, rays_per_sector=4, reduction="median").scan(0.0, 0.0, 0.0)
+    rays = Lidar(world, sectors=1, rays_per_sector=5).cast(0.0, 0.0, 0.0)
+    assert near == pytest.approx(2.0)
+    assert median == pytest.approx(np.median(rays))
+    assert even == pytest.approx(
+        np.median(Lidar(world, sectors=1, rays_per_sector=4).cast(0.0, 0.0, 0.0))
+    )
+
+
+def test_the_lidar_agrees_with_the_ray_test_of_the_engine() -> None:
+    rng = np.random.default_rng(0)
+    for world in (WORLDS["test"], load_world(EXAMPLE_WORLD)):
+        lidar = Lidar(world, max_range=9.0)
+        simulation = Simulation(time_step=0.02)
+        simulation.add_world(world)
+        for _ in range(20):
+            x, y = (rng.uniform(-0.5, 0.5, 2) * world.size).tolist()
+            if world.clearance(x, y) < 0.1:
+                continue
+            heading = rng.uniform(-math.pi, math.pi)
+            engine = simulation.cast_rays((x, y), lidar.angles + heading, height=0.3, reach=9.0)
+            ours = lidar.cast(x, y, heading)
+            # The engine rounds edges by millimeters, so single rays there may differ.
+            assert np.mean(np.abs(engine - ours) < 0.01) > 0.96
+        simulation.close()
+
+
+def test_noise_needs_a_generator_and_is_its_only_randomness() -> None:
+    lidar = Lidar(WORLDS["A"], noise=0.1)
+    with pytest.raises(ValueError, match=r"rng must be a Generator when noise is 0.1, got None"):
+        lidar.scan(0.0, 0.0, 0.0)
+    first, second = (lidar.scan(0, 0, 0, rng=np.random.default_rng(1)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)

@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import hashlib
+import math
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import mpfa_envs
+from mpfa_envs import (
+    ENV_IDS,
+    INFO_TYPES,
+    OBSERVATION,
+    ROBOTS,
+    Box,
+    NavigationEnv,
+    RewardTerms,
+    World,
+)
+
+STRAIGHT = {"start": (0.0, 0.0, 0.0), "goal": (2.98, 0.0)}
+
+
+def rolled(physics: str, *, world: str = "D", episodes_before: int = 0) -> str:
+    """Hash of a seeded drive, after other episodes in the same environment."""
+    env = NavigationEnv(world=world, physics=physics)
+    rng = np.random.default_rng(99)
+    for _ in range(episodes_before):
+        env.reset(seed=int(rng.integers(1000)))
+        for _ in range(7):
+            if any(env.step(rng.uniform(-1, 1, 2).astype(np.float32))[2:4]):
+                break
+    digest = hashlib.sha256()
+    observation, _ = env.reset(seed=5)
+    actions = np.random.default_rng(7).uniform(-1, 1, (40, 2)).astype(np.float32)
+    for action in actions:
+        digest.update(observation.tobytes())
+        observation, reward, terminated, truncated, info = env.step(action)
+        digest.update(np.array([reward, info["x"], info["y"], info["heading"]]).tobytes())
+        if terminated or truncated:
+            observation, _ = env.reset()
+    env.close()
+    return digest.hexdigest()
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_every_id_passes_the_checker_without_a_warning(env_id: str, physics: str) -> None:
+    env = gymnasium.make(env_id, physics=physics)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_the_package_can_be_imported_twice_and_needs_no_torch() -> None:
+    code = (
+        "import sys, importlib, mpfa_envs; importlib.reload(mpfa_envs); "
+        "assert not {'torch', 'torchrl', 'tensordict', 'pybullet'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, env=_path())
+
+
+def _path() -> dict[str, str]:
+    return {"PYTHONPATH": str(mpfa_envs.EXAMPLE_WORLD.parents[3])}
+
+
+def test_every_public_name_exists() -> None:
+    assert all(hasattr(mpfa_envs, name) for name in mpfa_envs.__all__)
+
+
+def test_the_same_seed_gives_the_same_bits_after_other_episodes(physics: str) -> None:
+    assert rolled(physics) == rolled(physics, episodes_before=5)
+
+
+def test_the_same_seed_gives_the_same_bits_in_another_process(physics: str) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); from test_navigation import rolled; "
+        "print(rolled(sys.argv[2]))"
+    )
+    here = str(__import__("pathlib").Path(__file__).parent)
+    result = subprocess.run(
+        [sys.executable, "-c", code, here, physics],
+        check=True,
+        capture_output=True,
+        text=True,
+        env=_path(),
+    )
+    assert result.stdout.split()[-1] == rolled(physics)
+
+
+def test_environments_side_by_side_do_not_know_each_other(physics: str) -> None:
+    alone = NavigationEnv(world="B", physics=physics)
+    envs = [NavigationEnv(world="B", physics=physics) for _ in range(2)]
+    for env in (alone, *envs):
+        env.reset(seed=1)
+    for step in range(10):
+        expected = alone.step([0.5, 0.4])[0]
+        envs[1].step([-0.2, 0.9 - 0.1 * step])
+        np.testing.assert_array_equal(envs[0].step([0.5, 0.4])[0], expected)
+    for env in (alone, *envs):
+        env.close()
+
+
+def test_close_twice_is_fine_and_the_server_is_gone() -> None:
+    import pybullet
+
+    env = NavigationEnv(physics="wheels")
+    client = env._drive.simulation.client
+    assert pybullet.isConnected(physicsClientId=client)
+    env.close()
+    env.close()
+    assert not pybullet.isConnected(physicsClientId=client)
+
+
+def test_the_observation_says_where_the_goal_is() -> None:
+    env = NavigationEnv(physics="kinematic")
+    observation, info = env.reset(options={"start": (0, 0, math.pi / 2), "goal": (3, 0)})
+    np.testing.assert_allclose(observation[OBSERVATION["goal_direction"]], [0, -1], atol=1e-6)
+    assert observation[OBSERVATION["goal_distance"]] == pytest.approx(0.3)
+    assert observation[OBSERVATION["goal_closeness"]] == pytest.approx(0.1)
+    assert (observation[OBSERVATION["linear_speed"]], info["distance"]) == (0.0, 3.0)
+    observation, *_ = env.step([1.0, -1.0])
+    assert observation[OBSERVATION["linear_speed"]] == pytest.approx(0.55)
+    assert observation[OBSERVATION["angular_speed"]] == pytest.approx(-1.0)
+
+
+def test_a_goal_behind_does_not_make_the_observation_jump() -> None:
+    env = NavigationEnv(physics="kinematic")
+    seen = [
+        env.reset(options={"start": (0, 0, math.pi + turn), "goal": (3, 0)})[0]
+        for turn in (-1e-4, 1e-4)
+    ]
+    np.testing.assert_allclose(seen[0], seen[1], atol=1e-3)
+
+
+def test_the_goal_ends_an_episode_with_success() -> None:
+    env = NavigationEnv(physics="kinematic")
+    env.reset(options=STRAIGHT)
+    for _ in range(49):
+        _, reward, terminated, _, info = env.step([1.0, 1.0])
+        assert not terminated and not info["success"]
+        assert reward == info["reward_progress"] == pytest.approx(15 * 0.05)
+    _, reward, terminated, truncated, info = env.step([1.0, 1.0])
+    assert (reward, terminated, truncated) == (10.0, True, False)
+    assert (info["success"], info["collision"], info["time_out"]) == (True, False, False)
+    assert info["path_length"] == pytest.approx(2.5)
+    assert info["shortest_path"] == pytest.approx(2.48)
+    assert info["sim_time"] == pytest.approx(5.0)
+
+
+def test_leaving_the_goal_costs_what_approaching_pays() -> None:
+    env = NavigationEnv(physics="kinematic")
+    env.reset(options={"start": (0, 0, math.pi), "goal": (3, 0)})
+    assert env.step([1.0, 1.0])[1] == pytest.approx(-15 * 0.05)
+
+
+@pytest.mark.parametrize(("rule", "distance"), [(None, 0.35), ("contact", 0.18), (0.4, 0.4)])
+def test_a_collision_ends_an_episode_at_its_distance(rule: object, distance: float) -> None:
+    world = World(name="post", boxes=(Box(1.0, -0.5, 2.0, 0.5),))
+    env = NavigationEnv(world=world, physics="kinematic", collision_distance=rule)
+    env.reset(options=STRAIGHT)
+    while True:
+        _, reward, terminated, truncated, info = env.step([1.0, 1.0])
+        if terminated:
+            break
+        assert 1.0 - info["x"] > distance
+    assert (reward, truncated, info["collision"], info["success"]) == (-5.0, False, True, False)
+    assert 1.0 - info["x"] <= distance + 1e-9
+    assert info["min_clearance"] == pytest.approx(1.0 - info["x"] - 0.18)
+
+
+def test_the_time_limit_truncates_and_does_not_terminate() -> None:
+    env = NavigationEnv(physics="kinematic", max_steps=3)
+    env.reset(options=STRAIGHT)
+    ends = [env.step([1.0, 1.0]) for _ in range(3)]
+    assert [end[2] for end in ends] == [False, False, False]
+    assert [end[3] for end in ends] == [False, False, True]
+    assert [end[4]["time_out"] for end in ends] == [False, False, True]
+    assert ends[-1][1] == pytest.approx(0.75)
+
+
+def test_a_goal_in_the_last_step_is_no_time_out() -> None:
+    env = NavigationEnv(physics="kinematic", max_steps=50)
+    env.reset(options=STRAIGHT)
+    for _ in range(50):
+        _, _, terminated, truncated, info = env.step([1.0, 1.0])
+    assert (terminated, truncated, info["time_out"]) == (True, False, False)
+
+
+def test_the_info_has_the_same_keys_and_types_always(physics: str) -> None:
+    env = NavigationEnv(world="C", physics=physics, max_steps=30)
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        done = False
+        while not done:
+            assert {key: type(value) for key, value in info.items()} == INFO_TYPES
+            _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            terms = [value for key, value in info.items() if key.startswith("reward_")]
+            assert reward == sum(terms)
+            done = terminated or truncated
+    env.close()
+
+
+def test_a_reward_of_your_own_replaces_the_equation() -> None:
+    env = NavigationEnv(
+        physics="kinematic", reward=lambda outcome: RewardTerms(other=outcome.clearance)
+    )
+    env.reset(options=STRAIGHT)
+    _, reward, _, _, info = env.step([1.0, 1.0])
+    assert reward == info["reward_other"] == pytest.approx(5 - 0.05 - 0.18)
+    assert info["reward_progress"] == 0.0
+
+
+def test_actions_beyond_the_box_are_clipped() -> None:
+    env = NavigationEnv(physics="kinematic")
+    env.reset(options=STRAIGHT)
+    assert env.step([9.0, 9.0])[4]["x"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([math.nan, 0.0], "action must not hold NaN, got .*nan"),
+        ([0.0], r"action must have shape \(2,\), got \(1,\)"),
+    ],
+)
+def test_a_bad_action_moves_nothing(action: list[float], message: str) -> None:
+    env = NavigationEnv(physics="kinematic")
+    env.reset(options=STRAIGHT)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    assert env.step([1.0, 1.0])[4]["sim_time"] == pytest.approx(0.1)
+
+
+def test_a_step_outside_an_episode_asks_for_a_reset() -> None:
+    env = NavigationEnv(physics="kinematic", max_steps=1, render_mode="rgb_array")
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step([0.0, 0.0])
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.render()
+    env.reset(options=STRAIGHT)
+    env.step([0.0, 0.0])
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step([0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": (0, 0, 0)}, r"options must have the keys 'start' and 'goal', got \['start'\]"),
+        ({"start": (0, 0), "goal": (3, 0)}, r"start must be 3 finite numbers, got \(0, 0\)"),
+        ({"start": (0, 0, 0), "goal": (math.inf, 0)}, "goal must be 2 finite numbers"),
+        ({"start": (4.8, 0, 0), "goal": (3, 0)}, r"start must be farther .*\(4.8, 0.0\)"),
+        ({"start": (0, 0, 0), "goal": (0.4, 0)}, r"goal must be farther .*\(0.4, 0.0\)"),
+        ({"start": (0, 0, 0), "goal": (7, 0)}, r"goal must be within reach .*\(7.0, 0.0\)"),
+        ({"start": (0, 0, 0), "goal": "ab"}, "goal must be 2 finite numbers, got 'ab'"),
+    ],
+)
+def test_a_bad_task_is_refused_and_the_episode_goes_on(
+    options: dict[str, object], message: str
+) -> None:
+    env = NavigationEnv(physics="kinematic")
+    env.reset(options=STRAIGHT)
+    env.step([1.0, 1.0])
+    with pytest.raises(ValueError, match=message):
+        env.reset(options=options)
+    assert env.step([1.0, 1.0])[4]["x"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "message"),
+    [
+        ("world", "tets", "world must be .*got 'tets' .did you mean 'test'"),
+        ("robot", "burgr", "robot must be .*got 'burgr' .did you mean 'burger'"),
+        ("physics", "magic", "physics must be one of .*got 'magic'"),
+        ("max_steps", 0, "max_steps must be a positive integer, got 0"),
+        ("max_steps", True, "max_steps must be a positive integer, got True"),
+        ("time_step", 0.0, "time_step must be positive, got 0.0"),
+        ("goal_radius", math.nan, "goal_radius must be positive, got nan"),
+        ("min_goal_distance", 0.3, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
+        ("progress_scale", math.inf, "progress_scale must be finite, got inf"),
+        ("collision_distance", 0.1, "collision_distance must be .*0.18, got 0.1"),
+        ("collision_distance", "touch", "collision_distance must be .*got 'touch'"),
+        ("reward", 3, "reward must be callable or None, got 3"),
+        ("render_mode", "human", "render_mode must be None or 'rgb_array', got 'human'"),
+        ("sectors", 0, "sectors must be a positive integer, got 0"),
+        ("reduction", "mean", "reduction must be one of .*got 'mean'"),
+        ("max_range", -1.0, "max_range must be a positive length, got -1.0"),
+        ("lidar_noise", -1.0, "noise must be a non-negative length, got -1.0"),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(argument: str, value: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        NavigationEnv(**{"physics": "kinematic", argument: value})
+
+
+def test_lidar_noise_is_drawn_from_the_seed() -> None:
+    env = NavigationEnv(physics="kinematic", lidar_noise=0.05)
+    first, second = (env.reset(seed=3, options=STRAIGHT)[0] for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(first, env.reset(seed=4, options=STRAIGHT)[0])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_wheels_and_kinematics_agree_once_the_robot_is_up_to_speed(robot: str) -> None:
+    ends = []
+    for physics in ("kinematic", "wheels"):
+        env = NavigationEnv(robot=robot, physics=physics)
+        env.reset(options={"start": (-2, -2, 0), "goal": (4, 4)})
+        for step in range(40):
+            info = env.step([0.2, 0.3] if step % 20 < 10 else [0.8, 0.6])[4]
+        ends.append((info["x"], info["y"], info["heading"]))
+        env.close()
+    # The motors take up to 0.3 s to reach a speed, so after four changes they are 10 cm behind.
+    np.testing.assert_allclose(ends[0][:2], ends[1][:2], atol=0.12)
+    assert ends[0][2] == pytest.approx(ends[1][2], abs=0.08)

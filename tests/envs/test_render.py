@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpfa_envs import WORLDS, NavigationEnv, World, draw_trajectories
+from mpfa_envs.render import FLOOR, GOAL, OBSTACLE, OUTCOMES, TRAIL, WALL
+
+
+def pixel(picture: np.ndarray, x: float, y: float) -> tuple[int, ...]:
+    """Color at a position [m] of a 10 x 10 m world."""
+    scale = 480 / 10.4
+    row, column = int((5.2 - y) * scale), int((x + 5.2) * scale)
+    return tuple(picture[row, column].tolist())
+
+
+def test_a_picture_shows_the_room_the_goal_the_robot_and_its_trail() -> None:
+    env = NavigationEnv(world="B", physics="kinematic", render_mode="rgb_array")
+    env.reset(options={"start": (-1.0, 0.5, 0.0), "goal": (1.6, 2.6)})
+    for _ in range(30):
+        env.step([1.0, 1.0])
+    picture = env.render()
+    assert (picture.shape, picture.dtype) == ((480, 480, 3), np.uint8)
+    assert pixel(picture, 1.6, 2.6) == GOAL[:3]
+    assert pixel(picture, 3.0, 0.0) == OBSTACLE[:3]
+    assert pixel(picture, 5.1, 0.0) == WALL[:3]
+    assert pixel(picture, -4.5, 0.4) == FLOOR[:3]
+    np.testing.assert_allclose(pixel(picture, -0.5, 0.5), TRAIL[:3], atol=60)
+    assert sum(pixel(picture, 0.5, 0.64)) < 150
+    env.step([1.0, 1.0])
+    assert not np.array_equal(picture, env.render())
+
+
+def test_without_a_render_mode_nothing_is_drawn() -> None:
+    env = NavigationEnv(physics="kinematic")
+    env.reset(seed=0)
+    assert env.render() is None
+
+
+def test_trajectories_have_the_color_of_their_outcome() -> None:
+    picture = draw_trajectories(
+        "A",
+        [np.array([(-4.0, 0.03), (4.0, 0.03)]), [(-4.0, -2.97), (4.0, -2.97)]],
+        [(4.0, 0.0), (4.0, 3.0)],
+        ["success", "collision"],
+        title="two",
+    )
+    assert picture.shape == (508, 480, 3)
+    np.testing.assert_allclose(pixel(picture, 2.5, 0.03), OUTCOMES["success"][:3], atol=90)
+    np.testing.assert_allclose(pixel(picture, 2.5, -2.97), OUTCOMES["collision"][:3], atol=90)
+
+
+def test_a_long_room_gives_a_long_picture() -> None:
+    world = World(name="hall", size=(9.6, 4.6))
+    assert draw_trajectories(world, [], [], [], size=200).shape == (128, 200, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([], [(0, 0)], []), "must have one entry per episode, got 0, 1 and 0"),
+        (([[(0, 0)]], [(0, 0)], ["lost"]), "outcomes must be among .*got 'lost'"),
+    ],
+)
+def test_bad_lists_are_refused(arguments: tuple[list, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        draw_trajectories(WORLDS["A"], *arguments)
+
+
+def test_a_bad_size_is_refused() -> None:
+    with pytest.raises(ValueError, match="size must be an integer of at least 32, got 3"):
+        draw_trajectories("A", [], [], [], size=3)

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pybullet
+import pytest
+
+from mpfa_envs import ROBOTS, WORLDS
+from mpfa_envs.drives import WheelDrive
+from mpfa_envs.simulation import Simulation
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("wheels", ["fast", "slow", "left", "right"])
+def test_the_simulated_robot_drives_and_turns_as_commanded(name: str, wheels: str) -> None:
+    robot = ROBOTS[name]
+    slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
+    left, right = {
+        "fast": (fast, fast),
+        "slow": (slow, slow),
+        "left": (slow, fast),
+        "right": (fast, slow),
+    }[wheels]
+    drive = WheelDrive(robot, WORLDS["A"], time_step=0.1)
+    drive.place(0.0, 0.0, 0.5)
+    for _ in range(8):
+        before = drive.move(left, right)
+    driven = turned = 0.0
+    for _ in range(20):
+        after = drive.move(left, right)
+        driven += math.hypot(after.x - before.x, after.y - before.y)
+        turned += math.remainder(after.heading - before.heading, math.tau)
+        before = after
+    drive.close()
+    assert driven / 2.0 == pytest.approx((left + right) / 2, rel=0.03)
+    assert turned / 2.0 == pytest.approx((right - left) / robot.wheel_base, rel=0.03, abs=0.01)
+
+
+def test_a_wall_stops_the_simulated_robot() -> None:
+    drive = WheelDrive(ROBOTS["turtlebot2"], WORLDS["A"], time_step=0.1)
+    drive.place(4.5, 0.0, 0.0)
+    for _ in range(30):
+        motion = drive.move(0.5, 0.5)
+    drive.close()
+    assert motion.x == pytest.approx(5.0 - 0.18, abs=0.02)
+
+
+def test_bodies_have_names_and_a_name_is_used_once() -> None:
+    simulation = Simulation(time_step=0.02)
+    simulation.add_world(WORLDS["B"])
+    simulation.add_robot(ROBOTS["burger"])
+    assert {"floor", "wall_0", "box_3", "robot"} <= set(simulation.bodies)
+    with pytest.raises(ValueError, match="name must be new, got 'box_0'"):
+        simulation.add_cylinder("box_0", x=0, y=0, radius=1, height=1)
+    client = simulation.client
+    simulation.close()
+    simulation.close()
+    assert not pybullet.isConnected(physicsClientId=client)
+    assert not simulation.is_connected
+    with pytest.raises(ValueError, match="time_step must be positive, got 0"):
+        Simulation(time_step=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"radius": 0.0}, "radius must be positive, got 0.0"),
+        ({"mass": math.inf}, "mass must be finite, got inf"),
+        ({"mass": "heavy"}, "mass must be a number, got 'heavy'"),
+        ({"name": ""}, "name must be a non-empty string, got ''"),
+        ({"wheel_base": 1.0}, "wheel_base must be at most the diameter 0.36, got 1.0"),
+        ({"wheel_radius": 0.3}, "wheel_radius must be at most half the height"),
+        ({"min_wheel_speed": 0.5}, "min_wheel_speed must be below max_wheel_speed = 0.5, got 0.5"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(ROBOTS["turtlebot2"], **change)
+
+
+def test_the_turtlebot2_has_the_measures_of_the_paper() -> None:
+    robot = ROBOTS["turtlebot2"]
+    assert (robot.radius, robot.wheel_base, robot.wheel_radius) == (0.18, 0.23, 0.035)
+    assert robot.margin == 0.35
+    assert robot.max_angular_speed == pytest.approx(1.9565, abs=1e-4)

@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from mpfa_envs import INFO_TYPES, evaluation_pairs, make_navigation_env
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_the_specs_hold(num_envs: int | None, physics: str) -> None:
+    env = make_navigation_env("B", num_envs=num_envs, physics=physics, seed=0)
+    check_env_specs(env)
+    batch = [] if num_envs is None else [num_envs]
+    assert list(env.batch_size) == batch
+    rollout = env.rollout(4)
+    assert rollout["observation"].shape == (*batch, 4, 24)
+    assert rollout["observation"].dtype == torch.float32
+    for name, kind in INFO_TYPES.items():
+        value = rollout["next", "info", name]
+        assert value.shape == (*batch, 4, 1)
+        assert value.dtype == (torch.bool if kind is bool else torch.float32)
+    env.close()
+    env.close()
+
+
+def test_parallel_environments_have_the_same_face() -> None:
+    env = make_navigation_env("A", num_envs=2, parallel=True, physics="kinematic", seed=0)
+    try:
+        assert env.rollout(3)["next", "info", "distance"].shape == (2, 3, 1)
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_a_seed_gives_the_same_episodes_again(num_envs: int | None) -> None:
+    env = make_navigation_env("C", num_envs=num_envs, physics="kinematic")
+    rollouts = []
+    for _ in range(2):
+        env.set_seed(3)
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(20, break_when_any_done=False))
+    assert (rollouts[0] == rollouts[1]).all()
+    if num_envs:
+        assert not torch.equal(rollouts[0]["observation"][0], rollouts[0]["observation"][1])
+
+
+def test_a_time_limit_is_truncated_and_a_collision_terminated() -> None:
+    env = make_navigation_env("A", physics="kinematic", max_steps=4, seed=0)
+    env.set_task((0.0, 0.0, 0.0), (3.0, 3.0))
+    last = env.rollout(10)[-1]["next"]
+    assert (last["truncated"].item(), last["terminated"].item(), last["done"].item()) == (1, 0, 1)
+    env.set_task((4.6, 0.0, 0.0), (-3.0, 3.0))
+    last = env.rollout(10)[-1]["next"]
+    assert (last["truncated"].item(), last["terminated"].item(), last["done"].item()) == (0, 1, 1)
+    assert last["info", "collision"].item() and last["reward"].item() == -5.0
+
+
+def test_a_task_holds_for_the_next_episode_of_its_environment_only() -> None:
+    env = make_navigation_env("test", num_envs=2, physics="kinematic", seed=0)
+    pair = evaluation_pairs("test", 1, seed=0)[0]
+    env.set_task(*pair, index=1)
+    x = env.reset()["info", "x"]
+    assert x[1].item() == pytest.approx(pair.start[0]) and x[0].item() != x[1].item()
+    assert env.reset()["info", "x"][1].item() != pytest.approx(pair.start[0])
+    with pytest.raises(IndexError, match=r"index must be in \[0, 2\), got 2"):
+        env.set_task(*pair, index=2)
+    with pytest.raises(ValueError, match="start must be farther"):
+        env.set_task((5.0, 0.0, 0.0), (0.0, 0.0))
+
+
+def test_a_rollout_can_wait_for_the_last_episode_of_a_batch() -> None:
+    env = make_navigation_env("A", num_envs=2, physics="kinematic", seed=0)
+    env.set_task((0.0, 0.0, 0.0), (1.0, 0.0), index=0)
+    env.set_task((0.0, 0.0, 0.0), (2.0, 0.0), index=1)
+
+    def ahead(tensordict):
+        return tensordict.set("action", torch.ones(2, 2))
+
+    rollout = env.rollout(
+        100, ahead, break_when_any_done=False, break_when_all_done=True, auto_reset=True
+    )
+    success = rollout["next", "info", "success"].any(dim=1)
+    assert success.all() and rollout.shape[1] in (30, 31)
+
+
+def test_the_usual_transforms_and_the_collector_work() -> None:
+    env = TransformedEnv(
+        make_navigation_env("B", physics="kinematic", max_steps=10, seed=0),
+        Compose(StepCounter(), RewardSum()),
+    )
+    rollout = env.rollout(10)
+    total = rollout["next", "episode_reward"][-1]
+    assert total.item() == pytest.approx(rollout["next", "reward"].sum().item(), rel=1e-5)
+    collector = Collector(env, None, frames_per_batch=32, total_frames=64)
+    batches = [batch.numel() for batch in collector]
+    collector.shutdown()
+    assert batches == [32, 32]
+
+
+def test_what_was_collected_does_not_change_with_the_next_step() -> None:
+    env = make_navigation_env("A", physics="kinematic", seed=0)
+    first = env.reset()
+    kept = first["observation"].clone()
+    env.step(first.set("action", torch.ones(2)))
+    assert torch.equal(first["observation"], kept)
+
+
+def test_info_keys_choose_what_is_handed_on() -> None:
+    env = make_navigation_env("A", physics="kinematic", info_keys=("success", "distance"))
+    check_env_specs(env)
+    assert set(env.reset()["info"].keys()) == {"success", "distance"}
+    bare = make_navigation_env("A", physics="kinematic", info_keys=())
+    check_env_specs(bare)
+    assert "info" not in bare.reset()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be a positive integer or None, got 0"),
+        ({"parallel": True}, "num_envs must be a positive integer with parallel=True, got None"),
+        ({"info_keys": ("succes",)}, "info_keys must be among .*got 'succes'"),
+        ({"max_steps": -1}, "max_steps must be a positive integer, got -1"),
+    ],
+)
+def test_a_bad_argument_is_named(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_navigation_env("A", physics="kinematic", **arguments)

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mpfa_envs import (
+    EXAMPLE_WORLD,
+    WORLDS,
+    NavigationEnv,
+    WorldFileError,
+    load_world,
+    save_world,
+)
+
+
+@pytest.mark.parametrize("world", [*WORLDS.values(), load_world(EXAMPLE_WORLD)])
+def test_a_saved_world_comes_back_equal(world: object, tmp_path: Path) -> None:
+    save_world(world, tmp_path / "world.yaml")
+    assert load_world(tmp_path / "world.yaml") == world
+
+
+def test_the_example_can_be_driven_in(physics: str) -> None:
+    env = NavigationEnv(world=EXAMPLE_WORLD, physics=physics)
+    _, info = env.reset(seed=0)
+    assert info["x"] < -2.4
+    assert env.step([0.0, 0.0])[4]["distance"] > 2.0
+    env.close()
+
+
+def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
+    (tmp_path / "hall.yaml").write_text("size: [4, 4]\n")
+    assert load_world(tmp_path / "hall.yaml").name == "hall"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("size: [4, 4]\nboxs: []\n", 2, "unknown key 'boxs' in the file; did you mean 'boxes'"),
+        ("size: [4, 4]\nzzzzz: 1\n", 2, "unknown key 'zzzzz' in the file; known are name, size"),
+        ("name: x\n", 1, "size is missing"),
+        ("- 1\n", 1, "the file must be a mapping"),
+        ("", 1, "the file must be a mapping"),
+        ("size: [4]\n", 1, r"size must be \[width, depth\], got 1 entries"),
+        ("size: 4\n", 1, "size must be a list"),
+        ("size: [4, wide]\n", 1, "size must be a number in meters, got 'wide'"),
+        ("size: [4, -4]\n", 1, "size must be positive"),
+        ("size: [4, 4]\nname: [a]\n", 2, "name must be text"),
+        ("size: [4, 4]\nsize: [5, 5]\n", 2, "key 'size' appears twice"),
+        ("size: [4, 4]\nboxes: 3\n", 2, "boxes must be a list"),
+        ("size: [4, 4]\nboxes:\n  - 3\n", 3, "an entry of boxes must be a mapping"),
+        (
+            "size: [4, 4]\ncylinders:\n  - {x: 0, y: 0, radius: 1}\n  - {x: 0, y: 0}\n",
+            4,
+            "an entry of cylinders lacks the key 'radius'",
+        ),
+        (
+            "size: [4, 4]\ncylinders:\n  - {x: 0, y: 0, radius: -1}\n",
+            3,
+            "cylinder must have a positive radius",
+        ),
+        (
+            "size: [4, 4]\nboxes:\n  - {x_min: 1, x_max: 0, y_min: 0, y_max: 1}\n",
+            3,
+            "box must have x_min < x_max",
+        ),
+        (
+            "size: [4, 4]\nboxes:\n  - {x_min: 1, x_max: 3, y_min: 0, y_max: 1}\n",
+            3,
+            "an entry of boxes lies outside the room",
+        ),
+        (
+            "size: [4, 4]\nboxes:\n  - {x_min: 1, xmax: 3, y_min: 0, y_max: 1}\n",
+            3,
+            "unknown key 'xmax' in an entry of boxes; did you mean 'x_max'",
+        ),
+        (
+            "size: [4, 4]\nboxes:\n  - {x_min: -1, x_max: 1, y_min: -1, y_max: 1}\n"
+            "goal:\n  - {x_min: -1, x_max: 1, y_min: -1, y_max: 1}\n",
+            5,
+            "an entry of goal has no point 0.5 m from every obstacle",
+        ),
+        ("size: [4, 4\nboxes: 1\n", 2, "is not YAML"),
+        ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_line(
+    text: str, line: int, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(WorldFileError, match=f"bad.yaml:{line}: .*{message}"):
+        load_world(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WorldFileError, match=r"none.yaml: cannot be read"):
+        NavigationEnv(world=tmp_path / "none.yaml")

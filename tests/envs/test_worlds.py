@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, World, evaluation_pairs, sample_task
+from mpfa_envs.path import planner_for
+
+
+def test_clearance_is_the_distance_to_the_nearest_face() -> None:
+    world = World(
+        name="two", boxes=(Box(1.0, 1.0, 2.0, 2.0),), cylinders=(Cylinder(-2.0, 0.0, 0.5),)
+    )
+    assert world.clearance(0.0, 1.5) == pytest.approx(1.0)
+    assert world.clearance(0.4, 0.2) == pytest.approx(1.0)
+    assert world.clearance(-1.0, 0.0) == pytest.approx(0.5)
+    assert world.clearance(4.9, -3.0) == pytest.approx(0.1)
+    assert world.clearance(1.5, 1.5) == 0.0
+    assert world.clearance(6.0, 0.0) == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Box(1, 0, 1, 2), "box must have x_min < x_max"),
+        (lambda: Box(0, 0, math.nan, 2), "box must have finite edges"),
+        (lambda: Cylinder(0, 0, 0), "cylinder must have a positive radius"),
+        (lambda: World(name="x", size=(0, 1)), r"size must be two positive lengths, got \(0, 1\)"),
+        (lambda: World(name="x", boxes=(Box(4, 0, 6, 1),)), "boxes must lie in the room"),
+        (lambda: World(name="x", cylinders=(Cylinder(5, 0, 1),)), "cylinders must lie in the room"),
+        (lambda: World(name="x", goal_regions=(Box(4, 0, 6, 1),)), "goal_regions must lie in"),
+    ],
+)
+def test_a_bad_shape_is_refused(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_the_training_maps_are_those_of_the_public_course() -> None:
+    assert [len(WORLDS[name].boxes) for name in "ABCD"] == [0, 4, 4, 6]
+    assert WORLDS["C"].boxes[0] == Box(-1.5, 1.5, 1.5, 2.0)
+    assert all(world.size == (10.0, 10.0) for world in WORLDS.values())
+
+
+def test_the_test_map_is_denser_than_the_densest_training_map() -> None:
+    dense, test = WORLDS["D"], WORLDS["test"]
+    assert len(test.boxes) > len(dense.boxes) and test.covered_area > dense.covered_area
+    assert not set(test.boxes) & {box for name in "ABCD" for box in WORLDS[name].boxes}
+    assert not set(test.boxes) & set(WORLDS["validation"].boxes)
+
+
+@pytest.mark.parametrize("name", ["validation", "test"])
+def test_most_unseen_tasks_need_a_detour_and_all_can_be_solved(name: str) -> None:
+    pairs = evaluation_pairs(name, 200, seed=0)
+    wide, tight = (planner_for(WORLDS[name], margin) for margin in (0.35, 0.18))
+    assert all(wide.is_reachable(pair.start[:2], pair.goal) for pair in pairs)
+    blocked = [not tight.is_straight(pair.start[:2], pair.goal) for pair in pairs]
+    assert sum(blocked) > 120
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_starts_and_goals_keep_their_margins(name: str) -> None:
+    world, rng = WORLDS[name], np.random.default_rng(0)
+    headings = []
+    for _ in range(60):
+        start, goal = sample_task(world, rng, collision_distance=0.35)
+        assert world.clearance(*start[:2]) >= 0.5
+        assert world.clearance(*goal) >= 0.5
+        assert math.dist(start[:2], goal) >= 2.0
+        headings.append(start[2])
+    assert min(headings) < -2.5 and max(headings) > 2.5
+
+
+def test_evaluation_pairs_are_reproducible_and_a_longer_list_starts_the_same() -> None:
+    assert evaluation_pairs("test", 5, seed=1) == evaluation_pairs("test", 8, seed=1)[:5]
+    assert evaluation_pairs("test", 5, seed=1) != evaluation_pairs("test", 5, seed=2)
+    for n in (0, True, 1.5):
+        with pytest.raises(ValueError, match="n must be a positive integer, got"):
+            evaluation_pairs("test", n, seed=0)
+
+
+def test_a_fixed_task_is_driven_as_it_was_given() -> None:
+    env = NavigationEnv(world="test", physics="kinematic")
+    for pair in evaluation_pairs("test", 5, seed=3):
+        _, info = env.reset(options=pair._asdict())
+        assert (info["x"], info["y"], info["heading"]) == pytest.approx(pair.start)
+        assert env.task == pair
+
+
+def test_regions_hold_the_starts_and_the_goals() -> None:
+    left, right = Box(-4, -4, -2, 4), Box(2, -4, 4, 4)
+    world = World(name="sides", start_regions=(left,), goal_regions=(right,))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        start, goal = sample_task(world, rng, collision_distance=0.35)
+        assert start[0] <= -2 and goal[0] >= 2
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        (World(name="closet", size=(0.9, 0.9)), "'closet' has no free start"),
+        (World(name="small", size=(2.2, 2.2)), "'small' has no start and goal"),
+        (
+            World(
+                name="cut",
+                boxes=(Box(-0.1, -5, 0.1, 5),),
+                start_regions=(Box(-4, -4, -2, 4),),
+                goal_regions=(Box(2, -4, 4, 4),),
+            ),
+            "'cut' has no start and goal",
+        ),
+    ],
+)
+def test_a_world_without_a_task_is_an_error_and_not_an_endless_search(
+    world: World, message: str
+) -> None:
+    env = NavigationEnv(world=world, physics="kinematic")
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=0)
