@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torchrl.objectives import SoftUpdate
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from torchrl_mpfa.loss import SignalDDPGLoss
 
@@ -77,9 +77,15 @@ class DDPGLearner:
         self.policy = loss.actor_network
         # TorchRL empties the modules it makes functional; the policy acts with the trained ones.
         loss.actor_network_params.to_module(self.policy)
-        self.targets = SoftUpdate(loss, tau=tau)
         actor = list(loss.actor_network_params.flatten_keys().values())
         critic = list(loss.value_network_params.flatten_keys().values())
+        self._online = [*actor, *critic]
+        self._target = [
+            *loss.target_actor_network_params.flatten_keys().values(),
+            *loss.target_value_network_params.flatten_keys().values(),
+        ]
+        # All tensors in one call: TorchRL's SoftUpdate goes through them one by one.
+        self._soft_update = get_ema_multi_avg_fn(1.0 - tau)
         self.optimizer = torch.optim.Adam(
             [
                 {"params": actor, "lr": actor_lr},
@@ -102,8 +108,13 @@ class DDPGLearner:
         # Only the losses: TorchRL's output holds values beside them.
         (losses["loss_value"] + losses["loss_actor"]).backward()
         self.optimizer.step()
-        self.targets.step()
+        self._update_targets()
         return {key: value.detach() for key, value in losses.items()}
+
+    @torch.no_grad()
+    def _update_targets(self) -> None:
+        r"""Move the targets, :math:`\theta' \leftarrow \tau\theta + (1-\tau)\theta'` (Eqs. 6-7)."""
+        self._soft_update(self._target, self._online, 0)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, target networks and optimizers; tensors and plain values only."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
@@ -127,6 +129,7 @@ class SignalDDPGLoss(DDPGLoss):
             use_prioritized_weights="auto" if importance == "torchrl" else False,
             **kwargs,
         )
+        self._bound: _Networks | None = None
         self.signals = tuple(signals)
         self.gradient_order = gradient_order
         self.gradient_at = gradient_at
@@ -193,12 +196,8 @@ class SignalDDPGLoss(DDPGLoss):
         inputs = tensordict.select(
             *self.actor_in_keys, *self.value_exclusive_keys, strict=False
         ).detach()
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            inputs = self.actor_network(inputs)
-        with self._cached_detached_value_params.to_module(
-            self.value_network, preserve_module_state=False
-        ):
-            inputs = self.value_network(inputs)
+        networks = self._networks()
+        inputs = networks.frozen_critic(networks.actor(inputs))
         value = inputs.get(self.tensor_keys.state_action_value).squeeze(-1)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
@@ -216,34 +215,73 @@ class SignalDDPGLoss(DDPGLoss):
             loss = loss + self.saturation_penalty * excess.square().mean()
         return loss, {"preactivation": size.detach()}
 
+    def _networks(self) -> _Networks:
+        """The networks with their parameters in place.
+
+        TorchRL swaps parameters in and out of one module at every call, which takes longer than
+        the networks themselves. These hold the same tensors for good.
+        """
+        if self._bound is None:
+            actor, critic = self.actor_network_params, self.value_network_params
+            target_actor = self.target_actor_network_params
+            target_critic = self.target_value_network_params
+            self._bound = _Networks(
+                actor=_with(self.actor_network, actor),
+                critic=_with(self.value_network, critic),
+                frozen_critic=_with(self.value_network, critic.detach()),
+                target_actor=_with(self.actor_network, target_actor),
+                target_critic=_with(self.value_network, target_critic),
+            )
+        return self._bound
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        # Called by ``to`` and its kin, which may put other tensors in the place of these.
+        self._bound = None
+        return super()._apply(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_bound": None}
+
     def _critic(self, inputs: TensorDictBase) -> Tensor:
         """Q of the current critic, shape ``[B]``."""
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            out = self.value_network(inputs)
-        return out.get(self.tensor_keys.state_action_value).squeeze(-1)
+        out = self._networks().critic(inputs)
+        value: Tensor = out.get(self.tensor_keys.state_action_value).squeeze(-1)
+        return value
 
     def _policy_gradient(self, inputs: TensorDictBase) -> Tensor:
         """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
         inputs = inputs.copy()
-        with (
-            torch.no_grad(),
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
-        ):
-            self.actor_network(inputs)
+        with torch.no_grad():
+            self._networks().actor(inputs)
         action = inputs.get(self.tensor_keys.action).requires_grad_(True)
         with torch.enable_grad():
             return _action_gradient(self._critic(inputs), action)
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Targets y of Eq. (5), shape ``[B]``; a time limit bootstraps, an end does not."""
-        if self.reward_scale != 1.0:
-            tensordict = tensordict.copy()
-            key = ("next", self.tensor_keys.reward)
-            tensordict.set(key, tensordict.get(key) * self.reward_scale)
-        target: Tensor = self.value_estimator.value_estimate(
-            tensordict, target_params=self._cached_target_params
-        )
-        return target.squeeze(-1)
+        keys = self.tensor_keys
+        if self.value_type is not ValueEstimators.TD0:
+            if self.reward_scale != 1.0:
+                tensordict = tensordict.copy()
+                scaled = tensordict.get(("next", keys.reward)) * self.reward_scale
+                tensordict.set(("next", keys.reward), scaled)
+            longer: Tensor = self.value_estimator.value_estimate(
+                tensordict, target_params=self._cached_target_params
+            )
+            return longer.squeeze(-1)
+        after = tensordict.get("next")
+        networks = self._networks()
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            inputs = after.select(*self.actor_in_keys, *self.value_exclusive_keys, strict=False)
+            value = networks.target_critic(networks.target_actor(inputs))
+            next_value = value.get(keys.state_action_value).squeeze(-1)
+            gamma = self.value_estimator.gamma
+            return bootstrap_target(
+                after.get(keys.reward).reshape(next_value.shape) * self.reward_scale,
+                next_value,
+                after.get(keys.terminated).reshape(next_value.shape),
+                gamma=gamma,
+            )
 
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         weights = self._maybe_get_priority_weight(tensordict)
@@ -252,6 +290,50 @@ class SignalDDPGLoss(DDPGLoss):
             if importance is not None:
                 loss = loss * importance.reshape(loss.shape).to(loss.device)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+
+
+@dataclass
+class _Networks:
+    """Networks that hold the tensors of a loss."""
+
+    actor: TensorDictModule
+    critic: TensorDictModule
+    frozen_critic: TensorDictModule
+    """The critic, through which the actor's gradient flows but which gets none itself."""
+    target_actor: TensorDictModule
+    target_critic: TensorDictModule
+
+
+def _with(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
+    """A copy of a network that holds these parameters."""
+    copied = deepcopy(network)
+    params.to_module(copied)
+    return copied
+
+
+def bootstrap_target(
+    reward: Tensor, next_value: Tensor, terminated: Tensor, *, gamma: float | Tensor
+) -> Tensor:
+    r"""One-step target, :math:`y_i = r_i + \gamma Q'(s_{i+1}, \mu'(s_{i+1}))` (Eq. 5).
+
+    The paper leaves out that nothing follows an end, and prints the current critic's parameters
+    where the target critic's are meant.
+
+    Args:
+        reward: :math:`r_i`, shape ``[B]``.
+        next_value: Q of the target networks at the next state, shape ``[B]``.
+        terminated: Whether the episode ended there; a time limit is no end, shape ``[B]``.
+        gamma: Discount.
+
+    Returns:
+        Targets, shape ``[B]``.
+
+    Examples:
+        >>> end = torch.tensor([False, True])
+        >>> bootstrap_target(torch.ones(2), torch.ones(2), end, gamma=0.5).tolist()
+        [1.5, 1.0]
+    """
+    return reward + gamma * next_value * ~terminated
 
 
 def _action_gradient(value: Tensor, action: Tensor) -> Tensor:

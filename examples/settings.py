@@ -1,0 +1,254 @@
+"""Settings of a training run: typed, in one place, each with its default and its reason.
+
+Hydra builds its command line from these: ``train.py replay=per learner.width=128 seed=3``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+
+
+@dataclass
+class Replay:
+    """The replay buffer and what its priority is made of."""
+
+    name: str = "mpfa"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
+    """Signals of the priority; none means uniform sampling."""
+    fusion: str = "entropy"
+    """``entropy`` (Eqs. 15-20) or ``fixed``, equal weights."""
+    boost: bool = True
+    """Raise positive transitions, Eq. 22."""
+    decay: bool = True
+    """Decay positive transitions above the batch mean, Eqs. 23-24."""
+    capacity: int = 100_000
+    """Table 1."""
+    batch_size: int = 256
+    """Table 1."""
+    alpha: float = 0.6
+    """Priority exponent, Eq. 8."""
+    beta: float = 0.4
+    """Importance exponent at the start, Eq. 10."""
+    beta_end: float = 1.0
+    """Importance exponent at the end; between the two it rises with the episodes."""
+    eps: float = 0.05
+    """Added to every priority, Eq. 21."""
+    boost_factor: float = 3.0
+    """phi of Eq. 22."""
+    boost_bound: str = "floor"
+    """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
+    decay_sharpness: float = 0.01
+    """sigma of Eq. 23."""
+    decay_position: str = "batch"
+    """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
+    population: str = "buffer"
+    """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
+
+
+@dataclass
+class PerReplay(Replay):
+    """Prioritized experience replay: the TD error alone."""
+
+    name: str = "per"
+    signals: list[str] = field(default_factory=lambda: ["td_error"])
+    fusion: str = "fixed"
+    boost: bool = False
+    decay: bool = False
+
+
+@dataclass
+class UniformReplay(Replay):
+    """Uniform replay: no signals, no importance weights."""
+
+    name: str = "uniform"
+    signals: list[str] = field(default_factory=list)
+    fusion: str = "fixed"
+    boost: bool = False
+    decay: bool = False
+
+
+@dataclass
+class Learner:
+    """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
+
+    name: str = "ddpg"
+    actor_lr: float = 1e-4
+    """Table 1."""
+    critic_lr: float = 1e-4
+    """Table 1."""
+    gamma: float = 0.99
+    """Table 1."""
+    tau: float = 0.01
+    """Table 1."""
+    width: int = 128
+    """Units of a hidden layer."""
+    layers: int = 2
+    """Hidden layers."""
+    layer_norm: bool = True
+    """Normalize hidden layers: features cannot grow without bound."""
+    late_action: bool = True
+    """The action joins the critic at its second layer, as in the original DDPG."""
+    final_init: float | None = 3e-3
+    """Last layers start within this, near the middle of the tanh; null: PyTorch's start."""
+    critic_weight_decay: float = 1e-2
+    """L2 decay of the critic, as in the original DDPG."""
+    reward_scale: float = 0.1
+    """Factor of rewards in the loss, so that Q is of order one."""
+    saturation_penalty: float = 1.0
+    """Factor of the penalty on actions deep in the tanh's flat ends, where no gradient is."""
+    saturation_limit: float = 1.5
+    """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
+    importance: str = "critic"
+    """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
+
+
+@dataclass
+class PlainLearner(Learner):
+    """DDPG without the recipe, as the paper's code most likely had it."""
+
+    name: str = "plain"
+    width: int = 256
+    layers: int = 3
+    layer_norm: bool = False
+    late_action: bool = True
+    final_init: float | None = None
+    critic_weight_decay: float = 0.0
+    reward_scale: float = 1.0
+    saturation_penalty: float = 0.0
+
+
+@dataclass
+class Exploration:
+    """Uniform actions at first, then Gaussian noise on the policy's."""
+
+    random_steps: int = 1_000
+    """Steps of uniformly random actions."""
+    sigma: float = 1.0
+    """Standard deviation of the noise at the start."""
+    sigma_end: float = 0.1
+    """Standard deviation at the end; it does not vanish, as narrow data makes DDPG forget."""
+    annealing_steps: int = 5_000
+    """Steps from one to the other."""
+
+
+@dataclass
+class Stage:
+    """Episodes on one map."""
+
+    world: str = "A"
+    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, or the path of a world file."""
+    episodes: int = 100
+
+
+@dataclass
+class Curriculum:
+    """Maps one after the other; networks and buffer carry on."""
+
+    name: str = "A"
+    stages: list[Stage] = field(default_factory=lambda: [Stage("A", 100)])
+
+
+def _single(world: str, episodes: int) -> Curriculum:
+    return Curriculum(name=world, stages=[Stage(world, episodes)])
+
+
+PAPER_STAGES = [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)]
+
+
+@dataclass
+class Environment:
+    """The navigation task."""
+
+    robot: str = "turtlebot2"
+    """``turtlebot2``, ``burger`` or ``waffle``."""
+    physics: str = "wheels"
+    """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
+    max_steps: int = 500
+    """Time limit of an episode [0.1 s]."""
+    progress_scale: float = 15.0
+    """eps_p of Eq. 25."""
+
+
+@dataclass
+class Tracking:
+    """Where the run is logged."""
+
+    mode: str = "offline"
+    """wandb: ``offline`` (no account), ``online`` or ``off``."""
+    project: str = "torchrl-mpfa"
+    log_every: int = 200
+    """Steps between two entries of losses, weights and priorities."""
+
+
+@dataclass
+class TrainSettings:
+    """A training run."""
+
+    defaults: list[Any] = field(
+        default_factory=lambda: [
+            "_self_",
+            {"replay": "mpfa"},
+            {"learner": "ddpg"},
+            {"curriculum": "A"},
+            {"tracking": "offline"},
+        ]
+    )
+    hydra: Any = field(
+        default_factory=lambda: {
+            "run": {"dir": "${run_dir}"},
+            "sweep": {
+                "dir": "runs/sweep-${now:%Y-%m-%d_%H-%M-%S}",
+                "subdir": "${hydra.job.override_dirname}",
+            },
+            "job_logging": {"root": {"level": "WARNING"}},
+        }
+    )
+    run_dir: str = "runs/${curriculum.name}-${replay.name}-${learner.name}-${seed}"
+    """Folder of checkpoints, logs and pictures."""
+    seed: int = 0
+    device: str = "cpu"
+    """Where the networks are; the buffer stays in main memory."""
+    threads: int = 1
+    """Threads of PyTorch; with networks this small a second one gains nothing."""
+    overwrite: bool = False
+    """Whether to start anew in a folder that holds a run."""
+    resume: str | None = None
+    """Folder of a run to go on with; its own settings are used."""
+    checkpoint_every: int = 25
+    """Episodes between two checkpoints."""
+    replay: Replay = field(default_factory=Replay)
+    learner: Learner = field(default_factory=Learner)
+    curriculum: Curriculum = field(default_factory=Curriculum)
+    tracking: Tracking = field(default_factory=Tracking)
+    exploration: Exploration = field(default_factory=Exploration)
+    environment: Environment = field(default_factory=Environment)
+
+
+GROUPS: dict[str, dict[str, Any]] = {
+    "replay": {"mpfa": Replay, "per": PerReplay, "uniform": UniformReplay},
+    "learner": {"ddpg": Learner, "plain": PlainLearner},
+    "curriculum": {
+        "A": _single("A", 100),
+        "B": _single("B", 200),
+        "C": _single("C", 300),
+        "D": _single("D", 400),
+        "paper": Curriculum(name="paper", stages=PAPER_STAGES),
+    },
+    "tracking": {
+        "offline": Tracking,
+        "online": Tracking(mode="online"),
+        "off": Tracking(mode="off"),
+    },
+}
+
+
+def register() -> None:
+    """Make the settings known to Hydra."""
+    store = ConfigStore.instance()
+    store.store(name="train", node=TrainSettings)
+    for group, choices in GROUPS.items():
+        for name, node in choices.items():
+            store.store(group=group, name=name, node=node)

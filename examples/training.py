@@ -1,0 +1,250 @@
+"""The training run: episodes of the curriculum, one update a step, checkpoints between episodes."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import EnvBase, set_exploration_type
+from torchrl.envs.utils import ExplorationType, step_mdp
+from tqdm import tqdm
+
+from assembly import make_buffer, make_learner, make_noise
+from mpfa_envs import make_navigation_env
+from records import EpisodeRecord, save_policy, write_episodes
+from settings import Stage, TrainSettings
+from torchrl_mpfa import load_safely, save_atomically
+from tracking import Tracker
+
+FORMAT = 1
+CHECKPOINT = "checkpoint.pt"
+_INFO = ("success", "collision", "time_out", "path_length", "shortest_path")
+_TRANSITION = ("observation", "action", ("next", "observation"), ("next", "reward"))
+_ENDS = (("next", "done"), ("next", "terminated"))
+_RECENT = 20
+
+
+class TrainingRun:
+    """Everything that a run is: parts, progress and records.
+
+    Randomness starts anew with each episode, from the seed of the run and the number of the
+    episode, so that a run which was stopped between two episodes goes on as if it had not been.
+
+    Args:
+        settings: The settings.
+        folder: Where checkpoints and records go.
+    """
+
+    def __init__(self, settings: TrainSettings, folder: Path) -> None:
+        self.settings = settings
+        self.folder = folder
+        self.stages: list[Stage] = list(settings.curriculum.stages)
+        self.total_episodes = sum(stage.episodes for stage in self.stages)
+        torch.manual_seed(settings.seed)
+        self.env = self._make_env(0)
+        observation_size = self.env.observation_spec["observation"].shape[-1]
+        action_size = self.env.action_spec.shape[-1]
+        self.buffer = make_buffer(settings.replay, seed=settings.seed)
+        self.learner = make_learner(
+            settings.learner,
+            settings.replay.signals,
+            observation_size,
+            action_size,
+            device=settings.device,
+        )
+        self.noise = make_noise(settings.exploration, self.env.action_spec)
+        self.behavior = TensorDictSequential(self.learner.policy, self.noise)
+        self.episode = 0
+        self.step = 0
+        self.records: list[EpisodeRecord] = []
+        self.tracker = Tracker(settings, folder)
+        self._stop = False
+
+    # Episodes --------------------------------------------------------------------------------
+
+    def train(self, on_episode: Callable[[EpisodeRecord], None] | None = None) -> bool:
+        """Run to the end of the curriculum, or until Ctrl-C.
+
+        Args:
+            on_episode: Called with the record of each finished episode.
+
+        Returns:
+            Whether the curriculum was finished.
+        """
+        previous = signal.signal(signal.SIGINT, self._on_interrupt)
+        bar = tqdm(total=self.total_episodes, initial=self.episode, unit="episode", smoothing=0.05)
+        try:
+            while self.episode < self.total_episodes and not self._stop:
+                record = self._run_episode()
+                self.records.append(record)
+                self.episode += 1
+                self.tracker.log_episode(record, self.step)
+                bar.update()
+                bar.set_postfix_str(self._summary())
+                if self.episode % self.settings.checkpoint_every == 0:
+                    self.save()
+                if on_episode is not None:
+                    on_episode(record)
+        finally:
+            bar.close()
+            signal.signal(signal.SIGINT, previous)
+        self.save()
+        return self.episode == self.total_episodes
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self._stop:  # The second Ctrl-C does not wait for the episode to end.
+            raise KeyboardInterrupt
+        self._stop = True
+        tqdm.write("stopping after this episode; Ctrl-C again to stop at once")
+
+    def _summary(self) -> str:
+        recent = self.records[-_RECENT:]
+        success = sum(r.success for r in recent) / len(recent)
+        return f"map {recent[-1].world}, success {success:.0%} of last {len(recent)}"
+
+    def _stage(self, episode: int) -> Stage:
+        for stage in self.stages:
+            if episode < stage.episodes:
+                return stage
+            episode -= stage.episodes
+        return self.stages[-1]
+
+    def _make_env(self, episode: int) -> EnvBase:
+        settings = self.settings.environment
+        self.world = self._stage(episode).world
+        return make_navigation_env(
+            self.world,
+            info_keys=_INFO,
+            robot=settings.robot,
+            physics=settings.physics,
+            max_steps=settings.max_steps,
+            progress_scale=settings.progress_scale,
+        )
+
+    def _run_episode(self) -> EpisodeRecord:
+        if self._stage(self.episode).world != self.world:
+            self.env.close()
+            self.env = self._make_env(self.episode)
+        seed = episode_seed(self.settings.seed, self.episode)
+        self.env.set_seed(seed)
+        torch.manual_seed(seed)
+        self._anneal_beta()
+        start, total_reward, steps = time.perf_counter(), 0.0, 0
+        state = self.env.reset()
+        done = False
+        while not done:
+            state = self.env.step(self._act(state))
+            self.buffer.extend(_transition(state))
+            self.step += 1
+            steps += 1
+            after = state["next"]
+            total_reward += after["reward"].item()
+            done = after["done"].item()
+            self._update()
+            last, state = after, step_mdp(state)
+        info = {name: last["info", name].item() for name in _INFO}
+        return EpisodeRecord(
+            episode=self.episode,
+            world=self.world,
+            steps=steps,
+            total_steps=self.step,
+            reward=total_reward,
+            average_reward=total_reward / steps,
+            seconds=time.perf_counter() - start,
+            **info,
+        )
+
+    @torch.no_grad()
+    def _act(self, state: TensorDictBase) -> TensorDictBase:
+        if self.step < self.settings.exploration.random_steps:
+            return self.env.rand_action(state)
+        with set_exploration_type(ExplorationType.RANDOM):
+            state = self.behavior(state.to(self.settings.device)).to("cpu")
+        self.noise.step(1)
+        return state
+
+    def _update(self) -> None:
+        if len(self.buffer) < self.settings.replay.batch_size:
+            return
+        batch = self.buffer.sample().to(self.settings.device)
+        losses = self.learner.update(batch)
+        self.buffer.update_tensordict_priority(batch.to("cpu"))
+        if self.step % self.settings.tracking.log_every == 0:
+            self.tracker.log_update(self.step, losses, self.buffer, batch)
+
+    def _anneal_beta(self) -> None:
+        """Raise the importance exponent of Eq. (10) linearly with the episodes."""
+        settings = self.settings.replay
+        if settings.signals:
+            done = self.episode / max(self.total_episodes - 1, 1)
+            beta = settings.beta + (settings.beta_end - settings.beta) * done
+            self.buffer.sampler.beta = beta
+
+    # Saving ----------------------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write checkpoint, policy and records, each of them whole or not at all."""
+        state = {
+            "format": FORMAT,
+            "settings": asdict(self.settings),
+            "episode": self.episode,
+            "step": self.step,
+            "learner": self.learner.state_dict(),
+            "buffer": self.buffer.state_dict(),
+            "noise": self.noise.state_dict(),
+            "records": [asdict(record) for record in self.records],
+        }
+        save_atomically(state, self.folder / CHECKPOINT)
+        save_policy(self.learner.policy, self.settings, self.records, self.folder / "policy.pt")
+        write_episodes(self.records, self.folder / "episodes.csv")
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on where a checkpoint was written."""
+        self.learner.load_state_dict(state["learner"])
+        self.buffer.load_state_dict(state["buffer"])
+        self.noise.load_state_dict(state["noise"])
+        self.episode, self.step = state["episode"], state["step"]
+        self.records = [EpisodeRecord(**record) for record in state["records"]]
+        if self.episode < self.total_episodes:
+            self.env.close()
+            self.env = self._make_env(self.episode)
+
+    def close(self) -> None:
+        """Release the simulation and finish the log."""
+        self.env.close()
+        self.tracker.close()
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """A seed for each episode of each run."""
+    return seed * 1_000_003 + episode
+
+
+def read_checkpoint(folder: Path) -> dict[str, Any]:
+    """Read a run's checkpoint without executing anything in it.
+
+    Raises:
+        FileNotFoundError: If there is none.
+        ValueError: If another version wrote it.
+    """
+    file = folder / CHECKPOINT
+    if not file.exists():
+        raise FileNotFoundError(f"resume: there is no {CHECKPOINT} in {folder}")
+    state: dict[str, Any] = load_safely(file)
+    if state.get("format") != FORMAT:
+        raise ValueError(f"{file} has format {state.get('format')}, this version reads {FORMAT}")
+    return state
+
+
+def _transition(state: TensorDictBase) -> TensorDict:
+    """What is stored of a step, as a batch of one."""
+    chosen = state.select(*_TRANSITION, *_ENDS)
+    return TensorDict(chosen, batch_size=[]).unsqueeze(0)
