@@ -50,7 +50,7 @@ class PathPlanner:
         >>> planner.is_straight((0.0, 0.0), (2.0, 3.0)), planner.is_straight((0.0, 0.0), (4.0, 0.0))
         (True, False)
         >>> round(planner.length((0.0, 0.0), (4.0, 0.0)), 2)  # [m]
-        5.74
+        6.39
     """
 
     def __init__(self, world: World, *, margin: float) -> None:

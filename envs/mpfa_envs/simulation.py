@@ -67,7 +67,7 @@ class Simulation:
             # always doing 50, at an error of 0.5 % of the slowest speed.
             numSolverIterations=50,
             solverResidualThreshold=1e-4,
-            # Without it the order of contacts, and so the last bits, depends on earlier episodes.
+            # The order of contacts, and so the last bits, must not depend on earlier episodes.
             deterministicOverlappingPairs=1,
             physicsClientId=self._client,
         )
@@ -224,14 +224,11 @@ class Simulation:
         pybullet.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=client)
         half = heading / 2
         turned = [0.0, 0.0, math.sin(half), math.cos(half)]
-        # Contacts remember their forces. High above the floor the engine forgets them.
-        pybullet.resetBasePositionAndOrientation(
-            body, [x, y, 100.0], turned, physicsClientId=client
-        )
-        pybullet.performCollisionDetection(physicsClientId=client)
-        pybullet.resetBasePositionAndOrientation(
-            body, [x, y, self._rest_height], turned, physicsClientId=client
-        )
+        # Contacts outlive a move to another place. High above the floor the engine drops them.
+        for height in (100.0, self._rest_height):
+            place = [x, y, height]
+            pybullet.resetBasePositionAndOrientation(body, place, turned, physicsClientId=client)
+            pybullet.performCollisionDetection(physicsClientId=client)
         self.set_wheel_speeds(0.0, 0.0)
 
     def set_wheel_speeds(self, left: float, right: float) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pybullet
 import pytest
 
@@ -44,6 +45,23 @@ def test_a_wall_stops_the_simulated_robot() -> None:
         motion = drive.move(0.5, 0.5)
     drive.close()
     assert motion.x == pytest.approx(5.0 - 0.18, abs=0.02)
+
+
+def test_a_drive_does_not_depend_on_earlier_ones_however_short() -> None:
+    def driven(drive: WheelDrive) -> list[tuple[float, ...]]:
+        rng = np.random.default_rng(0)
+        drive.place(0.3, 0.2, 0.7)
+        return [drive.move(*rng.uniform(0.05, 0.5, 2)) for _ in range(30)]
+
+    drives = [WheelDrive(ROBOTS["turtlebot2"], WORLDS["D"], time_step=0.1) for _ in range(2)]
+    expected = driven(drives[0])
+    for steps, pose in ((20, (4.6, 0.0, 0.1)), (1, (0.3, 0.2, 0.7)), (0, (0.3, 0.2, 0.7))):
+        drives[1].place(*pose)
+        for _ in range(steps):
+            drives[1].move(0.5, 0.4)
+        assert driven(drives[1]) == expected
+    for drive in drives:
+        drive.close()
 
 
 def test_bodies_have_names_and_a_name_is_used_once() -> None:
