@@ -73,21 +73,25 @@ class TreeSampler(PrioritizedSampler):
         # over the negated priorities has it at its root.
         self._max_tree = type(self._min_tree)(self._max_capacity)
         self._highest: float | None = None
+        self._highest_slot: int | None = None
 
     @property
     def _max_priority(self) -> tuple[float | None, int | None]:
-        """Highest priority without eps, and a slot that has it: TorchRL's own bookkeeping."""
+        """Highest priority without eps, and the slot that has or had it: TorchRL's bookkeeping."""
         highest = self._highest_priority()
         if highest is None:
             return None, None
+        if not self._max_priority_within_buffer:
+            return max(highest - self._eps, 0.0), self._highest_slot
         leaves = -self._max_tree[torch.arange(self._max_capacity)]
         slot = int((leaves == highest).long().argmax()) if bool((leaves == highest).any()) else None
         return max(highest - self._eps, 0.0), slot
 
     @_max_priority.setter
     def _max_priority(self, value: tuple[float | None, int | None] | None) -> None:
-        highest = None if value is None else value[0]
+        highest, slot = (None, None) if value is None else value
         self._highest = None if highest is None else float(highest) + self._eps
+        self._highest_slot = slot
 
     def _highest_priority(self) -> float | None:
         """Highest priority, eps included; None if nothing was written."""
@@ -133,7 +137,9 @@ class TreeSampler(PrioritizedSampler):
         index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass)).reshape(-1)
         # Rounding can carry the last bit of mass past the last slot.
         index.clamp_max_(size - 1)
-        weight = importance_weights(self._sum_tree[index], beta=self._beta, lowest=lowest)
+        # Of one slot the tree gives a bare number, of several a tensor.
+        leaf = torch.as_tensor(self._sum_tree[index]).reshape(-1)
+        weight = importance_weights(leaf, beta=self._beta, lowest=lowest)
         return index, {"priority_weight": weight}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
@@ -191,7 +197,8 @@ class TreeSampler(PrioritizedSampler):
         self._min_tree[index] = leaf
         self._max_tree[index] = -priority
         highest = -self._max_tree.query(0, self._max_capacity)
-        self._highest = highest if self._highest is None else max(self._highest, highest)
+        if self._highest is None or highest > self._highest:
+            self._highest, self._highest_slot = highest, int(index[priority.argmax()])
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
@@ -205,6 +212,7 @@ class TreeSampler(PrioritizedSampler):
             "_eps": float(self._eps),
             "_max_priority": self._max_priority,
             "_highest": self._highest,
+            "_highest_slot": self._highest_slot,
             "_sum_tree": torch.as_tensor(self._sum_tree[slots]).clone(),
             "_min_tree": torch.as_tensor(self._min_tree[slots]).clone(),
             "_max_tree": torch.as_tensor(self._max_tree[slots]).clone(),
@@ -235,6 +243,7 @@ class TreeSampler(PrioritizedSampler):
         self._beta = state_dict["_beta"]
         self._eps = state_dict["_eps"]
         self._highest = state_dict["_highest"]
+        self._highest_slot = state_dict["_highest_slot"]
         # Leaves that were never written hold what the tree takes for nothing; only the others
         # are written back, and inner nodes follow from the leaves alone.
         written = (state_dict["_max_tree"] <= 0).nonzero().squeeze(1)
