@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_mpfa.loss import SignalDDPGLoss
 
@@ -79,13 +80,7 @@ class DDPGLearner:
         loss.actor_network_params.to_module(self.policy)
         actor = list(loss.actor_network_params.flatten_keys().values())
         critic = list(loss.value_network_params.flatten_keys().values())
-        self._online = [*actor, *critic]
-        self._target = [
-            *loss.target_actor_network_params.flatten_keys().values(),
-            *loss.target_value_network_params.flatten_keys().values(),
-        ]
-        # All tensors in one call: TorchRL's SoftUpdate goes through them one by one.
-        self._soft_update = get_ema_multi_avg_fn(1.0 - tau)
+        self.targets = MultiTensorSoftUpdate(loss, tau=tau)
         self.optimizer = torch.optim.Adam(
             [
                 {"params": actor, "lr": actor_lr},
@@ -108,13 +103,8 @@ class DDPGLearner:
         # Only the losses: TorchRL's output holds values beside them.
         (losses["loss_value"] + losses["loss_actor"]).backward()
         self.optimizer.step()
-        self._update_targets()
+        self.targets.step()
         return {key: value.detach() for key, value in losses.items()}
-
-    @torch.no_grad()
-    def _update_targets(self) -> None:
-        r"""Move the targets, :math:`\theta' \leftarrow \tau\theta + (1-\tau)\theta'` (Eqs. 6-7)."""
-        self._soft_update(self._target, self._online, 0)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, target networks and optimizers; tensors and plain values only."""
@@ -124,3 +114,34 @@ class DDPGLearner:
         """Restore what :meth:`state_dict` gave."""
         self.loss.load_state_dict(state_dict["loss"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
+
+
+class MultiTensorSoftUpdate(SoftUpdate):
+    r"""Target networks, :math:`\theta' \leftarrow \tau\theta + (1 - \tau)\theta'` (Eqs. 6-7).
+
+    :class:`~torchrl.objectives.SoftUpdate` with all tensors in one call: one by one they take
+    a fifth of a training step.
+
+    Args:
+        loss: A loss with target parameters; they are set to the current ones.
+        tau: :math:`\tau`.
+
+    Examples:
+        >>> from torchrl_mpfa.loss import make_ddpg_loss
+        >>> from torchrl_mpfa.networks import make_actor, make_critic
+        >>> loss = make_ddpg_loss(make_actor(24, 2), make_critic(24, 2))
+        >>> MultiTensorSoftUpdate(loss, tau=0.01).step()
+    """
+
+    def __init__(self, loss: LossModule, *, tau: float) -> None:
+        super().__init__(loss, tau=tau)
+        params = dict(loss.named_parameters())
+        buffers = {**params, **dict(loss.named_buffers())}
+        pairs = [(p, buffers.get(f"target_{name}")) for name, p in params.items()]
+        self._pairs = [(online, target) for online, target in pairs if target is not None]
+        self._move = get_ema_multi_avg_fn(1.0 - tau)
+
+    def step(self) -> None:
+        """Move every target parameter by tau."""
+        online, target = zip(*self._pairs, strict=True)
+        self._move(list(target), list(online), 0)

@@ -228,7 +228,7 @@ class SignalDDPGLoss(DDPGLoss):
             self._bound = _Networks(
                 actor=_with(self.actor_network, actor),
                 critic=_with(self.value_network, critic),
-                frozen_critic=_with(self.value_network, critic.detach()),
+                frozen_critic=_with(self.value_network, critic.detach()).requires_grad_(False),
                 target_actor=_with(self.actor_network, target_actor),
                 target_critic=_with(self.value_network, target_critic),
             )
