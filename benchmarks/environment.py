@@ -93,7 +93,7 @@ def _physics_share(env: NavigationEnv, steps: int) -> float:
     """Part of the CPU time of driving that moving the robot takes, resets included in the whole."""
     run = _stepper(env)
     clock = _Clock(env._drive.move)
-    env._drive.move = clock  # type: ignore[method-assign]
+    env._drive.move = clock  # type: ignore[method-assign, assignment]
     start = time.process_time()
     run(steps)
     return clock.spent / (time.process_time() - start)
@@ -119,7 +119,7 @@ def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
     try:
         entries, rates = [], {}
         for physics in ("wheels", "kinematic"):
-            env = NavigationEnv(world="D", physics=physics)  # type: ignore[arg-type]
+            env = NavigationEnv(world="D", physics=physics)
             rates[physics] = _rate(_stepper(env), seconds)
             share = _physics_share(env, max(20, round(rates[physics] * seconds / ROUNDS)))
             env.close()

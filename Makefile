@@ -1,0 +1,108 @@
+# Everything that one types here. `make` alone lists it.
+#
+# The first use makes .venv and installs the project in it; later ones only when pyproject.toml
+# changed. On the command line:
+#   PYTHON=/path/to/python3.11     what .venv is made with; by default the first one that fits
+#   TORCH_INSTALL_ARGS='...'       what `pip install` gets for PyTorch before the project is
+#                                  installed, for another build of it: a wheel file of a CPU
+#                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
+#   ARGS='replay=per seed=1'       settings for demo and train, options for test and bench
+#   EPISODES=100                   episodes that demo trains for and evaluates on
+#   SLOW=1                         test: the slow tests as well
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help demo train test check lint types doctest format bench wheel-test clean
+
+PYTHON ?=
+TORCH_INSTALL_ARGS ?=
+ARGS ?=
+EPISODES ?= 100
+SLOW ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PYTEST := $(BIN)/python -m pytest
+
+# PyBullet has wheels for Python 3.9 to 3.11, this project needs 3.10. An interpreter is asked
+# rather than trusted by its name: the shims of version managers may exist and not run.
+CANDIDATES := python3.11 python3.10 python3 python
+FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))
+HOME_OF := import sys; print(sys.base_prefix)
+WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
+
+help: ## Print this list
+	@echo "usage: make TARGET"
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' Makefile | \
+	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
+	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, EPISODES, SLOW; see the top of the Makefile"
+
+demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minutes)
+	@echo "== training on map A, $(EPISODES) episodes; Ctrl-C stops after the current one"
+	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: A, episodes: $(EPISODES)}]' $(ARGS)
+	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
+	$(BIN)/python examples/evaluate.py runs/demo --world A --episodes $(EPISODES)
+
+train: $(STAMP) ## Train on the paper's curriculum, maps A to D (hours); ARGS='replay=per seed=1'
+	$(BIN)/python examples/train.py curriculum=paper $(ARGS)
+
+test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
+	$(PYTEST) $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)
+
+check: lint types doctest test ## Check format, lint, types, doctests and tests
+
+lint: $(STAMP)
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m ruff check .
+
+types: $(STAMP)
+	$(BIN)/python -m mypy
+	$(BIN)/python -m mypy --explicit-package-bases benchmarks .ci
+
+doctest: $(STAMP)
+	$(PYTEST) --doctest-modules torchrl_mpfa envs
+
+format: $(STAMP) ## Format the code and mend what ruff can mend
+	$(BIN)/python -m ruff format .
+	$(BIN)/python -m ruff check --fix .
+
+bench: $(STAMP) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
+	$(BIN)/python benchmarks/run.py $(ARGS)
+
+wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and use it
+	$(BIN)/python .ci/wheel_test.py
+
+clean: ## Remove builds and caches; runs/ and .venv stay
+	rm -rf dist build .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/latest.json
+	find . -name .venv -prune -o -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp is written last, so that an install which was interrupted is made again.
+$(STAMP): pyproject.toml
+	@rm -f $(STAMP); \
+	if [ -n "$(PYTHON)" ]; then \
+	  if ! "$(PYTHON)" -c "$(FITS)" >/dev/null 2>&1; then \
+	    echo "make: PYTHON=$(PYTHON) is not a Python 3.10 or 3.11 that runs and can make a venv (PyBullet has no wheels for others); $(WAY_OUT)" >&2; exit 1; \
+	  fi; \
+	  python="$(PYTHON)"; \
+	elif "$(BIN)/python" -c "import pip; $(FITS)" >/dev/null 2>&1; then \
+	  python="$(BIN)/python"; \
+	else \
+	  python=; \
+	  for candidate in $(CANDIDATES); do \
+	    if "$$candidate" -c "$(FITS)" >/dev/null 2>&1; then python="$$candidate"; break; fi; \
+	  done; \
+	  if [ -z "$$python" ]; then \
+	    echo "make: no Python 3.10 or 3.11 found that runs and can make a venv (PyBullet has no wheels for others); $(WAY_OUT)" >&2; exit 1; \
+	  fi; \
+	fi; \
+	home=`"$$python" -c "$(HOME_OF)"`; \
+	if [ "`"$(BIN)/python" -c "import pip; $(HOME_OF)" 2>/dev/null`" != "$$home" ]; then \
+	  echo "== making $(VENV) with $$python"; \
+	  "$$python" -m venv --clear $(VENV) || exit 1; \
+	fi
+	@echo "== installing in $(VENV); the first time this downloads PyTorch, some gigabytes"
+	$(if $(strip $(TORCH_INSTALL_ARGS)),$(BIN)/python -m pip install $(TORCH_INSTALL_ARGS))
+	$(BIN)/python -m pip install -e ".[dev]"
+	@touch $(STAMP)

@@ -1,0 +1,241 @@
+"""Replay of this package against TorchRL's prioritized replay, with navigation's transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler
+
+from benchmarks.timing import (
+    MICROSECONDS,
+    Call,
+    Entry,
+    Timing,
+    compare,
+    entry,
+    one_thread,
+    report_progress,
+    seconds_per_call,
+)
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+
+BATCH_SIZE = 256
+OBSERVATION_SIZE = 24
+ACTION_SIZE = 2
+ALPHA = 0.6
+BETA = 0.4
+GROWTH_CAPACITIES = (10_000, 100_000, 1_000_000)
+_FILL_ROWS = 100_000
+
+
+def make_transitions(count: int, *, seed: int = 0) -> TensorDict:
+    """Random transitions in the shape of the navigation task, batch size ``[count]``."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(size: int) -> torch.Tensor:
+        return torch.randn(count, size, generator=generator)
+
+    end = torch.zeros(count, 1, dtype=torch.bool)
+    after = {
+        "observation": normal(OBSERVATION_SIZE),
+        "reward": normal(1),
+        "done": end,
+        "terminated": end.clone(),
+    }
+    return TensorDict(
+        {
+            "observation": normal(OBSERVATION_SIZE),
+            "action": normal(ACTION_SIZE).tanh(),
+            "next": TensorDict(after, [count]),
+        },
+        [count],
+    )
+
+
+def make_mpfa_buffer(capacity: int) -> SignalReplayBuffer:
+    """A full buffer of this package with the paper's sampler."""
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(capacity),
+        sampler=MPFASampler(capacity, ALPHA, BETA),
+        batch_size=BATCH_SIZE,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return _fill(buffer, capacity)
+
+
+def make_stock_buffer(capacity: int) -> TensorDictReplayBuffer:
+    """A full buffer of TorchRL with its prioritized sampler."""
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity),
+        sampler=PrioritizedSampler(capacity, ALPHA, BETA),
+        batch_size=BATCH_SIZE,
+        priority_key="td_error",
+    )
+    return _fill(buffer, capacity)
+
+
+def _fill(buffer: TensorDictReplayBuffer, capacity: int) -> TensorDictReplayBuffer:
+    for start in range(0, capacity, _FILL_ROWS):
+        buffer.extend(make_transitions(min(_FILL_ROWS, capacity - start), seed=start))
+    return buffer
+
+
+def make_mpfa_update(buffer: SignalReplayBuffer) -> Call:
+    """One sample and one update of priorities; the loss's signals are made beforehand."""
+    generator = torch.Generator().manual_seed(1)
+    signals = TensorDict(
+        {
+            name: torch.rand(BATCH_SIZE, generator=generator)
+            for name in ("td_error", "action_gradient")
+        },
+        [BATCH_SIZE],
+    )
+
+    def update() -> None:
+        batch = buffer.sample()
+        batch.set("signals", signals)
+        buffer.update_tensordict_priority(batch)
+
+    return update
+
+
+def make_stock_update(buffer: TensorDictReplayBuffer) -> Call:
+    """The same with TorchRL's buffer, which takes one number a transition."""
+    td_error = torch.rand(BATCH_SIZE, generator=torch.Generator().manual_seed(1))
+
+    def update() -> None:
+        batch = buffer.sample()
+        batch.set("td_error", td_error)
+        buffer.update_tensordict_priority(batch)
+
+    return update
+
+
+def measure_sample_update(
+    name: str = "sample_update_1e5", *, capacity: int = 100_000, quick: bool
+) -> list[Entry]:
+    """Sample a batch, write its signals, update its priorities.
+
+    Args:
+        name: Name of the entry.
+        capacity: Slots of each buffer, all filled.
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        An entry for each replay; ours has the ratio.
+    """
+    ours = make_mpfa_update(make_mpfa_buffer(capacity))
+    stock = make_stock_update(make_stock_buffer(capacity))
+    return compare(name, ours, stock, quick=quick)
+
+
+def measure_extend_one(
+    name: str = "extend_one", *, capacity: int = 100_000, quick: bool
+) -> list[Entry]:
+    """Write one transition in a full buffer.
+
+    Args:
+        name: Name of the entry.
+        capacity: Slots of each buffer.
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        An entry for each replay; ours has the ratio.
+    """
+    ours, stock = make_mpfa_buffer(capacity), make_stock_buffer(capacity)
+    # A round with other priorities than the first ones, as training has them.
+    make_mpfa_update(ours)()
+    make_stock_update(stock)()
+    transition = make_transitions(1)
+    return compare(
+        name, lambda: ours.extend(transition), lambda: stock.extend(transition), quick=quick
+    )
+
+
+def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool) -> list[Entry]:
+    """Time of one training step's replay work by capacity, counting of entropies included.
+
+    A step writes one transition, samples and updates. The entropies of Eqs. (16)-(17) are counted
+    over the whole buffer whenever a fixed share of it was rewritten: each round is as long as it
+    takes for that to happen once, so that the mean of a round holds its full cost.
+
+    Args:
+        capacities: Slots of the buffers, from the smallest to the largest.
+        quick: One round.
+
+    Returns:
+        An entry for each capacity, and ``update_growth``: the largest one's time over the smallest
+        one's, whose ratio is that growth over the growth of log N, the depth of a segment tree.
+    """
+    steps, periods = {}, {}
+    for capacity in capacities:
+        buffer = make_mpfa_buffer(capacity)
+        update, transition = make_mpfa_update(buffer), make_transitions(1)
+        periods[capacity] = int(buffer.sampler.entropy_refresh * capacity) + 1
+
+        def step(
+            buffer: SignalReplayBuffer = buffer,
+            update: Call = update,
+            transition: TensorDict = transition,
+        ) -> None:
+            buffer.extend(transition)
+            update()
+
+        steps[capacity] = step
+    times: dict[int, list[float]] = {capacity: [] for capacity in capacities}
+    with one_thread():
+        for step in steps.values():
+            seconds_per_call(step, 50)
+        for _ in range(1 if quick else 5):
+            for capacity, step in steps.items():
+                # Small buffers count often: several of their periods make a round.
+                count = periods[capacity] * max(1, 400 // periods[capacity])
+                times[capacity].append(seconds_per_call(step, count))
+    timings = {capacity: Timing(tuple(found)) for capacity, found in times.items()}
+    entries = []
+    for capacity, timing in timings.items():
+        name = f"step_at_{_power_of_ten(capacity)}"
+        entries.append(entry(name, timing.median * MICROSECONDS, "us"))
+        report_progress(
+            f"{name}: {timing.median * MICROSECONDS:.1f} us "
+            f"(fastest round {timing.minimum * MICROSECONDS:.1f}), "
+            f"entropies counted every {periods[capacity]} steps"
+        )
+    small, large = min(capacities), max(capacities)
+    growth = timings[large].ratio(timings[small])
+    log_growth = float(torch.tensor(large).log2() / torch.tensor(small).log2())
+    return [
+        *entries,
+        entry(
+            "update_growth",
+            growth,
+            "x",
+            ratio=growth / log_growth,
+            baseline=f"log {_power_of_ten(large)} / log {_power_of_ten(small)} = {log_growth:.2f}",
+        ),
+    ]
+
+
+def _power_of_ten(capacity: int) -> str:
+    mantissa, exponent = f"{capacity:e}".split("e")
+    return f"{float(mantissa):g}e{int(exponent)}"
+
+
+def measure(*, quick: bool) -> list[Entry]:
+    """All of this file.
+
+    Args:
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        The entries.
+    """
+    return [
+        *measure_sample_update("sample_update_1e5", capacity=100_000, quick=quick),
+        *measure_sample_update("sample_update_1e6", capacity=1_000_000, quick=quick),
+        *measure_extend_one(quick=quick),
+        *measure_growth(quick=quick),
+    ]

@@ -1,0 +1,141 @@
+"""Run the benchmarks: print one table, write one file.
+
+    python benchmarks/run.py                 all of them, some minutes
+    python benchmarks/run.py --quick         all of them, with fewer and shorter rounds
+    python benchmarks/run.py --only loss     one of them
+    python benchmarks/run.py --check         exit with 1 if a ratio is above its target
+
+The file, ``benchmarks/latest.json``, holds what this run measured: a list of objects with ``name``,
+``value``, ``unit``, ``ratio`` and ``baseline``. A ratio is this package's time over TorchRL's, both
+from this run; times alone say more about the machine than about the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from benchmarks import environment, loss, replay
+from benchmarks.timing import Entry
+
+LATEST = Path(__file__).with_name("latest.json")
+
+TARGETS: Mapping[str, float] = {
+    "sample_update_1e5": 1.3,
+    "sample_update_1e6": 1.3,
+    "extend_one": 1.3,
+    "loss": 1.15,
+}
+"""Highest ratio that each entry may have."""
+
+
+def measure_environment(*, quick: bool) -> list[Entry]:
+    """The entries of the navigation task.
+
+    Args:
+        quick: A fifth of the time.
+
+    Returns:
+        The entries; their ratios are of rates, hence higher is faster.
+    """
+    entries: list[Entry] = environment.measure(seconds=0.2 if quick else 1.0)  # type: ignore[assignment]
+    return entries
+
+
+def measure_sample_update_1e6(*, quick: bool) -> list[Entry]:
+    """As at 1e5, with ten times the slots."""
+    return replay.measure_sample_update("sample_update_1e6", capacity=1_000_000, quick=quick)
+
+
+BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
+    "sample_update_1e5": replay.measure_sample_update,
+    "sample_update_1e6": measure_sample_update_1e6,
+    "update_growth": replay.measure_growth,
+    "extend_one": replay.measure_extend_one,
+    "loss": loss.measure,
+    "environment": measure_environment,
+}
+
+
+def format_table(entries: Sequence[Entry]) -> str:
+    """One line an entry, with the target beside the ratios that have one."""
+    width = max((len(entry["name"]) for entry in entries), default=4) + 2
+    lines = [f"{'name':{width}}{'value':>12} {'unit':9}{'ratio':>8}{'target':>8}  baseline"]
+    for entry in entries:
+        ratio = "" if entry["ratio"] is None else f"{entry['ratio']:.2f}"
+        target = f"{TARGETS[entry['name']]:.2f}" if entry["name"] in TARGETS else ""
+        line = f"{entry['name']:{width}}{entry['value']:12.5g} {entry['unit']:9}{ratio:>8}"
+        lines.append(f"{line}{target:>8}  {entry['baseline'] or ''}".rstrip())
+    return "\n".join(lines)
+
+
+def missed_targets(entries: Sequence[Entry]) -> list[str]:
+    """A sentence for each entry whose ratio is above its target."""
+    return [
+        f"{entry['name']}: ratio {entry['ratio']:.2f} is above its target {TARGETS[entry['name']]}"
+        for entry in entries
+        if entry["ratio"] is not None and entry["ratio"] > TARGETS.get(entry["name"], float("inf"))
+    ]
+
+
+def write_atomically(entries: Sequence[Entry], path: Path) -> None:
+    """Write the entries as JSON, whole or not at all."""
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", dir=path.parent, prefix=path.name, suffix=".tmp", delete=False
+    ) as file:
+        try:
+            json.dump(list(entries), file, indent=2)
+            file.write("\n")
+            file.close()
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="fewer and shorter rounds")
+    parser.add_argument(
+        "--only", choices=list(BENCHMARKS), metavar="NAME", help=f"one of {', '.join(BENCHMARKS)}"
+    )
+    parser.add_argument("--check", action="store_true", help="exit with 1 if a target is missed")
+    parser.add_argument("--output", type=Path, default=LATEST, help="file (default: %(default)s)")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, write.
+
+    Args:
+        arguments: The command line.
+
+    Returns:
+        Exit status.
+    """
+    options = parse(arguments)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    entries: list[Entry] = []
+    for name in [options.only] if options.only else BENCHMARKS:
+        print(f"measuring {name}", file=sys.stderr, flush=True)
+        entries += BENCHMARKS[name](quick=options.quick)
+    print(f"\n{format_table(entries)}")
+    write_atomically(entries, options.output)
+    print(f"\nwritten: {options.output}")
+    missed = missed_targets(entries) if options.check else []
+    for sentence in missed:
+        print(sentence, file=sys.stderr)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
