@@ -167,7 +167,9 @@ def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
 class Fusion(Protocol):
     """How the signals are weighted: one weight a signal, out of what the buffer holds.
 
-    A user's own fusion is any object with this method; it may keep state.
+    A user's own fusion is any object with this method; it may keep state. The sampler asks for
+    weights when enough of the buffer was rewritten, or, if the fusion has an attribute
+    ``every_batch`` that is true, at every update.
     """
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
@@ -217,6 +219,11 @@ class EntropyFusion:
             raise ValueError(f"ties must be 'complement' or 'strict', got {self.ties!r}")
         if not 0.0 <= self.floor < 1.0:
             raise ValueError(f"floor must be in [0, 1), got {self.floor}")
+
+    @property
+    def every_batch(self) -> bool:
+        """Weights that are counted over a batch hold for that batch alone."""
+        return self.population == "batch"
 
     def entropies(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Entropy of each signal in bits, Eqs. (16)-(17), shape ``[K]``."""

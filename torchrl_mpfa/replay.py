@@ -57,6 +57,36 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
     def _fuses(self) -> bool:
         return isinstance(self._sampler, SignalSampler)
 
+    def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
+        """Write transitions, and return their slots.
+
+        Args:
+            tensordicts: Transitions, batch size ``[B]``.
+            update_priority: As in TorchRL.
+
+        Returns:
+            Slots, shape ``[B]``.
+
+        Raises:
+            KeyError: If the transitions lack a reward or signal; nothing is changed.
+            ValueError: If a reward or signal is not finite or out of shape; nothing is changed.
+        """
+        if not self._fuses:
+            return super().extend(tensordicts, update_priority=update_priority)
+        writer, table = self._writer, self._storage.signal_table
+        with self._replay_lock:
+            place = {key: getattr(writer, key, None) for key in ("_cursor", "_write_count")}
+            writes = table.writes
+            try:
+                return super().extend(tensordicts, update_priority=update_priority)
+            except BaseException:
+                # TorchRL's writer moves on before the storage can refuse, and would leave slots
+                # that were never written among the filled ones.
+                if table.writes == writes and place["_cursor"] is not None:
+                    for key, value in place.items():
+                        setattr(writer, key, value)
+                raise
+
     def add(self, data: TensorDictBase) -> int | None:
         """Write one transition, and return its slot."""
         if not self._fuses:

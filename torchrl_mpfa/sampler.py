@@ -238,7 +238,7 @@ class SignalSampler(TreeSampler):
     def _weigh(self, table: SignalTable, index: Tensor) -> Tensor:
         """Count the probabilities of Eqs. (16)-(17) anew if enough of the buffer changed."""
         fresh = table.writes - self._weighed_at
-        due = fresh > self.entropy_refresh * table.size or fresh < 0
+        due = not 0 <= fresh <= self.entropy_refresh * table.size or self.entropy_refresh == 0
         if self._weights is None or due or getattr(self.fusion, "every_batch", False):
             weights = self.fusion.weights(self._names, table, index)
             if weights.shape != (len(self._names),):

@@ -132,13 +132,13 @@ class SignalTable:
             self.rows = torch.from_numpy(mapped)
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
+        self.writes = 0
         self.clear()
 
     def clear(self) -> None:
-        """Forget every slot."""
+        """Forget every slot; the count of writes goes on, so that old batches stay old."""
         self.rows.copy_(self._blank)
         self.size = 0
-        self.writes = 0
 
     @property
     def rewards(self) -> Tensor:
@@ -184,6 +184,11 @@ class SignalTable:
     def write(self, index: Tensor, rows: Tensor) -> None:
         """Put new transitions in their slots: nothing of what was there before stays."""
         count = len(rows)
+        if count > self.capacity:
+            # Of a slot that is named twice the last row must win, which indexing leaves open.
+            self.writes += count - self.capacity
+            index, rows = index[-self.capacity :], rows[-self.capacity :]
+            count = self.capacity
         if count == 1:
             rows[0, self.time_column] = self.writes
         else:

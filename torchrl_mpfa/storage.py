@@ -14,6 +14,7 @@ from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal, SignalTable
+from torchrl_mpfa.tree import bounds
 
 _FORMAT = 1
 _FILE = "signals.pt"
@@ -43,7 +44,13 @@ class SignalStorageMixin:
             keys = {s.name: s.key for s in self.signal_table.written}
             key = keys.get(name, self.signal_table.reward_key)
             raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
-        super().set(cursor, data, set_cursor=set_cursor)  # type: ignore[misc]
+        size = len(self)  # type: ignore[arg-type]
+        try:
+            super().set(cursor, data, set_cursor=set_cursor)  # type: ignore[misc]
+        except BaseException:
+            # TorchRL counts the rows before it writes them.
+            self._len = size
+            raise
         self.signal_table.write(index, rows)
         self.signal_table.size = len(self)  # type: ignore[arg-type]
 
@@ -135,22 +142,33 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
     ) -> None:
         _check_arguments(max_size, kwargs)
         self.signal_table = SignalTable(max_size, signals, reward_key=reward_key)
+        self._looked_at: Any = None
+        self._plain = False
         super().__init__(max_size, **kwargs)
 
     def get(self, index: Any) -> Any:
         """Read transitions; the usual case, a batch of slots, twice as fast as by indexing."""
         if (
             self.initialized
-            and isinstance(self._storage, TensorDict)
             and isinstance(index, Tensor)
             and index.ndim == 1
+            and len(index) > 0
             and index.dtype is torch.long
+            and isinstance(self._storage, TensorDict)
+            and self._has_plain_tensors()
             and index.device == self._storage.device
+            and _within(index, len(self))
         ):
             return self._storage.apply(
                 lambda leaf: leaf.index_select(0, index), batch_size=index.shape
             )
         return super().get(index)
+
+    def _has_plain_tensors(self) -> bool:
+        """Whether every entry is a tensor: texts and ragged entries need TorchRL's way."""
+        if self._looked_at is not self._storage:
+            self._looked_at, self._plain = self._storage, _only_tensors(self._storage)
+        return self._plain
 
 
 class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
@@ -207,7 +225,21 @@ def _as_index(cursor: Any, capacity: int) -> Tensor:
     """The slots that a writer's cursor names, shape ``[B]``."""
     if isinstance(cursor, slice):
         return torch.arange(*cursor.indices(capacity))
+    if isinstance(cursor, Tensor) and cursor.dtype is torch.bool:
+        return cursor.nonzero().squeeze(1).cpu()
     return torch.as_tensor(cursor, dtype=torch.long, device="cpu").reshape(-1)
+
+
+def _only_tensors(data: Any) -> bool:
+    if type(data) is TensorDict:
+        return all(_only_tensors(entry) for entry in data.values())
+    return isinstance(data, Tensor)
+
+
+def _within(index: Tensor, size: int) -> bool:
+    """Whether all slots are filled ones, counted from the front."""
+    low, high = bounds(index)
+    return low >= 0 and high < size
 
 
 def _as_batch(data: Any) -> Any:
