@@ -1,0 +1,143 @@
+"""Eqs. (22)-(24) against hand numbers, the oracle and what they degenerate to."""
+
+import math
+
+import oracles
+import pytest
+import torch
+from transitions import seeded
+
+from torchrl_mpfa import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import boost_positive, decay_factor, decay_threshold
+
+
+def facts(rewards, counts=None):
+    rewards = torch.as_tensor(rewards, dtype=torch.float32)
+    counts = torch.ones(len(rewards)) if counts is None else torch.as_tensor(counts)
+    return BatchFacts(reward=rewards, replay_count=counts, index=torch.arange(len(rewards)))
+
+
+@pytest.mark.parametrize(
+    ("bound", "expected"),
+    [("floor", [1.0, 1.5, 6.0]), ("cap", [0.3, 1.0, 1.0]), ("none", [0.3, 1.5, 6.0])],
+)
+def test_boost_of_hand_numbers_under_each_bound(bound, expected):
+    found = boost_positive(torch.tensor([0.1, 0.5, 2.0]), boost=3.0, bound=bound)
+    assert found.tolist() == pytest.approx(expected)
+
+
+def test_only_transitions_of_positive_reward_are_boosted():
+    priority = torch.tensor([2.0, 2.0, 2.0])
+    assert PositiveBoost()(priority, facts([1.0, 0.0, -1.0])).tolist() == [6.0, 2.0, 2.0]
+    assert priority.tolist() == [2.0, 2.0, 2.0], "the input must not be changed"
+
+
+def test_what_counts_as_positive_can_be_raised():
+    found = PositiveBoost(positive_above=9.0)(torch.tensor([2.0, 2.0]), facts([10.0, 9.0]))
+    assert found.tolist() == [6.0, 2.0]
+
+
+def test_boost_equals_the_oracle():
+    priority = torch.rand(64, generator=seeded())
+    rewards = torch.randn(64, generator=seeded(1))
+    pairs = zip(priority.tolist(), rewards.tolist(), strict=True)
+    expected = [oracles.boosted(p, r, 2.5) for p, r in pairs]
+    assert PositiveBoost(boost=2.5)(priority, facts(rewards)).tolist() == pytest.approx(expected)
+
+
+def test_decay_factor_of_hand_numbers():
+    # 1 / (1 + e^-1) and 1 / (1 + e^-2)
+    found = decay_factor(torch.tensor([0.0, 10.0, 20.0]), sharpness=0.1)
+    assert found.tolist() == pytest.approx([0.5, 0.7310586, 0.8807971])
+
+
+def test_threshold_is_the_mean_of_the_batch():
+    assert float(decay_threshold(torch.tensor([1.0, 2.0, 6.0]))) == pytest.approx(3.0)
+
+
+def test_decay_of_a_hand_example_counts_places_from_one_and_spares_who_is_not_above_the_mean():
+    # The mean is 3. The first and the third lie above it; the third is not positive.
+    found = PositiveDecay(sharpness=1.0)(torch.tensor([5.0, 1.0, 4.0, 2.0]), facts([1, 1, -1, 1]))
+    assert found.tolist() == pytest.approx([5.0 * 0.7310586, 1.0, 4.0, 2.0])
+
+
+@pytest.mark.parametrize("sharpness", [0.01, 0.3, 2.0])
+def test_decay_equals_the_oracle(sharpness):
+    priority = torch.rand(64, generator=seeded(2)) * 5
+    rewards = torch.randn(64, generator=seeded(3))
+    expected = oracles.decayed(priority.tolist(), rewards.tolist(), sharpness)
+    found = PositiveDecay(sharpness=sharpness)(priority, facts(rewards))
+    assert found.tolist() == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_large_sharpness_is_no_decay():
+    priority = torch.rand(32, generator=seeded(4))
+    found = PositiveDecay(sharpness=1e6)(priority, facts(torch.ones(32)))
+    torch.testing.assert_close(found, priority)
+
+
+def test_equal_priorities_do_not_decay():
+    priority = torch.full((8,), 0.5)
+    assert PositiveDecay()(priority, facts(torch.ones(8))).equal(priority)
+
+
+def test_positions_by_rank_decay_the_highest_most_in_whatever_order_they_come():
+    priority = torch.tensor([4.0, 9.0, 1.0, 8.0])
+    decay = PositiveDecay(sharpness=1.0, position="rank")
+    factors = decay.factors(priority, facts([1, 1, 1, 1]))
+    sigmoid = [1 / (1 + math.exp(-j)) for j in (3, 1, 4, 2)]
+    assert factors.tolist() == pytest.approx(sigmoid)
+    order = torch.tensor([2, 0, 3, 1])
+    shuffled = decay(priority[order], facts([1, 1, 1, 1]))
+    torch.testing.assert_close(shuffled, decay(priority, facts([1, 1, 1, 1]))[order])
+
+
+def test_positions_by_count_decay_by_how_often_a_transition_was_replayed():
+    decay = PositiveDecay(sharpness=1.0, position="count")
+    found = decay(torch.tensor([6.0, 6.0, 0.0]), facts([1, 1, 1], counts=[1.0, 5.0, 2.0]))
+    expected = [6 / (1 + math.exp(-1)), 6 / (1 + math.exp(-5)), 0.0]
+    assert found.tolist() == pytest.approx(expected)
+
+
+def test_with_clamp_nothing_falls_below_the_threshold():
+    priority, rewards = torch.tensor([4.0, 2.0]), facts([1.0, 1.0])
+    free = PositiveDecay(sharpness=0.01)(priority, rewards)
+    held = PositiveDecay(sharpness=0.01, clamp=True)(priority, rewards)
+    assert float(free[0]) < 3.0
+    assert held.tolist() == [3.0, 2.0]
+
+
+def test_decay_asks_for_more_than_positive_above():
+    decay = PositiveDecay(positive_above=5.0)
+    priority = torch.tensor([4.0, 4.0, 0.0])
+    found = decay(priority, facts([5.0, 6.0, 6.0]))
+    assert found[0] == 4.0
+    assert found[1] < 4.0
+
+
+def test_decay_keeps_the_type_it_was_given_for_every_batch_size():
+    for dtype in (torch.float32, torch.float64):
+        for count in (1, 5, 5, 3):
+            found = PositiveDecay()(torch.ones(count, dtype=dtype), facts(torch.ones(count)))
+            assert found.dtype == dtype
+            assert found.shape == (count,)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
+def test_factors_that_are_not_positive_are_refused(value):
+    with pytest.raises(ValueError, match=f"boost must be positive and finite, got {value}"):
+        PositiveBoost(boost=value)
+    with pytest.raises(ValueError, match=f"sharpness must be positive and finite, got {value}"):
+        PositiveDecay(sharpness=value)
+
+
+def test_unknown_words_are_refused():
+    with pytest.raises(ValueError, match="bound must be .*got 'wall'"):
+        PositiveBoost(bound="wall")
+    with pytest.raises(ValueError, match="position must be .*got 'front'"):
+        PositiveDecay(position="front")
+
+
+def test_any_callable_is_an_adjustment():
+    assert isinstance(PositiveBoost(), Adjustment)
+    assert isinstance(lambda priority, batch: priority, Adjustment)

@@ -1,0 +1,184 @@
+"""Eqs. (15)-(21) against hand numbers, the oracle and what they degenerate to."""
+
+import math
+
+import oracles
+import pytest
+import torch
+from transitions import make_transitions, seeded
+
+from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion, SignalTable
+from torchrl_mpfa.fusion import (
+    binary_entropy,
+    entropy_weights,
+    fuse,
+    positive_entropy,
+    reward_entropy,
+)
+
+NAMES = ["td_error", "action_gradient", "reward"]
+
+
+def make_table(rewards):
+    table = SignalTable(len(rewards), NAMES)
+    table.write(
+        torch.arange(len(rewards)),
+        table.read(make_transitions(len(rewards), rewards=rewards), len(rewards)),
+    )
+    table.size = len(rewards)
+    return table
+
+
+@pytest.mark.parametrize(
+    ("first", "expected"),
+    [(0.5, 1.0), (0.0, 0.0), (1.0, 0.0), (0.25, 0.8112781), (0.1, 0.4689956)],
+)
+def test_binary_entropy_of_hand_numbers(first, expected):
+    found = float(binary_entropy(torch.tensor(first), torch.tensor(1 - first)))
+    assert found == pytest.approx(expected, abs=1e-6)
+    assert math.copysign(1.0, found) == 1.0, "the entropy of a certain event must not be -0.0"
+
+
+def test_reward_entropy_of_a_hand_example():
+    # The average of 10, -1, -1, -1, -2 is 1: one of five lies above it.
+    rewards = torch.tensor([10.0, -1.0, -1.0, -1.0, -2.0])
+    assert float(reward_entropy(rewards)) == pytest.approx(0.7219281)
+
+
+def test_positive_entropy_of_a_hand_example():
+    # Three of four are above zero; the average, which would split them in halves, is not asked.
+    rewards = torch.tensor([9.0, 8.0, 1.0, -2.0])
+    assert float(positive_entropy(rewards)) == pytest.approx(0.8112781)
+
+
+@pytest.mark.parametrize("ties", ["complement", "strict"])
+@pytest.mark.parametrize("seed", range(5))
+def test_both_entropies_equal_the_oracle(ties, seed):
+    # Rounded, so that zeros and ties happen.
+    rewards = (torch.randn(200, generator=seeded(seed)) * 2).round()
+    expected = oracles.entropy_of_reward(rewards.tolist(), ties == "strict")
+    assert float(reward_entropy(rewards, ties=ties)) == pytest.approx(expected)
+    expected = oracles.entropy_of_positive(rewards.tolist(), ties == "strict")
+    assert float(positive_entropy(rewards, ties=ties)) == pytest.approx(expected)
+
+
+def test_ties_count_as_not_greater_by_default_and_not_at_all_when_strict():
+    rewards = torch.tensor([1.0, 0.0, 0.0, -1.0])
+    assert float(positive_entropy(rewards)) == pytest.approx(0.8112781)
+    # A quarter above, a quarter below, and half nowhere: -2 (1/4 log2 1/4).
+    assert float(positive_entropy(rewards, ties="strict")) == pytest.approx(1.0)
+    same = torch.zeros(4)
+    assert float(reward_entropy(same)) == 0.0
+    assert float(reward_entropy(same, ties="strict")) == 0.0
+
+
+@pytest.mark.parametrize("entropy", [reward_entropy, positive_entropy])
+def test_entropies_refuse_an_empty_population_and_unknown_ties(entropy):
+    with pytest.raises(ValueError, match="reward must hold at least one transition"):
+        entropy(torch.empty(0))
+    with pytest.raises(ValueError, match="ties must be 'complement' or 'strict', got 'none'"):
+        entropy(torch.ones(2), ties="none")
+
+
+def test_reward_entropy_does_not_change_with_scale_and_offset():
+    rewards = torch.randn(100, generator=seeded(7), dtype=torch.double)
+    torch.testing.assert_close(reward_entropy(rewards * 3 + 5), reward_entropy(rewards))
+
+
+def test_entropy_weights_of_a_hand_example_sum_to_one():
+    weights = entropy_weights(torch.tensor([0.5, 1.0, 1.0]))
+    assert weights.tolist() == pytest.approx([0.2, 0.4, 0.4])
+
+
+def test_entropy_weights_are_equal_when_no_entropy_says_anything():
+    assert entropy_weights(torch.zeros(3)).tolist() == pytest.approx([1 / 3] * 3)
+
+
+def test_a_zero_entropy_gets_no_weight():
+    assert entropy_weights(torch.tensor([0.7, 0.0, 0.0])).tolist() == [1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("wrong", [-0.1, math.nan, math.inf])
+def test_entropy_weights_refuse_what_is_no_entropy(wrong):
+    with pytest.raises(ValueError, match="entropies must be finite and not negative"):
+        entropy_weights(torch.tensor([0.5, wrong]))
+
+
+def test_fused_priority_of_a_hand_example():
+    # 0.2 * 10 + 0.4 * 3 + 0.4 * 0.5 + 0.05
+    found = fuse(torch.tensor([[10.0, 3.0, 0.5]]), torch.tensor([0.2, 0.4, 0.4]), eps=0.05)
+    assert found.tolist() == pytest.approx([3.45])
+
+
+def test_one_signal_of_weight_one_is_plain_per():
+    td_error = torch.rand(20, generator=seeded(8))
+    found = fuse(td_error.unsqueeze(1), torch.ones(1), eps=0.05)
+    torch.testing.assert_close(found, td_error + 0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_entropy_fusion_gives_the_weights_of_the_oracle_in_the_order_of_the_names(seed):
+    rewards = torch.randn(50, generator=seeded(seed)) + 0.4
+    of_positive = oracles.entropy_of_positive(rewards.tolist())
+    of_reward = oracles.entropy_of_reward(rewards.tolist())
+    a, beta, nu = oracles.fusion_weights(of_reward, of_positive, of_positive)
+    weights = EntropyFusion().weights(NAMES, make_table(rewards), torch.arange(4))
+    assert weights.tolist() == pytest.approx([beta, nu, a])
+
+
+def test_the_population_is_the_filled_buffer_or_the_batch():
+    table = make_table([1.0, -1.0, -1.0, -1.0])
+    index = torch.tensor([0, 1])
+    over_buffer = EntropyFusion(population="buffer").entropies(NAMES, table, index)
+    over_batch = EntropyFusion(population="batch").entropies(NAMES, table, index)
+    assert over_buffer.tolist() == pytest.approx([0.8112781] * 3)
+    assert over_batch.tolist() == pytest.approx([1.0] * 3)
+    table.size = 2
+    filled = EntropyFusion(population="buffer").entropies(NAMES, table, index)
+    assert filled.tolist() == pytest.approx([1.0] * 3)
+
+
+def test_when_every_reward_is_positive_only_the_reward_has_weight_unless_there_is_a_floor():
+    table, index = make_table([1.0, 2.0, 6.0, 7.0]), torch.arange(4)
+    assert EntropyFusion().weights(NAMES, table, index).tolist() == [0.0, 0.0, 1.0]
+    floored = EntropyFusion(floor=0.1).weights(NAMES, table, index)
+    assert floored.tolist() == pytest.approx([0.1 / 1.2, 0.1 / 1.2, 1 / 1.2])
+
+
+def test_a_signal_of_ones_own_gets_the_entropy_of_positive_training_unless_told_otherwise():
+    table, index = make_table([4.0, 1.0, 1.0, -2.0]), torch.arange(4)
+    of_reward = oracles.entropy_of_reward([4.0, 1.0, 1.0, -2.0])
+    names = ["novelty", "reward"]
+    found = EntropyFusion(ties="strict").entropies(names, table, index)
+    assert found[0] == pytest.approx(oracles.entropy_of_positive([4.0, 1.0, 1.0, -2.0]))
+    named = EntropyFusion(reward_signals=["novelty"], ties="strict")
+    strict = oracles.entropy_of_reward([4.0, 1.0, 1.0, -2.0], strict=True)
+    assert named.entropies(names, table, index)[0] == pytest.approx(strict)
+    assert strict != of_reward
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("population", "world"), ("ties", "both"), ("floor", -0.1), ("floor", 1.0)],
+)
+def test_entropy_fusion_refuses_what_is_out_of_range(argument, value):
+    with pytest.raises(ValueError, match=rf"{argument} must be .*got '?{value}"):
+        EntropyFusion(**{argument: value})
+
+
+def test_fixed_fusion_gives_its_weights_by_name_and_none_to_the_others():
+    weights = FixedFusion({"reward": 0.3, "td_error": 2.0}).weights(NAMES, None, None)
+    assert weights.tolist() == pytest.approx([2.0, 0.0, 0.3])
+    assert isinstance(FixedFusion(), Fusion)
+    assert isinstance(EntropyFusion(), Fusion)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, math.nan, math.inf])
+def test_fixed_fusion_refuses_a_wrong_weight(wrong):
+    with pytest.raises(ValueError, match=f"weight of 'td_error' must be .*got {wrong}"):
+        FixedFusion({"td_error": wrong})
+
+
+def test_fixed_fusion_refuses_weights_that_are_all_zero():
+    with pytest.raises(ValueError, match="values must have a positive weight"):
+        FixedFusion({"td_error": 0.0})

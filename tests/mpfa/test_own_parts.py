@@ -1,0 +1,173 @@
+"""A signal, a fusion and an adjustment of a user's own, without a change of the package."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from transitions import make_transitions, same, seeded
+
+from torchrl_mpfa import (
+    REWARD,
+    TD_ERROR,
+    FixedFusion,
+    MPFASampler,
+    Signal,
+    SignalReplayBuffer,
+    SignalSampler,
+    SignalTensorStorage,
+)
+
+NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
+SURPRISE = Signal("surprise", key="surprise", known_at="write", priority=torch.square)
+
+
+class LoudestSignal:
+    """All weight to the signal whose known values have the highest mean."""
+
+    def weights(self, names, table, index):
+        rows = table.rows[index][:, [table.column[name] for name in names]]
+        means = rows.nanmean(0).nan_to_num(-1.0)
+        return torch.nn.functional.one_hot(means.argmax(), len(names)).float()
+
+
+class CappedReplays:
+    """Transitions that were replayed often enough are set aside."""
+
+    def __init__(self, limit):
+        self.limit = limit
+
+    def __call__(self, priority, batch):
+        return torch.where(batch.replay_count > self.limit, 1e-6, priority)
+
+
+def make_own_buffer(**kwargs):
+    signals = [TD_ERROR, NOVELTY, REWARD, SURPRISE]
+    arguments = {
+        "signals": signals,
+        "fusion": FixedFusion({"novelty": 0.5, "surprise": 0.25, "td_error": 0.25}),
+        "adjustments": [],
+        "eps": 0.0,
+        **kwargs,
+    }
+    return SignalReplayBuffer(
+        storage=SignalTensorStorage(8, signals=signals),
+        sampler=MPFASampler(8, **arguments),
+        batch_size=4,
+        generator=seeded(),
+    )
+
+
+def make_own_transitions(count):
+    data = make_transitions(count)
+    data["surprise"] = torch.arange(float(count)).unsqueeze(1)
+    return data
+
+
+def update(buffer, index, td_error, novelty):
+    batch = TensorDict(
+        {
+            "index": torch.tensor(index),
+            "signals": {"td_error": torch.tensor(td_error)},
+            "curiosity": {"novelty": torch.tensor(novelty).unsqueeze(1)},
+        },
+        [len(index)],
+    )
+    buffer.update_tensordict_priority(batch)
+
+
+def priorities(buffer):
+    return (-torch.as_tensor(buffer.sampler._max_tree[torch.arange(len(buffer))])).tolist()
+
+
+def test_own_signals_go_from_the_batch_to_the_priority():
+    buffer = make_own_buffer()
+    buffer.extend(make_own_transitions(8))
+    update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
+    # 4/4 + 2/2 + 2^2/4 and 0 + 6/2 + 3^2/4
+    assert priorities(buffer)[2:4] == pytest.approx([3.0, 5.25])
+
+
+def test_own_signals_show_in_the_statistics():
+    buffer = make_own_buffer()
+    buffer.extend(make_own_transitions(8))
+    buffer.sample()
+    update(buffer, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
+    stats = buffer.stats()
+    assert stats["weight/novelty"] == pytest.approx(0.5)
+    assert stats["weight/reward"] == 0.0
+
+
+def test_own_signals_are_saved_and_loaded(tmp_path):
+    first, second = make_own_buffer(), make_own_buffer()
+    first.extend(make_own_transitions(6))
+    update(first, [2, 3], td_error=[4.0, 0.0], novelty=[2.0, 6.0])
+    first.dumps(tmp_path)
+    second.loads(tmp_path)
+    assert same(first.storage.signal_table.state_dict(), second.storage.signal_table.state_dict())
+    assert first.sample()["index"].equal(second.sample()["index"])
+
+
+def test_an_own_learned_signal_that_is_missing_is_named():
+    buffer = make_own_buffer()
+    buffer.extend(make_own_transitions(8))
+    batch = buffer.sample()
+    batch["signals"] = TensorDict({"td_error": torch.ones(4)}, [4])
+    with pytest.raises(KeyError, match=r"signal 'novelty' is missing: .*'curiosity', 'novelty'"):
+        buffer.update_tensordict_priority(batch)
+
+
+def test_transitions_without_an_own_signal_are_refused():
+    with pytest.raises(KeyError, match="the transitions lack 'surprise': .* at 'surprise'"):
+        make_own_buffer().extend(make_transitions(4))
+
+
+def test_an_own_fusion_and_an_own_adjustment_do_their_work():
+    buffer = make_own_buffer(
+        fusion=LoudestSignal(), adjustments=[CappedReplays(0)], entropy_refresh=0
+    )
+    buffer.extend(make_own_transitions(8))
+    update(buffer, [2, 3], td_error=[4.0, 0.5], novelty=[2.0, 60.0])
+    update(buffer, [2, 3], td_error=[4.0, 0.5], novelty=[2.0, 60.0])
+    assert buffer.sampler.weights["novelty"] == 1.0
+    assert priorities(buffer)[2:4] == pytest.approx([2.0, 60.0])
+    buffer.storage.signal_table.count_replay(torch.tensor([3]))
+    update(buffer, [2, 3], td_error=[4.0, 0.5], novelty=[2.0, 60.0])
+    assert priorities(buffer)[2:4] == pytest.approx([2.0, 1e-6])
+
+
+@pytest.mark.parametrize("weights", [torch.ones(2), torch.ones(4, 1), torch.ones(())])
+def test_an_own_fusion_of_the_wrong_shape_is_refused(weights):
+    class Wrong:
+        def weights(self, names, table, index):
+            return weights
+
+    buffer = make_own_buffer(fusion=Wrong())
+    buffer.extend(make_own_transitions(8))
+    before = buffer.state_dict()
+    with pytest.raises(ValueError, match="fusion must give 4 weights, got shape"):
+        update(buffer, [2], td_error=[4.0], novelty=[2.0])
+    assert same(before, buffer.state_dict())
+
+
+@pytest.mark.parametrize("wrong", [-1.0, torch.nan, torch.inf])
+def test_wrong_weights_and_wrong_adjusted_priorities_are_refused(wrong):
+    class Wrong:
+        def weights(self, names, table, index):
+            return torch.tensor([wrong, 1.0, 1.0, 1.0])
+
+    buffer = make_own_buffer(fusion=Wrong())
+    buffer.extend(make_own_transitions(8))
+    with pytest.raises(ValueError, match="weights of the fusion must be finite"):
+        update(buffer, [2], td_error=[4.0], novelty=[2.0])
+    buffer = make_own_buffer(adjustments=[lambda priority, batch: priority * wrong])
+    buffer.extend(make_own_transitions(8))
+    before = priorities(buffer)
+    with pytest.raises(ValueError, match="adjusted priorities must be finite and not negative"):
+        update(buffer, [2], td_error=[4.0], novelty=[2.0])
+    assert priorities(buffer) == before
+
+
+def test_names_alone_make_learned_signals():
+    sampler = SignalSampler(8, 0.6, 0.4, signals=["td_error", "novelty"])
+    assert [signal.known_at for signal in sampler.signals] == ["update", "update"]
+    assert sampler.signals[1].key == ("signals", "novelty")
+    assert sampler.fusion == FixedFusion({"td_error": 1.0, "novelty": 1.0})

@@ -1,0 +1,182 @@
+"""What a buffer refuses: the error names argument and value, and nothing has changed."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage
+from transitions import make_buffer, make_transitions, same, snapshot, train_rounds, write_signals
+
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+
+
+@pytest.fixture
+def buffer():
+    """A buffer in the middle of its training, not yet full."""
+    buffer = make_buffer(16)
+    buffer.extend(make_transitions(10))
+    train_rounds(buffer, 3)
+    return buffer
+
+
+@pytest.mark.parametrize("name", ["td_error", "action_gradient"])
+def test_a_missing_signal_is_named(buffer, name):
+    batch = write_signals(buffer.sample())
+    del batch["signals", name]
+    before = snapshot(buffer)
+    with pytest.raises(KeyError, match=f"signal '{name}' is missing: .*'signals', '{name}'"):
+        buffer.update_tensordict_priority(batch)
+    assert same(before, snapshot(buffer))
+
+
+def test_a_batch_without_any_signal_or_index_is_refused(buffer):
+    batch = buffer.sample()
+    before = snapshot(buffer)
+    with pytest.raises(KeyError, match="signal 'td_error' is missing"):
+        buffer.update_tensordict_priority(batch)
+    with pytest.raises(KeyError, match=r"'index' is missing in the batch, got \["):
+        buffer.update_tensordict_priority(write_signals(batch).exclude("index"))
+    assert same(before, snapshot(buffer))
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, -0.25])
+@pytest.mark.parametrize("name", ["td_error", "action_gradient"])
+def test_a_signal_that_is_negative_or_not_finite_is_named_with_its_value(buffer, name, wrong):
+    batch = write_signals(buffer.sample())
+    batch["signals", name][2] = wrong
+    before = snapshot(buffer)
+    message = f"signal '{name}' must be finite and not negative, got {wrong}"
+    with pytest.raises(ValueError, match=message):
+        buffer.update_tensordict_priority(batch)
+    assert same(before, snapshot(buffer))
+
+
+@pytest.mark.parametrize("shape", [(4, 2), (4, 3, 1)])
+def test_a_signal_of_the_wrong_shape_is_named_with_its_shape(buffer, shape):
+    batch = write_signals(buffer.sample())
+    batch["signals", "td_error"] = torch.ones(shape)
+    before = snapshot(buffer)
+    with pytest.raises(
+        ValueError, match=r"signal 'td_error' must have one .*shape \[4, .* 4 slots"
+    ):
+        buffer.update_tensordict_priority(batch)
+    assert same(before, snapshot(buffer))
+
+
+@pytest.mark.parametrize("slot", [10, 16, 1000, -2, -1])
+def test_a_slot_that_was_never_filled_is_refused(buffer, slot):
+    batch = write_signals(buffer.sample())
+    batch["index"][1] = slot
+    before = snapshot(buffer)
+    with pytest.raises(IndexError, match=rf"index must be in \[0, 10\).*got {slot}"):
+        buffer.update_tensordict_priority(batch)
+    assert same(before, snapshot(buffer))
+
+
+def test_an_empty_buffer_cannot_be_sampled_or_updated():
+    buffer = make_buffer(8)
+    before = snapshot(buffer)
+    with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
+        buffer.sample()
+    batch = write_signals(TensorDict({"index": torch.arange(2)}, [2]))
+    with pytest.raises(IndexError, match=r"index must be in \[0, 0\)"):
+        buffer.update_tensordict_priority(batch)
+    assert same(before, snapshot(buffer))
+
+
+@pytest.mark.parametrize("way", ["extend", "add"])
+@pytest.mark.parametrize("start", ["empty", "half full"])
+def test_transitions_without_a_reward_are_refused_and_leave_no_hole(way, start):
+    # The writer had moved on before the storage refused: the rows that were refused stayed
+    # unwritten slots, which were counted as filled once the next transitions came.
+    buffer = make_buffer(8)
+    if start == "half full":
+        buffer.extend(make_transitions(3))
+    before, filled = snapshot(buffer), len(buffer)
+    lacking = make_transitions(2).exclude(("next", "reward"))
+    with pytest.raises(KeyError, match=r"the transitions lack 'reward': .* \('next', 'reward'\)"):
+        if way == "extend":
+            buffer.extend(lacking)
+        else:
+            buffer.add(lacking[0])
+    assert same(before, snapshot(buffer))
+    assert buffer.extend(make_transitions(2, first=filled)).tolist() == [filled, filled + 1]
+    assert buffer[:]["observation"].squeeze(1).tolist() == list(range(filled + 2))
+    buffer.sample()
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_transitions_with_a_reward_that_is_not_finite_are_refused(buffer, wrong):
+    before = snapshot(buffer)
+    with pytest.raises(ValueError, match=f"reward at .* must be finite, got {wrong}"):
+        buffer.extend(make_transitions(3, rewards=[0.0, wrong, 1.0]))
+    assert same(before, snapshot(buffer))
+
+
+def test_transitions_that_were_not_flattened_are_refused(buffer):
+    before = snapshot(buffer)
+    rows = make_transitions(6).reshape(3, 2)
+    with pytest.raises(ValueError, match=r"reward .* one number a transition, got shape \[3, 2, 1"):
+        buffer.extend(rows)
+    assert same(before, snapshot(buffer))
+
+
+def test_transitions_of_another_form_than_those_before_are_refused_and_leave_no_hole(buffer):
+    # TorchRL's storage counts rows before it finds that they do not fit.
+    wide = make_transitions(2).set("observation", torch.zeros(2, 7))
+    with pytest.raises(RuntimeError):
+        buffer.extend(wide)
+    assert len(buffer) == buffer.storage.signal_table.size == 10
+    assert buffer.extend(make_transitions(2, first=10)).tolist() == [10, 11]
+    assert buffer[:]["observation"].squeeze(1).tolist() == list(range(12))
+
+
+def test_a_priority_of_ones_own_that_is_refused_leaves_the_transitions_written(buffer):
+    data = make_transitions(2).set("td_error", torch.tensor([1.0, -1.0]))
+    with pytest.raises(RuntimeError, match="Failed to update priority of extended data"):
+        buffer.extend(data)
+    assert len(buffer) == 12
+    assert buffer.extend(make_transitions(1)).tolist() == [12]
+
+
+def test_capacities_of_sampler_and_storage_must_agree():
+    with pytest.raises(ValueError, match="max_capacity of the sampler is 8, max_size .* 16"):
+        SignalReplayBuffer(storage=SignalTensorStorage(16), sampler=MPFASampler(8), batch_size=4)
+
+
+def test_a_storage_without_signals_is_refused():
+    with pytest.raises(TypeError, match="storage must keep signals .*got LazyTensorStorage"):
+        SignalReplayBuffer(storage=LazyTensorStorage(8), sampler=MPFASampler(8), batch_size=4)
+
+
+def test_signals_that_the_storage_does_not_keep_are_named():
+    with pytest.raises(
+        ValueError, match=r"signals \['novelty'\] of the sampler are not in the sto"
+    ):
+        SignalReplayBuffer(
+            storage=SignalTensorStorage(8),
+            sampler=MPFASampler(8, signals=["td_error", "novelty"]),
+            batch_size=4,
+        )
+
+
+def test_stored_transitions_that_lack_a_reward_are_found_at_the_update():
+    # A storage that was filled before it got to a buffer that fuses signals.
+    storage = SignalTensorStorage(8)
+    storage.set(torch.arange(4), make_transitions(4).exclude(("next", "reward")))
+    buffer = make_buffer(8, storage=storage)
+    batch = write_signals(buffer.sample())
+    with pytest.raises(KeyError, match="signal 'reward' is missing: the stored transitions lack"):
+        buffer.update_tensordict_priority(batch)
+
+
+def test_update_signals_can_be_called_by_hand_with_the_same_refusals(buffer):
+    sampler, storage = buffer.sampler, buffer.storage
+    signals = {"td_error": torch.ones(2), "action_gradient": torch.ones(2)}
+    assert sampler.update_signals(torch.tensor([0, 1]), signals, storage=storage) == 0
+    assert sampler.update_signals(torch.tensor([], dtype=torch.long), {}, storage=storage) == 0
+    before = snapshot(buffer)
+    with pytest.raises(KeyError, match=r"signal 'action_gradient' is missing, got \['td_error'\]"):
+        sampler.update_signals(torch.tensor([0]), {"td_error": torch.ones(1)}, storage=storage)
+    with pytest.raises(TypeError, match="storage must keep signals"):
+        sampler.update_signals(torch.tensor([0, 1]), signals, storage=LazyTensorStorage(16))
+    assert same(before, snapshot(buffer))

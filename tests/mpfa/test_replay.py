@@ -1,0 +1,279 @@
+"""SignalReplayBuffer: from batch to sampler, beside TorchRL's other parts."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage
+from torchrl.data.replay_buffers import PrioritizedSampler
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.envs.transforms import Compose, DoubleToFloat, RewardScaling
+from transitions import make_buffer, make_transitions, same, seeded, train_rounds, write_signals
+
+from torchrl_mpfa import (
+    REWARD,
+    MPFASampler,
+    Signal,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    TreeSampler,
+)
+
+
+def leaves(buffer):
+    return torch.as_tensor(buffer.sampler._sum_tree[torch.arange(len(buffer))])
+
+
+def test_rows_that_were_overwritten_since_they_were_sampled_are_dropped_and_counted():
+    buffer = make_buffer(8, 16)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample())
+    overwritten = buffer.extend(make_transitions(3, first=8))
+    fresh = leaves(buffer)[overwritten]
+    buffer.update_tensordict_priority(batch)
+    stale = int(torch.isin(batch["index"], overwritten).sum())
+    assert 0 < stale < 16
+    assert buffer.stale_updates == stale
+    assert leaves(buffer)[overwritten].equal(fresh)
+    table = buffer.storage.signal_table
+    assert table.rows[overwritten, table.column["td_error"]].isnan().all()
+    live = batch["index"][~torch.isin(batch["index"], overwritten)]
+    assert not table.rows[live, table.column["td_error"]].isnan().any()
+
+
+def test_a_batch_whose_rows_are_all_gone_changes_nothing():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample())
+    buffer.extend(make_transitions(8, first=8))
+    before = buffer.state_dict()
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 4
+    assert same(before, buffer.state_dict())
+
+
+def test_a_batch_from_before_the_buffer_was_emptied_is_stale():
+    # The count of writes must not start again, or the new rows would carry the old times.
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample())
+    buffer.empty()
+    buffer.extend(make_transitions(8))
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 4
+
+
+def test_a_row_that_was_written_in_place_is_stale():
+    buffer = make_buffer(2, 2)
+    buffer.extend(make_transitions(2))
+    batch = write_signals(buffer.sample())
+    buffer[torch.arange(2)] = make_transitions(2)
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 2
+
+
+def test_without_the_time_of_writing_every_row_is_taken():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample()).exclude("written_at")
+    buffer.extend(make_transitions(8, first=8))
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 0
+
+
+def test_a_part_of_a_batch_may_be_updated_and_signals_may_be_columns():
+    buffer = make_buffer(8, 6)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample())[:3]
+    batch["signals"] = TensorDict(
+        {key: value.unsqueeze(1) for key, value in batch["signals"].items()}, [3]
+    )
+    batch["index"] = batch["index"].unsqueeze(1)
+    buffer.update_tensordict_priority(batch)
+    table = buffer.storage.signal_table
+    known = table.rows[:, table.column["td_error"]].isfinite().nonzero().squeeze(1)
+    assert known.tolist() == batch["index"].unique().tolist()
+
+
+def test_an_update_of_nothing_is_nothing():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    before = buffer.state_dict()
+    buffer.update_tensordict_priority(write_signals(buffer.sample())[:0])
+    del before["_rng"]
+    after = buffer.state_dict()
+    del after["_rng"]
+    counts = buffer.storage.signal_table.count_column
+    before["_storage"]["_signals"]["rows"][:, counts] = 0
+    after["_storage"]["_signals"]["rows"][:, counts] = 0
+    assert same(before, after)
+
+
+def test_signals_are_read_under_nested_and_renamed_keys():
+    slope = Signal("slope", key=("agent", "critic", "slope"))
+    reward = Signal("reward", key=("next", "agent", "r"), known_at="write")
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(8, signals=[slope, reward], reward_key=reward.key),
+        sampler=MPFASampler(8, signals=[slope, reward], adjustments=[], eps=0.0),
+        batch_size=4,
+    )
+    rewards = torch.tensor([1.0, -3.0])
+    buffer.extend(TensorDict({"next": {"agent": {"r": rewards.unsqueeze(1)}}}, [2]))
+    batch = TensorDict(
+        {"index": torch.arange(2), "agent": {"critic": {"slope": torch.tensor([4.0, 5.0])}}}, [2]
+    )
+    buffer.update_tensordict_priority(batch)
+    assert leaves(buffer).tolist() == pytest.approx([2.5**0.6, 4.0**0.6])
+
+
+def test_extending_returns_the_slots_and_adding_returns_one():
+    buffer = make_buffer(4)
+    assert buffer.extend(make_transitions(3)).tolist() == [0, 1, 2]
+    assert buffer.add(make_transitions(1)[0]) == 3
+    assert buffer.add(make_transitions(1)[0]) == 0
+    assert len(buffer) == 4
+
+
+def test_adding_one_by_one_equals_extending_at_once():
+    one, many = make_buffer(8), make_buffer(8)
+    data = make_transitions(11)
+    many.extend(data)
+    for row in data.unbind(0):
+        one.add(row)
+    assert same(one.state_dict()["_sampler"], many.state_dict()["_sampler"])
+    rows = [buffer.storage.signal_table.rows for buffer in (one, many)]
+    assert same(rows[0], rows[1])
+
+
+def test_a_batch_has_what_the_loss_and_the_update_need():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    batch = buffer.sample()
+    assert not batch.is_locked
+    for key in ("index", "priority_weight", "written_at"):
+        assert batch[key].shape == (4,)
+    batch, info = buffer.sample(return_info=True)
+    assert info["priority_weight"].equal(batch["priority_weight"])
+    assert batch["observation"].squeeze(1).equal(batch["index"].float())
+    with pytest.warns(UserWarning, match="conflicting batch_sizes"):
+        assert buffer.sample(3).batch_size == (3,)
+
+
+def test_changing_a_batch_does_not_change_the_buffer():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    buffer.sample()["observation"].fill_(-1)
+    assert buffer[:]["observation"].min() == 0
+
+
+def test_two_buffers_of_one_seed_draw_the_same_and_another_seed_draws_otherwise():
+    drawn = []
+    for seed in (1, 1, 2):
+        buffer = make_buffer(64, 16, seed=seed)
+        buffer.extend(make_transitions(64))
+        drawn.append(train_rounds(buffer, 5))
+    assert drawn[0].equal(drawn[1])
+    assert not drawn[0].equal(drawn[2])
+
+
+def test_without_a_generator_the_global_seed_rules():
+    drawn = []
+    for _ in range(2):
+        torch.manual_seed(11)
+        buffer = SignalReplayBuffer(
+            storage=SignalTensorStorage(64), sampler=MPFASampler(64), batch_size=16
+        )
+        buffer.extend(make_transitions(64))
+        drawn.append(train_rounds(buffer, 3))
+    assert drawn[0].equal(drawn[1])
+
+
+def test_prefetching_gives_batches_that_can_be_updated():
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(32), sampler=MPFASampler(32), batch_size=8, prefetch=2
+    )
+    buffer.extend(make_transitions(32))
+    for seed in range(20):
+        batch = buffer.sample()
+        assert batch["observation"].squeeze(1).equal(batch["index"].float())
+        buffer.update_tensordict_priority(write_signals(batch, seed=seed))
+        buffer.add(make_transitions(1)[0].set("observation", batch["observation"][0]))
+        buffer[:]["observation"].copy_(torch.arange(32.0).unsqueeze(1))
+    assert buffer.sampler.weights
+    assert torch.isfinite(leaves(buffer)).all()
+
+
+def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():
+    transform = Compose(RewardScaling(loc=0.0, scale=10.0, in_keys=[("next", "reward")]))
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(8),
+        sampler=MPFASampler(8),
+        batch_size=4,
+        transform=transform,
+        generator=seeded(),
+    )
+    data = make_transitions(8)
+    buffer.extend(data)
+    batch = buffer.sample()
+    scaled = data["next", "reward"][batch["index"]] * 10
+    torch.testing.assert_close(batch["next", "reward"], scaled)
+    buffer.update_tensordict_priority(write_signals(batch))
+    written = data["next", "reward"].squeeze(1)
+    torch.testing.assert_close(buffer.storage.signal_table.rewards.float(), written)
+
+
+def test_inverse_transforms_act_before_the_reward_is_read():
+    transform = DoubleToFloat(in_keys=["observation"], in_keys_inv=["observation"])
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(8), sampler=MPFASampler(8), batch_size=4, transform=transform
+    )
+    buffer.extend(make_transitions(8))
+    assert buffer.sample()["observation"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "make_sampler",
+    [
+        RandomSampler,
+        lambda: PrioritizedSampler(16, 0.6, 0.4, 0.05),
+        lambda: TreeSampler(16, 0.6, 0.4, 0.05),
+    ],
+    ids=["uniform", "stock", "tree"],
+)
+@pytest.mark.parametrize("make_storage", [LazyTensorStorage, SignalTensorStorage])
+def test_with_any_other_sampler_it_is_torchrls_buffer(make_sampler, make_storage):
+    buffer = SignalReplayBuffer(
+        storage=make_storage(16), sampler=make_sampler(), batch_size=8, generator=seeded()
+    )
+    buffer.extend(make_transitions(10))
+    buffer.add(make_transitions(1)[0])
+    batch = buffer.sample()
+    batch["td_error"] = torch.arange(8.0)
+    buffer.update_tensordict_priority(batch)
+    assert len(buffer) == 11
+    assert batch["index"].max() < 11
+    assert "stale_updates" in buffer.stats()
+    if hasattr(buffer.sampler, "_sum_tree"):
+        last = {int(slot): float(td) for slot, td in zip(batch["index"], torch.arange(8.0))}
+        for slot, td_error in last.items():
+            assert float(buffer.sampler._sum_tree[slot]) == pytest.approx((td_error + 0.05) ** 0.6)
+
+
+def test_priorities_may_also_be_set_by_hand():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    buffer.update_priority(torch.arange(8), torch.arange(8.0))
+    expected = [(p + 0.05) ** 0.6 for p in range(8)]
+    assert leaves(buffer).tolist() == pytest.approx(expected)
+
+
+def test_transitions_that_bring_a_priority_of_their_own_start_with_it():
+    buffer = make_buffer(8)
+    data = make_transitions(4)
+    data["td_error"] = torch.arange(4.0)
+    buffer.extend(data)
+    expected = [(p + 0.05) ** 0.6 for p in range(4)]
+    assert leaves(buffer).tolist() == pytest.approx(expected)
+
+
+def test_the_paper_signal_of_the_reward_is_its_absolute_value():
+    assert REWARD.priority(torch.tensor([-2.0])).tolist() == [2.0]

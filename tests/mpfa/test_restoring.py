@@ -1,0 +1,247 @@
+"""Save, kill and load: what comes after is equal to the last bit, generator included."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.checkpoint import Checkpoint
+from transitions import make_buffer, make_transitions, same, seeded, snapshot, train_rounds
+
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    load_safely,
+    save_atomically,
+)
+
+ROUNDS = 100
+
+
+def make_kind(kind, folder, seed=0):
+    """A buffer whose entropies are counted anew every third of its size."""
+    if kind == "memory":
+        storage = SignalTensorStorage(24)
+    else:
+        storage = SignalMemmapStorage(24, scratch_dir=folder)
+    return make_buffer(24, 6, seed=seed, storage=storage, entropy_refresh=1 / 3)
+
+
+def go_on(buffer):
+    """A hundred more rounds with new transitions among them; everything that was drawn."""
+    drawn = []
+    for number in range(ROUNDS // 10):
+        buffer.extend(make_transitions(2, seed=number, first=1000 + number))
+        drawn.append(train_rounds(buffer, 10, seed=number))
+    return torch.cat(drawn)
+
+
+def by_state_dict(first, second, folder):
+    torch.save(first.state_dict(), folder / "buffer.pt")
+    second.load_state_dict(torch.load(folder / "buffer.pt", weights_only=True))
+
+
+def by_own_file(first, second, folder):
+    save_atomically(first.state_dict(), folder / "buffer.pt")
+    second.load_state_dict(load_safely(folder / "buffer.pt"))
+
+
+def by_folder(first, second, folder):
+    first.dumps(folder / "buffer")
+    second.loads(folder / "buffer")
+
+
+def by_checkpoint(first, second, folder):
+    Checkpoint(buffer=first).save(folder / "checkpoint")
+    Checkpoint(buffer=second).load(folder / "checkpoint")
+
+
+# TorchRL recommends a memory map that was allocated before; ours is a fresh one on purpose.
+@pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized TensorDict")
+@pytest.mark.parametrize("way", [by_state_dict, by_own_file, by_folder, by_checkpoint])
+@pytest.mark.parametrize("kind", ["memory", "memmap"])
+@pytest.mark.parametrize("rows", [11, 40], ids=["half full", "wrapped"])
+def test_training_goes_on_bit_for_bit(way, kind, rows, tmp_path):
+    first = make_kind(kind, tmp_path / "first")
+    first.extend(make_transitions(rows))
+    train_rounds(first, 7)
+    # Between two counts of the entropies: some of the buffer is new, not yet a third.
+    first.extend(make_transitions(3, seed=1, first=rows))
+    train_rounds(first, 2, seed=1)
+    assert first.sampler._weighed_at < first.storage.signal_table.writes
+
+    second = make_kind(kind, tmp_path / "second", seed=99)
+    way(first, second, tmp_path)
+    assert same(snapshot(first), snapshot(second))
+    assert go_on(first).equal(go_on(second))
+    assert same(snapshot(first), snapshot(second))
+
+
+def test_a_restored_buffer_does_not_share_memory_with_the_first(tmp_path):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
+    first.extend(make_transitions(24))
+    state = first.state_dict()
+    second.load_state_dict(state)
+    before = snapshot(second)
+    go_on(first)
+    assert same(before, snapshot(second))
+    assert same(state["_sampler"], second.state_dict()["_sampler"])
+
+
+def test_priorities_set_after_saving_are_forgotten_by_loading(tmp_path):
+    buffer = make_kind("memory", tmp_path)
+    buffer.extend(make_transitions(24))
+    train_rounds(buffer, 5)
+    buffer.dumps(tmp_path / "buffer")
+    before = snapshot(buffer)
+    buffer.extend(make_transitions(20, seed=8))
+    train_rounds(buffer, 5)
+    buffer.loads(tmp_path / "buffer")
+    assert same(before, snapshot(buffer))
+
+
+def test_a_second_save_replaces_the_first(tmp_path):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
+    for number in range(2):
+        first.extend(make_transitions(15, seed=number))
+        train_rounds(first, 3)
+        first.dumps(tmp_path / "buffer")
+    second.loads(tmp_path / "buffer")
+    assert go_on(first).equal(go_on(second))
+
+
+def spoil_capacity(state):
+    state["_sampler"]["_max_capacity"] = 25
+
+
+def spoil_signals(state):
+    state["_sampler"]["_signals"] = ["novelty", "td_error"]
+
+
+def spoil_format(state):
+    state["_sampler"]["_format"] = 2
+
+
+def spoil_table_capacity(state):
+    state["_storage"]["_signals"]["capacity"] = 25
+
+
+def spoil_table_names(state):
+    state["_storage"]["_signals"]["names"] = ["td_error"]
+
+
+def spoil_table_format(state):
+    state["_storage"]["_signals_format"] = 7
+
+
+def drop_table(state):
+    del state["_storage"]["_signals"]
+
+
+SPOILS = [
+    (spoil_capacity, ValueError, "max_capacity of the saved sampler is 25, of this one 24"),
+    (spoil_signals, ValueError, r"signals of the saved sampler are \['novelty', 'td_error'\]"),
+    (spoil_format, ValueError, "format of the saved sampler is 2, this version has 1"),
+    (spoil_table_capacity, ValueError, "capacity of the saved signals is 25, of this storage 24"),
+    (spoil_table_names, ValueError, r"names of the saved signals is \['td_error'\]"),
+    (spoil_table_format, ValueError, "format of the saved signals is 7, this version reads 1"),
+    (drop_table, KeyError, "the saved storage has no signals"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "error", "message"), SPOILS)
+@pytest.mark.parametrize("way", ["state", "folder"])
+def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(
+    spoil, error, message, way, tmp_path
+):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
+    first.extend(make_transitions(24))
+    second.extend(make_transitions(9, seed=3))
+    train_rounds(second, 4)
+    state = snapshot(first)
+    spoil(state)
+    if way == "folder":
+        first.dumps(tmp_path / "buffer")
+        save_atomically(state["_sampler"], tmp_path / "buffer/sampler/sampler.pt")
+        signals = {key: state["_storage"].get(key) for key in ("_signals", "_signals_format")}
+        file = tmp_path / "buffer/storage/signals.pt"
+        save_atomically(signals, file)
+        if spoil is drop_table:
+            file.unlink()
+    before = snapshot(second)
+    with pytest.raises(error, match=message):
+        if way == "state":
+            second.load_state_dict(state)
+        else:
+            second.loads(tmp_path / "buffer")
+    assert same(before, snapshot(second))
+
+
+def test_a_buffer_of_other_signals_is_refused(tmp_path):
+    first = make_kind("memory", tmp_path)
+    first.extend(make_transitions(9))
+    other = SignalReplayBuffer(
+        storage=SignalTensorStorage(24, signals=["td_error"]),
+        sampler=MPFASampler(24, signals=["td_error"]),
+        batch_size=6,
+    )
+    with pytest.raises(ValueError, match=r"signals of the saved sampler are \['action_gradient',"):
+        other.load_state_dict(first.state_dict())
+
+
+class Trap:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+@pytest.mark.parametrize("file", ["sampler/sampler.pt", "storage/signals.pt"])
+@pytest.mark.parametrize("harm", ["truncated", "malicious"])
+def test_a_harmed_folder_is_refused_and_nothing_changes(file, harm, tmp_path):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
+    first.extend(make_transitions(24))
+    second.extend(make_transitions(9, seed=3))
+    first.dumps(tmp_path / "buffer")
+    path, trap = tmp_path / "buffer" / file, tmp_path / "trap"
+    if harm == "truncated":
+        path.write_bytes(path.read_bytes()[:300])
+    else:
+        torch.save({"_format": 1, "x": Trap(str(trap))}, path)
+    before = snapshot(second)
+    with pytest.raises(Exception, match=r"(?i)weights_only|zip|central directory|truncated"):
+        second.loads(tmp_path / "buffer")
+    assert not trap.exists()
+    assert same(before, snapshot(second))
+
+
+def test_what_is_saved_of_the_sampler_can_be_read_by_a_person(tmp_path):
+    buffer = make_kind("memory", tmp_path)
+    buffer.extend(make_transitions(24))
+    train_rounds(buffer, 2)
+    buffer.dumps(tmp_path / "buffer")
+    text = Path(tmp_path / "buffer/sampler/sampler_metadata.json").read_text()
+    assert '"_alpha": 0.6' in text
+    assert '"td_error"' in text
+
+
+def test_a_folder_may_be_moved_before_it_is_loaded(tmp_path):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
+    first.extend(make_transitions(24))
+    first.dumps(tmp_path / "here")
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    second.loads(tmp_path / "there")
+    assert first.sample()["index"].equal(second.sample()["index"])
+
+
+def test_the_state_holds_tensors_and_plain_values_only(tmp_path):
+    buffer = make_kind("memory", tmp_path)
+    buffer.extend(make_transitions(24))
+    train_rounds(buffer, 2)
+    torch.save(buffer.sampler.state_dict(), tmp_path / "sampler.pt")
+    assert same(load_safely(tmp_path / "sampler.pt"), buffer.sampler.state_dict())
+    assert seeded(0).get_state().equal(seeded(0).get_state())

@@ -1,0 +1,279 @@
+"""Storages: a slot never keeps the signals of the transition that was there before."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictMaxValueWriter
+from torchrl.data.replay_buffers.samplers import RandomSampler
+from transitions import make_buffer, make_transitions, same, seeded, write_signals
+
+from torchrl_mpfa import Signal, SignalMemmapStorage, SignalTensorStorage
+
+KINDS = ["memory", "memmap", "memmap_scratch"]
+
+
+@pytest.fixture(params=KINDS)
+def make_storage(request, tmp_path):
+    def make(capacity, **kwargs):
+        if request.param == "memory":
+            return SignalTensorStorage(capacity, **kwargs)
+        if request.param == "memmap_scratch":
+            kwargs["scratch_dir"] = tmp_path / "scratch"
+        return SignalMemmapStorage(capacity, **kwargs)
+
+    return make
+
+
+def column(storage, name):
+    table = storage.signal_table
+    return table.rows[: table.size, table.column[name]]
+
+
+def fill_signals(storage):
+    """Give every slot learned signals and a replay count, as training would."""
+    table = storage.signal_table
+    table.rows[:, table.column["td_error"]] = 7.0
+    table.rows[:, table.count_column] = 3.0
+
+
+def is_fresh(storage, slots):
+    table = storage.signal_table
+    rows = table.rows[slots]
+    learned = [table.column["td_error"], table.column["action_gradient"]]
+    return rows[:, learned].isnan().all() and (rows[:, table.count_column] == 0).all()
+
+
+def test_a_wrap_of_the_ring_resets_exactly_the_rows_it_writes(make_storage):
+    storage = make_storage(8)
+    buffer = make_buffer(8, storage=storage)
+    buffer.extend(make_transitions(6))
+    fill_signals(storage)
+    index = buffer.extend(make_transitions(5, seed=1, first=6))
+    assert index.tolist() == [6, 7, 0, 1, 2]
+    assert is_fresh(storage, index)
+    assert column(storage, "td_error")[3:6].tolist() == [7.0] * 3
+    rewards = storage[:]["next", "reward"].squeeze(1)
+    torch.testing.assert_close(storage.signal_table.rewards.float(), rewards)
+    torch.testing.assert_close(column(storage, "reward").float(), rewards.abs())
+
+
+def test_adding_one_transition_resets_its_slot(make_storage):
+    storage = make_storage(2)
+    buffer = make_buffer(2, storage=storage)
+    buffer.extend(make_transitions(2))
+    fill_signals(storage)
+    assert buffer.add(make_transitions(1, rewards=[-4.0])[0]) == 0
+    assert is_fresh(storage, [0])
+    assert not is_fresh(storage, [1])
+    assert storage.signal_table.rewards[0] == -4.0
+    assert column(storage, "reward")[0] == 4.0
+
+
+@pytest.mark.parametrize(
+    ("cursor", "slots"),
+    [
+        (3, [3]),
+        (slice(1, 4), [1, 2, 3]),
+        (torch.tensor([5, 0]), [5, 0]),
+        (range(2, 4), [2, 3]),
+        (torch.tensor([True, False, True, False, False, False]), [0, 2]),
+        (torch.tensor([-1]), [-1]),
+    ],
+    ids=["number", "slice", "tensor", "range", "mask", "negative"],
+)
+def test_writing_in_place_resets_the_slots_it_names(make_storage, cursor, slots):
+    storage = make_storage(6)
+    make_buffer(6, storage=storage).extend(make_transitions(6))
+    fill_signals(storage)
+    rewards = torch.arange(len(slots)) + 10.0
+    new = make_transitions(len(slots), rewards=rewards)
+    storage[cursor] = new[0] if isinstance(cursor, int) else new
+    assert is_fresh(storage, slots)
+    assert storage.signal_table.rewards[slots].tolist() == rewards.tolist()
+    others = [slot for slot in range(6) if slot not in [s % 6 for s in slots]]
+    assert column(storage, "td_error")[others].tolist() == [7.0] * len(others)
+    torch.testing.assert_close(
+        storage.signal_table.rewards.float(), storage[:]["next", "reward"].squeeze(1)
+    )
+
+
+def test_a_batch_larger_than_the_storage_leaves_signals_of_the_rows_that_stay(make_storage):
+    storage = make_storage(4)
+    buffer = make_buffer(4, storage=storage)
+    buffer.extend(make_transitions(11))
+    assert len(buffer) == 4
+    assert storage.signal_table.size == 4
+    torch.testing.assert_close(
+        storage.signal_table.rewards.float(), storage[:]["next", "reward"].squeeze(1)
+    )
+    batch = buffer.sample()
+    buffer.update_tensordict_priority(write_signals(batch))
+    assert buffer.stale_updates == 0
+
+
+def test_a_list_of_transitions_is_written_like_a_batch(make_storage):
+    storage = make_storage(4)
+    buffer = ReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=2)
+    buffer.extend(list(make_transitions(3, rewards=[1.0, -2.0, 3.0]).unbind(0)))
+    assert storage.signal_table.rewards.tolist() == [1.0, -2.0, 3.0]
+
+
+def test_a_writer_that_keeps_the_best_keeps_signals_and_data_together():
+    storage = SignalTensorStorage(4)
+    buffer = make_buffer(4, storage=storage)
+    buffer.set_writer(TensorDictMaxValueWriter(rank_key=("next", "reward")))
+    for seed in range(4):
+        buffer.extend(make_transitions(6, seed=seed))
+    torch.testing.assert_close(
+        storage.signal_table.rewards.float(), storage[:]["next", "reward"].squeeze(1)
+    )
+
+
+def test_nothing_of_the_signals_shows_in_a_batch(make_storage):
+    buffer = make_buffer(8, storage=make_storage(8))
+    buffer.extend(make_transitions(8))
+    buffer.update_tensordict_priority(write_signals(buffer.sample()))
+    batch = buffer.sample()
+    bookkeeping = {"index", "priority_weight", "written_at"}
+    assert set(batch.keys()) == {"observation", "next"} | bookkeeping
+    assert set(buffer.storage[:].keys()) - {"index"} == {"observation", "next"}
+
+
+@pytest.mark.parametrize(
+    "index",
+    [
+        torch.tensor([3, 0, 3]),
+        torch.tensor([], dtype=torch.long),
+        torch.tensor([-1, 1]),
+        torch.tensor([[0, 1], [2, 3]]),
+        torch.tensor([True, False] * 3),
+        slice(1, 5, 2),
+        range(3),
+        [4, 1],
+        2,
+    ],
+    ids=["tensor", "empty", "negative", "matrix", "mask", "slice", "range", "list", "number"],
+)
+def test_get_equals_plain_indexing(make_storage, index):
+    # Only six of eight slots are filled: -1 is the last filled one.
+    ours, plain = make_storage(8), LazyTensorStorage(8)
+    data = make_transitions(6)
+    data["pixels"] = torch.randint(255, (6, 2, 3), generator=seeded(), dtype=torch.uint8)
+    data["long", "nested", "flag"] = torch.tensor([True, False] * 3)
+    for storage in (ours, plain):
+        storage.set(torch.arange(6), data)
+    found, expected = ours.get(index), plain.get(index)
+    assert found.batch_size == expected.batch_size
+    assert same(found.to_dict(), expected.to_dict())
+    if not isinstance(index, slice):
+        found["observation"].fill_(-1)
+        assert (ours[:]["observation"] >= 0).all() or isinstance(index, int)
+
+
+def test_reading_a_slot_that_was_never_written_is_an_error(make_storage):
+    storage = make_storage(8)
+    storage.set(torch.arange(3), make_transitions(3))
+    with pytest.raises(IndexError):
+        storage.get(torch.tensor([1, 5]))
+
+
+def test_entries_that_are_no_tensors_come_back():
+    storage = SignalTensorStorage(4)
+    data = make_transitions(3)
+    data.set_non_tensor("map", "A")
+    storage.set(torch.arange(3), data)
+    found = storage.get(torch.tensor([2, 0]))
+    assert found.batch_size == (2,)
+    assert found["map"] == ["A", "A"]
+    assert found["observation"].squeeze(1).tolist() == [2.0, 0.0]
+
+
+def test_an_emptied_buffer_forgets_the_signals_and_can_be_filled_again(make_storage):
+    storage = make_storage(8)
+    buffer = make_buffer(8, storage=storage)
+    buffer.extend(make_transitions(8))
+    buffer.update_tensordict_priority(write_signals(buffer.sample()))
+    buffer.empty()
+    assert len(buffer) == storage.signal_table.size == 0
+    assert storage.signal_table.rewards.numel() == 0
+    assert buffer.sampler.default_priority == 1.0
+    assert buffer.sampler.weights == {}
+    buffer.extend(make_transitions(3, seed=9))
+    assert is_fresh(storage, [0, 1, 2])
+    assert storage.signal_table.size == 3
+    assert buffer.sample()["index"].max() < 3
+
+
+def test_rewards_and_own_signals_are_read_under_the_keys_they_are_given():
+    novelty = Signal("novelty", key=("info", "novelty"), known_at="write", priority=torch.exp)
+    storage = SignalTensorStorage(
+        4, signals=["td_error", novelty], reward_key=("next", "agent", "reward")
+    )
+    data = TensorDict(
+        {
+            "next": {"agent": {"reward": torch.tensor([[1.0], [-2.0]])}},
+            "info": {"novelty": torch.tensor([0.0, 1.0])},
+        },
+        [2],
+    )
+    storage.set(torch.arange(2), data)
+    assert storage.signal_table.rewards.tolist() == [1.0, -2.0]
+    assert column(storage, "novelty").tolist() == pytest.approx([1.0, 2.7182817])
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_what_is_not_one_finite_number_a_transition_is_refused_before_it_is_written(rows):
+    storage = SignalTensorStorage(4)
+    storage.set(torch.arange(1), make_transitions(1))
+    before = storage.signal_table.state_dict()
+    wide = make_transitions(rows)
+    wide["next", "reward"] = torch.zeros(rows, 2)
+    with pytest.raises(ValueError, match=rf"reward at \('next', 'reward'\) .*shape \[{rows}, 2\]"):
+        storage.set(torch.arange(1, 1 + rows), wide)
+    for wrong in (torch.nan, torch.inf, -torch.inf):
+        data = make_transitions(rows, rewards=[0.0] * (rows - 1) + [wrong])
+        with pytest.raises(ValueError, match=f"reward at .* must be finite, got {wrong}"):
+            storage.set(torch.arange(1, 1 + rows), data)
+    assert len(storage) == 1
+    assert same(before, storage.signal_table.state_dict())
+
+
+def test_a_priority_function_that_gives_a_negative_signal_is_refused():
+    bad = Signal("bad", key=("next", "reward"), known_at="write", priority=torch.neg)
+    storage = SignalTensorStorage(4, signals=["td_error", bad])
+    with pytest.raises(ValueError, match=r"signal 'bad' must not be negative, got -1.0"):
+        storage.set(torch.arange(1), make_transitions(1, rewards=[1.0]))
+    assert len(storage) == 0
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_arguments_out_of_range_are_refused(kind):
+    for size in (0, -1, True, 2.5):
+        with pytest.raises(ValueError, match=f"max_size must be a positive integer, got {size}"):
+            kind(size)
+    with pytest.raises(ValueError, match="ndim must be 1, got 2"):
+        kind(4, ndim=2)
+    with pytest.raises(ValueError, match="signals must be one or more different signals"):
+        kind(4, signals=[])
+    with pytest.raises(ValueError, match="signals must be one or more different signals"):
+        kind(4, signals=["td_error", "td_error"])
+
+
+def test_a_signal_refuses_an_empty_name_and_an_unknown_time():
+    with pytest.raises(ValueError, match="name must not be empty"):
+        Signal("")
+    with pytest.raises(ValueError, match="known_at must be 'update' or 'write', got 'never'"):
+        Signal("novelty", known_at="never")
+
+
+def test_memory_mapped_signals_lie_in_the_scratch_folder(tmp_path):
+    storage = SignalMemmapStorage(8, scratch_dir=tmp_path)
+    storage.set(torch.arange(3), make_transitions(3))
+    file = tmp_path / "signals.memmap"
+    assert file.stat().st_size == 8 * 6 * 8
+
+
+def test_torchrls_own_sampler_may_sample_the_storage():
+    buffer = ReplayBuffer(storage=SignalTensorStorage(8), sampler=RandomSampler(), batch_size=4)
+    buffer.extend(torch.arange(5.0))
+    assert buffer.sample().shape == (4,)

@@ -1,0 +1,262 @@
+"""TreeSampler beside TorchRL's own sampler, and against Eqs. (8) and (10)."""
+
+import math
+
+import numpy as np
+import oracles
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler
+from torchrl.data.replay_buffers.scheduler import LinearScheduler
+from transitions import make_transitions, same, seeded
+
+from torchrl_mpfa import TreeSampler
+
+
+def filled(sampler, count, capacity):
+    """A storage with so many rows, marked in the sampler as TorchRL's buffer does."""
+    storage = LazyTensorStorage(capacity)
+    storage.set(torch.arange(count), torch.zeros(count))
+    sampler.mark_update(torch.arange(count), storage=storage)
+    return storage
+
+
+def leaves(sampler, count):
+    return torch.as_tensor(sampler._sum_tree[torch.arange(count)])
+
+
+@pytest.mark.parametrize("capacity", [1, 5, 7, 32, 50, 100])
+def test_priorities_are_those_of_torchrl_after_the_same_updates(capacity):
+    ours, theirs = (
+        TreeSampler(capacity, 0.7, 0.5, 0.01),
+        PrioritizedSampler(capacity, 0.7, 0.5, 0.01),
+    )
+    for sampler in (ours, theirs):
+        filled(sampler, capacity, capacity)
+    generator = seeded(capacity)
+    for _ in range(20):
+        index = torch.randint(capacity, (8,), generator=generator).unique()
+        priority = torch.rand(len(index), generator=generator) * 3
+        ours.update_priority(index, priority)
+        theirs.update_priority(index, priority)
+    slots = torch.arange(capacity)
+    expected = torch.as_tensor(theirs._sum_tree[slots])
+    assert torch.as_tensor(ours._sum_tree[slots]).equal(expected)
+    assert torch.as_tensor(ours._min_tree[slots]).equal(torch.as_tensor(theirs._min_tree[slots]))
+
+
+def test_weights_are_those_of_torchrl_for_the_same_slots():
+    ours, theirs = TreeSampler(50, 0.7, 0.5, 0.01), PrioritizedSampler(50, 0.7, 0.5, 0.01)
+    priority = torch.rand(50, generator=seeded())
+    for sampler in (ours, theirs):
+        storage = filled(sampler, 50, 50)
+        sampler.update_priority(torch.arange(50), priority)
+    np.random.seed(0)  # noqa: NPY002 - TorchRL's sampler draws from NumPy's global generator
+    index, info = theirs.sample(storage, 50)
+    weight = {int(slot): float(w) for slot, w in zip(index, info["priority_weight"], strict=True)}
+    index, info = ours.sample(storage, 200)
+    for slot, found in zip(index.tolist(), info["priority_weight"].tolist(), strict=True):
+        if slot in weight:
+            assert found == pytest.approx(weight[slot], rel=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0])
+def test_a_histogram_of_50000_draws_has_the_probabilities_of_eq_8(alpha):
+    sampler = TreeSampler(20, alpha, 0.4)
+    storage = filled(sampler, 20, 20)
+    priority = torch.rand(20, generator=seeded(1)) + 0.05
+    sampler.update_priority(torch.arange(20), priority)
+    sampler._rng = seeded(2)
+    drawn = torch.cat([sampler.sample(storage, 1000)[0] for _ in range(50)])
+    found = torch.bincount(drawn, minlength=20) / 50_000
+    expected = torch.tensor(oracles.probabilities(priority.tolist(), alpha))
+    # Five standard deviations of a binomial share.
+    tolerance = 5 * (expected * (1 - expected) / 50_000).sqrt()
+    assert ((found - expected).abs() < tolerance).all()
+
+
+def test_alpha_may_be_annealed_during_training():
+    sampler = TreeSampler(10, 0.9, 0.4, 0.0, max_priority_within_buffer=True)
+    filled(sampler, 10, 10)
+    priority = torch.rand(10, generator=seeded(3)) + 0.1
+    sampler.update_priority(torch.arange(10), priority)
+    for alpha in (0.7, 0.4, 0.9):
+        sampler.alpha = alpha
+        torch.testing.assert_close(leaves(sampler, 10), priority.pow(alpha), rtol=1e-4, atol=0)
+    assert sampler.default_priority == pytest.approx(float(priority.max()))
+
+
+def test_beta_follows_the_linear_scheduler_of_torchrl():
+    sampler = TreeSampler(10, 0.6, 0.4)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=4)
+    buffer.extend(torch.arange(10))
+    scheduler = LinearScheduler(buffer, param_name="beta", final_value=1.0, num_steps=6)
+    for _ in range(6):
+        scheduler.step()
+    assert sampler.beta == pytest.approx(1.0)
+    sampler.update_priority(torch.arange(10), torch.arange(1.0, 11.0))
+    index, info = sampler.sample(buffer.storage, 8)
+    priority = (torch.arange(1.0, 11.0) + 1e-8).tolist()
+    expected = oracles.importance_weights(priority, 0.6, 1.0, index.tolist())
+    assert info["priority_weight"].tolist() == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("within", [True, False])
+def test_the_highest_priority_falls_with_its_row_only_within_the_buffer(within):
+    sampler = TreeSampler(8, 0.6, 0.4, 0.0, max_priority_within_buffer=within)
+    filled(sampler, 4, 8)
+    assert sampler.default_priority == 1.0
+    sampler.update_priority(torch.tensor([0, 1]), torch.tensor([5.0, 3.0]))
+    assert sampler.default_priority == 5.0
+    sampler.update_priority(torch.tensor([1]), torch.tensor([2.0]))
+    assert sampler.default_priority == 5.0
+    sampler.update_priority(torch.tensor([0]), torch.tensor([0.5]))
+    assert sampler.default_priority == (2.0 if within else 5.0)
+    sampler.mark_update(4)
+    expected = 2.0 if within else 5.0
+    assert float(sampler._sum_tree[4]) == pytest.approx(expected**0.6)
+
+
+def test_slots_of_minus_one_are_skipped():
+    sampler = TreeSampler(4, 1.0, 0.4, 0.0)
+    filled(sampler, 4, 4)
+    sampler.update_priority(torch.tensor([-1, 2]), torch.tensor([9.0, 3.0]))
+    assert leaves(sampler, 4).tolist() == [1.0, 1.0, 3.0, 1.0]
+    sampler.update_priority(torch.tensor([-1]), torch.tensor([9.0]))
+    assert leaves(sampler, 4).tolist() == [1.0, 1.0, 3.0, 1.0]
+
+
+def test_one_number_may_serve_for_all_slots_and_a_column_for_a_row():
+    sampler = TreeSampler(4, 1.0, 0.4, 0.0)
+    sampler.update_priority(torch.arange(4), 2.0)
+    assert leaves(sampler, 4).tolist() == [2.0] * 4
+    sampler.update_priority(torch.tensor([0, 1]), torch.tensor([[3.0], [4.0]]))
+    sampler.update_priority(2, 5.0)
+    assert leaves(sampler, 4).tolist() == [3.0, 4.0, 5.0, 2.0]
+
+
+def test_of_a_slot_that_appears_twice_the_last_entry_counts():
+    sampler = TreeSampler(4, 1.0, 0.4, 0.0)
+    sampler.update_priority(torch.tensor([1, 1, 1]), torch.tensor([7.0, 9.0, 2.0]))
+    assert float(sampler._sum_tree[1]) == 2.0
+    assert float(sampler._min_tree[1]) == 2.0
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -0.5])
+def test_a_priority_that_would_poison_the_tree_is_refused_where_it_enters(wrong):
+    sampler = TreeSampler(4, 0.6, 0.4)
+    filled(sampler, 4, 4)
+    before = sampler.state_dict()
+    with pytest.raises(ValueError, match=f"priority must be finite and not negative, got {wrong}"):
+        sampler.update_priority(torch.tensor([0, 1]), torch.tensor([1.0, wrong]))
+    assert same(before, sampler.state_dict())
+
+
+@pytest.mark.parametrize("slot", [4, 7, -2])
+def test_a_slot_outside_the_buffer_is_refused(slot):
+    sampler = TreeSampler(4, 0.6, 0.4)
+    filled(sampler, 4, 4)
+    before = sampler.state_dict()
+    with pytest.raises(IndexError, match=rf"index must be in \[0, 4\), got {slot}"):
+        sampler.update_priority(torch.tensor([0, slot]), torch.tensor([1.0, 2.0]))
+    with pytest.raises(IndexError, match=rf"index must be in \[0, 4\), got {slot}"):
+        sampler.mark_update(torch.tensor([slot]))
+    assert same(before, sampler.state_dict())
+
+
+def test_priorities_that_do_not_fit_the_slots_are_refused():
+    sampler = TreeSampler(4, 0.6, 0.4)
+    with pytest.raises(RuntimeError, match="priority should be a number or an iterable"):
+        sampler.update_priority(torch.arange(3), torch.ones(2))
+    with pytest.raises(RuntimeError, match="index must have one dimension"):
+        sampler.update_priority(torch.zeros(2, 2, dtype=torch.long), torch.ones(2))
+
+
+def test_an_empty_buffer_and_priorities_of_zero_cannot_be_sampled():
+    sampler = TreeSampler(4, 1.0, 0.4, 0.0)
+    with pytest.raises(RuntimeError, match="cannot sample from an empty buffer"):
+        sampler.sample(LazyTensorStorage(4), 2)
+    storage = filled(sampler, 2, 4)
+    sampler.update_priority(torch.arange(2), 0.0)
+    with pytest.raises(RuntimeError, match=r"every priority must be positive.* sum of 0.0"):
+        sampler.sample(storage, 2)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("max_capacity", 0), ("alpha", -1.0), ("beta", math.nan), ("eps", math.inf)],
+)
+def test_arguments_out_of_range_are_refused(argument, value):
+    arguments = {"max_capacity": 4, "alpha": 0.6, "beta": 0.4, argument: value}
+    with pytest.raises(ValueError, match=f"{argument} must be .*got {value}"):
+        TreeSampler(**arguments)
+
+
+def test_a_batch_of_one_can_be_drawn_from_a_buffer_of_one():
+    # The tree gives a bare number for one slot, which has no pow.
+    sampler = TreeSampler(1, 0.6, 0.4)
+    index, info = sampler.sample(filled(sampler, 1, 1), 1)
+    assert index.tolist() == [0]
+    assert info["priority_weight"].tolist() == [1.0]
+
+
+def test_without_a_generator_of_the_buffer_draws_follow_the_global_seed():
+    drawn = []
+    for _ in range(2):
+        torch.manual_seed(5)
+        sampler = TreeSampler(50, 0.6, 0.4)
+        drawn.append(sampler.sample(filled(sampler, 50, 50), 20)[0])
+    assert drawn[0].equal(drawn[1])
+    assert not sampler.sample(filled(sampler, 50, 50), 20)[0].equal(drawn[0])
+
+
+def test_a_new_buffer_over_a_filled_storage_can_be_sampled():
+    storage = LazyTensorStorage(8)
+    ReplayBuffer(storage=storage, batch_size=2).extend(torch.arange(6))
+    buffer = ReplayBuffer(storage=storage, sampler=TreeSampler(8, 0.6, 0.4), batch_size=32)
+    assert set(buffer.sample().tolist()) <= set(range(6))
+
+
+def test_a_saved_sampler_goes_on_as_if_nothing_had_happened(tmp_path):
+    first = TreeSampler(10, 0.6, 0.4, 0.05)
+    storage = filled(first, 7, 10)
+    first.update_priority(torch.arange(5), torch.rand(5, generator=seeded(4)) * 4)
+    first.dumps(tmp_path)
+    by_file, by_state = TreeSampler(10, 1.0, 1.0), TreeSampler(10, 1.0, 1.0)
+    by_file.loads(tmp_path)
+    by_state.load_state_dict(first.state_dict())
+    for sampler in (first, by_file, by_state):
+        sampler._rng = seeded(5)
+    index, info = first.sample(storage, 50)
+    for sampler in (by_file, by_state):
+        again, weights = sampler.sample(storage, 50)
+        assert again.equal(index)
+        assert weights["priority_weight"].equal(info["priority_weight"])
+        assert same(sampler.state_dict(), first.state_dict())
+        assert sampler.default_priority == first.default_priority
+        assert (sampler.alpha, sampler.beta) == (0.6, 0.4)
+
+
+def test_a_saved_sampler_of_another_capacity_or_format_is_refused_and_changes_nothing():
+    first, other = TreeSampler(10, 0.6, 0.4), TreeSampler(20, 0.6, 0.4)
+    filled(other, 5, 20)
+    before = other.state_dict()
+    with pytest.raises(ValueError, match="max_capacity of the saved sampler is 10, of this one 20"):
+        other.load_state_dict(first.state_dict())
+    wrong = {**other.state_dict(), "_format": 99}
+    with pytest.raises(ValueError, match="format of the saved sampler is 99"):
+        other.load_state_dict(wrong)
+    with pytest.raises(ValueError, match="format of the saved sampler is None"):
+        other.load_state_dict(PrioritizedSampler(20, 0.6, 0.4).state_dict())
+    assert same(before, other.state_dict())
+
+
+def test_transitions_may_be_plain_tensor_dicts_in_a_buffer_of_torchrl():
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=TreeSampler(8, 0.6, 0.4), batch_size=4
+    )
+    buffer.extend(make_transitions(12))
+    batch, info = buffer.sample(return_info=True)
+    assert set(info) >= {"index", "priority_weight"}
+    assert batch["observation"].min() >= 4

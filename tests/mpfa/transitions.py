@@ -1,0 +1,81 @@
+"""Transitions and buffers that the tests of the replay parts share."""
+
+from copy import deepcopy
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+
+
+def seeded(seed=0):
+    """A generator of its own."""
+    return torch.Generator().manual_seed(seed)
+
+
+def make_transitions(count, *, seed=0, first=0, rewards=None):
+    """Transitions whose observation is their number, so that a row can be told from another."""
+    if rewards is None:
+        rewards = torch.randn(count, generator=seeded(seed))
+    number = torch.arange(first, first + count, dtype=torch.float32)
+    return TensorDict(
+        {
+            "observation": number.unsqueeze(1),
+            "next": {"reward": torch.as_tensor(rewards, dtype=torch.float32).reshape(-1, 1)},
+        },
+        [count],
+    )
+
+
+def make_buffer(capacity=16, batch_size=4, *, seed=0, storage=None, **kwargs):
+    """A buffer with the paper's sampler and a generator of its own."""
+    return SignalReplayBuffer(
+        storage=SignalTensorStorage(capacity) if storage is None else storage,
+        sampler=MPFASampler(capacity, **kwargs),
+        batch_size=batch_size,
+        generator=seeded(seed),
+    )
+
+
+def write_signals(batch, *, seed=0, generator=None):
+    """Write what a loss would: random absolute TD errors and gradient norms."""
+    generator = seeded(seed) if generator is None else generator
+    count = batch.batch_size[0]
+    batch["signals"] = TensorDict(
+        {
+            "td_error": torch.rand(count, generator=generator) * 3,
+            "action_gradient": torch.rand(count, generator=generator) * 2,
+        },
+        [count],
+    )
+    return batch
+
+
+def train_rounds(buffer, rounds, *, seed=0):
+    """Sample and update; give everything that was drawn."""
+    generator = seeded(seed)
+    drawn = []
+    for _ in range(rounds):
+        batch = buffer.sample()
+        drawn.append(torch.cat((batch["index"].double(), batch["priority_weight"].double())))
+        buffer.update_tensordict_priority(write_signals(batch, generator=generator))
+    return torch.stack(drawn)
+
+
+def same(first, second):
+    """Whether two states are equal, bit for bit, with NaN equal to NaN."""
+    if isinstance(first, torch.Tensor):
+        if first.shape != second.shape or first.dtype != second.dtype:
+            return False
+        return bool(((first == second) | ((first != first) & (second != second))).all())
+    if hasattr(first, "keys"):
+        keys = set(first.keys())
+        return keys == set(second.keys()) and all(same(first[k], second[k]) for k in keys)
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(same, first, second))
+    return bool(first == second)
+
+
+def snapshot(buffer):
+    """A copy of the whole state of a buffer, generator included."""
+    return deepcopy(buffer.state_dict())
