@@ -28,6 +28,8 @@ ACTION_SIZE = 2
 ALPHA = 0.6
 BETA = 0.4
 GROWTH_CAPACITIES = (10_000, 100_000, 1_000_000)
+SHORTEST_ROUND = 400
+"""Steps of a round of the growth; small buffers count their entropies several times in it."""
 _FILL_ROWS = 100_000
 
 
@@ -188,11 +190,10 @@ def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool
     times: dict[int, list[float]] = {capacity: [] for capacity in capacities}
     with one_thread():
         for step in steps.values():
-            seconds_per_call(step, 50)
-        for _ in range(1 if quick else 5):
+            seconds_per_call(step, 20)
+        for _ in range(1 if quick else 3):
             for capacity, step in steps.items():
-                # Small buffers count often: several of their periods make a round.
-                count = periods[capacity] * max(1, 400 // periods[capacity])
+                count = periods[capacity] * max(1, SHORTEST_ROUND // periods[capacity])
                 times[capacity].append(seconds_per_call(step, count))
     timings = {capacity: Timing(tuple(found)) for capacity, found in times.items()}
     entries = []
@@ -222,20 +223,3 @@ def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool
 def _power_of_ten(capacity: int) -> str:
     mantissa, exponent = f"{capacity:e}".split("e")
     return f"{float(mantissa):g}e{int(exponent)}"
-
-
-def measure(*, quick: bool) -> list[Entry]:
-    """All of this file.
-
-    Args:
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        The entries.
-    """
-    return [
-        *measure_sample_update("sample_update_1e5", capacity=100_000, quick=quick),
-        *measure_sample_update("sample_update_1e6", capacity=1_000_000, quick=quick),
-        *measure_extend_one(quick=quick),
-        *measure_growth(quick=quick),
-    ]

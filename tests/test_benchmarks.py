@@ -1,0 +1,112 @@
+"""The benchmarks in miniature: what they report, not how fast anything is."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from benchmarks import replay, run, timing
+from benchmarks.timing import Entry, Timing, entry
+
+
+def check_schema(entries: Sequence[Entry]) -> None:
+    for found in entries:
+        assert list(found) == ["name", "value", "unit", "ratio", "baseline"]
+        assert math.isfinite(found["value"]) and found["value"] > 0
+        assert found["unit"]
+        assert (found["ratio"] is None) == (found["baseline"] is None)
+        assert found["ratio"] is None or (math.isfinite(found["ratio"]) and found["ratio"] > 0)
+    names = [found["name"] for found in entries]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("measure", [replay.measure_sample_update, replay.measure_extend_one])
+def test_replay_is_compared_with_that_of_torchrl(measure) -> None:
+    stock, ours = measure("small", capacity=512, quick=True)
+    check_schema([stock, ours])
+    assert ours["name"] == "small"
+    assert ours["baseline"] == stock["name"] == "small_torchrl"
+    assert stock["ratio"] is None
+
+
+def test_growth_is_the_time_of_the_largest_buffer_over_that_of_the_smallest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(replay, "SHORTEST_ROUND", 20)
+    *sizes, growth = replay.measure_growth(capacities=(512, 4096), quick=True)
+    check_schema([*sizes, growth])
+    assert [found["name"] for found in sizes] == ["step_at_5.12e2", "step_at_4.096e3"]
+    assert growth["value"] == pytest.approx(sizes[1]["value"] / sizes[0]["value"])
+    assert growth["ratio"] == pytest.approx(growth["value"] / (12 / 9))
+
+
+def test_each_round_of_the_growth_counts_the_entropies(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: list[int] = []
+    weights = replay.MPFASampler(4).fusion.weights
+
+    def count(self, names, table, index):
+        counted.append(table.size)
+        return weights(names, table, index)
+
+    monkeypatch.setattr("torchrl_mpfa.EntropyFusion.weights", count)
+    monkeypatch.setattr(replay, "SHORTEST_ROUND", 20)
+    replay.measure_growth(capacities=(512, 16_384), quick=True)
+    assert counted.count(16_384) >= 2  # The first one, and at least one in the round.
+
+
+def test_the_run_prints_a_table_and_writes_what_it_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "latest.json"
+    assert run.main(["--quick", "--only", "loss", "--output", str(path)]) == 0
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    check_schema(entries)
+    assert [found["name"] for found in entries] == ["loss_torchrl", "loss"]
+    assert [file.name for file in tmp_path.iterdir()] == ["latest.json"]
+    table = capsys.readouterr().out.splitlines()
+    assert sum("loss_torchrl" in line for line in table) == 2  # Its row, and the baseline of ours.
+
+
+def test_check_fails_if_a_ratio_is_above_its_target(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ratio = run.TARGETS["loss"]
+
+    def measure(*, quick: bool) -> list[Entry]:
+        return [entry("loss", 1.0, "us", ratio=ratio, baseline="other")]
+
+    monkeypatch.setattr(run, "BENCHMARKS", {"loss": measure})
+    arguments = ["--check", "--output", str(tmp_path / "latest.json")]
+    assert run.main(arguments) == 0
+    ratio += 0.01
+    assert run.main(arguments) == 1
+    assert run.main(arguments[1:]) == 0
+    assert "loss: ratio 1.16 is above its target 1.15" in capsys.readouterr().err
+
+
+def test_every_target_belongs_to_a_benchmark() -> None:
+    assert set(run.TARGETS) <= set(run.BENCHMARKS)
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "latest.json"
+    run.write_atomically([entry("a", 1.0, "us")], path)
+    before = path.read_text(encoding="utf-8")
+    with pytest.raises(TypeError):
+        run.write_atomically([entry("a", object(), "us")], path)  # type: ignore[arg-type]
+    assert path.read_text(encoding="utf-8") == before
+    assert [file.name for file in tmp_path.iterdir()] == ["latest.json"]
+
+
+def test_calls_take_turns_and_a_ratio_is_the_median_of_the_rounds() -> None:
+    calls: list[str] = []
+    timing.take_turns(
+        {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, rounds=3, seconds=1e-9
+    )
+    assert calls[-6:] == ["a", "b", "b", "a", "a", "b"]
+    slow, fast = Timing((2.0, 9.0, 4.0)), Timing((1.0, 3.0, 2.0))
+    assert (slow.median, slow.minimum, slow.ratio(fast)) == (4.0, 2.0, 2.0)

@@ -1,0 +1,184 @@
+"""The Makefile, run in a copy with interpreters that only pretend: nothing is installed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+MAKE = shutil.which("make")
+pytestmark = pytest.mark.skipif(MAKE is None, reason="make is not installed")
+
+# Answers as Python does to what the Makefile asks of it, and writes down what pip is told.
+PRETENDER = """#!/bin/sh
+case "$*" in
+  *base_prefix*) echo /somewhere ;;
+  "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
+  "-m pip install"*) echo "$*" >> pip.log; [ ! -e no_network ] ;;
+esac
+"""
+SHIM_THAT_FAILS = "#!/bin/sh\necho 'pyenv: python: command not found' >&2\nexit 127\n"
+TOO_NEW = "#!/bin/sh\nexit 1\n"
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    folder = tmp_path / "copy"
+    (folder / "bin").mkdir(parents=True)
+    for name in ("Makefile", "pyproject.toml"):
+        shutil.copy(ROOT / name, folder)
+    for tool in ("sh", "rm", "mkdir", "cp", "touch", "sed", "cat"):
+        found = shutil.which(tool)
+        assert found is not None
+        (folder / "bin" / tool).symlink_to(found)
+    return folder
+
+
+@pytest.fixture
+def installed(copy: Path) -> Path:
+    add_program(copy / ".venv" / "bin" / "python", PRETENDER)
+    (copy / ".venv" / ".installed").touch()
+    return copy
+
+
+def add_program(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    path.chmod(0o755)
+
+
+def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    # These tests may themselves run under make, which hands its flags on.
+    dropped = ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHON", "ARGS", "SLOW", "EPISODES")
+    environment = {k: v for k, v in os.environ.items() if k not in dropped}
+    environment["PATH"] = str(folder / "bin")
+    assert MAKE is not None
+    return subprocess.run(
+        [MAKE, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def pip_calls(folder: Path) -> list[str]:
+    log = folder / "pip.log"
+    return log.read_text(encoding="utf-8").splitlines() if log.exists() else []
+
+
+def test_make_alone_lists_the_targets(copy: Path) -> None:
+    done = make(copy)
+    assert done.returncode == 0
+    targets = [line.split()[0] for line in done.stdout.splitlines() if line.startswith("  ")]
+    assert targets == [
+        "help", "demo", "train", "test", "check", "format", "bench", "wheel-test", "clean",
+    ]  # fmt: skip
+    assert not (copy / ".venv").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "commands"),
+    [
+        (
+            ["demo"],
+            [
+                "python examples/train.py run_dir=runs/demo overwrite=true",
+                "[{world: A, episodes: 100}]",
+                "python examples/evaluate.py runs/demo --world A --episodes 100",
+            ],
+        ),
+        (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--world A --episodes 2"]),
+        (
+            ["train", "ARGS=replay=per seed=1"],
+            ["python examples/train.py curriculum=paper replay=per seed=1"],
+        ),
+        (["test"], ["python -m pytest"]),
+        (["test", "SLOW=1"], ["python -m pytest -m 'slow or not slow'"]),
+        (
+            ["check"],
+            ["ruff format --check .", "ruff check .", "mypy", "--doctest-modules"],
+        ),
+        (["bench", "ARGS=--quick"], ["python benchmarks/run.py --quick"]),
+        (["wheel-test"], ["python .ci/wheel_test.py"]),
+    ],
+)
+def test_each_target_runs_its_commands_and_installs_nothing_twice(
+    installed: Path, arguments: list[str], commands: list[str]
+) -> None:
+    done = make(installed, "-n", *arguments)
+    assert done.returncode == 0, done.stderr
+    assert "pip install" not in done.stdout
+    places = [done.stdout.find(command) for command in commands]
+    assert -1 not in places, done.stdout
+    assert places == sorted(places)
+
+
+def test_the_tests_run_once_when_checks_and_tests_are_asked_for(installed: Path) -> None:
+    lines = make(installed, "-n", "check", "test").stdout.splitlines()
+    assert [line.strip().endswith("-m pytest") for line in lines].count(True) == 1
+
+
+@pytest.mark.parametrize("program", [SHIM_THAT_FAILS, TOO_NEW])
+def test_a_given_python_that_does_not_fit_is_refused_in_one_line(copy: Path, program: str) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    add_program(copy / "python", program)
+    done = make(copy, "PYTHON=./python", "demo")
+    assert done.returncode != 0
+    line, *rest = done.stderr.splitlines()
+    assert "PYTHON=./python is not a Python 3.10 or 3.11" in line
+    assert "make PYTHON=/path/to/python3.11 demo" in line
+    assert all("Error" in other for other in rest), done.stderr  # That make stops, no more.
+    assert pip_calls(copy) == []
+
+
+def test_without_a_python_that_fits_one_line_says_the_way_out(copy: Path) -> None:
+    for name, program in (("python3.11", SHIM_THAT_FAILS), ("python3", TOO_NEW)):
+        add_program(copy / "bin" / name, program)
+    done = make(copy, "test")
+    assert done.returncode != 0
+    line, *rest = done.stderr.splitlines()
+    assert "no Python 3.10 or 3.11 found" in line
+    assert "make PYTHON=/path/to/python3.11 test" in line
+    assert all("Error" in other for other in rest), done.stderr
+
+
+def test_a_shim_that_fails_is_passed_over(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", SHIM_THAT_FAILS)
+    add_program(copy / "bin" / "python3", PRETENDER)
+    done = make(copy, "bench")
+    assert done.returncode == 0, done.stderr
+    assert "making .venv with python3\n" in done.stdout
+
+
+def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    assert make(copy, "-q", ".venv/.installed").returncode == 1
+    assert make(copy, "test").returncode == 0
+    assert pip_calls(copy) == ["-m pip install -e .[dev]"]
+    assert make(copy, "test").returncode == 0
+    assert make(copy, "-q", ".venv/.installed").returncode == 0
+    assert len(pip_calls(copy)) == 1
+
+    stamp = (copy / ".venv" / ".installed").stat().st_mtime
+    os.utime(copy / "pyproject.toml", (stamp + 10, stamp + 10))
+    done = make(copy, "test")
+    assert done.returncode == 0
+    assert len(pip_calls(copy)) == 2
+    assert "making .venv" not in done.stdout  # The environment itself is kept.
+
+
+def test_an_install_that_failed_is_made_again(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    (copy / "no_network").touch()
+    assert make(copy, "test").returncode != 0
+    assert not (copy / ".venv" / ".installed").exists()
+    (copy / "no_network").unlink()
+    assert make(copy, "test").returncode == 0
+    assert len(pip_calls(copy)) == 2
+
+
+def test_another_build_of_torch_is_installed_before_the_project(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    assert make(copy, "test", "TORCH_INSTALL_ARGS=./torch-cpu.whl").returncode == 0
+    assert pip_calls(copy) == ["-m pip install ./torch-cpu.whl", "-m pip install -e .[dev]"]
