@@ -159,7 +159,7 @@ class SignalDDPGLoss(DDPGLoss):
             value = self._critic(inputs)
         if with_gradient:
             gradient = (
-                _action_gradient(value, action) if at_stored else self._policy_gradient(inputs)
+                _action_gradient(value, action) if at_stored else self._policy_gradient(tensordict)
             )
             size = action_gradient_priority(gradient, order=self.gradient_order)
             tensordict.set(keys.action_gradient_signal, size / self.reward_scale)
@@ -229,8 +229,8 @@ class SignalDDPGLoss(DDPGLoss):
                 actor=_with(self.actor_network, actor),
                 critic=_with(self.value_network, critic),
                 frozen_critic=_with(self.value_network, critic.detach()).requires_grad_(False),
-                target_actor=_with(self.actor_network, target_actor),
-                target_critic=_with(self.value_network, target_critic),
+                target_actor=_with(self.actor_network, target_actor).requires_grad_(False),
+                target_critic=_with(self.value_network, target_critic).requires_grad_(False),
             )
         return self._bound
 
@@ -248,9 +248,11 @@ class SignalDDPGLoss(DDPGLoss):
         value: Tensor = out.get(self.tensor_keys.state_action_value).squeeze(-1)
         return value
 
-    def _policy_gradient(self, inputs: TensorDictBase) -> Tensor:
+    def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
-        inputs = inputs.copy()
+        inputs = tensordict.select(
+            *self.actor_in_keys, *self.value_exclusive_keys, strict=False
+        ).detach()
         with torch.no_grad():
             self._networks().actor(inputs)
         action = inputs.get(self.tensor_keys.action).requires_grad_(True)
@@ -342,7 +344,9 @@ def _action_gradient(value: Tensor, action: Tensor) -> Tensor:
     The gradient of the sum has them all at once, as no transition enters another one's value;
     layers that mix a batch (batch normalization) would break that.
     """
-    (gradient,) = torch.autograd.grad(value.sum(), action, retain_graph=True)
+    (gradient,) = torch.autograd.grad(
+        value, action, grad_outputs=torch.ones_like(value), retain_graph=True
+    )
     return gradient.detach()
 
 
