@@ -132,9 +132,9 @@ def test_factors_that_are_not_positive_are_refused(value):
 
 
 def test_unknown_words_are_refused():
-    with pytest.raises(ValueError, match="bound must be .*got 'wall'"):
+    with pytest.raises(ValueError, match=r"bound must be .*got 'wall'"):
         PositiveBoost(bound="wall")
-    with pytest.raises(ValueError, match="position must be .*got 'front'"):
+    with pytest.raises(ValueError, match=r"position must be .*got 'front'"):
         PositiveDecay(position="front")
 
 

@@ -116,7 +116,7 @@ def test_an_own_learned_signal_that_is_missing_is_named():
 
 
 def test_transitions_without_an_own_signal_are_refused():
-    with pytest.raises(KeyError, match="the transitions lack 'surprise': .* at 'surprise'"):
+    with pytest.raises(KeyError, match=r"the transitions lack 'surprise': .* at 'surprise'"):
         make_own_buffer().extend(make_transitions(4))
 
 

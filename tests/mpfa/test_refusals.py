@@ -139,12 +139,12 @@ def test_a_priority_of_ones_own_that_is_refused_leaves_the_transitions_written(b
 
 
 def test_capacities_of_sampler_and_storage_must_agree():
-    with pytest.raises(ValueError, match="max_capacity of the sampler is 8, max_size .* 16"):
+    with pytest.raises(ValueError, match=r"max_capacity of the sampler is 8, max_size .* 16"):
         SignalReplayBuffer(storage=SignalTensorStorage(16), sampler=MPFASampler(8), batch_size=4)
 
 
 def test_a_storage_without_signals_is_refused():
-    with pytest.raises(TypeError, match="storage must keep signals .*got LazyTensorStorage"):
+    with pytest.raises(TypeError, match=r"storage must keep signals .*got LazyTensorStorage"):
         SignalReplayBuffer(storage=LazyTensorStorage(8), sampler=MPFASampler(8), batch_size=4)
 
 

@@ -253,7 +253,7 @@ def test_with_any_other_sampler_it_is_torchrls_buffer(make_sampler, make_storage
     assert batch["index"].max() < 11
     assert "stale_updates" in buffer.stats()
     if hasattr(buffer.sampler, "_sum_tree"):
-        last = {int(slot): float(td) for slot, td in zip(batch["index"], torch.arange(8.0))}
+        last = {int(slot): float(td) for td, slot in enumerate(batch["index"])}
         for slot, td_error in last.items():
             assert float(buffer.sampler._sum_tree[slot]) == pytest.approx((td_error + 0.05) ** 0.6)
 

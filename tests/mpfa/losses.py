@@ -1,0 +1,50 @@
+"""Small networks, batches and losses that the tests of loss and learner share."""
+
+import torch
+from tensordict import TensorDict
+from transitions import seeded
+
+from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
+
+GAMMA = 0.9
+
+
+def make_networks(seed=0, **kwargs):
+    """An actor and a critic that start far from zero, so that gradients are not tiny."""
+    torch.manual_seed(seed)
+    arguments = {"width": 16, "final_init": 0.5, **kwargs}
+    return make_actor(5, 2, **arguments), make_critic(5, 2, **arguments)
+
+
+def make_loss(seed=0, **kwargs):
+    return make_ddpg_loss(*make_networks(seed), gamma=GAMMA, **kwargs)
+
+
+def make_batch(count=6, *, seed=0, weighted=False):
+    """Transitions of which the second ended and the third was cut by a time limit."""
+    generator = seeded(seed)
+    terminated = torch.zeros(count, 1, dtype=torch.bool)
+    truncated = torch.zeros(count, 1, dtype=torch.bool)
+    terminated[1], truncated[2] = True, True
+    batch = TensorDict(
+        {
+            "observation": torch.randn(count, 5, generator=generator),
+            "action": torch.rand(count, 2, generator=generator) * 2 - 1,
+            "next": {
+                "observation": torch.randn(count, 5, generator=generator),
+                "reward": torch.randn(count, 1, generator=generator),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
+        },
+        [count],
+    )
+    if weighted:
+        batch["priority_weight"] = torch.rand(count, generator=generator) + 0.1
+    return batch
+
+
+def parameter_gradients(loss):
+    """Gradients by parameter name, of those parameters that have one."""
+    return {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}
