@@ -1,0 +1,190 @@
+"""The training script: resuming, stopping, refusing; every part of it on tiny runs."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.data import RandomSampler
+
+from records import draw_learning_curve, load_policy
+from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
+from torchrl_mpfa import SignalSampler, save_atomically
+from training import CHECKPOINT, TrainingRun, read_checkpoint
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+# Two maps, so that a change of map lies between the checkpoints too.
+STAGES = [Stage("A", 3), Stage("B", 3)]
+
+
+def tiny(replay: str = "mpfa", episodes: list[Stage] | None = None) -> TrainSettings:
+    settings = TrainSettings(
+        replay=GROUPS["replay"][replay](),
+        curriculum=Curriculum("tiny", episodes or STAGES),
+        environment=Environment(physics="kinematic", max_steps=25),
+        checkpoint_every=1000,
+        seed=3,
+    )
+    settings.replay.capacity, settings.replay.batch_size = 100, 16
+    settings.learner.width = 16
+    settings.exploration.random_steps = 20
+    settings.exploration.annealing_steps = 60
+    settings.tracking.mode = "off"
+    return settings
+
+
+def rows(run: TrainingRun) -> list[dict[str, object]]:
+    return [{k: v for k, v in asdict(r).items() if k != "seconds"} for r in run.records]
+
+
+def train(folder: Path, settings: TrainSettings) -> TrainingRun:
+    folder.mkdir(parents=True, exist_ok=True)
+    run = TrainingRun(settings, folder)
+    run.train()
+    run.close()
+    return run
+
+
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", tiny())
+    part = TrainingRun(tiny(), tmp_path)
+    part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 3))
+    part.close()
+    assert part.episode == 4
+
+    resumed = TrainingRun(tiny(), tmp_path)
+    resumed.load(read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+
+    assert rows(resumed) == rows(whole)
+    for mine, other in zip(
+        resumed.learner.loss.state_dict().values(),
+        whole.learner.loss.state_dict().values(),
+        strict=True,
+    ):
+        assert torch.equal(mine, other)
+    mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()
+    assert torch.equal(mine["_rng"][0], other["_rng"][0])
+    assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
+    signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
+    # NaN marks what is not known yet.
+    torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
+    first, again = train(tmp_path / "a", tiny()), train(tmp_path / "b", tiny())
+    other = tiny()
+    other.seed = 4
+    assert rows(first) == rows(again)
+    assert rows(first) != rows(train(tmp_path / "c", other))
+
+
+@pytest.mark.parametrize("replay", sorted(GROUPS["replay"]))
+def test_every_replay_trains_and_uses_its_own_signals(tmp_path: Path, replay: str) -> None:
+    settings = tiny(replay)
+    run = train(tmp_path, settings)
+    assert run.step > settings.replay.batch_size
+    assert all(math.isfinite(record.reward) for record in run.records)
+    if replay == "uniform":
+        assert isinstance(run.buffer.sampler, RandomSampler)
+    else:
+        assert isinstance(run.buffer.sampler, SignalSampler)
+        assert sorted(run.buffer.sampler.weights) == sorted(settings.replay.signals)
+        assert run.buffer.sampler.beta == settings.replay.beta_end
+
+
+def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
+    run = train(tmp_path, tiny())
+    assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
+    assert all(r.success + r.collision + r.time_out == 1 for r in run.records)
+    assert sum(r.steps for r in run.records) == run.step == run.records[-1].total_steps
+    assert (tmp_path / "episodes.csv").read_text().count("\n") == 1 + len(run.records)
+
+
+def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path) -> None:
+    run = train(tmp_path, tiny())
+    policy, state = load_policy(tmp_path)
+    observation = torch.rand(5, 24)
+    trained = run.learner.policy.module(observation)[-1]
+    assert torch.equal(policy.module(observation)[-1], trained)
+    assert state["trained"]["episodes"] == 6
+
+
+def test_a_policy_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    save_atomically({"format": 99}, tmp_path / "policy.pt")
+    with pytest.raises(ValueError, match=r"no policy of format 1"):
+        load_policy(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"train\.py writes policy\.pt"):
+        load_policy(tmp_path / "elsewhere")
+
+
+def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
+    save_atomically({"format": 99}, tmp_path / CHECKPOINT)
+    with pytest.raises(ValueError, match=r"format 99, this version reads 1"):
+        read_checkpoint(tmp_path)
+    with pytest.raises(FileNotFoundError, match="resume"):
+        read_checkpoint(tmp_path / "elsewhere")
+
+
+def test_the_learning_curve_is_drawn(tmp_path: Path) -> None:
+    run = train(tmp_path, tiny())
+    draw_learning_curve(run.records, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def script(folder: Path, *overrides: str) -> list[str]:
+    stages = "curriculum.stages=[{world: A, episodes: 10000}]"
+    sizes = ["replay.capacity=100", "replay.batch_size=16", "learner.width=16"]
+    return [
+        sys.executable,
+        str(EXAMPLES / "train.py"),
+        *(f"run_dir={folder}", stages, "environment.physics=kinematic", "environment.max_steps=20"),
+        *sizes,
+        *("tracking=off", "checkpoint_every=1", *overrides),
+    ]
+
+
+def start(command: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(file: Path, process: subprocess.Popen[str], seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not file.exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end, f"{file} did not appear"
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_a_killed_run_goes_on_and_ctrl_c_says_how(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    killed = start(script(folder))
+    wait_for(folder / CHECKPOINT, killed)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    episode = read_checkpoint(folder)["episode"]
+    assert episode >= 1
+
+    refused = subprocess.run(script(folder), capture_output=True, text=True, timeout=120)
+    assert refused.returncode != 0
+    assert f"go on with it by resume={folder}" in refused.stderr
+
+    (folder / "policy.pt").unlink(missing_ok=True)
+    command = [*script(tmp_path / "other"), f"resume={folder}"]
+    resumed = start(command)
+    wait_for(folder / "policy.pt", resumed)
+    resumed.send_signal(signal.SIGINT)
+    out, err = resumed.communicate(timeout=120)
+    assert resumed.returncode == 0, err
+    assert f"go on with: train.py resume={folder}" in out
+    assert read_checkpoint(folder)["episode"] > episode
