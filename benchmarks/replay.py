@@ -20,7 +20,13 @@ from benchmarks.timing import (
     report_progress,
     seconds_per_call,
 )
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import (
+    ACTION_GRADIENT,
+    TD_ERROR,
+    MPFASampler,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+)
 
 BATCH_SIZE = 256
 OBSERVATION_SIZE = 24
@@ -86,19 +92,14 @@ def _fill(buffer: TensorDictReplayBuffer, capacity: int) -> TensorDictReplayBuff
 
 
 def make_mpfa_update(buffer: SignalReplayBuffer) -> Call:
-    """One sample and one update of priorities; the loss's signals are made beforehand."""
+    """One sample and one update of priorities; signals are written as the loss writes them."""
     generator = torch.Generator().manual_seed(1)
-    signals = TensorDict(
-        {
-            name: torch.rand(BATCH_SIZE, generator=generator)
-            for name in ("td_error", "action_gradient")
-        },
-        [BATCH_SIZE],
-    )
+    td_error, action_gradient = torch.rand(2, BATCH_SIZE, generator=generator).unbind()
 
     def update() -> None:
         batch = buffer.sample()
-        batch.set("signals", signals)
+        batch.set(TD_ERROR.key, td_error)
+        batch.set(ACTION_GRADIENT.key, action_gradient)
         buffer.update_tensordict_priority(batch)
 
     return update
