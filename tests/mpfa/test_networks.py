@@ -1,0 +1,94 @@
+"""Actor and critic: shapes, options, and the start near the middle of the tanh."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from transitions import seeded
+
+from torchrl_mpfa import make_actor, make_critic
+
+
+def count(module, kind):
+    return sum(isinstance(part, kind) for part in module.modules())
+
+
+@pytest.mark.parametrize("batch_size", [[], [5], [3, 4]])
+def test_shapes_follow_the_batch(batch_size):
+    data = TensorDict({"observation": torch.zeros(*batch_size, 7)}, batch_size)
+    make_actor(7, 3)(data)
+    make_critic(7, 3)(data)
+    assert data["preactivation"].shape == data["action"].shape == (*batch_size, 3)
+    assert data["state_action_value"].shape == (*batch_size, 1)
+
+
+def test_the_action_is_the_tanh_of_the_preactivation():
+    observation = torch.randn(50, 7, generator=seeded()) * 20
+    before, action = make_actor(7, 2, final_init=None).module(observation)
+    assert action.equal(torch.tanh(before))
+    assert action.abs().max() <= 1
+
+
+def test_last_layers_start_near_zero_and_hence_actions_near_the_middle():
+    observation = torch.randn(50, 7, generator=seeded())
+    actor, critic = make_actor(7, 2, width=32), make_critic(7, 2, width=32)
+    last = actor.module.head, critic.module.rest[-1]
+    for layer in last:
+        assert layer.weight.abs().max() <= 3e-3
+        assert layer.bias.abs().max() <= 3e-3
+        assert layer.weight.abs().max() > 1e-3
+    before, action = actor.module(observation)
+    assert before.abs().max() < 0.2
+    assert critic.module(observation, action).abs().max() < 0.2
+    wide = make_actor(7, 2, width=32, final_init=None).module.head
+    assert wide.weight.abs().max() > 0.05
+
+
+@pytest.mark.parametrize("layers", [2, 3, 4])
+def test_the_number_of_hidden_layers_and_units_is_as_asked(layers):
+    for module in (
+        make_actor(7, 2, width=9, layers=layers),
+        make_critic(7, 2, width=9, layers=layers),
+    ):
+        linear = [part for part in module.modules() if isinstance(part, nn.Linear)]
+        assert len(linear) == layers + 1
+        assert [layer.out_features for layer in linear[:-1]] == [9] * layers
+        assert count(module, nn.LayerNorm) == layers
+
+
+def test_the_plain_variant_is_a_bare_perceptron_that_reads_the_action_first():
+    plain = {"layer_norm": False, "final_init": None}
+    actor, critic = make_actor(7, 2, **plain), make_critic(7, 2, late_action=False, **plain)
+    assert count(actor, nn.LayerNorm) == count(critic, nn.LayerNorm) == 0
+    assert critic.module.first[0].in_features == 9
+    assert critic.module.rest[0][0].in_features == 256
+    one_layer = make_critic(7, 2, layers=1, late_action=False, **plain)
+    assert count(one_layer, nn.Linear) == 2
+
+
+def test_a_late_action_joins_at_the_second_layer():
+    critic = make_critic(7, 2, width=11).module
+    assert critic.first[0].in_features == 7
+    assert critic.rest[0][0].in_features == 13
+
+
+@pytest.mark.parametrize("late_action", [True, False])
+def test_the_value_depends_on_observation_and_action(late_action):
+    critic = make_critic(7, 2, late_action=late_action, final_init=None).module
+    observation, action = torch.randn(4, 7, generator=seeded()), torch.zeros(4, 2)
+    value = critic(observation, action)
+    assert not critic(observation, action + 1).equal(value)
+    assert not critic(observation + 1, action).equal(value)
+
+
+@pytest.mark.parametrize("argument", ["observation_size", "action_size", "width", "layers"])
+def test_sizes_below_one_are_refused(argument):
+    sizes = {"observation_size": 3, "action_size": 2, argument: 0}
+    for make in (make_actor, make_critic):
+        with pytest.raises(ValueError, match=f"{argument} must be at least 1, got 0"):
+            make(**sizes)
+
+
+def test_a_late_action_needs_a_second_layer():
+    with pytest.raises(ValueError, match="layers must be at least 2 with late_action, got 1"):
+        make_critic(3, 2, layers=1)

@@ -1,0 +1,130 @@
+"""Each entry of the statistics against a plain computation."""
+
+import math
+
+import oracles
+import pytest
+import torch
+from transitions import make_buffer, make_transitions, train_rounds, write_signals
+
+from torchrl_mpfa import FixedFusion
+from torchrl_mpfa.statistics import effective_sample_size, signal_shares
+
+NAMES = ["td_error", "action_gradient", "reward"]
+
+
+@pytest.fixture
+def trained():
+    """A wrapped buffer after some rounds, with a last batch that was sampled and updated."""
+    buffer = make_buffer(24, 12, entropy_refresh=0)
+    buffer.extend(make_transitions(30))
+    train_rounds(buffer, 5)
+    batch = write_signals(buffer.sample())
+    buffer.update_tensordict_priority(batch)
+    return buffer, batch
+
+
+def test_effective_sample_size_of_hand_numbers():
+    assert effective_sample_size(torch.ones(7)) == pytest.approx(7.0)
+    assert effective_sample_size(torch.tensor([1.0, 0.0, 0.0])) == pytest.approx(1.0)
+    # (1 + 2 + 3)^2 / (1 + 4 + 9)
+    assert effective_sample_size(torch.tensor([1.0, 2.0, 3.0])) == pytest.approx(36 / 14)
+
+
+def test_shares_of_hand_numbers():
+    # Means 2 and 4, weights 0.75 and 0.25: parts 1.5 and 1.
+    found = signal_shares(torch.tensor([[1.0, 8.0], [3.0, 0.0]]), torch.tensor([0.75, 0.25]))
+    assert found.tolist() == pytest.approx([0.6, 0.4])
+    assert signal_shares(torch.zeros(3, 2), torch.ones(2)).tolist() == [0.5, 0.5]
+
+
+def test_weights_and_entropies_are_those_of_the_whole_buffer(trained):
+    buffer, _ = trained
+    rewards = buffer[:]["next", "reward"].squeeze(1).tolist()
+    of_reward = oracles.entropy_of_reward(rewards)
+    of_positive = oracles.entropy_of_positive(rewards)
+    a, beta, nu = oracles.fusion_weights(of_reward, of_positive, of_positive)
+    stats = buffer.stats()
+    for name, entropy, weight in zip(
+        NAMES, (of_positive, of_positive, of_reward), (beta, nu, a), strict=True
+    ):
+        assert stats[f"entropy/{name}"] == pytest.approx(entropy)
+        assert stats[f"weight/{name}"] == pytest.approx(weight, rel=1e-5)
+
+
+def test_shares_are_of_the_last_batch_after_its_update(trained):
+    buffer, batch = trained
+    stats = buffer.stats()
+    table = buffer.storage.signal_table
+    parts = []
+    for name in NAMES:
+        values = table.rows[batch["index"], table.column[name]].tolist()
+        parts.append(stats[f"weight/{name}"] * sum(values) / len(values))
+    for name, part in zip(NAMES, parts, strict=True):
+        assert stats[f"share/{name}"] == pytest.approx(part / sum(parts))
+    assert sum(stats[f"share/{name}"] for name in NAMES) == pytest.approx(1.0)
+
+
+def test_fractions_of_positive_transitions(trained):
+    buffer, batch = trained
+    stats = buffer.stats()
+    everything = buffer[:]["next", "reward"].squeeze(1).tolist()
+    sampled = batch["next", "reward"].squeeze(1).tolist()
+    assert stats["positive_fraction_buffer"] == sum(r > 0 for r in everything) / 24
+    assert stats["positive_fraction_batch"] == sum(r > 0 for r in sampled) / 12
+
+
+def test_effective_sample_size_age_and_replays_of_the_last_batch(trained):
+    buffer, batch = trained
+    stats = buffer.stats()
+    weight = batch["priority_weight"].tolist()
+    expected = sum(weight) ** 2 / sum(w * w for w in weight)
+    assert stats["effective_sample_size"] == pytest.approx(expected, rel=1e-5)
+    # The observation is the number of the transition; the youngest is number 29.
+    ages = [29 - number for number in batch["observation"].squeeze(1).tolist()]
+    assert stats["sampled_age_mean"] == pytest.approx(sum(ages) / 12)
+    assert stats["sampled_age_max"] == max(ages)
+    table = buffer.storage.signal_table
+    counts = table.rows[batch["index"], table.count_column]
+    assert stats["replay_count_mean"] == pytest.approx(float(counts.mean()))
+    assert counts.min() >= 1
+
+
+def test_statistics_grow_with_what_is_known():
+    buffer = make_buffer(8)
+    assert not any("/" in name for name in buffer.stats())
+    buffer.extend(make_transitions(8))
+    assert "positive_fraction_buffer" in buffer.stats()
+    assert "sampled_age_mean" not in buffer.stats()
+    batch = buffer.sample()
+    stats = buffer.stats()
+    assert "entropy/reward" in stats
+    assert "share/reward" not in stats
+    buffer.update_tensordict_priority(write_signals(batch))
+    assert "share/reward" in buffer.stats()
+
+
+def test_a_fusion_without_entropies_has_none_in_the_statistics():
+    buffer = make_buffer(8, fusion=FixedFusion({"reward": 0.5, "td_error": 0.5}))
+    buffer.extend(make_transitions(8))
+    train_rounds(buffer, 1)
+    stats = buffer.stats()
+    assert not any(name.startswith("entropy/") for name in stats)
+    assert stats["weight/reward"] == 0.5
+    assert stats["weight/action_gradient"] == 0.0
+
+
+def test_every_entry_is_a_plain_finite_number(trained):
+    buffer, _ = trained
+    for name, value in buffer.sampler.stats(buffer.storage).items():
+        assert type(value) is float, name
+        assert math.isfinite(value), name
+
+
+def test_reading_statistics_changes_nothing(trained):
+    buffer, _ = trained
+    before = buffer.sampler.state_dict()["_sum_tree"].clone()
+    weighed = buffer.sampler._weighed_at
+    buffer.stats()
+    assert buffer.sampler.state_dict()["_sum_tree"].equal(before)
+    assert buffer.sampler._weighed_at == weighed

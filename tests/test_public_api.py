@@ -1,0 +1,87 @@
+"""What the package promises: its names, their docstrings, and examples that run."""
+
+import ast
+import doctest
+import importlib
+import inspect
+import pkgutil
+import re
+from pathlib import Path
+
+import pytest
+
+import torchrl_mpfa
+
+MODULES = ["torchrl_mpfa"] + [
+    f"torchrl_mpfa.{module.name}" for module in pkgutil.iter_modules(torchrl_mpfa.__path__)
+]
+NAMES = [name for name in torchrl_mpfa.__all__ if name.upper() != name]
+
+
+def test_the_list_of_public_names_is_sorted_complete_and_without_twins():
+    names = torchrl_mpfa.__all__
+    constants = [name for name in names if name.upper() == name]
+    classes = [name for name in names if name[0].isupper() and name not in constants]
+    functions = [name for name in names if name[0].islower()]
+    assert names == sorted(constants) + sorted(classes) + sorted(functions)
+    assert len(set(names)) == len(names)
+    tree = ast.parse(Path(torchrl_mpfa.__file__).read_text(encoding="utf-8"))
+    imported = {
+        alias.asname or alias.name
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert imported == set(names)
+    assert all(hasattr(torchrl_mpfa, name) for name in names)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_public_name_has_a_docstring(name):
+    thing = getattr(torchrl_mpfa, name)
+    doc = inspect.getdoc(thing)
+    assert doc
+    assert re.match(r"\S.*[.]$", doc.splitlines()[0]), doc.splitlines()[0]
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name[0].isupper()])
+def test_every_public_class_has_an_example_unless_it_is_a_bare_protocol_or_record(name):
+    thing = getattr(torchrl_mpfa, name)
+    if getattr(thing, "_is_protocol", False) or name in {"BatchFacts", "SignalTable"}:
+        return
+    assert "Examples:" in thing.__doc__
+    assert ">>>" in thing.__doc__
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_argument_of_a_public_name_is_described(name):
+    thing = getattr(torchrl_mpfa, name)
+    if getattr(thing, "_is_protocol", False):
+        return
+    described = inspect.getdoc(thing)
+    # TorchRL's metaclasses add arguments of their own to the signature of a class.
+    function = thing.__init__ if inspect.isclass(thing) else thing
+    for parameter in inspect.signature(function).parameters.values():
+        kind, word = parameter.kind, parameter.name
+        stars = {kind.VAR_POSITIONAL: r"\*", kind.VAR_KEYWORD: r"\*\*"}.get(kind, "")
+        if parameter.name in {"args", "self"}:
+            continue
+        assert re.search(rf"^ *{stars}{word}:", described, re.MULTILINE), f"{name}: {word}"
+
+
+# TorchRL warns at every loss whose target networks nothing moves; examples show losses alone.
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("module", MODULES)
+def test_examples_in_docstrings_run_and_give_what_they_say(module):
+    result = doctest.testmod(importlib.import_module(module), optionflags=doctest.ELLIPSIS)
+    assert result.failed == 0
+
+
+def test_there_are_examples_to_run():
+    finder = doctest.DocTestFinder()
+    found = [test for name in MODULES for test in finder.find(importlib.import_module(name))]
+    assert sum(bool(test.examples) for test in found) >= 25
+
+
+def test_the_version_is_one():
+    assert re.fullmatch(r"\d+\.\d+\.\d+([.-]?\w+)?", torchrl_mpfa.__version__)
