@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -103,15 +104,13 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
     act = greedy(policy)
     results, trajectories = run_episodes(env, act, tasks)
     summary = summarize(results)
-    print(
-        f"\n{options.policy} on map {options.world}, {len(tasks)} fixed pairs, {settings['physics']}"
-    )
+    print(f"\n{options.policy} on map {options.world}, {len(tasks)} fixed pairs")
     print_table(summary)
 
     document = {
-        **{name: interval.value for name, interval in summary.items()},
+        **{name: _plain(interval.value) for name, interval in summary.items()},
         "episodes": len(results),
-        "intervals": {name: [i.low, i.high] for name, i in summary.items()},
+        "intervals": {name: [_plain(i.low), _plain(i.high)] for name, i in summary.items()},
         "world": str(options.world),
         "seed": options.seed,
         "physics": options.physics or settings["physics"],
@@ -130,6 +129,11 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
     env.close()
     print("written: " + ", ".join(str(folder / name) for name in written))
     return summary
+
+
+def _plain(value: float) -> float | None:
+    """A mean over no episode is null: JSON has no NaN."""
+    return None if math.isnan(value) else value
 
 
 def _longest(results: list[EpisodeResult]) -> int:

@@ -79,6 +79,9 @@ class Learner:
     """Table 1."""
     critic_lr: float = 1e-4
     """Table 1."""
+    lr_end_factor: float = 0.0
+    """Learning rates fall linearly with the episodes to this fraction of their start: DDPG goes on
+    oscillating at a constant rate, and the last policy is then a matter of luck. 1: constant."""
     gamma: float = 0.99
     """Table 1."""
     tau: float = 0.01
@@ -115,6 +118,7 @@ class PlainLearner(Learner):
     layer_norm: bool = False
     late_action: bool = True
     final_init: float | None = None
+    lr_end_factor: float = 1.0
     critic_weight_decay: float = 0.0
     reward_scale: float = 1.0
     saturation_penalty: float = 0.0

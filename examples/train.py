@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,8 @@ def run(config: DictConfig) -> None:
                 "overwrite=true"
             )
     torch.set_num_threads(settings.threads)
+    # TorchRL announces each storage in the middle of the progress bar.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     training = TrainingRun(settings, folder)
     try:
         if state is not None:

@@ -136,7 +136,7 @@ class TrainingRun:
         seed = episode_seed(self.settings.seed, self.episode)
         self.env.set_seed(seed)
         torch.manual_seed(seed)
-        self._anneal_beta()
+        self._anneal()
         start, total_reward, steps = time.perf_counter(), 0.0, 0
         state = self.env.reset()
         done = False
@@ -180,13 +180,17 @@ class TrainingRun:
         if self.step % self.settings.tracking.log_every == 0:
             self.tracker.log_update(self.step, losses, self.buffer, batch)
 
-    def _anneal_beta(self) -> None:
-        """Raise the importance exponent of Eq. (10) linearly with the episodes."""
-        settings = self.settings.replay
-        if settings.signals:
+    def _anneal(self) -> None:
+        """Move what changes linearly with the episodes: beta of Eq. (10) and learning rates."""
+        settings = self.settings
+        if settings.replay.signals:
             done = self.episode / max(self.total_episodes - 1, 1)
-            beta = settings.beta + (settings.beta_end - settings.beta) * done
-            self.buffer.sampler.beta = beta
+            start, end = settings.replay.beta, settings.replay.beta_end
+            self.buffer.sampler.beta = start + (end - start) * done
+        # Counted so that the last episode still learns.
+        left = 1.0 - self.episode / self.total_episodes
+        end_factor = settings.learner.lr_end_factor
+        self.learner.anneal(end_factor + (1.0 - end_factor) * left)
 
     # Saving ----------------------------------------------------------------------------------
 

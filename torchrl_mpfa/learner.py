@@ -27,6 +27,10 @@ class Learner(Protocol):
         """Train on a batch, write the signals in it, and give values for the log."""
         ...
 
+    def anneal(self, factor: float) -> None:
+        """Set the learning rates to a fraction of their first values."""
+        ...
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next update depends on."""
         ...
@@ -74,6 +78,7 @@ class DDPGLearner:
             raise ValueError(f"critic_weight_decay must not be negative, got {critic_weight_decay}")
         if not 0 < tau <= 1:
             raise ValueError(f"tau must be in (0, 1], got {tau}")
+        self._rates = (actor_lr, critic_lr)
         self.loss = loss
         self.policy = loss.actor_network
         # TorchRL empties the modules it makes functional; the policy acts with the trained ones.
@@ -105,6 +110,20 @@ class DDPGLearner:
         self.optimizer.step()
         self.targets.step()
         return {key: value.detach() for key, value in losses.items()}
+
+    def anneal(self, factor: float) -> None:
+        """Set the learning rates to a fraction of what the constructor was given.
+
+        Args:
+            factor: The fraction, in [0, 1].
+
+        Raises:
+            ValueError: If ``factor`` is outside.
+        """
+        if not 0.0 <= factor <= 1.0:
+            raise ValueError(f"factor must be in [0, 1], got {factor}")
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate * factor
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, target networks and optimizers; tensors and plain values only."""

@@ -60,7 +60,9 @@ class SignalDDPGLoss(DDPGLoss):
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl_mpfa.networks import make_actor, make_critic
+        >>> from torchrl.objectives import SoftUpdate
         >>> loss = SignalDDPGLoss(make_actor(24, 2), make_critic(24, 2))
+        >>> targets = SoftUpdate(loss, tau=0.01)
         >>> end = torch.zeros(8, 1, dtype=torch.bool)
         >>> after = {"observation": torch.rand(8, 24), "reward": torch.rand(8, 1)}
         >>> batch = TensorDict(
