@@ -81,8 +81,6 @@ class DDPGLearner:
         self._rates = (actor_lr, critic_lr)
         self.loss = loss
         self.policy = loss.actor_network
-        # TorchRL empties the modules it makes functional; the policy acts with the trained ones.
-        loss.actor_network_params.to_module(self.policy)
         actor = list(loss.actor_network_params.flatten_keys().values())
         critic = list(loss.value_network_params.flatten_keys().values())
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)

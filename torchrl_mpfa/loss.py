@@ -241,6 +241,12 @@ class SignalDDPGLoss(DDPGLoss):
         self._bound = None
         return super()._apply(*args, **kwargs)
 
+    def train(self, mode: bool = True) -> SignalDDPGLoss:
+        """Set training mode, of the networks that the loss holds too."""
+        self._bound = None
+        super().train(mode)
+        return self
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_bound": None}
 

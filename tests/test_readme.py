@@ -1,0 +1,46 @@
+"""The README: its code runs, its commands and links exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+@pytest.mark.filterwarnings("ignore:.*:DeprecationWarning")
+def test_the_first_code_trains_and_prints_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, object] = {}
+    exec(BLOCKS[0], names)
+    assert names["batch"]["signals"]["td_error"].shape == (256,)  # type: ignore[index]
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in ("reward", "td_error", "action_gradient"))
+    names["env"].close()  # type: ignore[attr-defined]
+
+
+def test_the_first_code_has_fifteen_lines_at_most() -> None:
+    assert len(BLOCKS[0].strip().splitlines()) <= 15
+
+
+@pytest.mark.parametrize("block", BLOCKS[1:])
+def test_the_other_code_runs(block: str) -> None:
+    exec(block, {})
+
+
+def test_its_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"(?:^|`| )make ([a-z-]+)", README, re.MULTILINE))
+    assert {"demo", "test"} <= targets
+    for target in targets:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+
+
+def test_its_files_exist() -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", README)
+    scripts = re.findall(r"examples/\w+\.py", README)
+    for path in [*(link for link in links if "://" not in link), *scripts]:
+        assert (ROOT / path).exists(), path
