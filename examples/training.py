@@ -189,8 +189,8 @@ class TrainingRun:
             self.buffer.sampler.beta = start + (end - start) * done
         # Counted so that the last episode still learns.
         left = 1.0 - self.episode / self.total_episodes
-        end_factor = settings.learner.lr_end_factor
-        self.learner.anneal(end_factor + (1.0 - end_factor) * left)
+        lowest = settings.learner.lr_end_factor
+        self.learner.anneal(lowest + (1.0 - lowest) * left**settings.learner.lr_power)
 
     # Saving ----------------------------------------------------------------------------------
 
