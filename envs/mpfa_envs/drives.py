@@ -94,7 +94,8 @@ class WheelDrive:
         robot: The robot.
         world: The room it drives in.
         time_step: Duration of a step [s].
-        substep: Duration of a step of the physics engine [s]; divides the time step.
+        substep: Duration of a step of the physics engine [s], rounded to divide the time step. The
+            wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do not.
 
     Examples:
         >>> from mpfa_envs import ROBOTS, WORLDS
@@ -109,15 +110,16 @@ class WheelDrive:
     """
 
     def __init__(
-        self, robot: RobotModel, world: World, *, time_step: float, substep: float = 0.02
+        self, robot: RobotModel, world: World, *, time_step: float, substep: float = 1 / 30
     ) -> None:
         # Imported here so that kinematic environments run without PyBullet, which also greets
         # the terminal whenever it is imported.
         from mpfa_envs.simulation import Simulation
 
-        self._substeps = max(1, round(time_step / substep))
         self._wheel_radius = robot.wheel_radius
-        self.simulation = Simulation(time_step=time_step / self._substeps)
+        self.simulation = Simulation(
+            time_step=time_step, substeps=max(1, round(time_step / substep))
+        )
         self.simulation.add_world(world)
         self.simulation.add_robot(robot)
 
@@ -129,7 +131,7 @@ class WheelDrive:
     def move(self, left: float, right: float) -> Motion:
         """Hold the wheel speeds [m/s] for one time step."""
         self.simulation.set_wheel_speeds(left / self._wheel_radius, right / self._wheel_radius)
-        self.simulation.step(self._substeps)
+        self.simulation.step()
         x, y, heading, speed_x, speed_y, turn = self.simulation.robot_motion()
         speed = speed_x * math.cos(heading) + speed_y * math.sin(heading)
         return Motion(x, y, heading, speed, turn)

@@ -59,15 +59,11 @@ class PathPlanner:
         self.world = world
         self.margin = float(margin)
         reach = self.margin - _TOUCH
-        rectangles: list[tuple[float, float, float, float]] = []
+        boxes: list[tuple[float, float, float, float]] = []
         circles: list[tuple[float, float, float]] = []
         corners: list[NDArray[np.float64]] = []
         for box in world.boxes:
-            # A box grown by a disc is two rectangles and a circle at each corner.
-            rectangles += [
-                (box.x_min - reach, box.y_min + _TOUCH, box.x_max + reach, box.y_max - _TOUCH),
-                (box.x_min + _TOUCH, box.y_min - reach, box.x_max - _TOUCH, box.y_max + reach),
-            ]
+            boxes.append((box.x_min, box.y_min, box.x_max, box.y_max))
             for quarter, (x, y) in enumerate(
                 (
                     (box.x_max, box.y_max),
@@ -85,8 +81,10 @@ class PathPlanner:
             around = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
             outer = radius / math.cos(math.pi / _CIRCLE_CORNERS)
             corners.append(_polygon(cylinder.x, cylinder.y, outer, around))
-        self._rectangles = np.array(rectangles).reshape(-1, 4)
-        self._circles = np.array(circles).reshape(-1, 3)
+        # Sides, rectangles in the last axis; centers and squared radii, circles in the last axis.
+        self._low, self._high = np.array(boxes).reshape(-1, 2, 2).transpose(1, 2, 0)
+        *self._centers, radii = np.array(circles).reshape(-1, 3).T
+        self._squares = radii * radii
         nodes = np.concatenate([np.empty((0, 2)), *corners])
         free = [world.clearance(x, y) >= self.margin - _TOUCH for x, y in nodes]
         self._nodes = nodes[np.array(free, dtype=np.bool_)]
@@ -221,28 +219,35 @@ class PathPlanner:
         return self._neighbors[node]
 
     def _visible(self, origin: Point, targets: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which targets ``[N, 2]`` are joined to the origin by a free line, shape ``[N]``."""
+        """Tell which targets ``[N, 2]`` are joined to the origin by a free line, shape ``[N]``.
+
+        All of these points keep the margin themselves, so that a line comes too near to a box only
+        by crossing it or by passing one of its corners.
+        """
+        x, y = origin
+        step_x, step_y = np.ascontiguousarray((targets - origin).T)
         free = np.ones(len(targets), dtype=np.bool_)
-        steps = targets - origin
-        if len(self._rectangles):
-            # The line is origin + t * step with t in [0, 1]; [N, rectangles] from here on.
-            inverse = 1.0 / np.where(steps == 0.0, 1e-300, steps)
+        if self._low.size:
+            # The line is origin + t * step with t in [0, 1]; [N, boxes] from here on.
             enter, leave = np.zeros(()), np.ones(())
-            for axis in (0, 1):
-                low = np.multiply.outer(inverse[:, axis], self._rectangles[:, axis] - origin[axis])
-                high = np.multiply.outer(
-                    inverse[:, axis], self._rectangles[:, axis + 2] - origin[axis]
-                )
+            for axis, (start, step) in enumerate(((x, step_x), (y, step_y))):
+                inverse = 1.0 / np.where(step == 0.0, 1e-300, step)[:, None]
+                low = inverse * (self._low[axis] - start)
+                high = inverse * (self._high[axis] - start)
                 enter = np.maximum(enter, np.minimum(low, high))
                 leave = np.minimum(leave, np.maximum(low, high))
-            free &= ~(enter < leave).any(axis=1)
-        if len(self._circles):
-            offsets = self._circles[:, :2] - origin
-            squares = (steps * steps).sum(axis=1)[:, None]
-            nearest = np.clip(steps @ offsets.T / np.maximum(squares, 1e-300), 0.0, 1.0)
-            x = offsets[:, 0] - nearest * steps[:, :1]
-            y = offsets[:, 1] - nearest * steps[:, 1:]
-            free &= (x * x + y * y >= self._circles[:, 2] ** 2).all(axis=1)
+            free &= (enter >= leave).all(axis=1)
+        if self._squares.size:
+            # [N, circles]: does the foot of the perpendicular lie on the line, and in the circle?
+            step_x, step_y = step_x[:, None], step_y[:, None]
+            across, up = self._centers[0] - x, self._centers[1] - y
+            length = step_x * step_x + step_y * step_y
+            along = step_x * across + step_y * up
+            aside = step_x * up - step_y * across
+            meets = aside * aside < self._squares * length
+            meets &= along > 0.0
+            meets &= along < length
+            free &= ~meets.any(axis=1)
         return free
 
 

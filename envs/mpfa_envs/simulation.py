@@ -28,10 +28,11 @@ class Simulation:
     Several of them live in one process without knowing of each other.
 
     Args:
-        time_step: Duration of a step of the physics engine [s].
+        time_step: Duration of a step of the simulation [s].
+        substeps: Steps of the physics engine in it.
 
     Raises:
-        ValueError: If the time step is not positive.
+        ValueError: If one of them is not positive.
 
     Examples:
         >>> from mpfa_envs import ROBOTS, WORLDS
@@ -47,10 +48,13 @@ class Simulation:
         >>> simulation.close()
     """
 
-    def __init__(self, *, time_step: float) -> None:
+    def __init__(self, *, time_step: float, substeps: int = 1) -> None:
         if not (math.isfinite(time_step) and time_step > 0):
             raise ValueError(f"time_step must be positive, got {time_step}")
+        if substeps < 1:
+            raise ValueError(f"substeps must be positive, got {substeps}")
         self.time_step = time_step
+        self.substeps = substeps
         self.bodies: dict[str, int] = {}
         """Names of the bodies and the engine's numbers for them."""
         self._client: int = pybullet.connect(pybullet.DIRECT)
@@ -63,6 +67,7 @@ class Simulation:
         pybullet.setGravity(0, 0, -9.81, physicsClientId=self._client)
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.time_step,
+            numSubSteps=self.substeps,
             # The solver stops once an iteration changes next to nothing: 1.6 times faster than
             # always doing 50, at an error of 0.5 % of the slowest speed.
             numSolverIterations=50,
@@ -251,7 +256,7 @@ class Simulation:
         """Advance the physics.
 
         Args:
-            count: Number of steps of the engine.
+            count: Number of time steps.
         """
         for _ in range(count):
             pybullet.stepSimulation(physicsClientId=self._client)
