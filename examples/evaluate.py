@@ -76,7 +76,10 @@ def write_pictures(
 def write_animation(frames: list[NDArray], path: Path) -> None:  # type: ignore[type-arg]
     """Write an animation of at most some hundred frames, twice as fast as real."""
     step = -(-len(frames) // _GIF_FRAMES)
-    pictures = [Image.fromarray(frame).quantize(64) for frame in [*frames[:-1:step], frames[-1]]]
+    chosen = [Image.fromarray(frame) for frame in [*frames[:-1:step], frames[-1]]]
+    # One palette and no dithering: what stands still is equal in all frames and stored once.
+    palette = chosen[0].quantize(64)
+    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chosen]
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=50 * step, loop=0, optimize=True
     )
