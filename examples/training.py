@@ -11,8 +11,7 @@ from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, set_exploration_type
 from torchrl.envs.utils import ExplorationType, step_mdp
 from tqdm import tqdm
@@ -27,8 +26,14 @@ from tracking import Tracker
 FORMAT = 1
 CHECKPOINT = "checkpoint.pt"
 _INFO = ("success", "collision", "time_out", "path_length", "shortest_path")
-_TRANSITION = ("observation", "action", ("next", "observation"), ("next", "reward"))
-_ENDS = (("next", "done"), ("next", "terminated"))
+_TRANSITION = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "done"),
+    ("next", "terminated"),
+)
 _RECENT = 20
 
 
@@ -61,7 +66,7 @@ class TrainingRun:
             device=settings.device,
         )
         self.noise = make_noise(settings.exploration, self.env.action_spec)
-        self.behavior = TensorDictSequential(self.learner.policy, self.noise)
+        self._waiting: list[TensorDictBase] = []
         self.episode = 0
         self.step = 0
         self.records: list[EpisodeRecord] = []
@@ -142,13 +147,14 @@ class TrainingRun:
         done = False
         while not done:
             state = self.env.step(self._act(state))
-            self.buffer.extend(_transition(state))
             self.step += 1
             steps += 1
             after = state["next"]
             total_reward += after["reward"].item()
             done = after["done"].item()
-            self._update()
+            self._store(state, flush=done)
+            if self.step % self.settings.learner.update_every == 0:
+                self._update()
             last, state = after, step_mdp(state)
         info = {name: last["info", name].item() for name in _INFO}
         return EpisodeRecord(
@@ -166,10 +172,18 @@ class TrainingRun:
     def _act(self, state: TensorDictBase) -> TensorDictBase:
         if self.step < self.settings.exploration.random_steps:
             return self.env.rand_action(state)
+        chosen = self.learner.policy(state.select("observation").to(self.settings.device))
         with set_exploration_type(ExplorationType.RANDOM):
-            state = self.behavior(state.to(self.settings.device)).to("cpu")
+            state.set("action", self.noise(chosen).get("action").cpu())
         self.noise.step(1)
         return state
+
+    def _store(self, state: TensorDictBase, *, flush: bool) -> None:
+        """Keep a step; those between two updates are written together, at the price of one."""
+        self._waiting.append(state.select(*_TRANSITION))
+        if flush or self.step % self.settings.learner.update_every == 0:
+            self.buffer.extend(torch.stack(self._waiting))
+            self._waiting.clear()
 
     def _update(self) -> None:
         if len(self.buffer) < self.settings.replay.batch_size:
@@ -246,9 +260,3 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
     if state.get("format") != FORMAT:
         raise ValueError(f"{file} has format {state.get('format')}, this version reads {FORMAT}")
     return state
-
-
-def _transition(state: TensorDictBase) -> TensorDict:
-    """What is stored of a step, as a batch of one."""
-    chosen = state.select(*_TRANSITION, *_ENDS)
-    return TensorDict(chosen, batch_size=[]).unsqueeze(0)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -16,6 +16,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
@@ -150,15 +151,14 @@ class SignalDDPGLoss(DDPGLoss):
             The loss, and detached values for the log.
         """
         keys = self.tensor_keys
-        inputs = tensordict.select(*self.value_network.in_keys, strict=False).detach()
         with_gradient = ACTION_GRADIENT.name in self.signals
         at_stored = with_gradient and self.gradient_at == "stored"
-        action = inputs.get(keys.action)
+        action = tensordict.get(keys.action).detach()
         # The gradient is wanted under no_grad as well, when a loss is only looked at.
         with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
             if at_stored:
                 action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
-            value = self._critic(inputs)
+            value = self._value(self._networks().critic, tensordict, {keys.action: action})
         if with_gradient:
             gradient = (
                 _action_gradient(value, action) if at_stored else self._policy_gradient(tensordict)
@@ -195,15 +195,12 @@ class SignalDDPGLoss(DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        inputs = tensordict.select(
-            *self.actor_in_keys, *self.value_exclusive_keys, strict=False
-        ).detach()
         networks = self._networks()
-        inputs = networks.frozen_critic(networks.actor(inputs))
-        value = inputs.get(self.tensor_keys.state_action_value).squeeze(-1)
+        chosen = _outputs(networks.actor, _inputs(networks.actor, tensordict))
+        value = self._value(networks.frozen_critic, tensordict, chosen)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
-        before = inputs.get(self.tensor_keys.preactivation, None)
+        before = chosen.get(self.tensor_keys.preactivation, None)
         if before is None:
             if self.saturation_penalty > 0:
                 raise KeyError(
@@ -250,22 +247,25 @@ class SignalDDPGLoss(DDPGLoss):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_bound": None}
 
-    def _critic(self, inputs: TensorDictBase) -> Tensor:
-        """Q of the current critic, shape ``[B]``."""
-        out = self._networks().critic(inputs)
+    def _value(
+        self,
+        critic: TensorDictModule,
+        source: TensorDictBase,
+        chosen: Mapping[NestedKey, Tensor] | TensorDictBase,
+    ) -> Tensor:
+        """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
+        out = _outputs(critic, _inputs(critic, source, chosen))
         value: Tensor = out.get(self.tensor_keys.state_action_value).squeeze(-1)
         return value
 
     def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
-        inputs = tensordict.select(
-            *self.actor_in_keys, *self.value_exclusive_keys, strict=False
-        ).detach()
+        networks, key = self._networks(), self.tensor_keys.action
         with torch.no_grad():
-            self._networks().actor(inputs)
-        action = inputs.get(self.tensor_keys.action).requires_grad_(True)
+            action = _outputs(networks.actor, _inputs(networks.actor, tensordict)).get(key)
+        action.requires_grad_(True)
         with torch.enable_grad():
-            return _action_gradient(self._critic(inputs), action)
+            return _action_gradient(self._value(networks.critic, tensordict, {key: action}), action)
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Targets y of Eq. (5), shape ``[B]``; a time limit bootstraps, an end does not."""
@@ -281,16 +281,14 @@ class SignalDDPGLoss(DDPGLoss):
             return longer.squeeze(-1)
         after = tensordict.get("next")
         networks = self._networks()
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            inputs = after.select(*self.actor_in_keys, *self.value_exclusive_keys, strict=False)
-            value = networks.target_critic(networks.target_actor(inputs))
-            next_value = value.get(keys.state_action_value).squeeze(-1)
-            gamma = self.value_estimator.gamma
+        with torch.no_grad():
+            chosen = _outputs(networks.target_actor, _inputs(networks.target_actor, after))
+            next_value = self._value(networks.target_critic, after, chosen)
             return bootstrap_target(
                 after.get(keys.reward).reshape(next_value.shape) * self.reward_scale,
                 next_value,
                 after.get(keys.terminated).reshape(next_value.shape),
-                gamma=gamma,
+                gamma=self.value_estimator.gamma,
             )
 
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -319,6 +317,30 @@ def _with(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule
     copied = deepcopy(network)
     params.to_module(copied)
     return copied
+
+
+def _inputs(
+    network: TensorDictModule,
+    source: TensorDictBase,
+    instead: Mapping[NestedKey, Tensor] | TensorDictBase | None = None,
+) -> dict[NestedKey, Tensor]:
+    """What a network reads: from ``instead`` where that has it, else detached from ``source``."""
+    inputs = {}
+    for key in network.in_keys:
+        value = None if instead is None else instead.get(key, None)
+        inputs[key] = source.get(key).detach() if value is None else value
+    return inputs
+
+
+def _outputs(
+    network: TensorDictModule, inputs: dict[NestedKey, Tensor]
+) -> dict[NestedKey, Tensor] | TensorDictBase:
+    """What a network gives, directly if it can."""
+    if isinstance(network, DirectModule):
+        return network.outputs(inputs)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        out: TensorDictBase = network(TensorDict(inputs))
+        return out
 
 
 def bootstrap_target(
