@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.data import RandomSampler, TensorSpec
@@ -14,14 +16,17 @@ from torchrl_mpfa import (
     DDPGLearner,
     EntropyFusion,
     FixedFusion,
+    Learner,
     PositiveBoost,
     PositiveDecay,
     SignalReplayBuffer,
     SignalSampler,
     SignalTensorStorage,
+    TD3Learner,
     make_actor,
     make_critic,
     make_ddpg_loss,
+    make_td3_loss,
 )
 
 
@@ -88,7 +93,7 @@ def make_learner(
     action_size: int,
     *,
     device: str = "cpu",
-) -> DDPGLearner:
+) -> Learner:
     """Networks, loss and optimizers; the loss writes those signals that the replay asks for."""
     critic = make_critic(
         observation_size,
@@ -99,23 +104,32 @@ def make_learner(
         final_init=settings.final_init,
         late_action=settings.late_action,
     )
-    loss = make_ddpg_loss(
-        make_policy(settings, observation_size, action_size).to(device),
-        critic.to(device),
-        gamma=settings.gamma,
-        signals=[name for name in signals if name in ("td_error", "action_gradient")],
-        importance=settings.importance,
-        reward_scale=settings.reward_scale,
-        saturation_penalty=settings.saturation_penalty,
-        saturation_limit=settings.saturation_limit,
-    )
-    return DDPGLearner(
-        loss,
-        actor_lr=settings.actor_lr,
-        critic_lr=settings.critic_lr,
-        critic_weight_decay=settings.critic_weight_decay,
-        tau=settings.tau,
-    )
+    actor = make_policy(settings, observation_size, action_size)
+    actor, critic = actor.to(device), critic.to(device)
+    of_loss: dict[str, Any] = {
+        "gamma": settings.gamma,
+        "signals": [name for name in signals if name in ("td_error", "action_gradient")],
+        "importance": settings.importance,
+        "reward_scale": settings.reward_scale,
+        "saturation_penalty": settings.saturation_penalty,
+        "saturation_limit": settings.saturation_limit,
+    }
+    of_learner: dict[str, Any] = {
+        "actor_lr": settings.actor_lr,
+        "critic_lr": settings.critic_lr,
+        "critic_weight_decay": settings.critic_weight_decay,
+        "tau": settings.tau,
+    }
+    if settings.algorithm == "ddpg":
+        return DDPGLearner(make_ddpg_loss(actor, critic, **of_loss), **of_learner)
+    if settings.algorithm == "td3":
+        smoothing: dict[str, Any] = {
+            "policy_noise": settings.policy_noise,
+            "noise_clip": settings.noise_clip,
+        }
+        loss = make_td3_loss(actor, critic, **of_loss, **smoothing)
+        return TD3Learner(loss, **of_learner, policy_delay=settings.policy_delay)
+    raise ValueError(f"learner.algorithm must be 'ddpg' or 'td3', got {settings.algorithm!r}")
 
 
 def make_noise(settings: Exploration, action_spec: TensorSpec) -> AdditiveGaussianModule:

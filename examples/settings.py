@@ -75,6 +75,8 @@ class Learner:
     """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
 
     name: str = "ddpg"
+    algorithm: str = "ddpg"
+    """``ddpg`` or ``td3``."""
     update_every: int = 2
     """Steps of the environment for each update, which the paper does not give. One costs twice the
     time and is no better (``docs/tuning.md``)."""
@@ -111,6 +113,20 @@ class Learner:
     """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
     importance: str = "critic"
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
+    policy_delay: int = 2
+    """TD3: updates of the critics for one of the actor and the targets."""
+    policy_noise: float = 0.2
+    """TD3: standard deviation of the noise that smooths the target."""
+    noise_clip: float = 0.5
+    """TD3: bound of that noise."""
+
+
+@dataclass
+class TD3(Learner):
+    """TD3 with networks and rates of the DDPG learner: two critics, smoothed target, delay."""
+
+    name: str = "td3"
+    algorithm: str = "td3"
 
 
 @dataclass
@@ -240,7 +256,7 @@ class TrainSettings:
 
 GROUPS: dict[str, dict[str, Any]] = {
     "replay": {"mpfa": Replay, "per": PerReplay, "uniform": UniformReplay},
-    "learner": {"ddpg": Learner, "plain": PlainLearner},
+    "learner": {"ddpg": Learner, "td3": TD3, "plain": PlainLearner},
     "curriculum": {
         "A": _single("A", 100),
         "B": _single("B", 200),

@@ -2,9 +2,14 @@
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
-from torchrl_mpfa.learner import DDPGLearner, Learner
-from torchrl_mpfa.loss import SignalDDPGLoss, make_ddpg_loss
-from torchrl_mpfa.networks import make_actor, make_critic
+from torchrl_mpfa.learner import DDPGLearner, Learner, TD3Learner
+from torchrl_mpfa.losses import (
+    SignalDDPGLoss,
+    SignalTD3Loss,
+    make_ddpg_loss,
+    make_td3_loss,
+)
+from torchrl_mpfa.networks import DirectModule, make_actor, make_critic
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.sampler import MPFASampler, SignalSampler
 from torchrl_mpfa.saving import load_safely, save_atomically
@@ -29,6 +34,7 @@ __all__ = [
     "Adjustment",
     "BatchFacts",
     "DDPGLearner",
+    "DirectModule",
     "EntropyFusion",
     "FixedFusion",
     "Fusion",
@@ -41,12 +47,15 @@ __all__ = [
     "SignalMemmapStorage",
     "SignalReplayBuffer",
     "SignalSampler",
+    "SignalTD3Loss",
     "SignalTable",
     "SignalTensorStorage",
+    "TD3Learner",
     "TreeSampler",
     "load_safely",
     "make_actor",
     "make_critic",
     "make_ddpg_loss",
+    "make_td3_loss",
     "save_atomically",
 ]

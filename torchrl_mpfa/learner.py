@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_mpfa.loss import SignalDDPGLoss
+from torchrl_mpfa.losses import SignalDDPGLoss, SignalTD3Loss
 
 
 @runtime_checkable
@@ -40,11 +40,12 @@ class Learner(Protocol):
         ...
 
 
-class DDPGLearner:
-    r"""DDPG with target networks, Eqs. (4)-(7), and the actor's sampled policy gradient.
+class ActorCriticLearner:
+    r"""One optimizer for actor and critic, target networks, and rates that can be lowered.
 
     Args:
-        loss: The loss with both networks in it.
+        loss: The loss with its networks in it.
+        critic: Name of the critic's parameters in the loss.
         actor_lr: Learning rate of the actor, Table 1.
         critic_lr: Learning rate of the critic, Table 1.
         critic_weight_decay: L2 decay of the critic's weights, as in the original DDPG paper; it
@@ -53,23 +54,17 @@ class DDPGLearner:
 
     Raises:
         ValueError: If a rate is not positive, the decay negative, or ``tau`` not in (0, 1].
-
-    Examples:
-        >>> from torchrl_mpfa.loss import make_ddpg_loss
-        >>> from torchrl_mpfa.networks import make_actor, make_critic
-        >>> learner = DDPGLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
-        >>> learner.policy.out_keys
-        ['preactivation', 'action']
     """
 
     def __init__(
         self,
-        loss: SignalDDPGLoss,
+        loss: LossModule,
         *,
-        actor_lr: float = 1e-4,
-        critic_lr: float = 1e-4,
-        critic_weight_decay: float = 1e-2,
-        tau: float = 0.01,
+        critic: str,
+        actor_lr: float,
+        critic_lr: float,
+        critic_weight_decay: float,
+        tau: float,
     ) -> None:
         for name, rate in (("actor_lr", actor_lr), ("critic_lr", critic_lr)):
             if not rate > 0:
@@ -80,34 +75,25 @@ class DDPGLearner:
             raise ValueError(f"tau must be in (0, 1], got {tau}")
         self._rates = (actor_lr, critic_lr)
         self.loss = loss
-        self.policy = loss.actor_network
-        actor = list(loss.actor_network_params.flatten_keys().values())
-        critic = list(loss.value_network_params.flatten_keys().values())
+        self.policy: TensorDictModule = loss.actor_network
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)
+        actors, critics = (
+            list(getattr(loss, name).flatten_keys().values())
+            for name in ("actor_network_params", critic)
+        )
         self.optimizer = torch.optim.Adam(
             [
-                {"params": actor, "lr": actor_lr},
-                {"params": critic, "lr": critic_lr, "weight_decay": critic_weight_decay},
+                {"params": actors, "lr": actor_lr},
+                {"params": critics, "lr": critic_lr, "weight_decay": critic_weight_decay},
             ],
             fused=True,
         )
 
-    def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
-        """One step of both optimizers and of the target networks.
-
-        Args:
-            batch: Transitions, batch size ``[B]``; the loss writes their signals.
-
-        Returns:
-            Detached values for the log.
-        """
-        losses = self.loss(batch)
+    def _descend(self, loss: torch.Tensor) -> None:
+        """One step of the optimizer; what has no gradient stays as it is."""
         self.optimizer.zero_grad(set_to_none=True)
-        # Only the losses: TorchRL's output holds values beside them.
-        (losses["loss_value"] + losses["loss_actor"]).backward()
+        loss.backward()
         self.optimizer.step()
-        self.targets.step()
-        return {key: value.detach() for key, value in losses.items()}
 
     def anneal(self, factor: float) -> None:
         """Set the learning rates to a fraction of what the constructor was given.
@@ -133,6 +119,138 @@ class DDPGLearner:
         self.optimizer.load_state_dict(state_dict["optimizer"])
 
 
+class DDPGLearner(ActorCriticLearner):
+    r"""DDPG with target networks, Eqs. (4)-(7), and the actor's sampled policy gradient.
+
+    Args:
+        loss: The loss with both networks in it.
+        actor_lr: Learning rate of the actor, Table 1.
+        critic_lr: Learning rate of the critic, Table 1.
+        critic_weight_decay: L2 decay of the critic's weights, as in the original DDPG paper.
+        tau: :math:`\tau` of Eqs. (6)-(7), Table 1.
+
+    Raises:
+        ValueError: If a rate is not positive, the decay negative, or ``tau`` not in (0, 1].
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
+        >>> learner = DDPGLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
+        >>> learner.policy.out_keys
+        ['preactivation', 'action']
+    """
+
+    def __init__(
+        self,
+        loss: SignalDDPGLoss,
+        *,
+        actor_lr: float = 1e-4,
+        critic_lr: float = 1e-4,
+        critic_weight_decay: float = 1e-2,
+        tau: float = 0.01,
+    ) -> None:
+        super().__init__(
+            loss,
+            critic="value_network_params",
+            actor_lr=actor_lr,
+            critic_lr=critic_lr,
+            critic_weight_decay=critic_weight_decay,
+            tau=tau,
+        )
+
+    def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
+        """One step of both networks and of the target networks.
+
+        Args:
+            batch: Transitions, batch size ``[B]``; the loss writes their signals.
+
+        Returns:
+            Detached values for the log.
+        """
+        losses = self.loss(batch)
+        # Only the losses: TorchRL's output holds values beside them.
+        self._descend(losses["loss_value"] + losses["loss_actor"])
+        self.targets.step()
+        return {key: value.detach() for key, value in losses.items()}
+
+
+class TD3Learner(ActorCriticLearner):
+    r"""TD3: two critics at each update, the actor and all targets at every other one.
+
+    Fujimoto et al. (2018), https://arxiv.org/abs/1802.09477
+
+    Args:
+        loss: The loss with all networks in it.
+        actor_lr: Learning rate of the actor.
+        critic_lr: Learning rate of the critics.
+        critic_weight_decay: L2 decay of the critics' weights.
+        tau: :math:`\tau` of Eqs. (6)-(7).
+        policy_delay: Updates of the critics for one of the actor and of the targets.
+
+    Raises:
+        ValueError: If a rate is not positive, the decay negative, ``tau`` not in (0, 1] or the
+            delay below one.
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic, make_td3_loss
+        >>> TD3Learner(make_td3_loss(make_actor(24, 2), make_critic(24, 2))).policy_delay
+        2
+    """
+
+    def __init__(
+        self,
+        loss: SignalTD3Loss,
+        *,
+        actor_lr: float = 1e-4,
+        critic_lr: float = 1e-4,
+        critic_weight_decay: float = 0.0,
+        tau: float = 0.01,
+        policy_delay: int = 2,
+    ) -> None:
+        if policy_delay < 1:
+            raise ValueError(f"policy_delay must be at least 1, got {policy_delay}")
+        super().__init__(
+            loss,
+            critic="qvalue_network_params",
+            actor_lr=actor_lr,
+            critic_lr=critic_lr,
+            critic_weight_decay=critic_weight_decay,
+            tau=tau,
+        )
+        self.policy_delay = policy_delay
+        self.updates = 0
+
+    def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
+        """One step of the critics, and when it is due of the actor and of the target networks.
+
+        Args:
+            batch: Transitions, batch size ``[B]``; the loss writes their signals.
+
+        Returns:
+            Detached values for the log.
+        """
+        self.updates += 1
+        due = self.updates % self.policy_delay == 0
+        total, log = self.loss.value_loss(batch)
+        log = {"loss_value": total, **log}
+        if due:
+            loss_actor, of_actor = self.loss.actor_loss(batch)
+            log.update(loss_actor=loss_actor, **of_actor)
+            total = total + loss_actor
+        self._descend(total)
+        if due:
+            self.targets.step()
+        return {key: value.detach() for key, value in log.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, target networks, optimizer and the count of updates."""
+        return {**super().state_dict(), "updates": self.updates}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        super().load_state_dict(state_dict)
+        self.updates = state_dict["updates"]
+
+
 class MultiTensorSoftUpdate(SoftUpdate):
     r"""Target networks, :math:`\theta' \leftarrow \tau\theta + (1 - \tau)\theta'` (Eqs. 6-7).
 
@@ -144,8 +262,7 @@ class MultiTensorSoftUpdate(SoftUpdate):
         tau: :math:`\tau`.
 
     Examples:
-        >>> from torchrl_mpfa.loss import make_ddpg_loss
-        >>> from torchrl_mpfa.networks import make_actor, make_critic
+        >>> from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
         >>> loss = make_ddpg_loss(make_actor(24, 2), make_critic(24, 2))
         >>> MultiTensorSoftUpdate(loss, tau=0.01).step()
     """

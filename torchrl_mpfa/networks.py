@@ -52,7 +52,10 @@ class DirectModule(TensorDictModule):
         Returns:
             Outputs by key.
         """
-        found = self.module(*[inputs.get(key) for key in self.in_keys])
+        return self.by_key(self.module(*[inputs.get(key) for key in self.in_keys]))
+
+    def by_key(self, found: Tensor | tuple[Tensor, ...]) -> dict[NestedKey, Tensor]:
+        """Name what the module gave."""
         return dict(
             zip(self.out_keys, found if isinstance(found, tuple) else (found,), strict=True)
         )

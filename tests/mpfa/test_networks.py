@@ -61,7 +61,7 @@ def test_the_plain_variant_is_a_bare_perceptron_that_reads_the_action_first():
     actor, critic = make_actor(7, 2, **plain), make_critic(7, 2, late_action=False, **plain)
     assert count(actor, nn.LayerNorm) == count(critic, nn.LayerNorm) == 0
     assert critic.module.first[0].in_features == 9
-    assert critic.module.rest[0][0].in_features == 256
+    assert critic.module.rest[0].in_features == 256
     one_layer = make_critic(7, 2, layers=1, late_action=False, **plain)
     assert count(one_layer, nn.Linear) == 2
 
@@ -69,7 +69,7 @@ def test_the_plain_variant_is_a_bare_perceptron_that_reads_the_action_first():
 def test_a_late_action_joins_at_the_second_layer():
     critic = make_critic(7, 2, width=11).module
     assert critic.first[0].in_features == 7
-    assert critic.rest[0][0].in_features == 13
+    assert critic.rest[0].in_features == 13
 
 
 @pytest.mark.parametrize("late_action", [True, False])

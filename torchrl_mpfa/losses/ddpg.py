@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import DDPGLoss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_mpfa.networks import DirectModule
-from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
+from torchrl_mpfa.losses.calling import Tensors, bind, call, read_inputs
+from torchrl_mpfa.losses.options import (
+    WRITTEN,
+    GradientAt,
+    Importance,
+    SignalLossMixin,
+    action_gradient,
+)
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
-Importance = Literal["critic", "torchrl", "none"]
-_WRITTEN = (TD_ERROR.name, ACTION_GRADIENT.name)
 
-
-class SignalDDPGLoss(DDPGLoss):
+class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
     r""":class:`~torchrl.objectives.DDPGLoss` that also writes the signals of Eqs. (13)-(14).
 
     The critic's loss is Eq. (11), :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2` with the
@@ -96,9 +97,9 @@ class SignalDDPGLoss(DDPGLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
-        signals: Sequence[str] = _WRITTEN,
+        signals: Sequence[str] = WRITTEN,
         gradient_order: float = 2.0,
-        gradient_at: Literal["stored", "policy"] = "stored",
+        gradient_at: GradientAt = "stored",
         importance: Importance = "critic",
         reward_scale: float = 1.0,
         saturation_penalty: float = 0.0,
@@ -106,25 +107,16 @@ class SignalDDPGLoss(DDPGLoss):
         delay_actor: bool = True,
         **kwargs: Any,
     ) -> None:
-        unknown = [name for name in signals if name not in _WRITTEN]
-        if unknown:
-            raise ValueError(f"signals must be among {_WRITTEN}, got {unknown}")
-        for name, value, allowed in (
-            ("gradient_at", gradient_at, ("stored", "policy")),
-            ("importance", importance, ("critic", "torchrl", "none")),
-        ):
-            if value not in allowed:
-                raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
-        if not (gradient_order > 0 and reward_scale > 0):
-            raise ValueError(
-                "gradient_order and reward_scale must be positive, got "
-                f"{gradient_order} and {reward_scale}"
-            )
-        if saturation_penalty < 0 or saturation_limit < 0:
-            raise ValueError(
-                "saturation_penalty and saturation_limit must not be negative, got "
-                f"{saturation_penalty} and {saturation_limit}"
-            )
+        options = {
+            "signals": signals,
+            "gradient_order": gradient_order,
+            "gradient_at": gradient_at,
+            "importance": importance,
+            "reward_scale": reward_scale,
+            "saturation_penalty": saturation_penalty,
+            "saturation_limit": saturation_limit,
+        }
+        self._check_options(**options)  # type: ignore[arg-type]
         super().__init__(
             actor_network,
             value_network,
@@ -132,14 +124,7 @@ class SignalDDPGLoss(DDPGLoss):
             use_prioritized_weights="auto" if importance == "torchrl" else False,
             **kwargs,
         )
-        self._bound: _Networks | None = None
-        self.signals = tuple(signals)
-        self.gradient_order = gradient_order
-        self.gradient_at = gradient_at
-        self.importance = importance
-        self.reward_scale = reward_scale
-        self.saturation_penalty = saturation_penalty
-        self.saturation_limit = saturation_limit
+        self._set_options(**options)
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Critic's loss (Eq. 11); writes the signals (Eqs. 13-14) in ``tensordict``.
@@ -151,27 +136,22 @@ class SignalDDPGLoss(DDPGLoss):
             The loss, and detached values for the log.
         """
         keys = self.tensor_keys
-        with_gradient = ACTION_GRADIENT.name in self.signals
-        at_stored = with_gradient and self.gradient_at == "stored"
+        at_stored = self._gradient_at_stored
         action = tensordict.get(keys.action).detach()
         # The gradient is wanted under no_grad as well, when a loss is only looked at.
         with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
             if at_stored:
                 action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
             value = self._value(self._networks().critic, tensordict, {keys.action: action})
-        if with_gradient:
-            gradient = (
-                _action_gradient(value, action) if at_stored else self._policy_gradient(tensordict)
-            )
-            size = action_gradient_priority(gradient, order=self.gradient_order)
-            tensordict.set(keys.action_gradient_signal, size / self.reward_scale)
+        gradient = action_gradient(value, action) if at_stored else None
+        if self._gradient_at_policy:
+            gradient = self._policy_gradient(tensordict)
         if not torch.is_grad_enabled():
             value = value.detach()
 
         target = self._target(tensordict)
         td_error = (target - value).detach()
-        if TD_ERROR.name in self.signals:
-            tensordict.set(keys.td_error_signal, td_error_priority(td_error) / self.reward_scale)
+        self._write_signals(tensordict, td_error, gradient)
         squared = td_error.square()
         tensordict.set(keys.priority, squared, inplace=True)
         loss = distance_loss(value, target, loss_function=self.loss_function)
@@ -196,76 +176,40 @@ class SignalDDPGLoss(DDPGLoss):
             The loss, and detached values for the log.
         """
         networks = self._networks()
-        chosen = _outputs(networks.actor, _inputs(networks.actor, tensordict))
+        chosen = call(networks.actor, read_inputs(networks.actor, tensordict))
         value = self._value(networks.frozen_critic, tensordict, chosen)
         weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
-        before = chosen.get(self.tensor_keys.preactivation, None)
-        if before is None:
-            if self.saturation_penalty > 0:
-                raise KeyError(
-                    f"saturation_penalty is {self.saturation_penalty}, but the actor writes no "
-                    f"{self.tensor_keys.preactivation!r}"
-                )
-            return loss, {}
-        size = before.abs()
-        if self.saturation_penalty > 0:
-            excess = (size - self.saturation_limit).clamp_min(0)
-            loss = loss + self.saturation_penalty * excess.square().mean()
-        return loss, {"preactivation": size.detach()}
+        return self._penalize_saturation(loss, chosen.get(self.tensor_keys.preactivation))
 
     def _networks(self) -> _Networks:
-        """The networks with their parameters in place.
-
-        TorchRL swaps parameters in and out of one module at every call, which takes longer than
-        the networks themselves. These hold the same tensors for good.
-        """
+        """The networks with their parameters in place, held for good."""
         if self._bound is None:
             actor, critic = self.actor_network_params, self.value_network_params
             target_actor = self.target_actor_network_params
             target_critic = self.target_value_network_params
             self._bound = _Networks(
-                actor=_with(self.actor_network, actor),
-                critic=_with(self.value_network, critic),
-                frozen_critic=_with(self.value_network, critic.detach()).requires_grad_(False),
-                target_actor=_with(self.actor_network, target_actor).requires_grad_(False),
-                target_critic=_with(self.value_network, target_critic).requires_grad_(False),
+                actor=bind(self.actor_network, actor),
+                critic=bind(self.value_network, critic),
+                frozen_critic=bind(self.value_network, critic.detach()).requires_grad_(False),
+                target_actor=bind(self.actor_network, target_actor).requires_grad_(False),
+                target_critic=bind(self.value_network, target_critic).requires_grad_(False),
             )
         return self._bound
 
-    def _apply(self, *args: Any, **kwargs: Any) -> Any:
-        # Called by ``to`` and its kin, which may put other tensors in the place of these.
-        self._bound = None
-        return super()._apply(*args, **kwargs)
-
-    def train(self, mode: bool = True) -> SignalDDPGLoss:
-        """Set training mode, of the networks that the loss holds too."""
-        self._bound = None
-        super().train(mode)
-        return self
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_bound": None}
-
-    def _value(
-        self,
-        critic: TensorDictModule,
-        source: TensorDictBase,
-        chosen: Mapping[NestedKey, Tensor] | TensorDictBase,
-    ) -> Tensor:
+    def _value(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
         """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
-        out = _outputs(critic, _inputs(critic, source, chosen))
-        value: Tensor = out.get(self.tensor_keys.state_action_value).squeeze(-1)
-        return value
+        found = call(critic, read_inputs(critic, source, chosen))
+        return found[self.tensor_keys.state_action_value].squeeze(-1)
 
     def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
         """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
         networks, key = self._networks(), self.tensor_keys.action
         with torch.no_grad():
-            action = _outputs(networks.actor, _inputs(networks.actor, tensordict)).get(key)
+            action = call(networks.actor, read_inputs(networks.actor, tensordict))[key]
         action.requires_grad_(True)
         with torch.enable_grad():
-            return _action_gradient(self._value(networks.critic, tensordict, {key: action}), action)
+            return action_gradient(self._value(networks.critic, tensordict, {key: action}), action)
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Targets y of Eq. (5), shape ``[B]``; a time limit bootstraps, an end does not."""
@@ -282,7 +226,7 @@ class SignalDDPGLoss(DDPGLoss):
         after = tensordict.get("next")
         networks = self._networks()
         with torch.no_grad():
-            chosen = _outputs(networks.target_actor, _inputs(networks.target_actor, after))
+            chosen = call(networks.target_actor, read_inputs(networks.target_actor, after))
             next_value = self._value(networks.target_critic, after, chosen)
             return bootstrap_target(
                 after.get(keys.reward).reshape(next_value.shape) * self.reward_scale,
@@ -290,14 +234,6 @@ class SignalDDPGLoss(DDPGLoss):
                 after.get(keys.terminated).reshape(next_value.shape),
                 gamma=self.value_estimator.gamma,
             )
-
-    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        weights = self._maybe_get_priority_weight(tensordict)
-        if self.importance == "critic":
-            importance = tensordict.get(self.tensor_keys.priority_weight, None)
-            if importance is not None:
-                loss = loss * importance.reshape(loss.shape).to(loss.device)
-        return self._reduce_loss(loss, tensordict=tensordict, weights=weights)
 
 
 @dataclass
@@ -310,37 +246,6 @@ class _Networks:
     """The critic, through which the actor's gradient flows but which gets none itself."""
     target_actor: TensorDictModule
     target_critic: TensorDictModule
-
-
-def _with(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
-    """A copy of a network that holds these parameters."""
-    copied = deepcopy(network)
-    params.to_module(copied)
-    return copied
-
-
-def _inputs(
-    network: TensorDictModule,
-    source: TensorDictBase,
-    instead: Mapping[NestedKey, Tensor] | TensorDictBase | None = None,
-) -> dict[NestedKey, Tensor]:
-    """What a network reads: from ``instead`` where that has it, else detached from ``source``."""
-    inputs = {}
-    for key in network.in_keys:
-        value = None if instead is None else instead.get(key, None)
-        inputs[key] = source.get(key).detach() if value is None else value
-    return inputs
-
-
-def _outputs(
-    network: TensorDictModule, inputs: dict[NestedKey, Tensor]
-) -> dict[NestedKey, Tensor] | TensorDictBase:
-    """What a network gives, directly if it can."""
-    if isinstance(network, DirectModule):
-        return network.outputs(inputs)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        out: TensorDictBase = network(TensorDict(inputs))
-        return out
 
 
 def bootstrap_target(
@@ -366,18 +271,6 @@ def bootstrap_target(
         [1.5, 1.0]
     """
     return reward + gamma * next_value * ~terminated
-
-
-def _action_gradient(value: Tensor, action: Tensor) -> Tensor:
-    """Gradient of each transition's Q by its own action, shape ``[B, A]``.
-
-    The gradient of the sum has them all at once, as no transition enters another one's value;
-    layers that mix a batch (batch normalization) would break that.
-    """
-    (gradient,) = torch.autograd.grad(
-        value, action, grad_outputs=torch.ones_like(value), retain_graph=True
-    )
-    return gradient.detach()
 
 
 def make_ddpg_loss(

@@ -1,0 +1,99 @@
+"""Calling networks from a loss: as functions of tensors where that is possible.
+
+TorchRL swaps parameters in and out of one module at every call, and passes tensordicts. With
+networks of a hundred units both take longer than the network itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.func import functional_call
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mpfa.networks import DirectModule
+
+Tensors = Mapping[NestedKey, Tensor]
+"""Tensors by key."""
+
+
+def bind(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
+    """Copy a network that holds these parameters, the same tensors and not copies of them."""
+    copied = deepcopy(network)
+    params.to_module(copied)
+    return copied
+
+
+def read_inputs(
+    network: TensorDictModule, source: TensorDictBase, instead: Tensors | None = None
+) -> dict[NestedKey, Tensor]:
+    """Collect what a network reads.
+
+    Args:
+        network: The network.
+        source: Where its inputs are taken from, detached.
+        instead: Tensors that take the place of those of ``source``.
+
+    Returns:
+        Inputs by key.
+    """
+    instead = instead or {}
+    return {
+        key: instead[key] if key in instead else source.get(key).detach() for key in network.in_keys
+    }
+
+
+def call(network: TensorDictModule, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
+    """Compute what a network gives, directly if it is a :class:`~torchrl_mpfa.DirectModule`.
+
+    Args:
+        network: The network.
+        inputs: What it reads, by key.
+
+    Returns:
+        Outputs by key.
+    """
+    if isinstance(network, DirectModule):
+        return network.outputs(inputs)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        found = network(TensorDict(inputs))
+    return {key: value for key in network.out_keys if (value := found.get(key)) is not None}
+
+
+class StackedNetworks:
+    """Networks of one structure whose parameters are stacked, called one after the other.
+
+    With two small networks ``torch.vmap`` costs twice as much.
+
+    Args:
+        network: Any of them.
+        params: Their parameters, batch size ``[C]``.
+    """
+
+    def __init__(self, network: TensorDictModule, params: TensorDictBase) -> None:
+        self.network = deepcopy(network)
+        flat = params.flatten_keys(".").items()
+        self._params = {name: value for name, value in flat if isinstance(value, Tensor)}
+        self._bare = {name.removeprefix("module."): value for name, value in self._params.items()}
+
+    def call(self, inputs: dict[NestedKey, Tensor]) -> list[dict[NestedKey, Tensor]]:
+        """Compute what each network gives, as :func:`call` does for one."""
+        direct = isinstance(self.network, DirectModule)
+        split = {
+            name: value.unbind(0)
+            for name, value in (self._bare if direct else self._params).items()
+        }
+        count = len(next(iter(split.values())))
+        weights = [{name: value[i] for name, value in split.items()} for i in range(count)]
+        if isinstance(self.network, DirectModule):
+            arguments = tuple(inputs[key] for key in self.network.in_keys)
+            found = [functional_call(self.network.module, one, arguments) for one in weights]
+            return [self.network.by_key(out) for out in found]
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            outs = [functional_call(self.network, one, (TensorDict(inputs),)) for one in weights]
+        return [dict(out.items(True, True)) for out in outs]

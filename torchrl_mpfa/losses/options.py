@@ -1,0 +1,147 @@
+"""What the losses of this package share: their options, and how they use signals and weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
+from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+
+Importance = Literal["critic", "torchrl", "none"]
+GradientAt = Literal["stored", "policy"]
+WRITTEN = (TD_ERROR.name, ACTION_GRADIENT.name)
+
+
+class SignalLossMixin:
+    """Options of a loss that writes signals, checked before TorchRL's constructor changes anything.
+
+    Mixed into a :class:`~torchrl.objectives.LossModule`; the options are documented at
+    :class:`~torchrl_mpfa.SignalDDPGLoss`.
+    """
+
+    tensor_keys: Any
+
+    @staticmethod
+    def _check_options(
+        *,
+        signals: Sequence[str],
+        gradient_order: float,
+        gradient_at: str,
+        importance: str,
+        reward_scale: float,
+        saturation_penalty: float,
+        saturation_limit: float,
+    ) -> None:
+        unknown = [name for name in signals if name not in WRITTEN]
+        if unknown:
+            raise ValueError(f"signals must be among {WRITTEN}, got {unknown}")
+        for name, value, allowed in (
+            ("gradient_at", gradient_at, ("stored", "policy")),
+            ("importance", importance, ("critic", "torchrl", "none")),
+        ):
+            if value not in allowed:
+                raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
+        if not (gradient_order > 0 and reward_scale > 0):
+            raise ValueError(
+                "gradient_order and reward_scale must be positive, got "
+                f"{gradient_order} and {reward_scale}"
+            )
+        if saturation_penalty < 0 or saturation_limit < 0:
+            raise ValueError(
+                "saturation_penalty and saturation_limit must not be negative, got "
+                f"{saturation_penalty} and {saturation_limit}"
+            )
+
+    def _set_options(self, **options: Any) -> None:
+        self._bound: Any = None
+        self.signals = tuple(options["signals"])
+        self.gradient_order: float = options["gradient_order"]
+        self.gradient_at: GradientAt = options["gradient_at"]
+        self.importance: Importance = options["importance"]
+        self.reward_scale: float = options["reward_scale"]
+        self.saturation_penalty: float = options["saturation_penalty"]
+        self.saturation_limit: float = options["saturation_limit"]
+
+    @property
+    def _gradient_at_stored(self) -> bool:
+        return ACTION_GRADIENT.name in self.signals and self.gradient_at == "stored"
+
+    @property
+    def _gradient_at_policy(self) -> bool:
+        return ACTION_GRADIENT.name in self.signals and self.gradient_at == "policy"
+
+    def _write_signals(
+        self, tensordict: TensorDictBase, td_error: Tensor, gradient: Tensor | None
+    ) -> None:
+        """Write ``|TD error|`` (Eq. 13) and the norm of the gradient (Eq. 14), each ``[B]``."""
+        if gradient is not None:
+            size = action_gradient_priority(gradient, order=self.gradient_order)
+            tensordict.set(self.tensor_keys.action_gradient_signal, size / self.reward_scale)
+        if TD_ERROR.name in self.signals:
+            size = td_error_priority(td_error)
+            tensordict.set(self.tensor_keys.td_error_signal, size / self.reward_scale)
+
+    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mean over the batch, with the importance weights of Eq. (11), or TorchRL's way."""
+        weights = self._maybe_get_priority_weight(tensordict)  # type: ignore[attr-defined]
+        if self.importance == "critic":
+            importance = tensordict.get(self.tensor_keys.priority_weight, None)
+            if importance is not None:
+                loss = loss * importance.reshape(loss.shape).to(loss.device)
+        reduced: Tensor = self._reduce_loss(loss, tensordict=tensordict, weights=weights)  # type: ignore[attr-defined]
+        return reduced
+
+    def _penalize_saturation(
+        self, loss: Tensor, preactivation: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Add the penalty on actions before their tanh, ``[B, A]``; give their size for the log."""
+        if preactivation is None:
+            if self.saturation_penalty > 0:
+                raise KeyError(
+                    f"saturation_penalty is {self.saturation_penalty}, but the actor writes no "
+                    f"{self.tensor_keys.preactivation!r}"
+                )
+            return loss, {}
+        size = preactivation.abs()
+        if self.saturation_penalty > 0:
+            excess = (size - self.saturation_limit).clamp_min(0)
+            loss = loss + self.saturation_penalty * excess.square().mean()
+        return loss, {"preactivation": size.detach()}
+
+    # The networks hold the parameters of the loss; these may put others in their place.
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        self._bound = None
+        return super()._apply(*args, **kwargs)  # type: ignore[misc]
+
+    def train(self, mode: bool = True) -> Any:
+        """Set training mode, of the networks that the loss holds too."""
+        self._bound = None
+        return super().train(mode)  # type: ignore[misc]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_bound": None}
+
+
+def action_gradient(value: Tensor, action: Tensor) -> Tensor:
+    """Gradient of each transition's Q by its own action, shape ``[B, A]``.
+
+    The gradient of the sum has them all at once, as no transition enters another one's value;
+    layers that mix a batch (batch normalization) would break that.
+
+    Args:
+        value: Q, shape ``[B]``.
+        action: The actions that it was computed from, shape ``[B, A]``.
+
+    Returns:
+        The gradient, detached; ``value`` can still be differentiated.
+    """
+    (gradient,) = torch.autograd.grad(
+        value, action, grad_outputs=torch.ones_like(value), retain_graph=True
+    )
+    return gradient.detach()

@@ -1,0 +1,262 @@
+"""TD3 loss that writes the signals of each transition, as the DDPG loss does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import TD3Loss, ValueEstimators
+from torchrl.objectives.utils import distance_loss
+
+from torchrl_mpfa.losses.calling import StackedNetworks, Tensors, bind, call, read_inputs
+from torchrl_mpfa.losses.ddpg import bootstrap_target
+from torchrl_mpfa.losses.options import (
+    WRITTEN,
+    GradientAt,
+    Importance,
+    SignalLossMixin,
+    action_gradient,
+)
+from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+
+
+class SignalTD3Loss(SignalLossMixin, TD3Loss):
+    r""":class:`~torchrl.objectives.TD3Loss` that also writes the signals of Eqs. (13)-(14).
+
+    Of its two critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; the
+    gradient is that of the first critic, the one that the actor climbs. Importance weights are
+    used as in :class:`SignalDDPGLoss`.
+
+    Fujimoto et al. (2018), https://arxiv.org/abs/1802.09477
+
+    Args:
+        actor_network: Policy; reads observations, writes ``"action"``.
+        qvalue_network: Critic, of which two are made; reads observations and action, writes
+            ``"state_action_value"``.
+        bounds: Least and greatest action.
+        signals: As in :class:`SignalDDPGLoss`, as are the following.
+        gradient_order: Order of the norm in Eq. (14).
+        gradient_at: ``"stored"`` or ``"policy"``.
+        importance: ``"critic"``, ``"torchrl"`` or ``"none"``.
+        reward_scale: Factor of the rewards in the loss.
+        saturation_penalty: Factor of the penalty on actions in the flat ends of the tanh.
+        saturation_limit: Where these begin.
+        **kwargs: Passed to :class:`~torchrl.objectives.TD3Loss`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic
+        >>> loss = make_td3_loss(make_actor(24, 2), make_critic(24, 2))
+        >>> loss.num_qvalue_nets
+        2
+    """
+
+    @dataclass
+    class _AcceptedKeys(TD3Loss._AcceptedKeys):
+        """Keys of TorchRL's loss, and those that this one reads or writes beside them."""
+
+        preactivation: NestedKey = "preactivation"
+        td_error_signal: NestedKey = TD_ERROR.key
+        action_gradient_signal: NestedKey = ACTION_GRADIENT.key
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        qvalue_network: TensorDictModule,
+        *,
+        bounds: tuple[float, float] | None = (-1.0, 1.0),
+        signals: Sequence[str] = WRITTEN,
+        gradient_order: float = 2.0,
+        gradient_at: GradientAt = "stored",
+        importance: Importance = "critic",
+        reward_scale: float = 1.0,
+        saturation_penalty: float = 0.0,
+        saturation_limit: float = 1.5,
+        **kwargs: Any,
+    ) -> None:
+        options = {
+            "signals": signals,
+            "gradient_order": gradient_order,
+            "gradient_at": gradient_at,
+            "importance": importance,
+            "reward_scale": reward_scale,
+            "saturation_penalty": saturation_penalty,
+            "saturation_limit": saturation_limit,
+        }
+        self._check_options(**options)  # type: ignore[arg-type]
+        super().__init__(
+            actor_network,
+            qvalue_network,
+            bounds=None if "action_spec" in kwargs else bounds,
+            use_prioritized_weights="auto" if importance == "torchrl" else False,
+            **kwargs,
+        )
+        self._set_options(**options)
+
+    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
+
+        Args:
+            tensordict: A batch of transitions, batch size ``[B]``.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        keys = self.tensor_keys
+        at_stored = self._gradient_at_stored
+        action = tensordict.get(keys.action).detach()
+        with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
+            if at_stored:
+                action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
+            values = self._values(tensordict, action)
+        gradient = action_gradient(values[0], action) if at_stored else None
+        if self._gradient_at_policy:
+            gradient = self._policy_gradient(tensordict)
+        value = torch.stack(values)
+        if not torch.is_grad_enabled():
+            value = value.detach()
+
+        target, next_value = self._target(tensordict)
+        td_error = (target - value).detach()
+        self._write_signals(tensordict, td_error.abs().amax(0), gradient)
+        loss = distance_loss(value, target.expand_as(value), loss_function=self.loss_function)
+        loss = self._reduce(loss.sum(0), tensordict)
+        metadata = {
+            "td_error": td_error.square(),
+            "next_state_value": next_value,
+            "pred_value": value.detach(),
+            "target_value": target,
+        }
+        return loss, metadata
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Actor's loss by the first critic, with the penalty on saturation if there is one.
+
+        Args:
+            tensordict: A batch of transitions, batch size ``[B]``.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        networks = self._networks()
+        chosen = call(networks.actor, read_inputs(networks.actor, tensordict))
+        value = self._value(networks.frozen_critic, tensordict, chosen)
+        weights = self._maybe_get_priority_weight(tensordict)
+        loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
+        loss, metadata = self._penalize_saturation(loss, chosen.get(self.tensor_keys.preactivation))
+        return loss, {"state_action_value_actor": value.detach(), **metadata}
+
+    def _networks(self) -> _Networks:
+        """The networks with their parameters in place, held for good."""
+        if self._bound is None:
+            first = self.qvalue_network_params[0].detach()
+            targets = self.target_qvalue_network_params.unbind(0)
+            actor, critic = self.actor_network, self.qvalue_network
+            self._bound = _Networks(
+                actor=bind(actor, self.actor_network_params),
+                critics=StackedNetworks(critic, self.qvalue_network_params),
+                frozen_critic=bind(critic, first).requires_grad_(False),
+                target_actor=bind(actor, self.target_actor_network_params).requires_grad_(False),
+                target_critics=[bind(critic, params).requires_grad_(False) for params in targets],
+            )
+        return self._bound
+
+    def _value(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
+        """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
+        found = call(critic, read_inputs(critic, source, chosen))
+        return found[self.tensor_keys.state_action_value].squeeze(-1)
+
+    def _values(self, source: TensorDictBase, action: Tensor) -> list[Tensor]:
+        """Q of the current critics, each of shape ``[B]``."""
+        critics = self._networks().critics
+        inputs = read_inputs(critics.network, source, {self.tensor_keys.action: action})
+        found = critics.call(inputs)
+        return [out[self.tensor_keys.state_action_value].squeeze(-1) for out in found]
+
+    def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
+        """Gradient of the first Q at the action of the current policy, shape ``[B, A]``."""
+        networks, key = self._networks(), self.tensor_keys.action
+        with torch.no_grad():
+            action = call(networks.actor, read_inputs(networks.actor, tensordict))[key]
+        action.requires_grad_(True)
+        with torch.enable_grad():
+            value = self._value(networks.frozen_critic, tensordict, {key: action})
+            return action_gradient(value, action)
+
+    def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Clipped double-Q targets at smoothed actions, and the values in them, each ``[B]``."""
+        keys, networks = self.tensor_keys, self._networks()
+        after = tensordict.get("next")
+        with torch.no_grad():
+            action = call(networks.target_actor, read_inputs(networks.target_actor, after))[
+                keys.action
+            ]
+            noise = torch.randn_like(action).mul_(self.policy_noise)
+            noise.clamp_(-self.noise_clip, self.noise_clip)
+            smoothed = torch.clamp(action + noise, self.min_action, self.max_action)
+            chosen = {keys.action: smoothed}
+            values = [self._value(critic, after, chosen) for critic in networks.target_critics]
+            next_value = torch.stack(values).amin(0)
+            target = bootstrap_target(
+                after.get(keys.reward).reshape(next_value.shape) * self.reward_scale,
+                next_value,
+                after.get(keys.terminated).reshape(next_value.shape),
+                gamma=self.value_estimator.gamma,
+            )
+        return target, next_value
+
+
+@dataclass
+class _Networks:
+    """Networks that hold the tensors of a loss."""
+
+    actor: TensorDictModule
+    critics: StackedNetworks
+    frozen_critic: TensorDictModule
+    """The first critic, through which gradients flow but which gets none itself."""
+    target_actor: TensorDictModule
+    target_critics: list[TensorDictModule]
+
+
+def make_td3_loss(
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    *,
+    gamma: float = 0.99,
+    loss_function: str = "l2",
+    **kwargs: Any,
+) -> SignalTD3Loss:
+    """A :class:`SignalTD3Loss` with one-step targets and the squared error of Eq. (11).
+
+    Args:
+        actor: Policy.
+        critic: Critic, of which two are made, the second with new weights.
+        gamma: Discount.
+        loss_function: Distance between value and target; TorchRL's own default is smoothed.
+        **kwargs: Passed to :class:`SignalTD3Loss`.
+
+    Returns:
+        The loss.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic
+        >>> make_td3_loss(make_actor(24, 2), make_critic(24, 2), policy_noise=0.1).policy_noise
+        0.1
+    """
+    loss = SignalTD3Loss(actor, critic, loss_function=loss_function, **kwargs)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+    return loss
