@@ -209,3 +209,15 @@ def test_the_value_estimator_is_one_step_if_none_is_made():
     loss = SignalDDPGLoss(actor, critic)
     losses = loss(make_batch())
     assert losses["loss_value"].isfinite()
+
+
+def test_networks_that_need_tensordicts_give_the_same_as_those_that_do_not():
+    direct = make_networks()
+    indirect = [TensorDictModule(n.module, n.in_keys, n.out_keys) for n in direct]
+    found = []
+    for networks in (direct, indirect):
+        batch = make_batch(weighted=True)
+        losses = make_ddpg_loss(*networks, gamma=GAMMA)(batch)
+        found.append([losses["loss_value"], losses["loss_actor"], *batch["signals"].values()])
+    for one, other in zip(*found, strict=True):
+        assert one.equal(other)
