@@ -25,9 +25,12 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 STAGES = [Stage("A", 3), Stage("B", 3)]
 
 
-def tiny(replay: str = "mpfa", episodes: list[Stage] | None = None) -> TrainSettings:
+def tiny(
+    replay: str = "mpfa", episodes: list[Stage] | None = None, learner: str = "ddpg"
+) -> TrainSettings:
     settings = TrainSettings(
         replay=GROUPS["replay"][replay](),
+        learner=GROUPS["learner"][learner](),
         curriculum=Curriculum("tiny", episodes or STAGES),
         environment=Environment(physics="kinematic", max_steps=25),
         checkpoint_every=1000,
@@ -53,14 +56,17 @@ def train(folder: Path, settings: TrainSettings) -> TrainingRun:
     return run
 
 
-def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole", tiny())
-    part = TrainingRun(tiny(), tmp_path)
+@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
+    tmp_path: Path, learner: str
+) -> None:
+    whole = train(tmp_path / "whole", tiny(learner=learner))
+    part = TrainingRun(tiny(learner=learner), tmp_path)
     part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 3))
     part.close()
     assert part.episode == 4
 
-    resumed = TrainingRun(tiny(), tmp_path)
+    resumed = TrainingRun(tiny(learner=learner), tmp_path)
     resumed.load(read_checkpoint(tmp_path))
     assert resumed.train()
     resumed.close()

@@ -1,0 +1,68 @@
+"""Training runs of minutes: does the robot learn to drive to its goal?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from evaluation import greedy, run_episodes
+from mpfa_envs import NavigationEnv, evaluation_pairs
+from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
+from training import TrainingRun
+
+pytestmark = pytest.mark.slow
+# Neither the tasks of training nor those that the documentation reports.
+TASKS = evaluation_pairs("A", 40, 4711)
+
+
+def settings_of(replay: str, learner: str, episodes: int) -> TrainSettings:
+    settings = TrainSettings(
+        replay=GROUPS["replay"][replay](),
+        learner=GROUPS["learner"][learner](),
+        curriculum=Curriculum("A", [Stage("A", episodes)]),
+        environment=Environment(physics="kinematic"),
+        seed=5,
+    )
+    settings.tracking.mode = "off"
+    return settings
+
+
+def greedy_success(run: TrainingRun) -> float:
+    env = NavigationEnv(world="A", physics="kinematic", collision_distance="contact")
+    results, _ = run_episodes(env, greedy(run.learner.policy), TASKS, progress=False)
+    env.close()
+    return sum(result.success for result in results) / len(results)
+
+
+def train(settings: TrainSettings, folder: Path) -> float:
+    torch.set_num_threads(1)
+    run = TrainingRun(settings, folder)
+    run.train()
+    run.close()
+    return greedy_success(run)
+
+
+@pytest.mark.parametrize(
+    ("replay", "learner"),
+    [("mpfa", "ddpg"), ("per", "ddpg"), ("uniform", "ddpg"), ("mpfa", "td3")],
+)
+def test_a_robot_that_trained_for_forty_episodes_finds_most_goals(
+    replay: str, learner: str, tmp_path: Path
+) -> None:
+    assert train(settings_of(replay, learner, 40), tmp_path) >= 0.85
+
+
+def test_a_robot_that_did_not_train_finds_few_goals(tmp_path: Path) -> None:
+    run = TrainingRun(settings_of("mpfa", "ddpg", 1), tmp_path)
+    assert greedy_success(run) <= 0.2
+    run.close()
+
+
+@pytest.mark.parametrize("broken", ["critic_lr", "gamma"])
+def test_a_broken_learner_does_not_pass_for_one_that_works(broken: str, tmp_path: Path) -> None:
+    settings = settings_of("mpfa", "ddpg", 40)
+    # Either leaves a critic that says nothing of what lies ahead.
+    setattr(settings.learner, broken, {"critic_lr": 1e-9, "gamma": 0.0}[broken])
+    assert train(settings, tmp_path) < 0.85
