@@ -16,7 +16,7 @@ from benchmarks.timing import (
     Timing,
     compare,
     entry,
-    one_thread,
+    few_threads,
     report_progress,
     seconds_per_call,
 )
@@ -189,7 +189,7 @@ def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool
 
         steps[capacity] = step
     times: dict[int, list[float]] = {capacity: [] for capacity in capacities}
-    with one_thread():
+    with few_threads(1):
         for step in steps.values():
             seconds_per_call(step, 20)
         for _ in range(1 if quick else 3):

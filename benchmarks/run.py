@@ -21,7 +21,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import environment, loss, replay
+from benchmarks import environment, loss, replay, training
 from benchmarks.timing import Entry
 
 LATEST = Path(__file__).with_name("latest.json")
@@ -31,6 +31,8 @@ TARGETS: Mapping[str, float] = {
     "sample_update_1e6": 1.3,
     "extend_one": 1.3,
     "loss": 1.15,
+    "train_step": 1.5,
+    "sb3_step": 0.9,
 }
 """Highest ratio that each entry may have."""
 
@@ -59,6 +61,8 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "update_growth": replay.measure_growth,
     "extend_one": replay.measure_extend_one,
     "loss": loss.measure,
+    "train_step": training.measure_train_step,
+    "sb3_step": training.measure_sb3_step,
     "environment": measure_environment,
 }
 

@@ -20,6 +20,7 @@ from typing import TypedDict
 import torch
 
 Call = Callable[[], object]
+Clock = Callable[[], float]
 MICROSECONDS = 1e6
 
 
@@ -55,10 +56,10 @@ class Timing:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Let PyTorch use one thread, and no garbage be collected, for as long as this is open."""
+def few_threads(count: int) -> Iterator[None]:
+    """Let PyTorch use so many threads, and no garbage be collected, for as long as this is open."""
     threads, collects = torch.get_num_threads(), gc.isenabled()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     gc.collect()
     gc.disable()
     try:
@@ -69,32 +70,46 @@ def one_thread() -> Iterator[None]:
             gc.enable()
 
 
-def seconds_per_call(call: Call, count: int) -> float:
-    """CPU time of one call, as the mean of ``count`` in a row [s]."""
-    start = time.process_time()
+def seconds_per_call(call: Call, count: int, *, clock: Clock = time.process_time) -> float:
+    """Time of one call, as the mean of ``count`` in a row [s]; CPU time by default."""
+    start = clock()
     for _ in range(count):
         call()
-    return (time.process_time() - start) / count
+    return (clock() - start) / count
 
 
-def take_turns(calls: Mapping[str, Call], *, rounds: int, seconds: float) -> dict[str, Timing]:
+def take_turns(
+    calls: Mapping[str, Call],
+    *,
+    rounds: int,
+    seconds: float,
+    threads: int = 1,
+    clock: Clock = time.process_time,
+    multiple_of: int = 1,
+) -> dict[str, Timing]:
     """Time calls in turns: A B, B A, A B and so on.
 
     Args:
         calls: What to call, by name.
         rounds: Number of rounds; each times every call once.
-        seconds: CPU time that a call is repeated for in each round [s].
+        seconds: Time that a call is repeated for in each round [s].
+        threads: Threads of PyTorch.
+        clock: What gives the time [s].
+        multiple_of: Calls come in blocks of so many.
 
     Returns:
         Times by name, with as many rounds each.
     """
-    with one_thread():
-        counts = {name: _repetitions(call, seconds) for name, call in calls.items()}
+    with few_threads(threads):
+        counts = {
+            name: _repetitions(call, seconds, clock=clock, multiple_of=multiple_of)
+            for name, call in calls.items()
+        }
         times: dict[str, list[float]] = {name: [] for name in calls}
         for number in range(rounds):
             names = list(calls) if number % 2 == 0 else list(calls)[::-1]
             for name in names:
-                times[name].append(seconds_per_call(calls[name], counts[name]))
+                times[name].append(seconds_per_call(calls[name], counts[name], clock=clock))
     timings = {name: Timing(tuple(found)) for name, found in times.items()}
     for name, timing in timings.items():
         report_progress(
@@ -105,14 +120,16 @@ def take_turns(calls: Mapping[str, Call], *, rounds: int, seconds: float) -> dic
     return timings
 
 
-def _repetitions(call: Call, seconds: float) -> int:
+def _repetitions(call: Call, seconds: float, *, clock: Clock, multiple_of: int) -> int:
     """How often a call fits in the time; also warms it up."""
-    seconds_per_call(call, 10)  # The first calls make caches, and would seem slow for good.
-    count, per_call = 1, seconds_per_call(call, 1)
+    # The first calls make caches, and would seem slow for good.
+    seconds_per_call(call, -(-10 // multiple_of) * multiple_of)
+    count = multiple_of
+    per_call = seconds_per_call(call, count, clock=clock)
     while per_call * count < seconds / 4:
         count *= 2
-        per_call = seconds_per_call(call, count)
-    return max(1, round(seconds / max(per_call, 1e-9)))
+        per_call = seconds_per_call(call, count, clock=clock)
+    return max(1, round(seconds / max(per_call, 1e-9) / multiple_of)) * multiple_of
 
 
 def compare(name: str, ours: Call, stock: Call, *, quick: bool) -> list[Entry]:
