@@ -37,6 +37,7 @@ WIDTH = 256
 CAPACITY = 100_000
 THREADS = 2
 _FILL = 10_000
+_BLOCK = 20
 _PLAIN = {"width": WIDTH, "layer_norm": False, "final_init": None}
 
 
@@ -219,14 +220,14 @@ def make_sb3_loop() -> Call:
         seed=0,
     )
     # Its loop is made for many steps; what starts and ends it is spread over as many.
-    block, waiting = 50, 0
+    waiting = 0
     model.learn(2 * BATCH_SIZE)
 
     def step() -> None:
         nonlocal waiting
         if waiting == 0:
-            model.learn(block, reset_num_timesteps=False)
-            waiting = block
+            model.learn(_BLOCK, reset_num_timesteps=False)
+            waiting = _BLOCK
         waiting -= 1
 
     return step
@@ -236,10 +237,10 @@ def _compare(name: str, ours: Call, baseline: str, theirs: Call, *, quick: bool)
     timings = take_turns(
         {name: ours, baseline: theirs},
         rounds=3 if quick else 21,
-        seconds=0.1 if quick else 1.0,
+        seconds=0.05 if quick else 1.0,
         threads=THREADS,
         clock=time.perf_counter,
-        multiple_of=50,
+        multiple_of=_BLOCK,
     )
     mine, other = timings[name], timings[baseline]
     return [

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import replay, run, timing
+from benchmarks import replay, run, timing, training
 from benchmarks.timing import Entry, Timing, entry
 
 
@@ -110,3 +110,31 @@ def test_calls_take_turns_and_a_ratio_is_the_median_of_the_rounds() -> None:
     assert calls[-6:] == ["a", "b", "b", "a", "a", "b"]
     slow, fast = Timing((2.0, 9.0, 4.0)), Timing((1.0, 3.0, 2.0))
     assert (slow.median, slow.minimum, slow.ratio(fast)) == (4.0, 2.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("measure", "name", "baseline"),
+    [
+        (training.measure_train_step, "train_step", "train_step_bare"),
+        (training.measure_sb3_step, "sb3_step", "sb3_step_sb3"),
+    ],
+)
+def test_a_training_step_is_compared_with_anothers(
+    measure, name: str, baseline: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "sb3_step":
+        pytest.importorskip("stable_baselines3")
+    for constant, small in (("WIDTH", 16), ("THREADS", 1), ("_BLOCK", 4), ("BATCH_SIZE", 32)):
+        monkeypatch.setattr(training, constant, small)
+    other, ours = measure(quick=True)
+    check_schema([other, ours])
+    assert (ours["name"], ours["baseline"], other["name"]) == (name, baseline, baseline)
+
+
+def test_both_training_steps_learn() -> None:
+    agent = training.Agent(plain=False)
+    before = [p.detach().clone() for p in agent.learner.loss.parameters()]
+    agent.learn(training.make_transitions(1))
+    after = list(agent.learner.loss.parameters())
+    assert any(not a.equal(b) for a, b in zip(after, before, strict=True))
+    assert agent.buffer.sampler.weights
