@@ -100,6 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
         robot=settings["robot"],
         physics=options.physics or settings["physics"],
         max_steps=settings["max_steps"],
+        action_repeat=settings["action_repeat"],
         collision_distance="contact",
         render_mode="rgb_array",
     )

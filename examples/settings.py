@@ -78,8 +78,7 @@ class Learner:
     algorithm: str = "ddpg"
     """``ddpg`` or ``td3``."""
     update_every: int = 2
-    """Steps of the environment for each update, which the paper does not give. One costs twice the
-    time and is no better (``docs/tuning.md``)."""
+    """Actions for each update, which the paper does not give. With one the time doubles."""
     actor_lr: float = 1e-4
     """Table 1."""
     critic_lr: float = 1e-4
@@ -134,7 +133,6 @@ class PlainLearner(Learner):
     """DDPG without the recipe, as the paper's code most likely had it."""
 
     name: str = "plain"
-    update_every: int = 1
     width: int = 256
     layers: int = 3
     layer_norm: bool = False
@@ -194,6 +192,8 @@ class Environment:
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int = 500
     """Time limit of an episode [0.1 s]."""
+    action_repeat: int = 1
+    """Time steps of 0.1 s for which an action is held."""
     progress_scale: float = 5.0
     """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
     far away, and a critic that is a little too smooth would rather circle than arrive."""

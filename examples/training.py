@@ -131,6 +131,7 @@ class TrainingRun:
             robot=settings.robot,
             physics=settings.physics,
             max_steps=settings.max_steps,
+            action_repeat=settings.action_repeat,
             progress_scale=settings.progress_scale,
         )
 

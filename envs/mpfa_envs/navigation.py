@@ -55,8 +55,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     **Reward**: Eq. (25) of the paper, see :func:`~mpfa_envs.navigation_reward`.
 
     **Episode end**: ``terminated`` at the goal or at a collision; ``truncated`` after ``max_steps``
-    steps. An episode that reaches the goal in the step of its collision counts as a success, as the
-    cases of Eq. (25) are ordered.
+    time steps. An episode that reaches the goal in the time step of its collision counts as a
+    success, as the cases of Eq. (25) are ordered.
 
     **Info**, the same keys after every reset and step (:data:`INFO_TYPES`): ``success``,
     ``collision``, ``time_out``; ``sim_time`` [s]; ``path_length`` driven so far [m];
@@ -74,8 +74,10 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         physics: ``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on
             exact arcs, several times faster, and needs no PyBullet. Lidar, clearance and
             collisions are computed from the same shapes in both.
-        max_steps: Time limit of an episode in steps.
-        time_step: Duration of a step [s].
+        max_steps: Time limit of an episode in time steps.
+        time_step: Duration of a time step [s].
+        action_repeat: Time steps for which an action is held. Their rewards add up, and the episode
+            may end after any of them.
         goal_radius: Distance of the robot's center from the goal that reaches it [m].
         collision_distance: Distance of the robot's center from an obstacle or wall that is a
             collision [m]. None: the robot's training margin, its radius and 0.17 m, which is 0.35 m
@@ -121,6 +123,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         physics: Physics = "wheels",
         max_steps: int = 500,
         time_step: float = 0.1,
+        action_repeat: int = 1,
         goal_radius: float = 0.5,
         collision_distance: float | Literal["contact"] | None = None,
         progress_scale: float = 15.0,
@@ -139,8 +142,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self.robot = resolve_robot(robot)
         if physics not in get_args(Physics):
             raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
-        if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-            raise ValueError(f"max_steps must be a positive integer, got {max_steps!r}")
+        for name, count in (("max_steps", max_steps), ("action_repeat", action_repeat)):
+            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name} must be a positive integer, got {count!r}")
         for name, value in (("time_step", time_step), ("goal_radius", goal_radius)):
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive, got {value}")
@@ -149,11 +153,12 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
                 f"min_goal_distance must be above goal_radius = {goal_radius}, "
                 f"got {min_goal_distance}"
             )
-        for name, value in (
-            ("progress_scale", progress_scale),
-            ("goal_reward", goal_reward),
-            ("collision_reward", collision_reward),
-        ):
+        scales = {
+            "progress_scale": progress_scale,
+            "goal_reward": goal_reward,
+            "collision_reward": collision_reward,
+        }
+        for name, value in scales.items():
             if not math.isfinite(value):
                 raise ValueError(f"{name} must be finite, got {value}")
         if reward is not None and not callable(reward):
@@ -172,15 +177,12 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self.physics = physics
         self.max_steps = max_steps
         self.time_step = float(time_step)
+        self.action_repeat = action_repeat
         self.goal_radius = float(goal_radius)
         self.min_goal_distance = float(min_goal_distance)
         self.render_mode = render_mode
         self._reward = reward
-        self._reward_scales = {
-            "progress_scale": float(progress_scale),
-            "goal_reward": float(goal_reward),
-            "collision_reward": float(collision_reward),
-        }
+        self._reward_scales = {name: float(value) for name, value in scales.items()}
         self.observation_slices = observation_slices(sectors)
         low, high = observation_bounds(sectors, self.world.diagonal)
         self.observation_space = BoxSpace(low, high, dtype=np.float32)
@@ -248,7 +250,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Drive for one time step.
+        """Drive until the next action is due.
 
         Args:
             action: Speeds of the left and the right wheel, shape ``[2]``, in [-1, 1].
@@ -263,6 +265,21 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         if not self._running:
             raise ResetNeeded("no episode is running: call reset() before step()")
         left, right = self._wheel_speeds(action)
+        success, collision, truncated, terms = self._advance(left, right)
+        for _ in range(self.action_repeat - 1):
+            if not self._running:
+                break
+            success, collision, truncated, more = self._advance(left, right)
+            terms = RewardTerms(*map(sum, zip(terms, more, strict=True)))
+        info = self._info(success, collision, truncated, terms)
+        return self._observe(), float(terms.total), success or collision, truncated, info
+
+    def _advance(self, left: float, right: float) -> tuple[bool, bool, bool, RewardTerms]:
+        """Hold the wheel speeds [m/s] for one time step.
+
+        Returns:
+            Whether the goal was reached, the robot collided, or time is up; and the reward.
+        """
         motion = self._drive.move(left, right)
         self._steps += 1
         before = self._motion
@@ -276,25 +293,16 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self._min_clearance = min(self._min_clearance, clearance)
         success = self._distance <= self.goal_radius
         collision = not success and to_obstacle <= self.collision_distance
-        outcome = StepOutcome(
-            previous,
-            self._distance,
-            success,
-            collision,
-            clearance,
-            motion.linear_speed,
-            motion.angular_speed,
-        )
+        speeds = motion.linear_speed, motion.angular_speed
+        outcome = StepOutcome(previous, self._distance, success, collision, clearance, *speeds)
         terms = (
             navigation_reward(outcome, **self._reward_scales)
             if self._reward is None
             else self._reward(outcome)
         )
-        terminated = success or collision
-        truncated = not terminated and self._steps >= self.max_steps
-        self._running = not (terminated or truncated)
-        info = self._info(success, collision, truncated, terms)
-        return self._observe(), float(terms.total), terminated, truncated, info
+        truncated = not (success or collision) and self._steps >= self.max_steps
+        self._running = not (success or collision or truncated)
+        return success, collision, truncated, terms
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the room from above.
