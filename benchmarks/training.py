@@ -212,7 +212,7 @@ def make_sb3_loop() -> Call:
         learning_starts=BATCH_SIZE,
         batch_size=BATCH_SIZE,
         tau=0.01,
-        train_freq=(1, "step"),  # type: ignore[arg-type]
+        train_freq=1,
         gradient_steps=1,
         action_noise=NormalActionNoise(zeros, zeros + 0.2),
         policy_kwargs={"net_arch": [WIDTH, WIDTH]},
