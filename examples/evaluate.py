@@ -19,7 +19,15 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from evaluation import EpisodeResult, Interval, greedy, run_episode, run_episodes, summarize
+from evaluation import (
+    EpisodeResult,
+    Interval,
+    greedy,
+    make_evaluation_env,
+    run_episode,
+    run_episodes,
+    summarize,
+)
 from mpfa_envs import NavigationEnv, Task, draw_trajectories, evaluation_pairs
 from records import load_policy, write_rows, write_text_atomically
 
@@ -94,16 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
         options.policy if options.policy.is_dir() else options.policy.parent
     )
     folder.mkdir(parents=True, exist_ok=True)
-    settings = state["environment"]
-    env = NavigationEnv(
-        world=options.world,
-        robot=settings["robot"],
-        physics=options.physics or settings["physics"],
-        max_steps=settings["max_steps"],
-        action_repeat=settings["action_repeat"],
-        collision_distance="contact",
-        render_mode="rgb_array",
-    )
+    settings = {**state["environment"]}
+    settings["physics"] = options.physics or settings["physics"]
+    env = make_evaluation_env(options.world, settings, render_mode="rgb_array")
     tasks = evaluation_pairs(options.world, options.episodes, options.seed, robot=settings["robot"])
     act = greedy(policy)
     results, trajectories = run_episodes(env, act, tasks)
@@ -117,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
         "intervals": {name: [_plain(i.low), _plain(i.high)] for name, i in summary.items()},
         "world": str(options.world),
         "seed": options.seed,
-        "physics": options.physics or settings["physics"],
+        "physics": settings["physics"],
         "trained": state["trained"],
     }
     write_text_atomically(json.dumps(document, indent=2) + "\n", folder / "evaluation.json")

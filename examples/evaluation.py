@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -47,13 +47,39 @@ class Interval:
     high: float
 
 
+def make_evaluation_env(
+    world: str, settings: dict[str, Any], *, render_mode: Literal["rgb_array"] | None = None
+) -> NavigationEnv:
+    """The environment that a policy was trained in, with contact as the only collision.
+
+    Args:
+        world: Map or world file.
+        settings: The environment's settings in training.
+        render_mode: As in :class:`~mpfa_envs.NavigationEnv`.
+
+    Returns:
+        The environment.
+    """
+    return NavigationEnv(
+        world=world,
+        robot=settings["robot"],
+        physics=settings["physics"],
+        max_steps=settings["max_steps"],
+        action_repeat=settings["action_repeat"],
+        collision_distance="contact",
+        render_mode=render_mode,
+    )
+
+
 def greedy(policy: TensorDictModule) -> Action:
     """The policy's action without noise, from one observation."""
     network = policy.module
+    device = next(network.parameters()).device
 
     @torch.no_grad()
     def act(observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        action: NDArray[np.float32] = network(torch.from_numpy(observation))[-1].numpy()
+        found = network(torch.from_numpy(observation).to(device))[-1]
+        action: NDArray[np.float32] = found.cpu().numpy()
         return action
 
     return act

@@ -42,6 +42,23 @@ class EpisodeRecord:
     """Shortest path of the task [m]."""
 
 
+@dataclass
+class ProgressRecord:
+    """One evaluation during training."""
+
+    total_steps: int
+    episode: int
+    """Training episodes finished."""
+    world: str
+    """Where it was evaluated."""
+    success: float
+    collision: float
+    timeout: float
+    spl: float
+    seconds: float
+    """Wall-clock time that it took [s]."""
+
+
 def write_text_atomically(text: str, path: Path) -> None:
     """Write a text file in one step: the old one or the new one, never half."""
     temporary = path.with_name(f".{path.name}.tmp")
@@ -58,9 +75,11 @@ def write_rows(rows: Sequence[dict[str, Any]], names: Sequence[str], path: Path)
     write_text_atomically(text.getvalue(), path)
 
 
-def write_episodes(records: Sequence[EpisodeRecord], path: Path) -> None:
-    """Write the episodes as CSV."""
-    names = [entry.name for entry in fields(EpisodeRecord)]
+def write_records(
+    records: Sequence[Any], kind: type[EpisodeRecord] | type[ProgressRecord], path: Path
+) -> None:
+    """Write records of one kind as CSV."""
+    names = [entry.name for entry in fields(kind)]
     write_rows([asdict(record) for record in records], names, path)
 
 

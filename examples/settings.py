@@ -200,6 +200,18 @@ class Environment:
 
 
 @dataclass
+class Evaluation:
+    """Greedy episodes during training, which show how fast it learns and change nothing in it."""
+
+    every: int = 0
+    """Steps between two evaluations; 0: none."""
+    world: str = "validation"
+    """Never the test map, by which nothing may be chosen."""
+    episodes: int = 20
+    """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
+
+
+@dataclass
 class Tracking:
     """Where the run is logged."""
 
@@ -252,6 +264,7 @@ class TrainSettings:
     tracking: Tracking = field(default_factory=Tracking)
     exploration: Exploration = field(default_factory=Exploration)
     environment: Environment = field(default_factory=Environment)
+    evaluation: Evaluation = field(default_factory=Evaluation)
 
 
 GROUPS: dict[str, dict[str, Any]] = {

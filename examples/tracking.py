@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from records import EpisodeRecord
+from records import EpisodeRecord, ProgressRecord
 from settings import TrainSettings
 from torchrl_mpfa import SignalReplayBuffer
 
@@ -68,6 +68,14 @@ class Tracker:
             },
             step=step,
         )
+
+    def log_progress(self, record: ProgressRecord) -> None:
+        """Log an evaluation."""
+        if self._run is None:
+            return
+        rates = ("success", "collision", "timeout", "spl")
+        entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
+        self._run.log(entries, step=record.total_steps)
 
     def log_update(
         self,

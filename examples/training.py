@@ -17,8 +17,9 @@ from torchrl.envs.utils import ExplorationType, step_mdp
 from tqdm import tqdm
 
 from assembly import make_buffer, make_learner, make_noise
-from mpfa_envs import make_navigation_env
-from records import EpisodeRecord, save_policy, write_episodes
+from evaluation import greedy, make_evaluation_env, run_episodes
+from mpfa_envs import evaluation_pairs, make_navigation_env
+from records import EpisodeRecord, ProgressRecord, save_policy, write_records
 from settings import Stage, TrainSettings
 from torchrl_mpfa import load_safely, save_atomically
 from tracking import Tracker
@@ -35,6 +36,7 @@ _TRANSITION = (
     ("next", "terminated"),
 )
 _RECENT = 20
+_PROGRESS_SEED = 1
 
 
 class TrainingRun:
@@ -70,6 +72,7 @@ class TrainingRun:
         self.episode = 0
         self.step = 0
         self.records: list[EpisodeRecord] = []
+        self.progress: list[ProgressRecord] = []
         self.tracker = Tracker(settings, folder)
         self._stop = False
 
@@ -92,6 +95,7 @@ class TrainingRun:
                 self.records.append(record)
                 self.episode += 1
                 self.tracker.log_episode(record, self.step)
+                self._evaluate(since=self.step - record.steps)
                 bar.update()
                 bar.set_postfix_str(self._summary())
                 if self.episode % self.settings.checkpoint_every == 0:
@@ -207,6 +211,31 @@ class TrainingRun:
         lowest = settings.learner.lr_end_factor
         self.learner.anneal(lowest + (1.0 - lowest) * left**settings.learner.lr_power)
 
+    def _evaluate(self, *, since: int) -> None:
+        """Evaluate if that fell due after step ``since``; nothing of the training is touched."""
+        settings = self.settings.evaluation
+        if settings.every <= 0 or self.step // settings.every == since // settings.every:
+            return
+        start = time.perf_counter()
+        env = make_evaluation_env(settings.world, asdict(self.settings.environment))
+        tasks = evaluation_pairs(settings.world, settings.episodes, _PROGRESS_SEED, robot=env.robot)
+        results, _ = run_episodes(env, greedy(self.learner.policy), tasks, progress=False)
+        env.close()
+
+        def mean(name: str) -> float:
+            return sum(getattr(result, name) for result in results) / len(results)
+
+        rates = {name: mean(name) for name in ("success", "collision", "timeout", "spl")}
+        record = ProgressRecord(
+            total_steps=self.step,
+            episode=self.episode,
+            world=settings.world,
+            seconds=time.perf_counter() - start,
+            **rates,
+        )
+        self.progress.append(record)
+        self.tracker.log_progress(record)
+
     # Saving ----------------------------------------------------------------------------------
 
     def save(self) -> None:
@@ -220,10 +249,13 @@ class TrainingRun:
             "buffer": self.buffer.state_dict(),
             "noise": self.noise.state_dict(),
             "records": [asdict(record) for record in self.records],
+            "progress": [asdict(record) for record in self.progress],
         }
         save_atomically(state, self.folder / CHECKPOINT)
         save_policy(self.learner.policy, self.settings, self.records, self.folder / "policy.pt")
-        write_episodes(self.records, self.folder / "episodes.csv")
+        write_records(self.records, EpisodeRecord, self.folder / "episodes.csv")
+        if self.progress:
+            write_records(self.progress, ProgressRecord, self.folder / "progress.csv")
 
     def load(self, state: dict[str, Any]) -> None:
         """Go on where a checkpoint was written."""
@@ -232,6 +264,7 @@ class TrainingRun:
         self.noise.load_state_dict(state["noise"])
         self.episode, self.step = state["episode"], state["step"]
         self.records = [EpisodeRecord(**record) for record in state["records"]]
+        self.progress = [ProgressRecord(**record) for record in state["progress"]]
         if self.episode < self.total_episodes:
             self.env.close()
             self.env = self._make_env(self.episode)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,23 @@ def train(folder: Path, settings: TrainSettings) -> TrainingRun:
     run.train()
     run.close()
     return run
+
+
+def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.evaluation.every, settings.evaluation.episodes = 50, 2
+    evaluated, plain = train(tmp_path / "evaluated", settings), train(tmp_path / "plain", tiny())
+    assert rows(evaluated) == rows(plain)
+    steps = [record.total_steps for record in evaluated.progress]
+    # At the first end of an episode after each multiple of fifty.
+    ends = [0, *(record.total_steps for record in evaluated.records)]
+    assert steps == [end for before, end in pairwise(ends) if end // 50 > before // 50]
+    for record in evaluated.progress:
+        assert record.success + record.collision + record.timeout == pytest.approx(1.0)
+        assert record.world == "validation"
+    lines = (tmp_path / "evaluated" / "progress.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(steps)
+    assert not (tmp_path / "plain" / "progress.csv").exists()
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
