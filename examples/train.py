@@ -26,6 +26,9 @@ from records import draw_learning_curve
 from settings import TrainSettings, register
 from training import CHECKPOINT, TrainingRun, read_checkpoint
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
 
 def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     """Typed settings from what Hydra composed or a checkpoint holds."""
@@ -72,6 +75,7 @@ def run(config: DictConfig) -> None:
         print(f"policy: {folder / 'policy.pt'}   curve: {folder / 'learning_curve.png'}")
     else:
         print(f"stopped after episode {training.episode}; go on with: train.py resume={folder}")
+        raise SystemExit(INTERRUPTED)
 
 
 def main() -> None:
