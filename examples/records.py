@@ -160,7 +160,7 @@ def draw_learning_curve(records: Sequence[EpisodeRecord], path: Path, *, window:
     )
     for axis, (label, values) in zip(axes, curves, strict=True):
         axis.plot(episodes, values, ".", color="0.75", markersize=3)
-        axis.plot(episodes, _running_mean(values, window), color="tab:blue")
+        axis.plot(episodes, running_mean(values, window), color="tab:blue")
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
         for start in range(1, len(records)):
@@ -172,7 +172,8 @@ def draw_learning_curve(records: Sequence[EpisodeRecord], path: Path, *, window:
     pyplot.close(figure)
 
 
-def _running_mean(values: np.ndarray[Any, Any], window: int) -> np.ndarray[Any, Any]:
+def running_mean(values: np.ndarray[Any, Any], window: int) -> np.ndarray[Any, Any]:
+    """Mean of the last ``window`` values, of fewer at the start."""
     sums = np.cumsum(np.concatenate(([0.0], values)))
     ends = np.arange(1, len(values) + 1)
     starts = np.maximum(ends - window, 0)
