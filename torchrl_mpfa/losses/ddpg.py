@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_mpfa.losses.calling import Tensors, bind, call, read_inputs
+from torchrl_mpfa.losses.calling import bind, call, read_inputs
 from torchrl_mpfa.losses.options import (
     WRITTEN,
     GradientAt,
@@ -145,7 +145,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
             value = self._value(self._networks().critic, tensordict, {keys.action: action})
         gradient = action_gradient(value, action) if at_stored else None
         if self._gradient_at_policy:
-            gradient = self._policy_gradient(tensordict)
+            gradient = self._policy_gradient(tensordict, self._networks().frozen_critic)
         if not torch.is_grad_enabled():
             value = value.detach()
 
@@ -196,20 +196,6 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
                 target_critic=bind(self.value_network, target_critic).requires_grad_(False),
             )
         return self._bound
-
-    def _value(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
-        """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
-        found = call(critic, read_inputs(critic, source, chosen))
-        return found[self.tensor_keys.state_action_value].squeeze(-1)
-
-    def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
-        """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
-        networks, key = self._networks(), self.tensor_keys.action
-        with torch.no_grad():
-            action = call(networks.actor, read_inputs(networks.actor, tensordict))[key]
-        action.requires_grad_(True)
-        with torch.enable_grad():
-            return action_gradient(self._value(networks.critic, tensordict, {key: action}), action)
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Targets y of Eq. (5), shape ``[B]``; a time limit bootstraps, an end does not."""

@@ -7,8 +7,10 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
@@ -85,6 +87,20 @@ class SignalLossMixin:
         if TD_ERROR.name in self.signals:
             size = td_error_priority(td_error)
             tensordict.set(self.tensor_keys.td_error_signal, size / self.reward_scale)
+
+    def _value(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
+        """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
+        found = call(critic, read_inputs(critic, source, chosen))
+        return found[self.tensor_keys.state_action_value].squeeze(-1)
+
+    def _policy_gradient(self, tensordict: TensorDictBase, critic: TensorDictModule) -> Tensor:
+        """Gradient of a critic's Q at the action of the current policy, shape ``[B, A]``."""
+        actor, key = self._networks().actor, self.tensor_keys.action  # type: ignore[attr-defined]
+        with torch.no_grad():
+            action = call(actor, read_inputs(actor, tensordict))[key]
+        action.requires_grad_(True)
+        with torch.enable_grad():
+            return action_gradient(self._value(critic, tensordict, {key: action}), action)
 
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Mean over the batch, with the importance weights of Eq. (11), or TorchRL's way."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_mpfa.losses.calling import StackedNetworks, Tensors, bind, call, read_inputs
+from torchrl_mpfa.losses.calling import StackedNetworks, bind, call, read_inputs
 from torchrl_mpfa.losses.ddpg import bootstrap_target
 from torchrl_mpfa.losses.options import (
     WRITTEN,
@@ -122,7 +122,7 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             values = self._values(tensordict, action)
         gradient = action_gradient(values[0], action) if at_stored else None
         if self._gradient_at_policy:
-            gradient = self._policy_gradient(tensordict)
+            gradient = self._policy_gradient(tensordict, self._networks().frozen_critic)
         value = torch.stack(values)
         if not torch.is_grad_enabled():
             value = value.detach()
@@ -172,27 +172,12 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             )
         return self._bound
 
-    def _value(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
-        """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
-        found = call(critic, read_inputs(critic, source, chosen))
-        return found[self.tensor_keys.state_action_value].squeeze(-1)
-
     def _values(self, source: TensorDictBase, action: Tensor) -> list[Tensor]:
         """Q of the current critics, each of shape ``[B]``."""
         critics = self._networks().critics
         inputs = read_inputs(critics.network, source, {self.tensor_keys.action: action})
         found = critics.call(inputs)
         return [out[self.tensor_keys.state_action_value].squeeze(-1) for out in found]
-
-    def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
-        """Gradient of the first Q at the action of the current policy, shape ``[B, A]``."""
-        networks, key = self._networks(), self.tensor_keys.action
-        with torch.no_grad():
-            action = call(networks.actor, read_inputs(networks.actor, tensordict))[key]
-        action.requires_grad_(True)
-        with torch.enable_grad():
-            value = self._value(networks.frozen_critic, tensordict, {key: action})
-            return action_gradient(value, action)
 
     def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Clipped double-Q targets at smoothed actions, and the values in them, each ``[B]``."""
