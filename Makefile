@@ -45,7 +45,7 @@ demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minu
 	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
 	$(BIN)/python examples/evaluate.py runs/demo --world A --episodes $(EPISODES)
 
-train: $(STAMP) ## Train on the paper's curriculum, maps A to D (hours); ARGS='replay=per seed=1'
+train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='replay=per seed=1'
 	$(BIN)/python examples/train.py curriculum=paper $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses

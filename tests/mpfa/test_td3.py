@@ -8,7 +8,7 @@ from losses import GAMMA, make_batch, make_networks, parameter_gradients
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import TD3Loss, ValueEstimators
 
-from torchrl_mpfa import SignalTD3Loss, TD3Learner, make_td3_loss
+from torchrl_mpfa import SignalTD3Loss, TD3Learner, make_ddpg_loss, make_td3_loss
 
 # TorchRL warns at every loss whose target networks nothing moves.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -185,3 +185,12 @@ def test_an_action_spec_takes_the_place_of_bounds():
     spec = Bounded(low=-0.5, high=0.5, shape=(2,))
     loss = SignalTD3Loss(*make_networks(), action_spec=spec)
     assert loss.max_action.tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("key", ["observation", "action"])
+def test_a_missing_input_is_named(key):
+    batch = make_batch().exclude(key)
+    with pytest.raises(KeyError, match=key):
+        make_loss()(batch)
+    with pytest.raises(KeyError, match=key):
+        make_ddpg_loss(*make_networks())(batch)

@@ -44,7 +44,7 @@ def read_inputs(
     """
     instead = instead or {}
     return {
-        key: instead[key] if key in instead else source.get(key).detach() for key in network.in_keys
+        key: instead[key] if key in instead else source[key].detach() for key in network.in_keys
     }
 
 

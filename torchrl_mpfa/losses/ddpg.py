@@ -137,7 +137,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         """
         keys = self.tensor_keys
         at_stored = self._gradient_at_stored
-        action = tensordict.get(keys.action).detach()
+        action = tensordict[keys.action].detach()
         # The gradient is wanted under no_grad as well, when a loss is only looked at.
         with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
             if at_stored:

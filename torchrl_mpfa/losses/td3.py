@@ -115,7 +115,7 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         """
         keys = self.tensor_keys
         at_stored = self._gradient_at_stored
-        action = tensordict.get(keys.action).detach()
+        action = tensordict[keys.action].detach()
         with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
             if at_stored:
                 action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
