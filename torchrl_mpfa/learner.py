@@ -58,7 +58,7 @@ class ActorCriticLearner:
 
     def __init__(
         self,
-        loss: LossModule,
+        loss: SignalDDPGLoss | SignalTD3Loss,
         *,
         critic: str,
         actor_lr: float,
@@ -89,10 +89,11 @@ class ActorCriticLearner:
             fused=True,
         )
 
-    def _descend(self, loss: torch.Tensor) -> None:
+    def _descend(self, loss: torch.Tensor, batch: TensorDictBase) -> None:
         """One step of the optimizer; what has no gradient stays as it is."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        self.loss.write_action_gradient(batch)
         self.optimizer.step()
 
     def anneal(self, factor: float) -> None:
@@ -166,11 +167,12 @@ class DDPGLearner(ActorCriticLearner):
         Returns:
             Detached values for the log.
         """
-        losses = self.loss(batch)
-        # Only the losses: TorchRL's output holds values beside them.
-        self._descend(losses["loss_value"] + losses["loss_actor"])
+        loss_value, of_critic = self.loss.loss_value(batch, defer_gradient=True)
+        loss_actor, of_actor = self.loss.loss_actor(batch)
+        self._descend(loss_value + loss_actor, batch)
         self.targets.step()
-        return {key: value.detach() for key, value in losses.items()}
+        log = {"loss_value": loss_value, "loss_actor": loss_actor, **of_critic, **of_actor}
+        return {key: value.detach() for key, value in log.items()}
 
 
 class TD3Learner(ActorCriticLearner):
@@ -230,13 +232,13 @@ class TD3Learner(ActorCriticLearner):
         """
         self.updates += 1
         due = self.updates % self.policy_delay == 0
-        total, log = self.loss.value_loss(batch)
+        total, log = self.loss.value_loss(batch, defer_gradient=True)
         log = {"loss_value": total, **log}
         if due:
             loss_actor, of_actor = self.loss.actor_loss(batch)
             log.update(loss_actor=loss_actor, **of_actor)
             total = total + loss_actor
-        self._descend(total)
+        self._descend(total, batch)
         if due:
             self.targets.step()
         return {key: value.detach() for key, value in log.items()}

@@ -6,7 +6,7 @@ networks of a hundred units both take longer than the network itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 
 from tensordict import TensorDict, TensorDictBase
@@ -81,19 +81,27 @@ class StackedNetworks:
         self._params = {name: value for name, value in flat if isinstance(value, Tensor)}
         self._bare = {name.removeprefix("module."): value for name, value in self._params.items()}
 
-    def call(self, inputs: dict[NestedKey, Tensor]) -> list[dict[NestedKey, Tensor]]:
-        """Compute what each network gives, as :func:`call` does for one."""
+    def call(self, inputs: Sequence[dict[NestedKey, Tensor]]) -> list[dict[NestedKey, Tensor]]:
+        """Compute what each network gives for inputs of its own, as :func:`call` does for one."""
         direct = isinstance(self.network, DirectModule)
         split = {
             name: value.unbind(0)
             for name, value in (self._bare if direct else self._params).items()
         }
-        count = len(next(iter(split.values())))
-        weights = [{name: value[i] for name, value in split.items()} for i in range(count)]
+        pairs = [
+            ({name: value[i] for name, value in split.items()}, each)
+            for i, each in enumerate(inputs)
+        ]
         if isinstance(self.network, DirectModule):
-            arguments = tuple(inputs[key] for key in self.network.in_keys)
-            found = [functional_call(self.network.module, one, arguments) for one in weights]
+            keys, module = self.network.in_keys, self.network.module
+            found = [
+                functional_call(module, weights, tuple(each[key] for key in keys))
+                for weights, each in pairs
+            ]
             return [self.network.by_key(out) for out in found]
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            outs = [functional_call(self.network, one, (TensorDict(inputs),)) for one in weights]
+            outs = [
+                functional_call(self.network, weights, (TensorDict(each),))
+                for weights, each in pairs
+            ]
         return [dict(out.items(True, True)) for out in outs]

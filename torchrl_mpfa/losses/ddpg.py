@@ -20,7 +20,6 @@ from torchrl_mpfa.losses.options import (
     GradientAt,
     Importance,
     SignalLossMixin,
-    action_gradient,
 )
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
@@ -126,11 +125,15 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         )
         self._set_options(**options)
 
-    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss_value(
+        self, tensordict: TensorDictBase, *, defer_gradient: bool = False
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Critic's loss (Eq. 11); writes the signals (Eqs. 13-14) in ``tensordict``.
 
         Args:
             tensordict: A batch of transitions, batch size ``[B]``.
+            defer_gradient: Leave the signal of Eq. (14) to :meth:`write_action_gradient`, which
+                has it from the backward pass at no cost.
 
         Returns:
             The loss, and detached values for the log.
@@ -143,9 +146,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
             if at_stored:
                 action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
             value = self._value(self._networks().critic, tensordict, {keys.action: action})
-        gradient = action_gradient(value, action) if at_stored else None
-        if self._gradient_at_policy:
-            gradient = self._policy_gradient(tensordict, self._networks().frozen_critic)
+        gradient = self._stored_gradient(tensordict, action, value, defer=defer_gradient)
         if not torch.is_grad_enabled():
             value = value.detach()
 

@@ -61,6 +61,7 @@ class SignalLossMixin:
 
     def _set_options(self, **options: Any) -> None:
         self._bound: Any = None
+        self._deferred: tuple[Tensor, Tensor] | None = None
         self.signals = tuple(options["signals"])
         self.gradient_order: float = options["gradient_order"]
         self.gradient_at: GradientAt = options["gradient_at"]
@@ -82,25 +83,77 @@ class SignalLossMixin:
     ) -> None:
         """Write ``|TD error|`` (Eq. 13) and the norm of the gradient (Eq. 14), each ``[B]``."""
         if gradient is not None:
-            size = action_gradient_priority(gradient, order=self.gradient_order)
-            tensordict.set(self.tensor_keys.action_gradient_signal, size / self.reward_scale)
+            self._write_gradient(tensordict, gradient)
         if TD_ERROR.name in self.signals:
             size = td_error_priority(td_error)
             tensordict.set(self.tensor_keys.td_error_signal, size / self.reward_scale)
+
+    def _write_gradient(self, tensordict: TensorDictBase, gradient: Tensor) -> None:
+        size = action_gradient_priority(gradient, order=self.gradient_order)
+        tensordict.set(self.tensor_keys.action_gradient_signal, size / self.reward_scale)
+
+    def _stored_gradient(
+        self, tensordict: TensorDictBase, action: Tensor, value: Tensor, *, defer: bool
+    ) -> Tensor | None:
+        """Gradient of Q at the stored action, ``[B, A]``; None if it is not wanted, or not yet."""
+        self._deferred = None
+        if self._gradient_at_policy:
+            return self._policy_gradient(tensordict)
+        if not self._gradient_at_stored:
+            return None
+        if defer and torch.is_grad_enabled():
+            value.retain_grad()
+            self._deferred = action, value
+            return None
+        return action_gradient(value, action)
+
+    def write_action_gradient(self, tensordict: TensorDictBase) -> None:
+        r"""Write the signal of Eq. (14) that the critic's loss was asked to defer.
+
+        A transition's action enters the loss through its own Q alone, so
+        :math:`\nabla_a Q = \nabla_a L / (\partial L / \partial Q)`: the backward pass of the loss
+        has found it on its way, and needs no other one before it.
+
+        Args:
+            tensordict: The batch that the loss was computed of; nothing happens if it deferred
+                nothing.
+
+        Raises:
+            RuntimeError: If the loss was not differentiated.
+        """
+        if self._deferred is None:
+            return
+        (action, value), self._deferred = self._deferred, None
+        if action.grad is None or value.grad is None:
+            raise RuntimeError(
+                "the action gradient was deferred: call backward() on the loss first"
+            )
+        slope = value.grad.unsqueeze(-1)
+        gradient = action.grad / slope
+        flat = slope == 0
+        if bool(flat.any()):  # Where there is no error there is nothing to divide.
+            gradient = torch.where(flat, self._gradient(tensordict, action), gradient)
+        self._write_gradient(tensordict, gradient)
 
     def _value(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
         """Q of a critic, shape ``[B]``, at the observations of one and the actions of the other."""
         found = call(critic, read_inputs(critic, source, chosen))
         return found[self.tensor_keys.state_action_value].squeeze(-1)
 
-    def _policy_gradient(self, tensordict: TensorDictBase, critic: TensorDictModule) -> Tensor:
-        """Gradient of a critic's Q at the action of the current policy, shape ``[B, A]``."""
-        actor, key = self._networks().actor, self.tensor_keys.action  # type: ignore[attr-defined]
+    def _policy_gradient(self, tensordict: TensorDictBase) -> Tensor:
+        """Gradient of Q at the action of the current policy, shape ``[B, A]``."""
+        actor = self._networks().actor  # type: ignore[attr-defined]
         with torch.no_grad():
-            action = call(actor, read_inputs(actor, tensordict))[key]
-        action.requires_grad_(True)
+            chosen = call(actor, read_inputs(actor, tensordict))
+        return self._gradient(tensordict, chosen[self.tensor_keys.action])
+
+    def _gradient(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
+        """Gradient of Q at these actions, shape ``[B, A]``."""
+        critic = self._networks().frozen_critic  # type: ignore[attr-defined]
+        action = action.detach().requires_grad_(True)
         with torch.enable_grad():
-            return action_gradient(self._value(critic, tensordict, {key: action}), action)
+            value = self._value(critic, tensordict, {self.tensor_keys.action: action})
+            return action_gradient(value, action)
 
     def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Mean over the batch, with the importance weights of Eq. (11), or TorchRL's way."""
@@ -141,7 +194,7 @@ class SignalLossMixin:
         return super().train(mode)  # type: ignore[misc]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_bound": None}
+        return {**self.__dict__, "_bound": None, "_deferred": None}
 
 
 def action_gradient(value: Tensor, action: Tensor) -> Tensor:

@@ -21,7 +21,6 @@ from torchrl_mpfa.losses.options import (
     GradientAt,
     Importance,
     SignalLossMixin,
-    action_gradient,
 )
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
@@ -104,11 +103,14 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         )
         self._set_options(**options)
 
-    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def value_loss(
+        self, tensordict: TensorDictBase, *, defer_gradient: bool = False
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
 
         Args:
             tensordict: A batch of transitions, batch size ``[B]``.
+            defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
 
         Returns:
             The loss, and detached values for the log.
@@ -120,9 +122,7 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             if at_stored:
                 action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
             values = self._values(tensordict, action)
-        gradient = action_gradient(values[0], action) if at_stored else None
-        if self._gradient_at_policy:
-            gradient = self._policy_gradient(tensordict, self._networks().frozen_critic)
+        gradient = self._stored_gradient(tensordict, action, values[0], defer=defer_gradient)
         value = torch.stack(values)
         if not torch.is_grad_enabled():
             value = value.detach()
@@ -173,10 +173,10 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         return self._bound
 
     def _values(self, source: TensorDictBase, action: Tensor) -> list[Tensor]:
-        """Q of the current critics, each of shape ``[B]``."""
-        critics = self._networks().critics
-        inputs = read_inputs(critics.network, source, {self.tensor_keys.action: action})
-        found = critics.call(inputs)
+        """Q of the current critics, each of shape ``[B]``; the action leads to the first alone."""
+        critics, key = self._networks().critics, self.tensor_keys.action
+        actions = [action] + [action.detach()] * (self.num_qvalue_nets - 1)
+        found = critics.call([read_inputs(critics.network, source, {key: a}) for a in actions])
         return [out[self.tensor_keys.state_action_value].squeeze(-1) for out in found]
 
     def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
