@@ -46,7 +46,7 @@ demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minu
 	$(BIN)/python examples/evaluate.py runs/demo --world A --episodes $(EPISODES)
 
 train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='replay=per seed=1'
-	$(BIN)/python examples/train.py curriculum=paper $(ARGS)
+	$(BIN)/python examples/train.py curriculum=paper learner.lr_power=1 $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
 	$(PYTEST) $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)

@@ -100,7 +100,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-DEFAULTS = ("curriculum=paper", "tracking=off", "evaluation.every=5000")
+DEFAULTS = ("curriculum=paper", "learner.lr_power=1", "tracking=off", "evaluation.every=5000")
 
 
 def with_defaults(overrides: Sequence[str]) -> list[str]:

@@ -60,6 +60,9 @@ def run(config: DictConfig) -> None:
                 "overwrite=true"
             )
     torch.set_num_threads(settings.threads)
+    # Weights that no gradient reaches decay until they are denormal numbers, with which a CPU takes
+    # twice the time for an update after some ten thousand of them.
+    torch.set_flush_denormal(True)
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     training = TrainingRun(settings, folder)
