@@ -43,6 +43,16 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     return settings
 
 
+def prepare_process(settings: TrainSettings) -> None:
+    """Set what holds for the whole process."""
+    torch.set_num_threads(settings.threads)
+    # Weights that no gradient reaches decay until they are denormal numbers; after some five
+    # thousand updates a CPU takes twice as long for each because of them.
+    torch.set_flush_denormal(True)
+    # TorchRL announces each storage in the middle of the progress bar.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
 def run(config: DictConfig) -> None:
     """Train, save, draw."""
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -59,12 +69,7 @@ def run(config: DictConfig) -> None:
                 f"{folder} holds a run: go on with it by resume={folder}, or start anew by "
                 "overwrite=true"
             )
-    torch.set_num_threads(settings.threads)
-    # Weights that no gradient reaches decay until they are denormal numbers, with which a CPU takes
-    # twice the time for an update after some ten thousand of them.
-    torch.set_flush_denormal(True)
-    # TorchRL announces each storage in the middle of the progress bar.
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    prepare_process(settings)
     training = TrainingRun(settings, folder)
     try:
         if state is not None:

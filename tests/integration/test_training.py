@@ -19,6 +19,7 @@ from torchrl.data import RandomSampler
 from records import draw_learning_curve, load_policy
 from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
 from torchrl_mpfa import SignalSampler, save_atomically
+from train import prepare_process
 from training import CHECKPOINT, TrainingRun, read_checkpoint
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -55,6 +56,17 @@ def train(folder: Path, settings: TrainSettings) -> TrainingRun:
     run.train()
     run.close()
     return run
+
+
+def test_training_treats_denormal_numbers_as_zero() -> None:
+    threads, least = torch.get_num_threads(), torch.finfo(torch.float32).tiny
+    try:
+        prepare_process(TrainSettings(threads=1))
+        assert (torch.tensor([least]) / 2).item() == 0.0
+    finally:
+        torch.set_flush_denormal(False)
+        torch.set_num_threads(threads)
+    assert (torch.tensor([least]) / 2).item() > 0.0
 
 
 def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -> None:
