@@ -46,14 +46,16 @@ class Agent:
 
     Args:
         plain: Whether the networks are plain perceptrons, as Stable-Baselines3's are.
+        compile: Whether an update is one compiled program.
     """
 
-    def __init__(self, *, plain: bool) -> None:
+    def __init__(self, *, plain: bool, compile: bool = False) -> None:
         torch.manual_seed(0)
         sizes = OBSERVATION_SIZE, ACTION_SIZE
         options: dict[str, Any] = _PLAIN if plain else {"width": WIDTH}
         critic = make_critic(*sizes, **options, late_action=not plain)
-        self.learner = DDPGLearner(make_ddpg_loss(make_actor(*sizes, **options), critic))
+        loss = make_ddpg_loss(make_actor(*sizes, **options), critic)
+        self.learner = DDPGLearner(loss, compile=compile)
         spec = Bounded(low=-1.0, high=1.0, shape=(ACTION_SIZE,))
         self.noise = AdditiveGaussianModule(spec, sigma_init=0.2, sigma_end=0.2)
         self.buffer = SignalReplayBuffer(
@@ -78,9 +80,9 @@ class Agent:
         self.buffer.update_tensordict_priority(batch)
 
 
-def make_step() -> Call:
+def make_step(*, compile: bool = False) -> Call:
     """One training step of this package, but for the environment's part."""
-    agent, transition = Agent(plain=False), make_transitions(1)
+    agent, transition = Agent(plain=False, compile=compile), make_transitions(1)
 
     def step() -> None:
         agent.act(transition[0].select("observation"))
@@ -183,9 +185,9 @@ class IdleTorchEnv(EnvBase):
         """Nothing is random."""
 
 
-def make_loop() -> Call:
+def make_loop(*, compile: bool = False) -> Call:
     """One round of a whole training loop of this package."""
-    agent, env = Agent(plain=True), IdleTorchEnv()
+    agent, env = Agent(plain=True, compile=compile), IdleTorchEnv()
     state = env.reset()
     keys = ("observation", "action", "next")
 

@@ -119,6 +119,7 @@ def make_learner(
         "critic_lr": settings.critic_lr,
         "critic_weight_decay": settings.critic_weight_decay,
         "tau": settings.tau,
+        "compile": settings.compile,
     }
     if settings.algorithm == "ddpg":
         return DDPGLearner(make_ddpg_loss(actor, critic, **of_loss), **of_learner)

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,8 @@ def prepare_process(settings: TrainSettings) -> None:
     # Weights that no gradient reaches decay until they are denormal numbers; after some five
     # thousand updates a CPU takes twice as long for each because of them.
     torch.set_flush_denormal(True)
+    # By default a pool of processes would wait for programs to compile, of which there are two.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -79,14 +81,14 @@ class StackedNetworks:
         self.network = deepcopy(network)
         flat = params.flatten_keys(".").items()
         self._params = {name: value for name, value in flat if isinstance(value, Tensor)}
-        self._bare = {name.removeprefix("module."): value for name, value in self._params.items()}
+        self.bare = {name.removeprefix("module."): value for name, value in self._params.items()}
+        """The parameters by the names that the module in a :class:`DirectModule` has for them."""
 
     def call(self, inputs: Sequence[dict[NestedKey, Tensor]]) -> list[dict[NestedKey, Tensor]]:
         """Compute what each network gives for inputs of its own, as :func:`call` does for one."""
         direct = isinstance(self.network, DirectModule)
         split = {
-            name: value.unbind(0)
-            for name, value in (self._bare if direct else self._params).items()
+            name: value.unbind(0) for name, value in (self.bare if direct else self._params).items()
         }
         pairs = [
             ({name: value[i] for name, value in split.items()}, each)
@@ -105,3 +107,28 @@ class StackedNetworks:
                 for weights, each in pairs
             ]
         return [dict(out.items(True, True)) for out in outs]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a loss is made of, as functions of tensors."""
+
+    actor: DirectModule
+    """Policy that holds the current parameters."""
+    critic: DirectModule
+    """Any of the critics, for its structure."""
+    critic_parameters: dict[str, Tensor]
+    """Parameters of all critics; of several they are stacked, ``[C, ...]``."""
+    target_actor: DirectModule
+    """Policy that holds the target parameters."""
+    target_critics: Sequence[DirectModule]
+    """``C`` critics that hold the target parameters."""
+    action_bounds: tuple[Any, Any] = (-1.0, 1.0)
+    """Least and greatest action of a smoothed target."""
+
+    def split(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:
+        """Parameters of each critic."""
+        count = len(self.target_critics)
+        if count == 1:
+            return [parameters]
+        return [{name: value[i] for name, value in parameters.items()} for i in range(count)]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_mpfa.losses.calling import bind, call, read_inputs
+from torchrl_mpfa.losses.calling import Parts, bind, call, read_inputs
 from torchrl_mpfa.losses.options import (
     WRITTEN,
     GradientAt,
@@ -197,6 +197,18 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
                 target_critic=bind(self.value_network, target_critic).requires_grad_(False),
             )
         return self._bound
+
+    def parts(self) -> Parts:
+        """The networks as functions of tensors."""
+        networks = self._networks()
+        critic = networks.critic
+        return Parts(
+            actor=networks.actor,
+            critic=critic,
+            critic_parameters=dict(critic.module.named_parameters()),
+            target_actor=networks.target_actor,
+            target_critics=[networks.target_critic],
+        )
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Targets y of Eq. (5), shape ``[B]``; a time limit bootstraps, an end does not."""

@@ -176,11 +176,11 @@ class SignalLossMixin:
                     f"{self.tensor_keys.preactivation!r}"
                 )
             return loss, {}
-        size = preactivation.abs()
         if self.saturation_penalty > 0:
-            excess = (size - self.saturation_limit).clamp_min(0)
-            loss = loss + self.saturation_penalty * excess.square().mean()
-        return loss, {"preactivation": size.detach()}
+            loss = loss + self.saturation_penalty * saturation(
+                preactivation, limit=self.saturation_limit
+            )
+        return loss, {"preactivation": preactivation.detach().abs()}
 
     # The networks hold the parameters of the loss; these may put others in their place.
 
@@ -195,6 +195,19 @@ class SignalLossMixin:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_bound": None, "_deferred": None}
+
+
+def saturation(preactivation: Tensor, *, limit: float) -> Tensor:
+    r"""How deep actions lie in the flat ends of the tanh, the mean of :math:`\max(0, |u| - l)^2`.
+
+    Args:
+        preactivation: Actions before the tanh :math:`u`, shape ``[B, A]``.
+        limit: The limit :math:`l`.
+
+    Returns:
+        The mean, shape ``[]``.
+    """
+    return (preactivation.abs() - limit).clamp_min(0).square().mean()
 
 
 def action_gradient(value: Tensor, action: Tensor) -> Tensor:

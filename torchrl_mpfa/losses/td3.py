@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_mpfa.losses.calling import StackedNetworks, bind, call, read_inputs
+from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bind, call, read_inputs
 from torchrl_mpfa.losses.ddpg import bootstrap_target
 from torchrl_mpfa.losses.options import (
     WRITTEN,
@@ -172,12 +172,29 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             )
         return self._bound
 
+    def parts(self) -> Parts:
+        """The networks as functions of tensors."""
+        networks = self._networks()
+        return Parts(
+            actor=networks.actor,
+            critic=networks.critics.network,
+            critic_parameters=networks.critics.bare,
+            target_actor=networks.target_actor,
+            target_critics=networks.target_critics,
+            action_bounds=(self.min_action, self.max_action),
+        )
+
     def _values(self, source: TensorDictBase, action: Tensor) -> list[Tensor]:
         """Q of the current critics, each of shape ``[B]``; the action leads to the first alone."""
         critics, key = self._networks().critics, self.tensor_keys.action
         actions = [action] + [action.detach()] * (self.num_qvalue_nets - 1)
         found = critics.call([read_inputs(critics.network, source, {key: a}) for a in actions])
         return [out[self.tensor_keys.state_action_value].squeeze(-1) for out in found]
+
+    def target_noise(self, action: Tensor) -> Tensor:
+        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
+        noise = torch.randn_like(action).mul_(self.policy_noise)
+        return noise.clamp_(-self.noise_clip, self.noise_clip)
 
     def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Clipped double-Q targets at smoothed actions, and the values in them, each ``[B]``."""
@@ -187,10 +204,8 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             action = call(networks.target_actor, read_inputs(networks.target_actor, after))[
                 keys.action
             ]
-            noise = torch.randn_like(action).mul_(self.policy_noise)
-            noise.clamp_(-self.noise_clip, self.noise_clip)
-            smoothed = torch.clamp(action + noise, self.min_action, self.max_action)
-            chosen = {keys.action: smoothed}
+            smoothed = action + self.target_noise(action)
+            chosen = {keys.action: torch.clamp(smoothed, self.min_action, self.max_action)}
             values = [self._value(critic, after, chosen) for critic in networks.target_critics]
             next_value = torch.stack(values).amin(0)
             target = bootstrap_target(
