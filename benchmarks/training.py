@@ -59,7 +59,7 @@ class Agent:
         spec = Bounded(low=-1.0, high=1.0, shape=(ACTION_SIZE,))
         self.noise = AdditiveGaussianModule(spec, sigma_init=0.2, sigma_end=0.2)
         self.buffer = SignalReplayBuffer(
-            storage=SignalTensorStorage(CAPACITY),
+            storage=SignalTensorStorage(CAPACITY, device="auto"),
             sampler=MPFASampler(CAPACITY),
             batch_size=BATCH_SIZE,
         )
@@ -68,9 +68,10 @@ class Agent:
     @torch.no_grad()
     def act(self, state: TensorDictBase) -> TensorDictBase:
         """Choose an action with noise."""
-        chosen = self.learner.policy(state)
+        found = self.learner.policy.outputs(state)
         with set_exploration_type(ExplorationType.RANDOM):
-            return self.noise(chosen)
+            noisy = self.noise(TensorDict({"action": found["action"]}))
+        return state.set("action", noisy.get("action"))
 
     def learn(self, transition: TensorDictBase) -> None:
         """Store a transition of batch size ``[1]``, and make one update."""

@@ -65,7 +65,8 @@ def make_sampler(settings: Replay) -> SignalSampler | RandomSampler:
 def make_buffer(settings: Replay, *, seed: int) -> SignalReplayBuffer:
     """Storage, sampler and buffer, with a generator of their own."""
     return SignalReplayBuffer(
-        storage=SignalTensorStorage(settings.capacity),
+        # As the environment gives it: each write would be converted to a device that is named.
+        storage=SignalTensorStorage(settings.capacity, device="auto"),
         sampler=make_sampler(settings),
         batch_size=settings.batch_size,
         generator=torch.Generator().manual_seed(seed),

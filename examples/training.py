@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, set_exploration_type
 from torchrl.envs.utils import ExplorationType, step_mdp
 from tqdm import tqdm
@@ -177,9 +177,11 @@ class TrainingRun:
     def _act(self, state: TensorDictBase) -> TensorDictBase:
         if self.step < self.settings.exploration.random_steps:
             return self.env.rand_action(state)
-        chosen = self.learner.policy(state.select("observation").to(self.settings.device))
+        observation = state.get("observation").to(self.settings.device)
+        found = self.learner.policy.outputs({"observation": observation})
         with set_exploration_type(ExplorationType.RANDOM):
-            state.set("action", self.noise(chosen).get("action").cpu())
+            noisy = self.noise(TensorDict({"action": found["action"]}))
+        state.set("action", noisy.get("action").cpu())
         self.noise.step(1)
         return state
 
@@ -187,15 +189,22 @@ class TrainingRun:
         """Keep a step; those between two updates are written together, at the price of one."""
         self._waiting.append(state.select(*_TRANSITION))
         if flush or self.step % self.settings.learner.update_every == 0:
-            self.buffer.extend(torch.stack(self._waiting))
+            first, *more = self._waiting
+            # Most often there is one alone, for which stacking takes twice the time.
+            self.buffer.extend(torch.stack(self._waiting) if more else first.unsqueeze(0))
             self._waiting.clear()
 
     def _update(self) -> None:
         if len(self.buffer) < self.settings.replay.batch_size:
             return
-        batch = self.buffer.sample().to(self.settings.device)
-        losses = self.learner.update(batch)
-        self.buffer.update_tensordict_priority(batch.to("cpu"))
+        batch = self.buffer.sample()
+        if self.settings.device == "cpu":
+            losses = self.learner.update(batch)
+        else:
+            batch = batch.to(self.settings.device)
+            losses = self.learner.update(batch)
+            batch = batch.to("cpu")
+        self.buffer.update_tensordict_priority(batch)
         if self.step % self.settings.tracking.log_every == 0:
             self.tracker.log_update(self.step, losses, self.buffer, batch)
 

@@ -143,7 +143,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         _check_arguments(max_size, kwargs)
         self.signal_table = SignalTable(max_size, signals, reward_key=reward_key)
         self._looked_at: Any = None
-        self._plain = False
+        self._where: torch.device | None = None
         super().__init__(max_size, **kwargs)
 
     def get(self, index: Any) -> Any:
@@ -155,8 +155,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
             and len(index) > 0
             and index.dtype is torch.long
             and isinstance(self._storage, TensorDict)
-            and self._has_plain_tensors()
-            and index.device == self._storage.device
+            and index.device == self._device_of_tensors()
             and _within(index, len(self))
         ):
             return self._storage.apply(
@@ -164,11 +163,11 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
             )
         return super().get(index)
 
-    def _has_plain_tensors(self) -> bool:
-        """Whether every entry is a tensor: texts and ragged entries need TorchRL's way."""
+    def _device_of_tensors(self) -> torch.device | None:
+        """Device of all entries; None if one is no tensor: texts need TorchRL's way."""
         if self._looked_at is not self._storage:
-            self._looked_at, self._plain = self._storage, _only_tensors(self._storage)
-        return self._plain
+            self._looked_at, self._where = self._storage, _common_device(self._storage)
+        return self._where
 
 
 class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
@@ -230,10 +229,14 @@ def _as_index(cursor: Any, capacity: int) -> Tensor:
     return torch.as_tensor(cursor, dtype=torch.long, device="cpu").reshape(-1)
 
 
-def _only_tensors(data: Any) -> bool:
-    if type(data) is TensorDict:
-        return all(_only_tensors(entry) for entry in data.values())
-    return isinstance(data, Tensor)
+def _common_device(data: Any) -> torch.device | None:
+    """Device of all tensors in a tensordict; None if there are several, or other entries."""
+    if isinstance(data, Tensor):
+        return data.device
+    if type(data) is not TensorDict:
+        return None
+    devices = {_common_device(entry) for entry in data.values()}
+    return devices.pop() if len(devices) == 1 else None
 
 
 def _within(index: Tensor, size: int) -> bool:
