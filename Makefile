@@ -7,6 +7,7 @@
 #                                  installed, for another build of it: a wheel file of a CPU
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
 #   ARGS='replay=per seed=1'       settings for demo and train, options for test and bench
+#   COMPILE=false                  train: no compiled updates; by default if a C++ compiler is found
 #   EPISODES=100                   episodes that demo trains for and evaluates on
 #   SLOW=1                         test: the slow tests as well
 
@@ -19,6 +20,7 @@ PYTHON ?=
 TORCH_INSTALL_ARGS ?=
 ARGS ?=
 EPISODES ?= 100
+COMPILE ?= $(if $(shell command -v "$${CXX:-g++}" 2>/dev/null),true,false)
 SLOW ?=
 
 VENV := .venv
@@ -37,7 +39,7 @@ help: ## Print this list
 	@echo "usage: make TARGET"
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' Makefile | \
 	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
-	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, EPISODES, SLOW; see the top of the Makefile"
+	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, EPISODES, SLOW; see the top of the Makefile"
 
 demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minutes)
 	@echo "== training on map A, $(EPISODES) episodes; Ctrl-C stops after the current one"
@@ -46,7 +48,7 @@ demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minu
 	$(BIN)/python examples/evaluate.py runs/demo --world A --episodes $(EPISODES)
 
 train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='replay=per seed=1'
-	$(BIN)/python examples/train.py curriculum=paper learner.lr_power=1 $(ARGS)
+	$(BIN)/python examples/train.py curriculum=paper learner.lr_power=1 learner.compile=$(COMPILE) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
 	$(PYTEST) $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)

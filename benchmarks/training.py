@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import os
+import shutil
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -22,7 +25,15 @@ from torchrl.envs.utils import ExplorationType, step_mdp
 from torchrl.modules import AdditiveGaussianModule
 
 from benchmarks.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
-from benchmarks.timing import MICROSECONDS, Call, Entry, entry, report_progress, take_turns
+from benchmarks.timing import (
+    MICROSECONDS,
+    Call,
+    Entry,
+    entry,
+    few_threads,
+    report_progress,
+    take_turns,
+)
 from torchrl_mpfa import (
     DDPGLearner,
     MPFASampler,
@@ -236,19 +247,31 @@ def make_sb3_loop() -> Call:
     return step
 
 
-def _compare(name: str, ours: Call, baseline: str, theirs: Call, *, quick: bool) -> list[Entry]:
+def _compare(ours: dict[str, Call], baseline: str, theirs: Call, *, quick: bool) -> list[Entry]:
+    with few_threads(THREADS):
+        for call in ours.values():
+            call()  # Compiles, for as many threads, where that is asked for.
     timings = take_turns(
-        {name: ours, baseline: theirs},
+        {**ours, baseline: theirs},
         rounds=3 if quick else 21,
         seconds=0.05 if quick else 1.0,
         threads=THREADS,
         clock=time.perf_counter,
         multiple_of=_BLOCK,
     )
-    mine, other = timings[name], timings[baseline]
+    other = timings[baseline]
     return [
         entry(baseline, other.median * MICROSECONDS, "us"),
-        entry(name, mine.median * MICROSECONDS, "us", ratio=mine.ratio(other), baseline=baseline),
+        *(
+            entry(
+                name,
+                timings[name].median * MICROSECONDS,
+                "us",
+                ratio=timings[name].ratio(other),
+                baseline=baseline,
+            )
+            for name in ours
+        ),
     ]
 
 
@@ -256,24 +279,36 @@ def measure_train_step(*, quick: bool) -> list[Entry]:
     """Compare a training step, without the environment's part, with a hand-written one.
 
     Args:
-        quick: Fewer and shorter rounds.
+        quick: Fewer and shorter rounds, and nothing compiled.
 
     Returns:
-        An entry for each; ours has the ratio.
+        An entry for each; ours have the ratio.
     """
-    return _compare("train_step", make_step(), "train_step_bare", make_bare_step(), quick=quick)
+    ours = _variants("train_step", make_step, quick=quick)
+    return _compare(ours, "train_step_bare", make_bare_step(), quick=quick)
 
 
 def measure_sb3_step(*, quick: bool) -> list[Entry]:
     """Compare the whole loop on an idle environment with Stable-Baselines3's, if that is there.
 
     Args:
-        quick: Fewer and shorter rounds.
+        quick: Fewer and shorter rounds, and nothing compiled.
 
     Returns:
-        An entry for each; ours has the ratio. None without Stable-Baselines3.
+        An entry for each; ours have the ratio. None without Stable-Baselines3.
     """
     if importlib.util.find_spec("stable_baselines3") is None:
         report_progress("sb3_step: left out, stable-baselines3 is not installed")
         return []
-    return _compare("sb3_step", make_loop(), "sb3_step_sb3", make_sb3_loop(), quick=quick)
+    ours = _variants("sb3_step", make_loop, quick=quick)
+    return _compare(ours, "sb3_step_sb3", make_sb3_loop(), quick=quick)
+
+
+def _variants(name: str, make: Callable[..., Call], *, quick: bool) -> dict[str, Call]:
+    """The way ``make train`` has it, compiled if there is a C++ compiler, and beside it eager."""
+    if quick:
+        return {name: make()}
+    if shutil.which(os.environ.get("CXX", "g++")) is None:
+        report_progress(f"{name}: not compiled, there is no C++ compiler")
+        return {name: make()}
+    return {name: make(compile=True), f"{name}_eager": make()}

@@ -114,8 +114,8 @@ class Learner:
     importance: str = "critic"
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     compile: bool = False
-    """Make one program of an update with ``torch.compile``. It needs a C++ compiler and half a minute
-    at the start, a few seconds the next time, and halves the time of a run."""
+    """Make one program of an update with ``torch.compile``, which halves the time of a run. Needs a
+    C++ compiler, and half a minute at the start, a few seconds the next time."""
     policy_delay: int = 2
     """TD3: updates of the critics for one of the actor and the targets."""
     policy_noise: float = 0.2

@@ -90,8 +90,11 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
         ),
         (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--world A --episodes 2"]),
         (
-            ["train", "ARGS=replay=per seed=1"],
-            ["python examples/train.py curriculum=paper learner.lr_power=1 replay=per seed=1"],
+            ["train", "COMPILE=false", "ARGS=replay=per seed=1"],
+            [
+                "python examples/train.py curriculum=paper learner.lr_power=1 "
+                "learner.compile=false replay=per seed=1"
+            ],
         ),
         (["test"], ["python -m pytest"]),
         (["test", "SLOW=1"], ["python -m pytest -m 'slow or not slow'"]),
