@@ -47,9 +47,10 @@ from torchrl_mpfa import (
 WIDTH = 256
 CAPACITY = 100_000
 THREADS = 2
+TRANSITION = ("observation", "action", "next")
 _FILL = 10_000
 _BLOCK = 20
-_PLAIN = {"width": WIDTH, "layer_norm": False, "final_init": None}
+_PLAIN = {"layer_norm": False, "final_init": None}
 
 
 class Agent:
@@ -57,13 +58,14 @@ class Agent:
 
     Args:
         plain: Whether the networks are plain perceptrons, as Stable-Baselines3's are.
+        width: Units of a hidden layer.
         compile: Whether an update is one compiled program.
     """
 
-    def __init__(self, *, plain: bool, compile: bool = False) -> None:
+    def __init__(self, *, plain: bool, width: int = WIDTH, compile: bool = False) -> None:
         torch.manual_seed(0)
         sizes = OBSERVATION_SIZE, ACTION_SIZE
-        options: dict[str, Any] = _PLAIN if plain else {"width": WIDTH}
+        options: dict[str, Any] = {"width": width, **(_PLAIN if plain else {})}
         critic = make_critic(*sizes, **options, late_action=not plain)
         loss = make_ddpg_loss(make_actor(*sizes, **options), critic)
         self.learner = DDPGLearner(loss, compile=compile)
@@ -201,12 +203,11 @@ def make_loop(*, compile: bool = False) -> Call:
     """One round of a whole training loop of this package."""
     agent, env = Agent(plain=True, compile=compile), IdleTorchEnv()
     state = env.reset()
-    keys = ("observation", "action", "next")
 
     def step() -> None:
         nonlocal state
         stepped = env.step(agent.act(state))
-        agent.learn(stepped.select(*keys).unsqueeze(0))
+        agent.learn(stepped.select(*TRANSITION).unsqueeze(0))
         state = step_mdp(stepped)
 
     return step
@@ -308,7 +309,12 @@ def _variants(name: str, make: Callable[..., Call], *, quick: bool) -> dict[str,
     """The way ``make train`` has it, compiled if there is a C++ compiler, and beside it eager."""
     if quick:
         return {name: make()}
-    if shutil.which(os.environ.get("CXX", "g++")) is None:
+    if not has_compiler():
         report_progress(f"{name}: not compiled, there is no C++ compiler")
         return {name: make()}
     return {name: make(compile=True), f"{name}_eager": make()}
+
+
+def has_compiler() -> bool:
+    """Whether there is a C++ compiler, without which nothing can be compiled."""
+    return shutil.which(os.environ.get("CXX", "g++")) is not None
