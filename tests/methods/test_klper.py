@@ -1,0 +1,95 @@
+"""KLPER: the divergence against a plain computation, and the batch that is chosen."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import MultivariateNormal, kl_divergence
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from torchrl_mpfa import make_actor
+from torchrl_mpfa.methods import LowestDivergence, gaussian_divergence
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+@pytest.mark.parametrize("variance", [0.01, 0.5])
+def test_the_divergence_is_that_of_two_gaussians(size, variance):
+    deviation = torch.randn(3, 64, size, generator=seeded(size)).double() * 0.3 + 0.1
+    found = gaussian_divergence(deviation, variance=variance)
+    for batch, value in zip(deviation, found, strict=True):
+        mean = batch.mean(0)
+        covariance = (batch - mean).T @ (batch - mean) / len(batch) + 1e-6 * torch.eye(size)
+        reference = MultivariateNormal(
+            torch.zeros(size).double(), variance * torch.eye(size).double()
+        )
+        expected = kl_divergence(MultivariateNormal(mean, covariance), reference)
+        torch.testing.assert_close(value, expected)
+
+
+def test_the_divergence_of_one_number_by_hand():
+    # Deviations of 1 and -1: mean 0, variance 1. Against N(0, 1/4): (4 - 1 - ln 4) / 2.
+    found = gaussian_divergence(torch.tensor([[1.0], [-1.0]]), variance=0.25)
+    assert found.item() == pytest.approx((4 - 1 - math.log(4)) / 2, abs=1e-5)
+
+
+def test_equal_deviations_have_a_finite_divergence():
+    assert gaussian_divergence(torch.full((8, 2), 0.5), variance=0.04).isfinite()
+
+
+def drawn(policy, shifts, *, count=64, sigma=0.2):
+    """Batches whose actions are the policy's with noise, each shifted by so much."""
+    observation = torch.randn(len(shifts) * count, 6, generator=seeded(0))
+    action = policy(TensorDict({"observation": observation}, [len(observation)]))["action"]
+    noise = torch.randn(action.shape, generator=seeded(1)) * sigma
+    shift = torch.tensor(shifts).repeat_interleave(count).unsqueeze(-1)
+    number = torch.arange(len(observation))
+    return TensorDict(
+        {"observation": observation, "action": action.detach() + noise + shift, "number": number},
+        [len(observation)],
+    )
+
+
+@pytest.mark.parametrize("best", [0, 1, 2])
+def test_the_batch_of_the_current_policy_is_chosen(best):
+    policy = make_actor(6, 2, width=16)
+    shifts = [0.7, 0.7, 0.7]
+    shifts[best] = 0.0
+    batch = LowestDivergence(policy, sigma=0.2)(drawn(policy, shifts))
+    assert batch["number"].tolist() == list(range(64 * best, 64 * (best + 1)))
+
+
+def test_the_present_noise_is_asked_for_at_each_batch():
+    policy = make_actor(6, 2, width=16)
+    asked = iter([0.2, 0.7])
+    select = LowestDivergence(policy, batches=2, sigma=lambda: next(asked))
+    wide = drawn(policy, [0.0, 0.0], sigma=0.7)
+    narrow = drawn(policy, [0.0, 0.0], sigma=0.2)
+    both = torch.cat([narrow[:64], wide[64:]])
+    assert select(both)["number"][0] == 0
+    assert select(both)["number"][0] == 64
+
+
+def test_of_what_a_buffer_draws_one_batch_is_left_with_its_index():
+    policy = make_actor(6, 2, width=16)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=30)
+    buffer.extend(drawn(policy, [0.0, 0.5]))
+    batch = LowestDivergence(policy, batches=3, sigma=0.2)(buffer.sample())
+    assert batch.batch_size == (10,)
+    assert batch["number"].equal(batch["index"])
+
+
+def test_wrong_arguments_are_refused_by_name():
+    policy = make_actor(6, 2, width=16)
+    with pytest.raises(ValueError, match="batches must be a positive integer, got 0"):
+        LowestDivergence(policy, batches=0, sigma=0.2)
+    with pytest.raises(ValueError, match="sigma must be finite"):
+        LowestDivergence(policy, sigma=-1.0)
+    with pytest.raises(ValueError, match="64 transitions cannot be 3 batches"):
+        LowestDivergence(policy, sigma=0.2)(drawn(policy, [0.0]))
+    with pytest.raises(ValueError, match="variance must be positive"):
+        gaussian_divergence(torch.zeros(4, 2), variance=0.0)
