@@ -66,7 +66,9 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
 
 
 class LowestDivergence:
-    """Keeps the most on-policy one of several batches that a replay buffer drew as one::
+    """Keeps the most on-policy one of several batches that a replay buffer drew as one.
+
+    In a training loop::
 
         select = LowestDivergence(policy, batches=3, sigma=lambda: float(noise.sigma))
         batch = select(buffer.sample(3 * 256))
