@@ -2,7 +2,7 @@
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
-from torchrl_mpfa.learner import DDPGLearner, Learner, TD3Learner
+from torchrl_mpfa.learners import DDPGLearner, Learner, TD3Learner
 from torchrl_mpfa.losses import (
     SignalDDPGLoss,
     SignalTD3Loss,

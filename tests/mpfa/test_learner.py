@@ -8,7 +8,7 @@ from losses import GAMMA, make_batch, make_loss, make_networks
 from torchrl.objectives import SoftUpdate
 
 from torchrl_mpfa import DDPGLearner, Learner, make_ddpg_loss
-from torchrl_mpfa.learner import MultiTensorSoftUpdate
+from torchrl_mpfa.learners import MultiTensorSoftUpdate
 
 
 def make_learner(seed=0, **kwargs):

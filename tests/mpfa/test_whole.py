@@ -25,16 +25,16 @@ def make_loss(name, **options):
     return loss
 
 
-def by_losses(name, loss, batch, *, with_actor=True):
+def by_losses(name, loss, batch, actor_batch=None, **kwargs):
     """Gradients and values for the log as TorchRL's interface gives them."""
     of_critic, of_actor = {
         "ddpg": ("loss_value", "loss_actor"),
         "td3": ("value_loss", "actor_loss"),
     }[name]
-    total, log = getattr(loss, of_critic)(batch)
+    total, log = getattr(loss, of_critic)(batch, **kwargs)
     log = {"loss_value": total, **log}
-    if with_actor:
-        log["loss_actor"], more = getattr(loss, of_actor)(batch)
+    if actor_batch is not None:
+        log["loss_actor"], more = getattr(loss, of_actor)(actor_batch)
         log.update(more)
         total = total + log["loss_actor"]
     total.backward()
@@ -52,6 +52,8 @@ def by_losses(name, loss, batch, *, with_actor=True):
         {"loss_function": "smooth_l1"},
         {"importance": "none", "signals": ["td_error"]},
         {"signals": []},
+        {"signals": ["value"], "loss_function": "pal"},
+        {"target_average": 3},
     ],
     ids=str,
 )
@@ -59,9 +61,9 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
     expected, batch = (make_batch(weighted=weighted) for _ in range(2))
     loss, whole = make_loss(name, **options), make_loss(name, **options)
     torch.manual_seed(5)  # TD3 draws the noise of its targets.
-    gradients, log = by_losses(name, loss, expected)
+    gradients, log = by_losses(name, loss, expected, expected)
     torch.manual_seed(5)
-    found = WholeGradients(whole, compile=None)(batch)
+    found = WholeGradients(whole, compile=None)(batch, actor_batch=batch)
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
@@ -74,12 +76,27 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
         torch.testing.assert_close(value.reshape(log[key].shape), log[key].detach())
 
 
+@pytest.mark.parametrize("name", MAKE)
+def test_the_actor_may_learn_from_another_batch_and_the_critic_by_another_distance(name):
+    expected, batch = (make_batch(count=6) for _ in range(2))
+    other = make_batch(count=4, seed=1)
+    loss, whole = make_loss(name), make_loss(name)
+    torch.manual_seed(5)
+    gradients, _ = by_losses(name, loss, expected, other, loss_function="smooth_l1")
+    torch.manual_seed(5)
+    WholeGradients(whole, compile=None)(batch, actor_batch=other, loss_function="smooth_l1")
+    again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
+    assert again.keys() == gradients.keys()
+    for key, value in gradients.items():
+        torch.testing.assert_close(again[key], value, rtol=1e-4, atol=1e-6)
+
+
 def test_without_the_actor_only_the_critics_get_gradients():
     loss, whole = make_loss("td3"), make_loss("td3")
     torch.manual_seed(5)
-    gradients, _ = by_losses("td3", loss, make_batch(), with_actor=False)
+    gradients, _ = by_losses("td3", loss, make_batch())
     torch.manual_seed(5)
-    log = WholeGradients(whole, compile=None)(make_batch(), with_actor=False)
+    log = WholeGradients(whole, compile=None)(make_batch(), actor_batch=None)
     assert "loss_actor" not in log
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()

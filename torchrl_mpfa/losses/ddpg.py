@@ -12,16 +12,17 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
-from torchrl.objectives.utils import distance_loss
 
 from torchrl_mpfa.losses.calling import Parts, bind, call, read_inputs
+from torchrl_mpfa.losses.distances import distance
 from torchrl_mpfa.losses.options import (
-    WRITTEN,
+    DEFAULT_SIGNALS,
+    VALUE,
     GradientAt,
     Importance,
     SignalLossMixin,
 )
-from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
 
 
 class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
@@ -39,7 +40,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
     Args:
         actor_network: Policy; reads observations, writes ``"action"``.
         value_network: Critic; reads observations and action, writes ``"state_action_value"``.
-        signals: Which of ``"td_error"`` and ``"action_gradient"`` to write.
+        signals: Which of ``"td_error"``, ``"action_gradient"`` and ``"value"`` (Q itself) to write.
         gradient_order: Order of the norm in Eq. (14).
         gradient_at: Where the gradient is taken: at the ``"stored"`` action (Eq. 14), or at that
             of the current ``"policy"``, for one more forward pass.
@@ -51,6 +52,8 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         saturation_penalty: Factor of the mean of :math:`\max(0, |u| - l)^2`, added to the actor's
             loss, where :math:`u` is the action before its tanh (``"preactivation"``).
         saturation_limit: The limit :math:`l`.
+        target_average: Number of critics of which the target's Q is the mean: the target critic
+            and what it was at the last calls of :meth:`keep_target_critics`; 1 is Eq. (5).
         delay_actor: Whether the target has a target actor, as Eq. (5) has; TorchRL's default is
             not to.
         **kwargs: Passed to :class:`~torchrl.objectives.DDPGLoss`.
@@ -87,6 +90,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         preactivation: NestedKey = "preactivation"
         td_error_signal: NestedKey = TD_ERROR.key
         action_gradient_signal: NestedKey = ACTION_GRADIENT.key
+        value_signal: NestedKey = (SIGNALS_KEY, VALUE)
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -96,13 +100,14 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
-        signals: Sequence[str] = WRITTEN,
+        signals: Sequence[str] = DEFAULT_SIGNALS,
         gradient_order: float = 2.0,
         gradient_at: GradientAt = "stored",
         importance: Importance = "critic",
         reward_scale: float = 1.0,
         saturation_penalty: float = 0.0,
         saturation_limit: float = 1.5,
+        target_average: int = 1,
         delay_actor: bool = True,
         **kwargs: Any,
     ) -> None:
@@ -114,6 +119,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
             "reward_scale": reward_scale,
             "saturation_penalty": saturation_penalty,
             "saturation_limit": saturation_limit,
+            "target_average": target_average,
         }
         self._check_options(**options)  # type: ignore[arg-type]
         super().__init__(
@@ -126,7 +132,11 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         self._set_options(**options)
 
     def loss_value(
-        self, tensordict: TensorDictBase, *, defer_gradient: bool = False
+        self,
+        tensordict: TensorDictBase,
+        *,
+        defer_gradient: bool = False,
+        loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Critic's loss (Eq. 11); writes the signals (Eqs. 13-14) in ``tensordict``.
 
@@ -134,6 +144,8 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
             tensordict: A batch of transitions, batch size ``[B]``.
             defer_gradient: Leave the signal of Eq. (14) to :meth:`write_action_gradient`, which
                 has it from the backward pass at no cost.
+            loss_function: Distance of value and target for this call, one of ``"l1"``, ``"l2"``,
+                ``"smooth_l1"`` and ``"pal"``; by default the loss's own.
 
         Returns:
             The loss, and detached values for the log.
@@ -152,10 +164,10 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
 
         target = self._target(tensordict)
         td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, gradient)
+        self._write_signals(tensordict, td_error, value, gradient)
         squared = td_error.square()
         tensordict.set(keys.priority, squared, inplace=True)
-        loss = distance_loss(value, target, loss_function=self.loss_function)
+        loss = distance(value, target, loss_function or self.loss_function)
         loss = self._reduce(loss, tensordict)
         seen = value.detach()
         metadata = {
@@ -188,15 +200,19 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         if self._bound is None:
             actor, critic = self.actor_network_params, self.value_network_params
             target_actor = self.target_actor_network_params
-            target_critic = self.target_value_network_params
             self._bound = _Networks(
                 actor=bind(self.actor_network, actor),
                 critic=bind(self.value_network, critic),
                 frozen_critic=bind(self.value_network, critic.detach()).requires_grad_(False),
                 target_actor=bind(self.actor_network, target_actor).requires_grad_(False),
-                target_critic=bind(self.value_network, target_critic).requires_grad_(False),
+                target_critic=self._averaged_critics()[0],
             )
         return self._bound
+
+    def _target_critics(self) -> list[TensorDictModule]:
+        """Critics that hold the target parameters."""
+        params = self.target_value_network_params
+        return [bind(self.value_network, params).requires_grad_(False)]
 
     def parts(self) -> Parts:
         """The networks as functions of tensors."""

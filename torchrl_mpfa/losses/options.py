@@ -8,15 +8,20 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchrl_mpfa.losses.averaging import AveragedNetwork, PastCritics
 from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
+from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
 Importance = Literal["critic", "torchrl", "none"]
 GradientAt = Literal["stored", "policy"]
-WRITTEN = (TD_ERROR.name, ACTION_GRADIENT.name)
+VALUE = "value"
+"""Name of the signal that is Q itself, which may be negative."""
+DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
+WRITTEN = (*DEFAULT_SIGNALS, VALUE)
 
 
 class SignalLossMixin:
@@ -38,6 +43,7 @@ class SignalLossMixin:
         reward_scale: float,
         saturation_penalty: float,
         saturation_limit: float,
+        target_average: int,
     ) -> None:
         unknown = [name for name in signals if name not in WRITTEN]
         if unknown:
@@ -58,6 +64,8 @@ class SignalLossMixin:
                 "saturation_penalty and saturation_limit must not be negative, got "
                 f"{saturation_penalty} and {saturation_limit}"
             )
+        if isinstance(target_average, bool) or target_average < 1:
+            raise ValueError(f"target_average must be at least 1, got {target_average}")
 
     def _set_options(self, **options: Any) -> None:
         self._bound: Any = None
@@ -69,6 +77,45 @@ class SignalLossMixin:
         self.reward_scale: float = options["reward_scale"]
         self.saturation_penalty: float = options["saturation_penalty"]
         self.saturation_limit: float = options["saturation_limit"]
+        self.target_average: int = options["target_average"]
+        # A list of modules, so that the past is saved, loaded and moved with the loss.
+        self.past_critics = nn.ModuleList()
+        if self.target_average > 1:
+            for network in self._target_critics():
+                if not isinstance(network, DirectModule):
+                    raise ValueError(
+                        f"target_average = {self.target_average} needs a DirectModule as critic, "
+                        f"got {type(network).__name__}"
+                    )
+                past = PastCritics(network.module, self.target_average - 1)
+                self.past_critics.append(past)
+
+    def _past(self) -> list[PastCritics]:
+        return [past for past in self.past_critics if isinstance(past, PastCritics)]
+
+    def _target_critics(self) -> list[TensorDictModule]:
+        """Critics that hold the target parameters."""
+        raise NotImplementedError
+
+    def _averaged_critics(self) -> list[TensorDictModule]:
+        """Target critics, each of them with its past ones if ``target_average`` is above one."""
+        critics = self._target_critics()
+        if not self.past_critics:
+            return critics
+        return [
+            DirectModule(
+                AveragedNetwork(critic.module, past),
+                in_keys=critic.in_keys,
+                out_keys=critic.out_keys,
+            )
+            for critic, past in zip(critics, self._past(), strict=True)
+        ]
+
+    def keep_target_critics(self) -> None:
+        """Keep the target critics as they are now for the average that later targets have."""
+        if self.past_critics:
+            for critic, past in zip(self._target_critics(), self._past(), strict=True):
+                past.push(critic.module)
 
     @property
     def _gradient_at_stored(self) -> bool:
@@ -79,14 +126,16 @@ class SignalLossMixin:
         return ACTION_GRADIENT.name in self.signals and self.gradient_at == "policy"
 
     def _write_signals(
-        self, tensordict: TensorDictBase, td_error: Tensor, gradient: Tensor | None
+        self, tensordict: TensorDictBase, td_error: Tensor, value: Tensor, gradient: Tensor | None
     ) -> None:
-        """Write ``|TD error|`` (Eq. 13) and the norm of the gradient (Eq. 14), each ``[B]``."""
+        """Write ``|TD error|`` (Eq. 13), Q and the norm of the gradient (Eq. 14), each ``[B]``."""
         if gradient is not None:
             self._write_gradient(tensordict, gradient)
         if TD_ERROR.name in self.signals:
             size = td_error_priority(td_error)
             tensordict.set(self.tensor_keys.td_error_signal, size / self.reward_scale)
+        if VALUE in self.signals:
+            tensordict.set(self.tensor_keys.value_signal, value.detach() / self.reward_scale)
 
     def _write_gradient(self, tensordict: TensorDictBase, gradient: Tensor) -> None:
         size = action_gradient_priority(gradient, order=self.gradient_order)

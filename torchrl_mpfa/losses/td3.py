@@ -12,17 +12,18 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
-from torchrl.objectives.utils import distance_loss
 
 from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bind, call, read_inputs
 from torchrl_mpfa.losses.ddpg import bootstrap_target
+from torchrl_mpfa.losses.distances import distance
 from torchrl_mpfa.losses.options import (
-    WRITTEN,
+    DEFAULT_SIGNALS,
+    VALUE,
     GradientAt,
     Importance,
     SignalLossMixin,
 )
-from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
 
 
 class SignalTD3Loss(SignalLossMixin, TD3Loss):
@@ -46,6 +47,7 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         reward_scale: Factor of the rewards in the loss.
         saturation_penalty: Factor of the penalty on actions in the flat ends of the tanh.
         saturation_limit: Where these begin.
+        target_average: As in :class:`SignalDDPGLoss`, of each of the target critics.
         **kwargs: Passed to :class:`~torchrl.objectives.TD3Loss`.
 
     Raises:
@@ -65,6 +67,7 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         preactivation: NestedKey = "preactivation"
         td_error_signal: NestedKey = TD_ERROR.key
         action_gradient_signal: NestedKey = ACTION_GRADIENT.key
+        value_signal: NestedKey = (SIGNALS_KEY, VALUE)
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -75,13 +78,14 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         qvalue_network: TensorDictModule,
         *,
         bounds: tuple[float, float] | None = (-1.0, 1.0),
-        signals: Sequence[str] = WRITTEN,
+        signals: Sequence[str] = DEFAULT_SIGNALS,
         gradient_order: float = 2.0,
         gradient_at: GradientAt = "stored",
         importance: Importance = "critic",
         reward_scale: float = 1.0,
         saturation_penalty: float = 0.0,
         saturation_limit: float = 1.5,
+        target_average: int = 1,
         **kwargs: Any,
     ) -> None:
         options = {
@@ -92,6 +96,7 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             "reward_scale": reward_scale,
             "saturation_penalty": saturation_penalty,
             "saturation_limit": saturation_limit,
+            "target_average": target_average,
         }
         self._check_options(**options)  # type: ignore[arg-type]
         super().__init__(
@@ -104,13 +109,18 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         self._set_options(**options)
 
     def value_loss(
-        self, tensordict: TensorDictBase, *, defer_gradient: bool = False
+        self,
+        tensordict: TensorDictBase,
+        *,
+        defer_gradient: bool = False,
+        loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
 
         Args:
             tensordict: A batch of transitions, batch size ``[B]``.
             defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
+            loss_function: As there.
 
         Returns:
             The loss, and detached values for the log.
@@ -129,8 +139,8 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
 
         target, next_value = self._target(tensordict)
         td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error.abs().amax(0), gradient)
-        loss = distance_loss(value, target.expand_as(value), loss_function=self.loss_function)
+        self._write_signals(tensordict, td_error.abs().amax(0), value[0], gradient)
+        loss = distance(value, target.expand_as(value), loss_function or self.loss_function)
         loss = self._reduce(loss.sum(0), tensordict)
         metadata = {
             "td_error": td_error.square(),
@@ -161,16 +171,20 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         """The networks with their parameters in place, held for good."""
         if self._bound is None:
             first = self.qvalue_network_params[0].detach()
-            targets = self.target_qvalue_network_params.unbind(0)
             actor, critic = self.actor_network, self.qvalue_network
             self._bound = _Networks(
                 actor=bind(actor, self.actor_network_params),
                 critics=StackedNetworks(critic, self.qvalue_network_params),
                 frozen_critic=bind(critic, first).requires_grad_(False),
                 target_actor=bind(actor, self.target_actor_network_params).requires_grad_(False),
-                target_critics=[bind(critic, params).requires_grad_(False) for params in targets],
+                target_critics=self._averaged_critics(),
             )
         return self._bound
+
+    def _target_critics(self) -> list[TensorDictModule]:
+        """Critics that hold the target parameters."""
+        each = self.target_qvalue_network_params.unbind(0)
+        return [bind(self.qvalue_network, params).requires_grad_(False) for params in each]
 
     def parts(self) -> Parts:
         """The networks as functions of tensors."""

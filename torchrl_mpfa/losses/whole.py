@@ -15,10 +15,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import functional_call, grad, grad_and_value
 from torchrl.objectives import ValueEstimators
-from torchrl.objectives.utils import distance_loss
 
 from torchrl_mpfa.losses.ddpg import SignalDDPGLoss, bootstrap_target
-from torchrl_mpfa.losses.options import saturation
+from torchrl_mpfa.losses.distances import distance
+from torchrl_mpfa.losses.options import VALUE, saturation
 from torchrl_mpfa.losses.td3 import SignalTD3Loss
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
@@ -47,7 +47,6 @@ class WholeGradients:
         self._actor_parameters = dict(self._parts.actor.module.named_parameters())
         self._gamma = float(loss.value_estimator.gamma)
         self._scale: float = loss.reward_scale
-        self._distance: str = loss.loss_function
         self._order, self._at_policy = loss.gradient_order, loss.gradient_at == "policy"
         self._penalty, self._limit = loss.saturation_penalty, loss.saturation_limit
         keys = loss.tensor_keys
@@ -57,12 +56,19 @@ class WholeGradients:
         if compile is not None:
             self._call = torch.compile(self._gradients, fullgraph=True, dynamic=False, **compile)
 
-    def __call__(self, batch: TensorDictBase, *, with_actor: bool = True) -> dict[str, Tensor]:
+    def __call__(
+        self,
+        batch: TensorDictBase,
+        *,
+        actor_batch: TensorDictBase | None,
+        loss_function: str | None = None,
+    ) -> dict[str, Tensor]:
         """Differentiate.
 
         Args:
             batch: Transitions, batch size ``[B]``; gets its signals.
-            with_actor: Whether the actor's parameters get gradients as well.
+            actor_batch: What the actor learns from; None: its parameters get no gradients.
+            loss_function: Distance of the critic's loss; None: the loss's own.
 
         Returns:
             Detached values for the log.
@@ -81,7 +87,8 @@ class WholeGradients:
             after[keys.terminated].reshape(-1),
             weight=None if weight is None else weight.reshape(-1),
             noise=loss.target_noise(action) if isinstance(loss, SignalTD3Loss) else None,
-            with_actor=with_actor,
+            actor_state=None if actor_batch is None else {key: actor_batch[key] for key in inputs},
+            loss_function=loss_function or loss.loss_function,
             with_slope=ACTION_GRADIENT.name in loss.signals,
         )
         for parameters, gradients in (
@@ -93,6 +100,7 @@ class WholeGradients:
         for name, key in (
             (TD_ERROR.name, keys.td_error_signal),
             (ACTION_GRADIENT.name, keys.action_gradient_signal),
+            (VALUE, keys.value_signal),
         ):
             if name in loss.signals:
                 batch.set(key, signals[name])
@@ -111,7 +119,8 @@ class WholeGradients:
         *,
         weight: Tensor | None,
         noise: Tensor | None,
-        with_actor: bool,
+        actor_state: State | None,
+        loss_function: str,
         with_slope: bool,
     ) -> tuple[Parameters, Parameters, Parameters, Parameters]:
         """Gradients of critics and actor, signals, and values for the log; a pure function."""
@@ -121,14 +130,17 @@ class WholeGradients:
         def critic_loss(parameters: Parameters) -> tuple[Tensor, Tensor]:
             each = [self._q(_with(module, p), state, action) for p in parts.split(parameters)]
             value = torch.stack(each)
-            loss = distance_loss(value, target.expand_as(value), self._distance).sum(0)
+            loss = distance(value, target.expand_as(value), loss_function).sum(0)
             return (loss if weight is None else loss * weight).mean(), value
 
         of_critic, (loss_value, value) = grad_and_value(critic_loss, has_aux=True)(
             critic_parameters
         )
         td_error = target - value
-        signals = {TD_ERROR.name: td_error_priority(td_error).amax(0) / self._scale}
+        signals = {
+            TD_ERROR.name: td_error_priority(td_error).amax(0) / self._scale,
+            VALUE: value[0] / self._scale,
+        }
         log = {
             "loss_value": loss_value,
             "td_error": td_error.square(),
@@ -142,12 +154,12 @@ class WholeGradients:
             slope = grad(lambda a: self._q(first, state, a).sum())(at)
             size = action_gradient_priority(slope, order=self._order)
             signals[ACTION_GRADIENT.name] = size / self._scale
-        if not with_actor:
+        if actor_state is None:
             return of_critic, {}, signals, log
 
         def actor_loss(parameters: Parameters) -> tuple[Tensor, Parameters]:
-            chosen = self._chosen(_with(parts.actor.module, parameters), state)
-            loss = -self._q(first, state, chosen[self._action]).mean()
+            chosen = self._chosen(_with(parts.actor.module, parameters), actor_state)
+            loss = -self._q(first, actor_state, chosen[self._action]).mean()
             before = chosen.get(self._preactivation)
             if before is None:
                 return loss, {}
