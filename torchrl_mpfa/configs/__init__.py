@@ -1,0 +1,71 @@
+"""Hydra configurations of the replay parts, for TorchRL's own groups.
+
+TorchRL composes trainers out of groups of configurations (``torchrl.trainers.algorithms.configs``).
+:func:`register_configs` adds those of this package to them: ``sampler=mpfa``,
+``storage=signal_tensor``, ``replay_buffer=signal``, ``loss=signal_ddpg``. Hydra is needed here and
+nowhere else in the package, which does not import this module by itself.
+"""
+
+from torchrl.trainers.algorithms.configs import ConfigStore
+
+from torchrl_mpfa.configs.learning import (
+    ActorConfig,
+    CriticConfig,
+    PriorityGuardConfig,
+    PriorityStepperConfig,
+    SignalDDPGLossConfig,
+    SignalTD3LossConfig,
+)
+from torchrl_mpfa.configs.replay import (
+    MPFASamplerConfig,
+    SignalMemmapStorageConfig,
+    SignalReplayBufferConfig,
+    SignalSamplerConfig,
+    SignalTensorStorageConfig,
+)
+
+__all__ = [
+    "CONFIGS",
+    "ActorConfig",
+    "CriticConfig",
+    "MPFASamplerConfig",
+    "PriorityGuardConfig",
+    "PriorityStepperConfig",
+    "SignalDDPGLossConfig",
+    "SignalMemmapStorageConfig",
+    "SignalReplayBufferConfig",
+    "SignalSamplerConfig",
+    "SignalTD3LossConfig",
+    "SignalTensorStorageConfig",
+    "register_configs",
+]
+
+CONFIGS: dict[tuple[str, str], type] = {
+    ("sampler", "mpfa"): MPFASamplerConfig,
+    ("sampler", "signal"): SignalSamplerConfig,
+    ("storage", "signal_tensor"): SignalTensorStorageConfig,
+    ("storage", "signal_memmap"): SignalMemmapStorageConfig,
+    ("replay_buffer", "signal"): SignalReplayBufferConfig,
+    ("loss", "signal_ddpg"): SignalDDPGLossConfig,
+    ("loss", "signal_td3"): SignalTD3LossConfig,
+    ("network", "signal_actor"): ActorConfig,
+    ("network", "signal_critic"): CriticConfig,
+    ("hook", "priority_stepper"): PriorityStepperConfig,
+    ("hook", "priority_guard"): PriorityGuardConfig,
+}
+"""The configurations by TorchRL's group and by name."""
+
+
+def register_configs() -> None:
+    """Add the configurations of this package to TorchRL's groups in Hydra's store.
+
+    TorchRL's own are there as soon as this module is imported. A second call changes nothing.
+
+    Examples:
+        >>> register_configs()
+        >>> sorted(name for group, name in CONFIGS if group == "sampler")
+        ['mpfa', 'signal']
+    """
+    store = ConfigStore.instance()
+    for (group, name), node in CONFIGS.items():
+        store.store(group=group, name=name, node=node)
