@@ -1,0 +1,170 @@
+"""The replay parts in TorchRL's own ``DDPGTrainer``, on the navigation task. Runs in seconds.
+
+    python examples/torchrl_trainer.py
+    python examples/torchrl_trainer.py --frames 20000 --seed 1
+
+``torchrl_config.py`` composes the same out of Hydra's groups.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
+from torchrl.modules import AdditiveGaussianModule
+from torchrl.objectives import SoftUpdate
+from torchrl.trainers import Trainer
+from torchrl.trainers.algorithms import DDPGTrainer
+
+from mpfa_envs import make_navigation_env
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalReplayBuffer,
+    SignalSampler,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+)
+from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """How much is collected, kept and learned."""
+
+    frames: int = 2_000
+    frames_per_batch: int = 200
+    steps_per_batch: int = 50
+    capacity: int = 100_000
+    batch_size: int = 128
+    width: int = 64
+
+
+def make_env(*, world: str, seed: int) -> EnvBase:
+    """The navigation task, with the sum of rewards that the trainer logs under its own name."""
+    env = make_navigation_env(world, physics="kinematic", info_keys=(), seed=seed)
+    return TransformedEnv(env, RewardSum(in_keys=["reward"], out_keys=["reward_sum"]))
+
+
+def make_trainer(
+    sizes: Sizes, *, world: str = "A", seed: int = 0, progress_bar: bool = True
+) -> DDPGTrainer:
+    """Everything that learns.
+
+    Args:
+        sizes: How much is collected, kept and learned.
+        world: Name of the map.
+        seed: Seed of networks, environment, noise and replay.
+        progress_bar: Whether to show one.
+
+    Returns:
+        The trainer, ready to train.
+    """
+    torch.manual_seed(seed)
+    env = make_env(world=world, seed=seed)
+    actor, critic = (make(24, 2, width=sizes.width) for make in (make_actor, make_critic))
+    # The trainer copies the loss's actor over the collector's policy: both have the noise, which
+    # the loss leaves out when it calls the actor.
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    policy = TensorDictSequential(actor, noise)
+    loss = make_ddpg_loss(policy, critic, reward_scale=0.1)
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(sizes.capacity),
+        sampler=MPFASampler(sizes.capacity),
+        batch_size=sizes.batch_size,
+    )
+    return DDPGTrainer(
+        collector=Collector(
+            env,
+            policy,
+            frames_per_batch=sizes.frames_per_batch,
+            total_frames=sizes.frames,
+            auto_register_policy_transforms=True,
+        ),
+        total_frames=sizes.frames,
+        frame_skip=1,
+        optim_steps_per_batch=sizes.steps_per_batch,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), lr=3e-4),
+        target_net_updater=SoftUpdate(loss, tau=0.01),
+        replay_buffer=buffer,
+        progress_bar=progress_bar,
+        seed=seed,
+        log_interval=sizes.frames_per_batch,
+    )
+
+
+def report(trainer: Trainer) -> list[str]:
+    """What happened: frames, steps, updates of priorities, and what the priorities are made of.
+
+    Args:
+        trainer: A trainer after its training.
+
+    Returns:
+        Lines to print.
+    """
+    buffer, stepper = trainer.replay_buffer, trainer.optimization_stepper
+    lines = [
+        f"frames collected        {trainer.collected_frames}",
+        f"transitions in replay   {len(buffer)}, drawn by {type(buffer.sampler).__name__}",
+        f"steps of the optimizer  {trainer._optim_count}",
+    ]
+    if isinstance(stepper, PriorityStepper):
+        lines.append(f"updates of priorities   {stepper.priority_updates}")
+    if isinstance(buffer.sampler, SignalSampler):
+        statistics = buffer.stats()
+        lines += [
+            f"signal {name:16} weight {weight:.3f}, share of the priority "
+            f"{statistics[f'share/{name}']:.3f}"
+            for name, weight in buffer.sampler.weights.items()
+        ]
+    return lines
+
+
+def silence() -> None:
+    """Keep the console to the progress bar and the report."""
+    # That the trainer is new, and that stages which it uses itself will go.
+    warnings.filterwarnings("ignore", message=".*experimental/prototype feature")
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"torchrl\..*")
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
+def close_progress_bar(trainer: Trainer) -> None:
+    """Finish the line of the progress bar; TorchRL leaves it open until Python ends."""
+    if trainer.progress_bar:
+        trainer._pbar.close()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train, and say what happened."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=Sizes.frames)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--world", default="A", help="name of a map, A to D")
+    parser.add_argument("--no-progress", action="store_true", help="show no progress bar")
+    options = parser.parse_args(arguments)
+    silence()
+    torch.set_num_threads(1)
+    trainer = make_trainer(
+        Sizes(frames=options.frames),
+        world=options.world,
+        seed=options.seed,
+        progress_bar=not options.no_progress,
+    )
+    PriorityStepper().register(trainer)  # The step, and then the priorities of its batch.
+    PriorityGuard().register(trainer)  # An error, if another stepper did without the latter.
+    trainer.train()
+    close_progress_bar(trainer)
+    print(*report(trainer), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""TorchRL's ``DDPGTrainer`` with our parts: priorities are updated, or there is an error."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler
+from torchrl.trainers import (
+    DefaultOptimizationStepper,
+    MixedPrecisionOptimizationStepper,
+    ReplayBufferTrainer,
+    Trainer,
+)
+from torchrl.trainers.algorithms import DDPGTrainer
+from torchrl.trainers.algorithms.td3 import TD3OptimizationStepper
+
+from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper, check_priority_updates
+from torchrl_trainer import Sizes, main, make_trainer
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:DDPGTrainer is an experimental"),
+    # Stages that the trainer itself uses.
+    pytest.mark.filterwarnings("ignore:The '.*' hook stage:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:OptimizerHook:FutureWarning"),
+]
+TINY = Sizes(
+    frames=60, frames_per_batch=20, steps_per_batch=3, capacity=100, batch_size=4, width=16
+)
+
+
+def tiny_trainer(seed: int = 0) -> DDPGTrainer:
+    return make_trainer(TINY, seed=seed, progress_bar=False)
+
+
+def known_and_replayed(trainer: Trainer) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which slots have both learned signals, and which were in a batch."""
+    table = trainer.replay_buffer.storage.signal_table
+    rows = table.rows[: table.size]
+    learned = [table.column[name] for name in ("td_error", "action_gradient")]
+    return rows[:, learned].isfinite().all(1), rows[:, table.count_column] > 0
+
+
+class Forgetful(DefaultOptimizationStepper):
+    """Says that it updates priorities, and does not."""
+
+    updates_replay_priority = True
+
+
+def test_the_stepper_updates_the_signals_of_every_transition_that_is_replayed() -> None:
+    trainer = tiny_trainer()
+    stepper = PriorityStepper()
+    stepper.register(trainer)
+    PriorityGuard().register(trainer)
+    trainer.train()
+    known, replayed = known_and_replayed(trainer)
+    assert known.equal(replayed)
+    assert 0 < int(replayed.sum()) < len(trainer.replay_buffer) == 60
+    assert stepper.priority_updates == trainer._optim_count == 9
+    weights = trainer.replay_buffer.sampler.weights
+    assert set(weights) == {"reward", "td_error", "action_gradient"}
+    assert sum(weights.values()) == pytest.approx(1)
+
+
+def test_without_a_stepper_the_trainers_own_hook_updates_them() -> None:
+    trainer = tiny_trainer()
+    PriorityGuard().register(trainer)
+    trainer.train()
+    known, replayed = known_and_replayed(trainer)
+    assert known.equal(replayed)
+    assert replayed.any()
+    assert trainer.replay_buffer.sampler.weights
+
+
+def test_two_trainings_of_one_seed_are_the_same_and_of_another_seed_are_not() -> None:
+    tables, policies = [], []
+    for seed in (0, 0, 1):
+        trainer = tiny_trainer(seed)
+        PriorityStepper().register(trainer)
+        trainer.train()
+        tables.append(trainer.replay_buffer.storage.signal_table.rows.nan_to_num(-1))
+        policies.append(torch.cat([p.flatten() for p in trainer.loss_module.parameters()]))
+    assert tables[0].equal(tables[1])
+    assert policies[0].equal(policies[1])
+    assert not tables[0].equal(tables[2])
+
+
+def test_the_trap_is_there_a_silent_stepper_leaves_all_priorities_as_they_were() -> None:
+    trainer = tiny_trainer()
+    trainer.optimization_stepper = DefaultOptimizationStepper()
+    trainer.train()
+    known, replayed = known_and_replayed(trainer)
+    assert replayed.any()
+    assert not known.any()
+    assert trainer.replay_buffer.sampler.weights == {}
+
+
+def test_the_guard_names_a_silent_stepper_before_anything_is_collected() -> None:
+    trainer = tiny_trainer()
+    PriorityGuard().register(trainer)
+    trainer.optimization_stepper = DefaultOptimizationStepper()
+    with pytest.raises(RuntimeError, match="DefaultOptimizationStepper does not update priorities"):
+        trainer.train()
+    assert trainer.collected_frames == len(trainer.replay_buffer) == 0
+
+
+def test_the_guard_names_a_stepper_that_does_not_do_what_it_declares() -> None:
+    trainer = tiny_trainer()
+    PriorityGuard().register(trainer)
+    trainer.optimization_stepper = Forgetful()
+    with pytest.raises(RuntimeError, match=r"step\(\) of Forgetful does not call it"):
+        trainer.train()
+    assert trainer._optim_count == 1
+
+
+def test_the_guard_finds_a_trainer_without_the_hook_that_updates() -> None:
+    parts = tiny_trainer()
+    trainer = Trainer(
+        collector=parts.collector,
+        total_frames=60,
+        frame_skip=1,
+        optim_steps_per_batch=3,
+        loss_module=parts.loss_module,
+        optimizer=parts.optimizer,
+        progress_bar=False,
+    )
+    hook = ReplayBufferTrainer(parts.replay_buffer, batch_size=4, flatten_tensordicts=True)
+    trainer.register_op("pre_epoch", hook.extend)
+    trainer.register_op("process_optim_batch", hook.sample)
+    with pytest.raises(ValueError, match="replay_buffer of the trainer must not be None"):
+        PriorityGuard().register(trainer)
+    PriorityGuard(parts.replay_buffer).register(trainer)
+    with pytest.raises(RuntimeError, match="no hook does at the stage 'post_loss'"):
+        trainer.train()
+
+
+def test_another_stepper_takes_the_step_where_one_is_given() -> None:
+    trainer = tiny_trainer()
+    inner = MixedPrecisionOptimizationStepper(trainer.optimizer)
+    stepper = PriorityStepper(inner)
+    assert stepper.optimizer_step_count == 0
+    stepper.register(trainer)
+    PriorityGuard().register(trainer)
+    trainer.train()
+    assert (stepper.priority_updates, stepper.optimizer_step_count) == (9, 9)
+    state = stepper.state_dict()
+    assert state["optimizer_step_count"] == 9
+    fresh = PriorityStepper(MixedPrecisionOptimizationStepper(trainer.optimizer))
+    fresh.load_state_dict(state)
+    assert fresh.optimizer_step_count == 9
+
+
+def test_the_values_for_the_log_keep_no_graph() -> None:
+    trainer = tiny_trainer()
+    seen: list[TensorDictBase] = []
+    stepper = PriorityStepper()
+    step = stepper.step
+
+    def remember(trainer: Trainer, batch: TensorDictBase) -> TensorDictBase:
+        seen.append(step(trainer, batch))
+        return seen[-1]
+
+    stepper.step = remember  # type: ignore[method-assign]
+    stepper.register(trainer)
+    trainer.train()
+    assert not any(value.requires_grad for value in seen[0].values())
+
+
+def test_a_stepper_that_cannot_be_wrapped_is_refused() -> None:
+    with pytest.raises(TypeError, match="stepper must be an OptimizationStepper, got str"):
+        PriorityStepper("step")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="must not update priorities itself, got PriorityStepper"):
+        PriorityStepper(PriorityStepper())
+    with pytest.raises(ValueError, match="got Forgetful"):
+        PriorityStepper(Forgetful())
+
+
+def test_a_step_without_a_replay_buffer_is_refused_before_it_is_taken() -> None:
+    with pytest.raises(ValueError, match="replay_buffer of the trainer must not be None"):
+        PriorityStepper().step(SimpleNamespace(loss_module=None), None)
+
+
+@pytest.mark.parametrize("prioritized", [True, False])
+def test_the_check_asks_of_prioritized_samplers_of_torchrl_alone(prioritized: bool) -> None:
+    sampler = PrioritizedSampler(10, 0.6, 0.4) if prioritized else RandomSampler()
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=2)
+    trainer = SimpleNamespace(
+        replay_buffer=buffer, optimization_stepper=DefaultOptimizationStepper()
+    )
+    if prioritized:
+        with pytest.raises(RuntimeError, match="PrioritizedSampler would draw by the priorities"):
+            check_priority_updates(trainer)
+        assert TD3OptimizationStepper.updates_replay_priority
+        trainer.optimization_stepper = PriorityStepper()
+    check_priority_updates(trainer)
+
+
+def test_a_learner_elsewhere_updates_priorities_itself() -> None:
+    trainer = SimpleNamespace(
+        learner_backend="ray", optimization_stepper=DefaultOptimizationStepper()
+    )
+    check_priority_updates(trainer)
+    PriorityGuard().register(trainer)
+
+
+def test_the_example_trains_and_says_what_happened(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--frames", "200", "--no-progress"])
+    printed = capsys.readouterr().out
+    assert "frames collected        200" in printed
+    assert "steps of the optimizer  50" in printed
+    assert "updates of priorities   50" in printed
+    assert all(f"signal {name}" in printed for name in ("reward", "td_error", "action_gradient"))
+
+
+def test_the_code_of_the_page_runs() -> None:
+    page = Path(__file__).parents[2] / "docs" / "torchrl_trainer.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    names: dict[str, object] = {}
+    exec(code, names)
+    assert names["trainer"].replay_buffer.sampler.weights  # type: ignore[attr-defined]
