@@ -1,0 +1,306 @@
+"""Our parts out of Hydra's groups, beside TorchRL's own, up to a trainer that trains."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from torchrl.data import LazyMemmapStorage, RandomSampler
+from torchrl.trainers import DefaultOptimizationStepper, Trainer
+
+from torchrl_config import main, register, train
+from torchrl_mpfa import (
+    FixedFusion,
+    MPFASampler,
+    Signal,
+    SignalDDPGLoss,
+    SignalMemmapStorage,
+    SignalSampler,
+    SignalTD3Loss,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+)
+from torchrl_mpfa.configs import (
+    CONFIGS,
+    ActorConfig,
+    CriticConfig,
+    MPFASamplerConfig,
+    SignalDDPGLossConfig,
+    SignalMemmapStorageConfig,
+    SignalSamplerConfig,
+    SignalTD3LossConfig,
+    SignalTensorStorageConfig,
+)
+from torchrl_mpfa.trainer import PriorityGuard
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*Trainer is an experimental"),
+    # Stages that the trainer itself uses.
+    pytest.mark.filterwarnings("ignore:The '.*' hook stage:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:OptimizerHook:FutureWarning"),
+]
+EXAMPLES = Path(__file__).parents[2] / "examples"
+TINY = [
+    "frames=60",
+    "storage.max_size=100",
+    "replay_buffer.batch_size=4",
+    "collector.frames_per_batch=20",
+    "trainer.optim_steps_per_batch=3",
+    "trainer.progress_bar=false",
+    "actor.width=16",
+    "critic.width=16",
+]
+
+
+@pytest.fixture(autouse=True)
+def hydra_at_work() -> Iterator[None]:
+    GlobalHydra.instance().clear()
+    register()
+    with initialize_config_dir(str(EXAMPLES), version_base="1.3"):
+        yield
+
+
+def tiny(*overrides: str) -> Trainer:
+    return train(compose("torchrl_config", [*TINY, *overrides]))
+
+
+def assert_learned(trainer: Trainer, *names: str) -> None:
+    """The transitions that were replayed have these signals, and no others have."""
+    table = trainer.replay_buffer.storage.signal_table
+    rows = table.rows[: table.size]
+    known = rows[:, [table.column[name] for name in names]].isfinite().all(1)
+    replayed = rows[:, table.count_column] > 0
+    assert known.equal(replayed)
+    assert replayed.any()
+    assert trainer.replay_buffer.sampler.weights
+
+
+def test_the_composed_pipeline_updates_the_priorities_of_what_it_replays() -> None:
+    trainer = tiny()
+    assert_learned(trainer, "td_error", "action_gradient")
+    assert trainer.optimization_stepper.priority_updates == 9
+    buffer = trainer.replay_buffer
+    assert type(buffer.sampler) is MPFASampler
+    assert type(buffer.storage) is SignalTensorStorage
+    assert type(trainer.loss_module) is SignalDDPGLoss
+    assert buffer.sampler.max_size == buffer.storage.max_size == 100
+
+
+def test_the_policy_that_collects_has_the_weights_that_were_learned() -> None:
+    trainer = tiny()
+    learned = trainer.loss_module.actor_network_params.flatten_keys(".")
+    collecting = dict(trainer.collector.policy.named_parameters())
+    assert collecting
+    for name, weights in collecting.items():
+        assert weights.data_ptr() != learned[name].data_ptr()
+        assert weights.equal(learned[name])
+
+
+def test_two_runs_of_one_seed_are_the_same() -> None:
+    first, second = (tiny("seed=3").replay_buffer.storage.signal_table.rows for _ in range(2))
+    assert first.nan_to_num(-1).equal(second.nan_to_num(-1))
+
+
+def test_other_choices_of_the_groups_fit_the_same_places() -> None:
+    trainer = tiny("sampler=signal", "sampler.alpha=0.7", "storage=signal_memmap")
+    assert type(trainer.replay_buffer.sampler) is SignalSampler
+    assert trainer.replay_buffer.sampler.alpha == 0.7
+    assert type(trainer.replay_buffer.storage) is SignalMemmapStorage
+    assert_learned(trainer, "td_error")
+
+
+def test_torchrls_own_sampler_and_storage_fit_as_well() -> None:
+    trainer = tiny("sampler=random", "storage=lazy_memmap")
+    assert type(trainer.replay_buffer.sampler) is RandomSampler
+    assert type(trainer.replay_buffer.storage) is LazyMemmapStorage
+    assert len(trainer.replay_buffer) == 60
+
+
+def test_torchrls_own_networks_fit_the_loss() -> None:
+    critic = "{_target_: torchrl.modules.ValueOperator, module: ${mlp}, "
+    critic += "in_keys: [observation, action], out_keys: [state_action_value]}"
+    trainer = tiny(
+        "+network@mlp=mlp",
+        "mlp.in_features=26",
+        "mlp.out_features=1",
+        "mlp.num_cells=[16]",
+        f"loss.value_network={critic}",
+    )
+    assert_learned(trainer, "td_error", "action_gradient")
+
+
+def test_the_guard_of_the_configuration_names_a_silent_stepper() -> None:
+    config = compose("torchrl_config", [*TINY, "trainer.hooks=['${guard}']"])
+    trainer = instantiate(config.trainer)
+    trainer.optimization_stepper = DefaultOptimizationStepper()
+    with pytest.raises(RuntimeError, match="DefaultOptimizationStepper does not update priorities"):
+        trainer.train()
+
+
+def test_a_storage_without_signals_is_refused_by_name() -> None:
+    with pytest.raises(Exception, match=r"storage must keep signals.*got LazyTensorStorage"):
+        tiny("storage=lazy_tensor")
+
+
+def test_the_capacity_of_a_sampler_is_that_of_the_storage_beside_it() -> None:
+    groups = [
+        "+replay_buffer=signal",
+        "+sampler@replay_buffer.sampler=mpfa",
+        "+storage@replay_buffer.storage=signal_tensor",
+        "replay_buffer.storage.max_size=32",
+    ]
+    buffer = instantiate(compose(overrides=groups).replay_buffer)
+    assert buffer.sampler.max_size == buffer.storage.max_size == 32
+
+
+def test_the_configuration_of_the_page_builds_a_buffer() -> None:
+    page = (EXAMPLES.parent / "docs" / "torchrl_trainer.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    given = OmegaConf.create(text)
+    ConfigStore.instance().store(name="page", node=given)
+    buffer = instantiate(compose("page").replay_buffer)
+    assert [signal.name for signal in buffer.sampler.signals] == ["reward", "td_error", "novelty"]
+    assert buffer.sampler.max_size == 100_000
+
+
+def test_fusion_adjustments_and_signals_are_configurations_of_their_own() -> None:
+    novelty = {"_target_": "torchrl_mpfa.Signal", "name": "novelty", "key": ["info", "novelty"]}
+    config = MPFASamplerConfig(
+        max_capacity=10,
+        signals=["reward", novelty],
+        fusion={"_target_": "torchrl_mpfa.FixedFusion", "values": {"reward": 1.0, "novelty": 2.0}},
+        adjustments=[{"_target_": "torchrl_mpfa.PositiveBoost", "boost": 2.0}],
+    )
+    sampler = instantiate(config)
+    assert sampler.fusion == FixedFusion({"reward": 1.0, "novelty": 2.0})
+    assert sampler.signals[1] == Signal("novelty", key=("info", "novelty"))
+    assert [adjust.boost for adjust in sampler.adjustments] == [2.0]
+    storage = instantiate(SignalTensorStorageConfig(max_size=10, signals=["reward", novelty]))
+    assert storage.signal_table.names == ["novelty", "reward"]
+    assert storage.signal_table.reward_key == ("next", "reward")
+
+
+@pytest.mark.parametrize(
+    ("config", "made", "left_out"),
+    [
+        # A type is no value of a configuration.
+        (SignalSamplerConfig, SignalSampler, {"dtype"}),
+        (MPFASamplerConfig, MPFASampler, {"dtype"}),
+        (SignalTensorStorageConfig, SignalTensorStorage, set()),
+        (SignalMemmapStorageConfig, SignalMemmapStorage, set()),
+        # A trainer of TorchRL does not keep the target critics that would be averaged.
+        (SignalDDPGLossConfig, SignalDDPGLoss, {"target_average"}),
+        (SignalTD3LossConfig, SignalTD3Loss, {"target_average"}),
+        (ActorConfig, make_actor, set()),
+        (CriticConfig, make_critic, set()),
+    ],
+)
+def test_every_argument_is_a_field_with_the_same_default(
+    config: type, made: type, left_out: set[str]
+) -> None:
+    function = made.__init__ if inspect.isclass(made) else made  # type: ignore[misc]
+    arguments = {
+        name: parameter
+        for name, parameter in inspect.signature(function).parameters.items()
+        if name not in {"self", *left_out}
+        and parameter.kind not in {parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL}
+    }
+    assert set(arguments) <= {field.name for field in fields(config)}
+    if made in (SignalSampler, SignalTD3Loss):
+        return  # By default PER; and bounds that the trainer may give.
+    defaults = OmegaConf.structured(config)
+    for name, parameter in arguments.items():
+        if isinstance(parameter.default, bool | int | float | str):
+            assert defaults[name] == parameter.default, name
+
+
+def test_every_configuration_is_in_a_group_that_torchrl_has() -> None:
+    repo = ConfigStore.instance().repo
+    for group, name in CONFIGS:
+        others = {file.removesuffix(".yaml") for file in repo[group]}
+        assert name in others
+        assert others - {own for at, own in CONFIGS if at == group}, group
+
+
+def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
+    choices = {
+        **{"sampler": "mpfa", "storage": "signal_tensor", "replay_buffer": "signal"},
+        **{"loss": "signal_td3", "trainer": "td3", "collector": "sync", "optimizer": "adam"},
+        **{"env": "navigation", "target_net_updater": "soft"},
+        **{"network@actor": "signal_actor", "network@critic": "signal_critic"},
+    }
+    values = {
+        **{"replay_buffer.storage": "${storage}", "replay_buffer.sampler": "${sampler}"},
+        **{"storage.max_size": 100, "replay_buffer.batch_size": 4},
+        **{f"{net}.observation_size": 24 for net in ("actor", "critic")},
+        **{f"{net}.action_size": 2 for net in ("actor", "critic")},
+        **{"env._partial_": "true", "loss._partial_": "true", "collector._partial_": "true"},
+        **{"collector.create_env_fn": "${env}", "collector.frames_per_batch": 20},
+        **{"collector.total_frames": 60, "trainer.total_frames": 60},
+        **{"collector.auto_register_policy_transforms": "true"},
+        **{f"trainer.{part}": f"${{{part}}}" for part in ("collector", "optimizer")},
+        **{"trainer.replay_buffer": "${replay_buffer}", "trainer.loss_module": "${loss}"},
+        **{"trainer.actor_network": "${actor}", "trainer.qvalue_network": "${critic}"},
+        **{"trainer.target_net_updater": "${target_net_updater}", "trainer.logger": "null"},
+        **{"trainer.save_trainer_file": "null", "trainer.progress_bar": "false"},
+        **{"trainer.optim_steps_per_batch": 3},
+    }
+    overrides = [f"+{group}={name}" for group, name in choices.items()]
+    config = compose(overrides=overrides + [f"{key}={value}" for key, value in values.items()])
+    trainer = instantiate(config.trainer)
+    PriorityGuard().register(trainer)
+    trainer.train()
+    assert type(trainer.loss_module) is SignalTD3Loss
+    assert_learned(trainer, "td_error", "action_gradient")
+
+
+def test_a_loss_without_networks_waits_for_them() -> None:
+    partial = instantiate(SignalDDPGLossConfig(_partial_=True, gamma=0.5))
+    networks = make_actor(24, 2, width=8), make_critic(24, 2, width=8)
+    made = partial(actor_network=networks[0], value_network=networks[1])
+    assert float(made.value_estimator.gamma) == 0.5
+    assert made.importance == make_ddpg_loss(*networks).importance
+
+
+def test_the_script_trains_by_its_command_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    GlobalHydra.instance().clear()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["torchrl_config.py", *TINY, "sampler=signal"])
+    main()
+    printed = capsys.readouterr().out
+    assert "updates of priorities   9" in printed
+    assert "signal td_error         weight 1.000" in printed
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_importing_the_package_does_not_import_hydra() -> None:
+    code = "import sys, torchrl_mpfa, torchrl_mpfa.trainer; print('hydra' in sys.modules)"
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split()[-1] == "False"
+
+
+def test_a_seed_is_set_before_the_networks_are_made() -> None:
+    config = compose("torchrl_config", [*TINY, "seed=5"])
+    torch.manual_seed(5)
+    expected = next(iter(instantiate(config.trainer).loss_module.parameters())).clone()
+    torch.manual_seed(5)
+    assert next(iter(instantiate(config.trainer).loss_module.parameters())).equal(expected)
