@@ -2,6 +2,7 @@
 
 from torchrl_mpfa.learners.base import ActorCriticLearner, Learner
 from torchrl_mpfa.learners.ddpg import DDPGLearner
+from torchrl_mpfa.learners.sac import SACLearner
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.learners.td3 import TD3Learner
 
@@ -10,5 +11,6 @@ __all__ = [
     "DDPGLearner",
     "Learner",
     "MultiTensorSoftUpdate",
+    "SACLearner",
     "TD3Learner",
 ]

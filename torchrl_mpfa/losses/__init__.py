@@ -1,12 +1,15 @@
 """TorchRL's losses, which write the signals of each transition as they go."""
 
 from torchrl_mpfa.losses.ddpg import SignalDDPGLoss, bootstrap_target, make_ddpg_loss
+from torchrl_mpfa.losses.sac import SignalSACLoss, make_sac_loss
 from torchrl_mpfa.losses.td3 import SignalTD3Loss, make_td3_loss
 
 __all__ = [
     "SignalDDPGLoss",
+    "SignalSACLoss",
     "SignalTD3Loss",
     "bootstrap_target",
     "make_ddpg_loss",
+    "make_sac_loss",
     "make_td3_loss",
 ]

@@ -1,0 +1,148 @@
+"""SACLearner: what moves and what does not, saving, and a problem that it solves."""
+
+import io
+import math
+from copy import deepcopy
+
+import pytest
+import torch
+from losses import make_batch
+from sac_networks import critics_of, make_learner, make_networks
+from tensordict import TensorDict
+from transitions import make_buffer, seeded
+
+from torchrl_mpfa import Learner, SACLearner, make_sac_loss
+
+
+def test_the_target_may_average_over_earlier_critics():
+    learner = make_learner(of_loss={"target_average": 2}, critic_lr=1e-2, tau=0.5)
+    learner.end_episode()
+    states = [deepcopy(learner.loss.target_qvalue_network_params)]
+    learner.update(make_batch())
+    states.append(learner.loss.target_qvalue_network_params)
+    after = make_batch()["next", "observation"]
+    torch.manual_seed(3)
+    action, log_density, _ = learner.policy.draw({"observation": after})
+    each = [[q(after, action) for q in critics_of(learner.loss, state)] for state in states]
+    least = torch.stack([torch.stack(pair) for pair in each]).mean(0).amin(0).squeeze(-1)
+    torch.manual_seed(3)
+    found = learner.loss.value_loss(make_batch())[1]["next_state_value"]
+    expected = least - learner.loss.log_alpha.exp() * log_density
+    torch.testing.assert_close(found, expected.detach())
+
+
+@pytest.mark.parametrize(("deviation", "falls"), [(1.0, True), (0.01, False)])
+def test_the_temperature_falls_while_the_entropy_is_above_its_target_and_rises_below(
+    deviation, falls
+):
+    learner = make_learner(alpha_lr=1e-2, actor_lr=1e-8)
+    head = learner.policy.module[0].module.scale_head
+    torch.nn.init.zeros_(head.weight)
+    torch.nn.init.constant_(head.bias, math.log(math.expm1(deviation) / math.expm1(1.0)))
+    log = [learner.update(make_batch(seed=seed)) for seed in range(5)]
+    assert (log[0]["entropy"] > learner.loss.target_entropy) == falls
+    assert (log[4]["alpha"] < log[0]["alpha"]) == falls
+    assert log[0]["alpha"] == 1.0
+
+
+def test_a_fixed_temperature_stays():
+    learner = make_learner(of_loss={"fixed_alpha": True, "alpha_init": 0.2})
+    for seed in range(3):
+        log = learner.update(make_batch(seed=seed))
+    assert float(log["alpha"]) == pytest.approx(0.2)
+    assert len(learner.optimizer.param_groups) == 2
+
+
+def test_an_update_moves_everything_but_the_target_critics_follow_by_tau():
+    learner = make_learner(tau=0.1)
+    values = {**dict(learner.loss.named_parameters()), **dict(learner.loss.named_buffers())}
+    before = {name: value.detach().clone() for name, value in values.items()}
+    batch = make_batch()
+    log = learner.update(batch)
+    assert not any(value.requires_grad for value in log.values())
+    assert {"loss_value", "loss_actor", "loss_alpha", "alpha", "entropy"} <= set(log)
+    assert set(batch["signals"].keys()) == {"td_error", "action_gradient"}
+    moved = {name for name, value in values.items() if not value.equal(before[name])}
+    targets = {name for name in values if name.startswith("target_")}
+    assert moved == {name for name, _ in learner.loss.named_parameters()} | targets
+    assert all("qvalue" in name for name in targets)
+    for name in targets:
+        expected = 0.1 * values[name.removeprefix("target_")] + 0.9 * before[name]
+        torch.testing.assert_close(values[name], expected.detach())
+
+
+def test_actor_and_temperature_may_learn_from_a_batch_of_their_own():
+    log = make_learner().update(make_batch(6), actor_batch=make_batch(4), loss_function="pal")
+    assert log["state_action_value_actor"].shape == (4,)
+    assert log["pred_value"].shape == (2, 6)
+
+
+def test_a_restored_learner_goes_on_bit_for_bit():
+    options = {"of_loss": {"target_average": 2}, "optimizer": "radam"}
+    first, second = make_learner(0, **options), make_learner(1, **options)
+    for seed in range(4):
+        first.update(make_batch(seed=seed))
+        first.end_episode()
+    second.update(make_batch(seed=9))
+    first.anneal(0.5)
+    assert [group["lr"] for group in first.optimizer.param_groups] == [5e-4, 5e-4, 1.5e-4]
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    found = []
+    for learner in (first, second):
+        torch.manual_seed(7)
+        batches = [make_batch(seed=seed) for seed in range(4, 8)]
+        logs = [learner.update(batch) for batch in batches]
+        found.append([*logs[-1].values(), *(b["signals", "td_error"] for b in batches)])
+        found[-1] += learner.loss.state_dict().values()
+    assert all(one.equal(other) for one, other in zip(*found, strict=True))
+
+
+def solve_bandit(updates=300, **rates):
+    """Mean distance of the greedy action from the best one, and the entropy of the policy."""
+    rates = {"actor_lr": 3e-3, "critic_lr": 3e-3, "alpha_lr": 2e-2, **rates}
+    loss = make_sac_loss(*make_networks(size=2, width=32), alpha_init=0.1, target_entropy=-1.0)
+    learner = SACLearner(loss, **rates)
+    generator, end = seeded(), torch.ones(64, 1, dtype=torch.bool)
+    for _ in range(updates):
+        state, action = (torch.rand(64, 2, generator=generator) * 2 - 1 for _ in range(2))
+        reward = -(action - 0.8 * state).square().sum(1, keepdim=True)
+        after = {"observation": state, "reward": reward, "terminated": end, "done": end}
+        batch = TensorDict({"observation": state, "action": action, "next": after}, [64])
+        log = learner.update(batch)
+    with torch.no_grad():
+        chosen = learner.policy.outputs({"observation": state})["action"]
+    return float((chosen - 0.8 * state).norm(dim=1).mean()), float(log["entropy"])
+
+
+def test_learning_finds_the_best_action_at_the_entropy_that_is_asked_for():
+    distance, entropy = solve_bandit()
+    assert distance < 0.2
+    assert entropy == pytest.approx(-1.0, abs=0.5)
+
+
+@pytest.mark.parametrize("rate", ["actor_lr", "critic_lr"])
+def test_without_one_of_its_networks_it_does_not(rate):
+    assert solve_bandit(**{rate: 1e-9})[0] > 0.3
+
+
+def test_its_signals_are_what_a_replay_of_several_signals_reads():
+    buffer, learner = make_buffer(16, 8), make_learner()
+    buffer.extend(make_batch(16))
+    for _ in range(3):
+        batch = buffer.sample()
+        learner.update(batch)
+        buffer.update_tensordict_priority(batch)
+    assert set(buffer.sampler.weights) == {"reward", "td_error", "action_gradient"}
+    assert isinstance(learner, Learner)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("alpha_lr", 0.0), ("actor_lr", 0.0), ("tau", 0.0), ("compile", True)],
+)
+def test_a_bad_argument_of_the_learner_is_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} .*got {value}"):
+        make_learner(**{name: value})

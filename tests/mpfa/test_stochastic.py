@@ -1,0 +1,51 @@
+"""The stochastic policy: what it draws, and what it does when it is not to explore."""
+
+import pytest
+import torch
+from losses import make_batch
+from sac_networks import make_networks
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+
+from torchrl_mpfa import make_stochastic_actor
+from torchrl_mpfa.stochastic import draw_tanh_normal
+
+
+def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
+    policy, _ = make_networks()
+    observed = make_batch().select("observation")
+    found = policy.outputs(observed)
+    assert found["action"].equal(found["preactivation"].tanh())
+    torch.testing.assert_close(policy(observed.copy())["action"], found["action"])
+    with set_exploration_type(ExplorationType.RANDOM):
+        drawn = []
+        for _ in range(2):
+            torch.manual_seed(3)
+            drawn.append(policy.outputs(observed)["action"])
+        torch.manual_seed(3)
+        torch.testing.assert_close(policy(observed.copy())["action"], drawn[0])
+    assert drawn[0].equal(drawn[1])
+    assert not drawn[0].equal(found["action"])
+
+
+def test_the_sizes_of_a_policy_can_be_read_from_its_weights():
+    weights = [value for value in make_networks()[0].state_dict().values() if value.ndim == 2]
+    assert weights[0].shape[1] == 5
+    assert weights[-1].shape[0] == 2
+
+
+@pytest.mark.parametrize("loc", [0.0, 1.5, -30.0])
+def test_drawn_actions_and_densities_are_torchrls(loc):
+    means, deviations = torch.full((100, 2), loc), torch.linspace(0.01, 2, 200).reshape(100, 2)
+    torch.manual_seed(0)
+    action, log_density = draw_tanh_normal(means, deviations)
+    torch.manual_seed(0)
+    expected = TanhNormal(means, deviations).rsample_and_log_prob()
+    torch.testing.assert_close(action, expected[0])
+    torch.testing.assert_close(log_density, expected[1])
+    assert action.abs().max() <= 1.0
+
+
+def test_a_policy_without_units_is_refused():
+    with pytest.raises(ValueError, match="width must be at least 1, got 0"):
+        make_stochastic_actor(5, 2, width=0)
