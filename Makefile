@@ -6,7 +6,7 @@
 #   TORCH_INSTALL_ARGS='...'       what `pip install` gets for PyTorch before the project is
 #                                  installed, for another build of it: a wheel file of a CPU
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
-#   ARGS='replay=per seed=1'       settings for demo and train, options for test and bench
+#   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   COMPILE=false                  train: no compiled updates; by default if a C++ compiler is found
 #   EPISODES=100                   episodes that demo trains for and evaluates on
 #   SLOW=1                         test: the slow tests as well
@@ -47,7 +47,7 @@ demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minu
 	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
 	$(BIN)/python examples/evaluate.py runs/demo --world A --episodes $(EPISODES)
 
-train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='replay=per seed=1'
+train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='method=per seed=1'
 	$(BIN)/python examples/train.py curriculum=paper learner.lr_power=1 learner.compile=$(COMPILE) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses

@@ -21,7 +21,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import environment, loss, replay, training
+from benchmarks import environment, loss, method_steps, replay, training
 from benchmarks.timing import Entry
 
 LATEST = Path(__file__).with_name("latest.json")
@@ -63,6 +63,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "loss": loss.measure,
     "train_step": training.measure_train_step,
     "sb3_step": training.measure_sb3_step,
+    "methods": method_steps.measure,
     "environment": measure_environment,
 }
 

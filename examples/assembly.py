@@ -1,83 +1,36 @@
-"""The parts of a training run, put together from its settings."""
+"""Networks, loss and optimizers of a training run, put together from its settings."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModule
-from torchrl.data import RandomSampler, TensorSpec
-from torchrl.modules import AdditiveGaussianModule
 
-from settings import Exploration, Replay
+from methods import Method
+from replay_assembly import learned_signals
 from settings import Learner as LearnerSettings
 from torchrl_mpfa import (
-    Adjustment,
     DDPGLearner,
-    EntropyFusion,
-    FixedFusion,
     Learner,
-    PositiveBoost,
-    PositiveDecay,
-    SignalReplayBuffer,
-    SignalSampler,
-    SignalTensorStorage,
+    SACLearner,
     TD3Learner,
     make_actor,
     make_critic,
     make_ddpg_loss,
+    make_sac_loss,
+    make_stochastic_actor,
     make_td3_loss,
 )
-
-
-def make_sampler(settings: Replay) -> SignalSampler | RandomSampler:
-    """The sampler that the settings describe: signals, fusion, adjustments."""
-    if not settings.signals:
-        return RandomSampler()
-    if settings.fusion not in ("entropy", "fixed"):
-        raise ValueError(f"replay.fusion must be 'entropy' or 'fixed', got {settings.fusion!r}")
-    adjustments: list[Adjustment] = []
-    if settings.boost:
-        adjustments.append(
-            PositiveBoost(boost=settings.boost_factor, bound=settings.boost_bound)  # type: ignore[arg-type]
-        )
-    if settings.decay:
-        adjustments.append(
-            PositiveDecay(
-                sharpness=settings.decay_sharpness,
-                position=settings.decay_position,  # type: ignore[arg-type]
-            )
-        )
-    return SignalSampler(
-        settings.capacity,
-        settings.alpha,
-        settings.beta,
-        settings.eps,
-        max_priority_within_buffer=True,
-        signals=settings.signals,
-        fusion=EntropyFusion(population=settings.population)  # type: ignore[arg-type]
-        if settings.fusion == "entropy"
-        else FixedFusion(dict.fromkeys(settings.signals, 1.0)),
-        adjustments=adjustments,
-    )
-
-
-def make_buffer(settings: Replay, *, seed: int) -> SignalReplayBuffer:
-    """Storage, sampler and buffer, with a generator of their own."""
-    return SignalReplayBuffer(
-        # As the environment gives it: each write would be converted to a device that is named.
-        storage=SignalTensorStorage(settings.capacity, device="auto"),
-        sampler=make_sampler(settings),
-        batch_size=settings.batch_size,
-        generator=torch.Generator().manual_seed(seed),
-    )
+from torchrl_mpfa.methods import Curiosity
 
 
 def make_policy(
     settings: LearnerSettings, observation_size: int, action_size: int
 ) -> TensorDictModule:
-    """The actor."""
-    return make_actor(
+    """The actor, random by itself for SAC."""
+    make = make_stochastic_actor if settings.algorithm == "sac" else make_actor
+    return make(
         observation_size,
         action_size,
         width=settings.width,
@@ -89,13 +42,21 @@ def make_policy(
 
 def make_learner(
     settings: LearnerSettings,
-    signals: list[str],
+    method: Method,
     observation_size: int,
     action_size: int,
     *,
     device: str = "cpu",
 ) -> Learner:
-    """Networks, loss and optimizers; the loss writes those signals that the replay asks for."""
+    """Networks, loss and optimizers; the loss writes those signals that the method asks for.
+
+    Raises:
+        ValueError: If the algorithm is unknown.
+    """
+    if settings.algorithm not in ALGORITHMS:
+        raise ValueError(
+            f"learner.algorithm must be one of {sorted(ALGORITHMS)}, got {settings.algorithm!r}"
+        )
     critic = make_critic(
         observation_size,
         action_size,
@@ -109,8 +70,10 @@ def make_learner(
     actor, critic = actor.to(device), critic.to(device)
     of_loss: dict[str, Any] = {
         "gamma": settings.gamma,
-        "signals": [name for name in signals if name in ("td_error", "action_gradient")],
-        "importance": settings.importance,
+        "signals": learned_signals(method),
+        "importance": method.importance,
+        "loss_function": method.loss_function,
+        "target_average": method.target_average,
         "reward_scale": settings.reward_scale,
         "saturation_penalty": settings.saturation_penalty,
         "saturation_limit": settings.saturation_limit,
@@ -120,25 +83,57 @@ def make_learner(
         "critic_lr": settings.critic_lr,
         "critic_weight_decay": settings.critic_weight_decay,
         "tau": settings.tau,
+        "optimizer": method.optimizer,
         "compile": settings.compile,
     }
-    if settings.algorithm == "ddpg":
-        return DDPGLearner(make_ddpg_loss(actor, critic, **of_loss), **of_learner)
-    if settings.algorithm == "td3":
-        smoothing: dict[str, Any] = {
-            "policy_noise": settings.policy_noise,
-            "noise_clip": settings.noise_clip,
-        }
-        loss = make_td3_loss(actor, critic, **of_loss, **smoothing)
-        return TD3Learner(loss, **of_learner, policy_delay=settings.policy_delay)
-    raise ValueError(f"learner.algorithm must be 'ddpg' or 'td3', got {settings.algorithm!r}")
+    return ALGORITHMS[settings.algorithm](settings, actor, critic, of_loss, of_learner)
 
 
-def make_noise(settings: Exploration, action_spec: TensorSpec) -> AdditiveGaussianModule:
-    """Gaussian noise on the action, clipped to its range, falling linearly."""
-    return AdditiveGaussianModule(
-        action_spec,
-        sigma_init=settings.sigma,
-        sigma_end=settings.sigma_end,
-        annealing_num_steps=settings.annealing_steps,
-    )
+Options = dict[str, Any]
+
+
+def _ddpg(
+    settings: LearnerSettings,
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    of_loss: Options,
+    of_learner: Options,
+) -> Learner:
+    return DDPGLearner(make_ddpg_loss(actor, critic, **of_loss), **of_learner)
+
+
+def _td3(
+    settings: LearnerSettings,
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    of_loss: Options,
+    of_learner: Options,
+) -> Learner:
+    smoothing: Options = {"policy_noise": settings.policy_noise, "noise_clip": settings.noise_clip}
+    loss = make_td3_loss(actor, critic, **of_loss, **smoothing)
+    return TD3Learner(loss, **of_learner, policy_delay=settings.policy_delay)
+
+
+def _sac(
+    settings: LearnerSettings,
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    of_loss: Options,
+    of_learner: Options,
+) -> Learner:
+    loss = make_sac_loss(actor, critic, **of_loss, alpha_init=settings.alpha_init)
+    return SACLearner(loss, **of_learner, alpha_lr=settings.alpha_lr)
+
+
+ALGORITHMS: dict[str, Callable[..., Learner]] = {"ddpg": _ddpg, "td3": _td3, "sac": _sac}
+"""Learners by the name of their algorithm."""
+
+
+def make_curiosity(
+    method: Method, observation_size: int, action_size: int, *, device: str = "cpu"
+) -> Curiosity | None:
+    """The bonus on rewards, if the method has one."""
+    if not method.curiosity:
+        return None
+    made = Curiosity(observation_size, action_size, scale=method.curiosity_scale)
+    return made.to(device)

@@ -1,15 +1,15 @@
-"""Train several replays with several seeds, evaluate the last policy of each, keep every episode.
+"""Train several methods with several seeds, evaluate the last policy of each, keep every episode.
 
-    python examples/compare.py                             three replays, three seeds, two at a time
+    python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners, too
-    python examples/compare.py --seeds 0 --replays per --folder runs/try -- curriculum=A
+    python examples/compare.py --seeds 0 --methods per --folder runs/try -- curriculum=A
 
 What follows ``--`` goes to ``train.py``. Stopped at any moment, the same command goes on: finished
 runs are left alone, others continue at their last checkpoint. ``report.py`` makes tables and
 figures of the folder. Files in it:
 
-    LEARNER-REPLAY-SEED/   a run of train.py, and test.csv, a row per evaluation episode
-    episodes.csv           all rows of all test.csv, with learner, replay and seed
+    LEARNER-METHOD-SEED/   a run of train.py, and test.csv, a row per evaluation episode
+    episodes.csv           all rows of all test.csv, with learner, method and seed
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Job:
     """One training run."""
 
     learner: str
-    replay: str
+    method: str
     seed: int
     folder: Path
 
     @property
     def name(self) -> str:
         """Name of the run, and of its folder."""
-        return f"{self.learner}-{self.replay}-{self.seed}"
+        return f"{self.learner}-{self.method}-{self.seed}"
 
     @property
     def path(self) -> Path:
@@ -69,7 +69,7 @@ class Job:
         return [
             *script,
             f"learner={self.learner}",
-            f"replay={self.replay}",
+            f"method={self.method}",
             f"seed={self.seed}",
             f"run_dir={self.path}",
             *overrides,
@@ -81,7 +81,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--replays", nargs="+", default=["mpfa", "per", "uniform"])
+    parser.add_argument("--methods", nargs="+", default=["mpfa_per", "per", "uniform"])
     parser.add_argument("--learners", nargs="+", default=["ddpg"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--folder", type=Path, default=Path("runs/compare"))
@@ -90,7 +90,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=200, help="its pairs (default: 200)")
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
-    for group, names in (("replay", options.replays), ("learner", options.learners)):
+    for group, names in (("method", options.methods), ("learner", options.learners)):
         for name in names:
             if name not in GROUPS[group]:
                 parser.error(f"unknown {group} {name!r}; there are: {', '.join(GROUPS[group])}")
@@ -169,10 +169,10 @@ def collect(jobs: Sequence[Job], path: Path) -> None:
     rows: list[dict[str, str]] = []
     for job in jobs:
         if job.is_done:
-            which = {"learner": job.learner, "replay": job.replay, "seed": str(job.seed)}
+            which = {"learner": job.learner, "method": job.method, "seed": str(job.seed)}
             with (job.path / DONE).open(encoding="utf-8", newline="") as file:
                 rows += [{**which, **row} for row in csv.DictReader(file)]
-    write_rows(rows, ["learner", "replay", "seed", *RESULT_FIELDS], path)
+    write_rows(rows, ["learner", "method", "seed", *RESULT_FIELDS], path)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -188,11 +188,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     overrides = with_defaults(options.overrides)
     jobs = [
-        Job(learner, replay, seed, options.folder)
-        # Seeds outside: a study that is cut short has as much of each replay.
+        Job(learner, method, seed, options.folder)
+        # Seeds outside: a study that is cut short has as much of each method.
         for seed in options.seeds
         for learner in options.learners
-        for replay in options.replays
+        for method in options.methods
     ]
     waiting = [job for job in jobs if not job.is_done]
     print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {options.folder}")

@@ -73,13 +73,13 @@ def make_evaluation_env(
 
 def greedy(policy: TensorDictModule) -> Action:
     """The policy's action without noise, from one observation."""
-    network = policy.module
-    device = next(network.parameters()).device
+    device = next(policy.parameters()).device
 
     @torch.no_grad()
     def act(observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        found = network(torch.from_numpy(observation).to(device))[-1]
-        action: NDArray[np.float32] = found.cpu().numpy()
+        # Outside of exploration a stochastic policy gives the middle of its distribution.
+        found = policy.outputs({"observation": torch.from_numpy(observation).to(device)})
+        action: NDArray[np.float32] = found["action"].cpu().numpy()
         return action
 
     return act

@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule
 from settings import Learner, TrainSettings
 from torchrl_mpfa import load_safely, save_atomically
 
-POLICY_FORMAT = 1
+POLICY_FORMAT = 2
 
 
 @dataclass
@@ -95,7 +95,7 @@ def save_policy(
         "learner": asdict(settings.learner),
         "environment": asdict(settings.environment),
         "trained": {
-            "replay": settings.replay.name,
+            "method": settings.method.name,
             "curriculum": settings.curriculum.name,
             "seed": settings.seed,
             "episodes": len(records),

@@ -24,7 +24,7 @@ from aggregates import Array, interquartile_mean, probability_of_improvement, st
 from records import running_mean, write_text_atomically
 
 Method = tuple[str, str]
-"""Learner and replay."""
+"""Learner and method."""
 
 PAPER = {
     ("paper", "MPFA-PER"): (0.905, 19, 27.3),
@@ -43,10 +43,10 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def by_method(rows: Iterable[dict[str, str]]) -> dict[Method, dict[int, list[dict[str, str]]]]:
-    """Rows by learner and replay, then by seed."""
+    """Rows by learner and method, then by seed."""
     found: dict[Method, dict[int, list[dict[str, str]]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        found[row["learner"], row["replay"]][int(row["seed"])].append(row)
+        found[row["learner"], row["method"]][int(row["seed"])].append(row)
     return {method: dict(seeds) for method, seeds in found.items()}
 
 
@@ -70,14 +70,14 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def outcome_table(methods: dict[Method, dict[int, list[dict[str, str]]]]) -> str:
     """Success of each seed, and means over the seeds, beside the paper's."""
     rows = []
-    for (learner, replay), seeds in methods.items():
+    for (learner, name), seeds in methods.items():
         success, time = matrix(seeds, "success"), matrix(seeds, "time_s")
         each = ", ".join(f"{value:.1%}" for value in success.mean(axis=1))
         reached = time[success == 1.0]
         rows.append(
             [
                 learner,
-                replay,
+                name,
                 f"{success.mean():.1%}",
                 each,
                 f"{matrix(seeds, 'collision').mean():.1%}",
@@ -89,7 +89,7 @@ def outcome_table(methods: dict[Method, dict[int, list[dict[str, str]]]]) -> str
     for (source, name), (rate, collisions, seconds) in PAPER.items():
         of_200 = f"{collisions / 200:.1%}"
         rows.append([source, name, f"{rate:.1%}", "", of_200, "", "", f"{seconds:.1f}"])
-    head = ["learner", "replay", "success", "of each seed", "collision", "time-out", "SPL"]
+    head = ["learner", "method", "success", "of each seed", "collision", "time-out", "SPL"]
     return table([*head, "time [s]"], rows)
 
 
@@ -141,7 +141,7 @@ def area_under(steps: Array, values: Array) -> float:
 def speed_table(curves: dict[Method, dict[int, list[dict[str, str]]]]) -> str:
     """Steps until nine of ten goals are found on the validation map, and area under that curve."""
     rows = []
-    for (learner, replay), seeds in curves.items():
+    for (learner, name), seeds in curves.items():
         firsts, areas = [], []
         for _, found in sorted(seeds.items()):
             steps = np.array([float(row["total_steps"]) for row in found])
@@ -150,8 +150,8 @@ def speed_table(curves: dict[Method, dict[int, list[dict[str, str]]]]) -> str:
             firsts.append(f"{reached[0]:,.0f}" if reached.size else "never")
             areas.append(area_under(steps, success))
         each = ", ".join(f"{value:.3f}" for value in areas)
-        rows.append([learner, replay, "; ".join(firsts), f"{np.mean(areas):.3f}", each])
-    head = ["learner", "replay", f"steps to {GOAL:.0%}, each seed", "area under the curve"]
+        rows.append([learner, name, "; ".join(firsts), f"{np.mean(areas):.3f}", each])
+    head = ["learner", "method", f"steps to {GOAL:.0%}, each seed", "area under the curve"]
     return table([*head, "of each seed"], rows)
 
 

@@ -1,6 +1,7 @@
 """Settings of a training run: typed, in one place, each with its default and its reason.
 
-Hydra builds its command line from these: ``train.py replay=per learner.width=128 seed=3``.
+Hydra builds its command line from these: ``train.py method=per learner.width=128 seed=3``. The
+methods are in ``methods.py``.
 """
 
 from __future__ import annotations
@@ -10,64 +11,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 
-
-@dataclass
-class Replay:
-    """The replay buffer and what its priority is made of."""
-
-    name: str = "mpfa"
-    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
-    """Signals of the priority; none means uniform sampling."""
-    fusion: str = "entropy"
-    """``entropy`` (Eqs. 15-20) or ``fixed``, equal weights."""
-    boost: bool = True
-    """Raise positive transitions, Eq. 22."""
-    decay: bool = True
-    """Decay positive transitions above the batch mean, Eqs. 23-24."""
-    capacity: int = 100_000
-    """Table 1."""
-    batch_size: int = 256
-    """Table 1."""
-    alpha: float = 0.6
-    """Priority exponent, Eq. 8."""
-    beta: float = 0.4
-    """Importance exponent at the start, Eq. 10."""
-    beta_end: float = 1.0
-    """Importance exponent at the end; between the two it rises with the episodes."""
-    eps: float = 0.05
-    """Added to every priority, Eq. 21."""
-    boost_factor: float = 3.0
-    """phi of Eq. 22."""
-    boost_bound: str = "floor"
-    """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
-    decay_sharpness: float = 0.01
-    """sigma of Eq. 23."""
-    decay_position: str = "batch"
-    """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
-    population: str = "buffer"
-    """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
-
-
-@dataclass
-class PerReplay(Replay):
-    """Prioritized experience replay: the TD error alone."""
-
-    name: str = "per"
-    signals: list[str] = field(default_factory=lambda: ["td_error"])
-    fusion: str = "fixed"
-    boost: bool = False
-    decay: bool = False
-
-
-@dataclass
-class UniformReplay(Replay):
-    """Uniform replay: no signals, no importance weights."""
-
-    name: str = "uniform"
-    signals: list[str] = field(default_factory=list)
-    fusion: str = "fixed"
-    boost: bool = False
-    decay: bool = False
+from methods import METHODS, Method
 
 
 @dataclass
@@ -76,7 +20,7 @@ class Learner:
 
     name: str = "ddpg"
     algorithm: str = "ddpg"
-    """``ddpg`` or ``td3``."""
+    """``ddpg``, ``td3`` or ``sac``."""
     update_every: int = 1
     """Actions for each update, which the paper does not give."""
     actor_lr: float = 1e-4
@@ -111,8 +55,6 @@ class Learner:
     """Factor of the penalty on actions deep in the tanh's flat ends, where no gradient is."""
     saturation_limit: float = 1.5
     """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
-    importance: str = "critic"
-    """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     compile: bool = False
     """Make one program of an update with ``torch.compile``, which halves the time of a run. Needs a
     C++ compiler, and half a minute at the start, a few seconds the next time."""
@@ -122,6 +64,10 @@ class Learner:
     """TD3: standard deviation of the noise that smooths the target."""
     noise_clip: float = 0.5
     """TD3: bound of that noise."""
+    alpha_init: float = 0.01
+    """SAC: temperature of the entropy at the start, of rewards that are scaled."""
+    alpha_lr: float = 3e-4
+    """SAC: learning rate of its logarithm."""
 
 
 @dataclass
@@ -130,6 +76,14 @@ class TD3(Learner):
 
     name: str = "td3"
     algorithm: str = "td3"
+
+
+@dataclass
+class SAC(Learner):
+    """SAC with networks and rates of the DDPG learner, and a policy that is random by itself."""
+
+    name: str = "sac"
+    algorithm: str = "sac"
 
 
 @dataclass
@@ -173,10 +127,12 @@ class Stage:
 
 @dataclass
 class Curriculum:
-    """Maps one after the other; networks and buffer carry on."""
+    """Maps one after the other."""
 
     name: str = "A"
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", 100)])
+    carry: bool = True
+    """Whether networks and buffer carry on from map to map, or start anew."""
 
 
 def _single(world: str, episodes: int) -> Curriculum:
@@ -234,7 +190,7 @@ class TrainSettings:
     defaults: list[Any] = field(
         default_factory=lambda: [
             "_self_",
-            {"replay": "mpfa"},
+            {"method": "mpfa_per"},
             {"learner": "ddpg"},
             {"curriculum": "A"},
             {"tracking": "offline"},
@@ -250,7 +206,7 @@ class TrainSettings:
             "job_logging": {"root": {"level": "WARNING"}},
         }
     )
-    run_dir: str = "runs/${curriculum.name}-${replay.name}-${learner.name}-${seed}"
+    run_dir: str = "runs/${curriculum.name}-${method.name}-${learner.name}-${seed}"
     """Folder of checkpoints, logs and pictures."""
     seed: int = 0
     device: str = "cpu"
@@ -263,7 +219,7 @@ class TrainSettings:
     """Folder of a run to go on with; its own settings are used."""
     checkpoint_every: int = 25
     """Episodes between two checkpoints."""
-    replay: Replay = field(default_factory=Replay)
+    method: Method = field(default_factory=Method)
     learner: Learner = field(default_factory=Learner)
     curriculum: Curriculum = field(default_factory=Curriculum)
     tracking: Tracking = field(default_factory=Tracking)
@@ -273,8 +229,8 @@ class TrainSettings:
 
 
 GROUPS: dict[str, dict[str, Any]] = {
-    "replay": {"mpfa": Replay, "per": PerReplay, "uniform": UniformReplay},
-    "learner": {"ddpg": Learner, "td3": TD3, "plain": PlainLearner},
+    "method": METHODS,
+    "learner": {"ddpg": Learner, "td3": TD3, "sac": SAC, "plain": PlainLearner},
     "curriculum": {
         "A": _single("A", 100),
         "B": _single("B", 200),

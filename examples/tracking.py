@@ -44,7 +44,7 @@ class Tracker:
         self._run = wandb.init(
             project=settings.tracking.project,
             name=folder.name,
-            group=f"{settings.curriculum.name}-{settings.replay.name}-{settings.learner.name}",
+            group=f"{settings.curriculum.name}-{settings.method.name}-{settings.learner.name}",
             mode=mode,  # type: ignore[arg-type]
             dir=folder,
             config=asdict(settings),

@@ -1,10 +1,10 @@
-"""Train a navigation policy with any replay of this package.
+"""Train a navigation policy with any method and learner.
 
     python examples/train.py                              MPFA-PER on map A
-    python examples/train.py replay=per seed=3            another replay, another seed
+    python examples/train.py method=per seed=3            another method, another seed
     python examples/train.py curriculum=paper             maps A, B, C, D one after the other
-    python examples/train.py -m seed=0,1,2 replay=mpfa,per    a sweep
-    python examples/train.py resume=runs/A-mpfa-ddpg-0    go on with a run that was stopped
+    python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
+    python examples/train.py resume=runs/A-mpfa_per-ddpg-0    go on with a run that was stopped
 
 ``settings.py`` has every setting; ``--help`` prints them with their values.
 """

@@ -5,26 +5,28 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, set_exploration_type
-from torchrl.envs.utils import ExplorationType, step_mdp
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from assembly import make_buffer, make_learner, make_noise
+from assembly import make_curiosity, make_learner
 from evaluation import greedy, make_evaluation_env, run_episodes
+from exploration import make_explorer
 from mpfa_envs import evaluation_pairs, make_navigation_env
 from records import EpisodeRecord, ProgressRecord, save_policy, write_records
+from replay_assembly import make_buffer, make_selection
 from settings import Stage, TrainSettings
-from torchrl_mpfa import load_safely, save_atomically
+from torchrl_mpfa import Draw, SignalSampler, load_safely, save_atomically
 from tracking import Tracker
 
-FORMAT = 1
+FORMAT = 2
 CHECKPOINT = "checkpoint.pt"
 _INFO = ("success", "collision", "time_out", "path_length", "shortest_path")
 _TRANSITION = (
@@ -57,17 +59,7 @@ class TrainingRun:
         self.total_episodes = sum(stage.episodes for stage in self.stages)
         torch.manual_seed(settings.seed)
         self.env = self._make_env(0)
-        observation_size = self.env.observation_spec["observation"].shape[-1]
-        action_size = self.env.action_spec.shape[-1]
-        self.buffer = make_buffer(settings.replay, seed=settings.seed)
-        self.learner = make_learner(
-            settings.learner,
-            settings.replay.signals,
-            observation_size,
-            action_size,
-            device=settings.device,
-        )
-        self.noise = make_noise(settings.exploration, self.env.action_spec)
+        self._build()
         self._waiting: list[TensorDictBase] = []
         self.episode = 0
         self.step = 0
@@ -75,6 +67,20 @@ class TrainingRun:
         self.progress: list[ProgressRecord] = []
         self.tracker = Tracker(settings, folder)
         self._stop = False
+
+    def _build(self) -> None:
+        """Make the parts that learn, and the buffer."""
+        settings, spec = self.settings, self.env.action_spec
+        sizes = self.env.observation_spec["observation"].shape[-1], spec.shape[-1]
+        self.buffer = make_buffer(settings.method, seed=settings.seed)
+        self.learner = make_learner(
+            settings.learner, settings.method, *sizes, device=settings.device
+        )
+        self.curiosity = make_curiosity(settings.method, *sizes, device=settings.device)
+        self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
+        self.select = make_selection(
+            settings.method, self.learner.policy, lambda: self.explorer.sigma
+        )
 
     # Episodes --------------------------------------------------------------------------------
 
@@ -143,6 +149,8 @@ class TrainingRun:
         if self._stage(self.episode).world != self.world:
             self.env.close()
             self.env = self._make_env(self.episode)
+            if not self.settings.curriculum.carry:
+                self._build()
         seed = episode_seed(self.settings.seed, self.episode)
         self.env.set_seed(seed)
         torch.manual_seed(seed)
@@ -161,6 +169,7 @@ class TrainingRun:
             if self.step % self.settings.learner.update_every == 0:
                 self._update()
             last, state = after, step_mdp(state)
+        self.learner.end_episode()
         info = {name: last["info", name].item() for name in _INFO}
         return EpisodeRecord(
             episode=self.episode,
@@ -178,12 +187,7 @@ class TrainingRun:
         if self.step < self.settings.exploration.random_steps:
             return self.env.rand_action(state)
         observation = state.get("observation").to(self.settings.device)
-        found = self.learner.policy.outputs({"observation": observation})
-        with set_exploration_type(ExplorationType.RANDOM):
-            noisy = self.noise(TensorDict({"action": found["action"]}))
-        state.set("action", noisy.get("action").cpu())
-        self.noise.step(1)
-        return state
+        return state.set("action", self.explorer.act(observation).cpu())
 
     def _store(self, state: TensorDictBase, *, flush: bool) -> None:
         """Keep a step; those between two updates are written together, at the price of one."""
@@ -195,26 +199,31 @@ class TrainingRun:
             self._waiting.clear()
 
     def _update(self) -> None:
-        if len(self.buffer) < self.settings.replay.batch_size:
+        if len(self.buffer) < self.settings.method.batch_size:
             return
-        batch = self.buffer.sample()
-        if self.settings.device == "cpu":
-            losses = self.learner.update(batch)
-        else:
-            batch = batch.to(self.settings.device)
-            losses = self.learner.update(batch)
-            batch = batch.to("cpu")
-        self.buffer.update_tensordict_priority(batch)
+        device = self.settings.device
+        for number, drawn in enumerate(self.select(self.buffer)):
+            draw = drawn if device == "cpu" else _moved(drawn, device)
+            bonus = {} if self.curiosity is None else self.curiosity(draw.batch)
+            losses = self.learner.update(
+                draw.batch,
+                actor_batch=draw.actor_batch,
+                loss_function=draw.loss_function,
+                new_step=number == 0,
+            )
+            batch = draw.batch if device == "cpu" else draw.batch.to("cpu")
+            self.buffer.update_tensordict_priority(batch)
         if self.step % self.settings.tracking.log_every == 0:
-            self.tracker.log_update(self.step, losses, self.buffer, batch)
+            self.tracker.log_update(self.step, {**losses, **bonus}, self.buffer, batch)
 
     def _anneal(self) -> None:
-        """Move what changes linearly with the episodes: beta of Eq. (10) and learning rates."""
+        """Move what changes with the episodes: beta of Eq. (10), fusion and learning rates."""
         settings = self.settings
-        if settings.replay.signals:
+        if isinstance(self.buffer.sampler, SignalSampler):
             done = self.episode / max(self.total_episodes - 1, 1)
-            start, end = settings.replay.beta, settings.replay.beta_end
+            start, end = settings.method.beta, settings.method.beta_end
             self.buffer.sampler.beta = start + (end - start) * done
+            self.buffer.sampler.anneal(done)
         # Counted so that the last episode still learns.
         left = 1.0 - self.episode / self.total_episodes
         lowest = settings.learner.lr_end_factor
@@ -256,7 +265,8 @@ class TrainingRun:
             "step": self.step,
             "learner": self.learner.state_dict(),
             "buffer": self.buffer.state_dict(),
-            "noise": self.noise.state_dict(),
+            "explorer": self.explorer.state_dict(),
+            "curiosity": None if self.curiosity is None else self.curiosity.checkpoint(),
             "records": [asdict(record) for record in self.records],
             "progress": [asdict(record) for record in self.progress],
         }
@@ -270,7 +280,9 @@ class TrainingRun:
         """Go on where a checkpoint was written."""
         self.learner.load_state_dict(state["learner"])
         self.buffer.load_state_dict(state["buffer"])
-        self.noise.load_state_dict(state["noise"])
+        self.explorer.load_state_dict(state["explorer"])
+        if self.curiosity is not None:
+            self.curiosity.restore(state["curiosity"])
         self.episode, self.step = state["episode"], state["step"]
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.progress = [ProgressRecord(**record) for record in state["progress"]]
@@ -282,6 +294,12 @@ class TrainingRun:
         """Release the simulation and finish the log."""
         self.env.close()
         self.tracker.close()
+
+
+def _moved(draw: Draw, device: str) -> Draw:
+    """The batches of a draw on another device."""
+    actor_batch = None if draw.actor_batch is None else draw.actor_batch.to(device)
+    return replace(draw, batch=draw.batch.to(device), actor_batch=actor_batch)
 
 
 def episode_seed(seed: int, episode: int) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import replay, run, timing, training
+from benchmarks import method_steps, replay, run, timing, training
 from benchmarks.timing import Entry, Timing, entry
 
 
@@ -138,3 +138,12 @@ def test_both_training_steps_learn() -> None:
     after = list(agent.learner.loss.parameters())
     assert any(not a.equal(b) for a, b in zip(after, before, strict=True))
     assert agent.buffer.sampler.weights
+
+
+def test_a_step_of_each_method_is_compared_with_uniform_ddpg() -> None:
+    found = method_steps.measure(quick=True)
+    check_schema(found)
+    names = [each["name"] for each in found]
+    assert names[0] == "step_ddpg"
+    assert found[0]["ratio"] == pytest.approx(1.0)
+    assert {"step_mpfa_per", "step_la3p"} <= set(names)

@@ -90,10 +90,10 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
         ),
         (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--world A --episodes 2"]),
         (
-            ["train", "COMPILE=false", "ARGS=replay=per seed=1"],
+            ["train", "COMPILE=false", "ARGS=method=per seed=1"],
             [
                 "python examples/train.py curriculum=paper learner.lr_power=1 "
-                "learner.compile=false replay=per seed=1"
+                "learner.compile=false method=per seed=1"
             ],
         ),
         (["test"], ["python -m pytest"]),

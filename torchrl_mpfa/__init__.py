@@ -2,17 +2,21 @@
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
-from torchrl_mpfa.learners import DDPGLearner, Learner, TD3Learner
+from torchrl_mpfa.learners import DDPGLearner, Learner, SACLearner, TD3Learner
 from torchrl_mpfa.losses import (
     SignalDDPGLoss,
+    SignalSACLoss,
     SignalTD3Loss,
     make_ddpg_loss,
+    make_sac_loss,
     make_td3_loss,
 )
+from torchrl_mpfa.moving_fusion import Annealed, ScaledFusion, ScheduledFusion
 from torchrl_mpfa.networks import DirectModule, make_actor, make_critic
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.sampler import MPFASampler, SignalSampler
 from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.selection import Draw, Selection, one_batch
 from torchrl_mpfa.signals import (
     ACTION_GRADIENT,
     MPFA_SIGNALS,
@@ -21,6 +25,7 @@ from torchrl_mpfa.signals import (
     Signal,
     SignalTable,
 )
+from torchrl_mpfa.stochastic import make_stochastic_actor
 from torchrl_mpfa.storage import SignalMemmapStorage, SignalTensorStorage
 from torchrl_mpfa.tree import TreeSampler
 
@@ -32,9 +37,11 @@ __all__ = [
     "REWARD",
     "TD_ERROR",
     "Adjustment",
+    "Annealed",
     "BatchFacts",
     "DDPGLearner",
     "DirectModule",
+    "Draw",
     "EntropyFusion",
     "FixedFusion",
     "Fusion",
@@ -42,10 +49,15 @@ __all__ = [
     "MPFASampler",
     "PositiveBoost",
     "PositiveDecay",
+    "SACLearner",
+    "ScaledFusion",
+    "ScheduledFusion",
+    "Selection",
     "Signal",
     "SignalDDPGLoss",
     "SignalMemmapStorage",
     "SignalReplayBuffer",
+    "SignalSACLoss",
     "SignalSampler",
     "SignalTD3Loss",
     "SignalTable",
@@ -56,6 +68,9 @@ __all__ = [
     "make_actor",
     "make_critic",
     "make_ddpg_loss",
+    "make_sac_loss",
+    "make_stochastic_actor",
     "make_td3_loss",
+    "one_batch",
     "save_atomically",
 ]

@@ -13,6 +13,9 @@ from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl_mpfa.sampler import SignalSampler, signal_table_of
 from torchrl_mpfa.tree import seeded_generator
 
+_UNRETURNED = 100
+"""Batches in a row with signals that were not handed back, after which sampling is refused."""
+
 
 class SignalReplayBuffer(TensorDictReplayBuffer):
     """:class:`~torchrl.data.TensorDictReplayBuffer` for samplers that fuse several signals.
@@ -49,6 +52,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
     def __init__(self, *, generator: torch.Generator | None = None, **kwargs: Any) -> None:
         super().__init__(generator=generator or seeded_generator(), **kwargs)
         self.stale_updates = 0
+        self._unreturned = 0
+        self._handed_out: TensorDictBase | None = None
         if self._fuses:
             signal_table_of(self._storage, self._sampler)
             self._storage.strict = True
@@ -120,10 +125,31 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
 
         Returns:
             The batch, or the batch and the information.
+
+        Raises:
+            RuntimeError: If a loss wrote signals in the last hundred batches and none of them came
+                back to :meth:`update_tensordict_priority`.
         """
         if return_info or include_info is not None or not self._fuses:
             return super().sample(batch_size, return_info, include_info)
-        return ReplayBuffer.sample(self, batch_size)
+        self._check_returned()
+        self._handed_out = batch = ReplayBuffer.sample(self, batch_size)
+        return batch
+
+    def _check_returned(self) -> None:
+        """Refuse to go on where a training loop keeps the signals to itself."""
+        batch = self._handed_out
+        learned = [s for s in self._sampler.signals if s.known_at == "update"]
+        if batch is None or all(batch.get(s.key, None) is None for s in learned):
+            return
+        self._unreturned += 1
+        if self._unreturned >= _UNRETURNED:
+            raise RuntimeError(
+                f"the signals of {self._unreturned} batches in a row were computed and no priority "
+                "was updated: call update_tensordict_priority(batch) after the loss. A trainer of "
+                "TorchRL skips it once it has an optimization stepper whose step() does not; "
+                "torchrl_mpfa.trainer.PriorityStepper does"
+            )
 
     def update_tensordict_priority(self, data: TensorDictBase) -> None:
         """Update signals and priorities of a sampled batch.
@@ -139,6 +165,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         if not self._fuses:
             super().update_tensordict_priority(data)
             return
+        self._unreturned, self._handed_out = 0, None
         index = data.get("index", None)
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
@@ -164,6 +191,9 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         if self._fuses:
             found.update(self._sampler.stats(self._storage))
         return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_handed_out": None}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore storage, signals, priorities, writer and generator.

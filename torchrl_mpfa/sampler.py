@@ -12,6 +12,7 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion, fuse
+from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal, SignalTable, as_signals
 from torchrl_mpfa.statistics import batch_statistics
 from torchrl_mpfa.tree import TreeSampler, bounds, check_finite, check_index, check_range
@@ -85,7 +86,7 @@ class SignalSampler(TreeSampler):
             if not callable(adjust):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
         self.entropy_refresh = entropy_refresh
-        self._learned = [s.name for s in self.signals if s.known_at == "update"]
+        self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
         self._names = [s.name for s in self.signals]
         self._columns: slice | list[int] = []
         self._table: SignalTable | None = None
@@ -105,6 +106,11 @@ class SignalSampler(TreeSampler):
         if self._weights is None:
             return {}
         return dict(zip(self._names, self._weights.tolist(), strict=True))
+
+    def anneal(self, progress: float) -> None:
+        """Tell the fusion how much of the training is done, from 0 to 1, if it wants to know."""
+        if isinstance(self.fusion, Annealed):
+            self.fusion.anneal(progress)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Draw slots by Eq. (8), and count a replay for each.
@@ -161,7 +167,7 @@ class SignalSampler(TreeSampler):
         if len(check_index(slots, table.size)) < len(slots):
             raise IndexError(f"index must be in [0, {table.size}), the filled slots, got -1")
         rows = table.rows.index_select(0, slots)
-        for name in self._learned:
+        for name, priority_of in self._learned.items():
             if name not in signals:
                 raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
             value = signals[name].detach()
@@ -170,7 +176,10 @@ class SignalSampler(TreeSampler):
                     f"signal {name!r} must have one number a transition, got shape "
                     f"{[*value.shape]} for {slots.numel()} slots"
                 )
-            rows.select(1, table.column[name]).copy_(value.reshape(-1))
+            value = value.reshape(-1)
+            if priority_of is not None:
+                value = priority_of(value)
+            rows.select(1, table.column[name]).copy_(value)
         stale = 0
         if written_at is not None:
             live = rows.select(1, table.time_column) == written_at.reshape(-1)

@@ -35,7 +35,8 @@ class Signal:
         known_at: ``"update"`` (default): it comes with the batch after the loss, and is unknown
             for a fresh transition. ``"write"``: it is read when the transition is stored.
         priority: Function from what is read, shape ``[B]``, to a non-negative number, shape
-            ``[B]``, for signals known at the write; a learned signal is stored as it comes.
+            ``[B]``. By default the size of what is known at the write; a learned signal is stored
+            as it comes.
 
     Raises:
         ValueError: If ``name`` is empty or ``known_at`` unknown.
@@ -48,7 +49,7 @@ class Signal:
     name: str
     key: NestedKey = ""
     known_at: Literal["update", "write"] = "update"
-    priority: Callable[[Tensor], Tensor] = torch.abs
+    priority: Callable[[Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -258,7 +259,7 @@ def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
 
 
 def _not_negative(signal: Signal, value: Tensor) -> Tensor:
-    priority = signal.priority(value)
+    priority = (signal.priority or torch.abs)(value)
     if not priority.min().item() >= 0:
         bad = priority[~(priority >= 0)][0].item()
         raise ValueError(f"signal {signal.name!r} must not be negative, got {bad}")

@@ -163,6 +163,31 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
             )
         return super().get(index)
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore data and signals.
+
+        Raises:
+            KeyError: See :meth:`check_state`.
+            ValueError: See :meth:`check_state`.
+        """
+        super().load_state_dict(state_dict)
+        self._settle_device()
+
+    def loads(self, path: str | Path) -> None:
+        """Restore data and signals from a folder.
+
+        Raises:
+            KeyError: See :meth:`check_state`.
+            ValueError: See :meth:`check_state`.
+        """
+        super().loads(path)
+        self._settle_device()
+
+    def _settle_device(self) -> None:
+        # TorchRL finds the device "auto" out at the first write, which a restored storage has had.
+        if self.initialized and getattr(self, "device", None) == "auto":
+            self.device = self._device_of_tensors() or torch.device("cpu")
+
     def _device_of_tensors(self) -> torch.device | None:
         """Device of all entries; None if one is no tensor: texts need TorchRL's way."""
         if self._looked_at is not self._storage:

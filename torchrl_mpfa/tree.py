@@ -127,20 +127,28 @@ class TreeSampler(PrioritizedSampler):
         size = len(storage)
         if size == 0:
             raise RuntimeError("cannot sample from an empty buffer: len(storage) is 0")
+        index, weight = self._draw(size, batch_size)
+        return index, {"priority_weight": weight}
+
+    def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+        """Slots and their weights, each of shape ``[B]``, out of the first ``size`` slots."""
         total, lowest = self._sum_tree.query(0, size), self._min_tree.query(0, size)
         if not (total > 0 and lowest > 0):
             raise RuntimeError(
                 f"every priority must be positive to sample, got a sum of {total} and a lowest "
                 f"of {lowest}: raise eps, or give the buffer its sampler before its data"
             )
-        mass = torch.rand(batch_size, generator=self._rng) * total
-        index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass)).reshape(-1)
-        # Rounding can carry the last bit of mass past the last slot.
-        index.clamp_max_(size - 1)
+        index = self._proportional(self._sum_tree, size, batch_size)
         # Of one slot the tree gives a bare number, of several a tensor.
         leaf = torch.as_tensor(self._sum_tree[index]).reshape(-1)
-        weight = importance_weights(leaf, beta=self._beta, lowest=lowest)
-        return index, {"priority_weight": weight}
+        return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
+
+    def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
+        """Slots drawn in proportion to the leaves of a tree of sums, shape ``[B]``."""
+        mass = torch.rand(batch_size, generator=self._rng) * tree.query(0, size)
+        index = torch.as_tensor(tree.scan_lower_bound(mass)).reshape(-1)
+        # Rounding can carry the last bit of mass past the last slot.
+        return index.clamp_max_(size - 1)
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give fresh transitions the highest priority."""
@@ -192,13 +200,17 @@ class TreeSampler(PrioritizedSampler):
 
     def _write(self, index: Tensor, priority: Tensor) -> None:
         """Write priorities, eps included, to the trees."""
-        leaf = priority.pow(self._alpha)
+        leaf = self._leaf(priority)
         self._sum_tree[index] = leaf
         self._min_tree[index] = leaf
         self._max_tree[index] = -priority
         highest = -self._max_tree.query(0, self._max_capacity)
         if self._highest is None or highest > self._highest:
             self._highest, self._highest_slot = highest, int(index[priority.argmax()])
+
+    def _leaf(self, priority: Tensor) -> Tensor:
+        """What slots are drawn in proportion to, priorities to the power of alpha, ``[B]``."""
+        return priority.pow(self._alpha)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""

@@ -17,8 +17,8 @@ import compare
 EXAMPLES = Path(compare.__file__).parent
 TINY = [
     "learner.width=8",
-    "replay.batch_size=8",
-    "replay.capacity=200",
+    "method.batch_size=8",
+    "method.capacity=200",
     "environment.physics=kinematic",
     "environment.max_steps=20",
     "evaluation.every=0",
@@ -26,9 +26,11 @@ TINY = [
 ]
 
 
-def study(folder: Path, *more: str, replays: tuple[str, ...] = ("mpfa", "uniform")) -> list[str]:
+def study(
+    folder: Path, *more: str, methods: tuple[str, ...] = ("mpfa_per", "uniform")
+) -> list[str]:
     return [
-        *("--folder", str(folder), "--replays", *replays, "--seeds", "0"),
+        *("--folder", str(folder), "--methods", *methods, "--seeds", "0"),
         *("--world", "B", "--episodes", "3", *more, "--", *TINY),
     ]
 
@@ -41,20 +43,20 @@ def rows(folder: Path) -> list[dict[str, str]]:
 def test_a_study_keeps_every_episode_and_a_second_call_does_nothing(tmp_path: Path) -> None:
     assert compare.main(study(tmp_path)) == 0
     found = rows(tmp_path)
-    assert [(row["replay"], row["episode"]) for row in found] == [
-        (replay, str(number)) for replay in ("mpfa", "uniform") for number in range(3)
+    assert [(row["method"], row["episode"]) for row in found] == [
+        (method, str(number)) for method in ("mpfa_per", "uniform") for number in range(3)
     ]
     for row in found:
         ends = [row[name] == "True" for name in ("success", "collision", "timeout")]
         assert sum(ends) == 1
-    before = (tmp_path / "ddpg-mpfa-0" / "checkpoint.pt").stat().st_mtime_ns
+    before = (tmp_path / "ddpg-mpfa_per-0" / "checkpoint.pt").stat().st_mtime_ns
     assert compare.main(study(tmp_path)) == 0
-    assert (tmp_path / "ddpg-mpfa-0" / "checkpoint.pt").stat().st_mtime_ns == before
+    assert (tmp_path / "ddpg-mpfa_per-0" / "checkpoint.pt").stat().st_mtime_ns == before
     assert rows(tmp_path) == found
 
 
 def test_a_killed_study_goes_on_to_the_same_rows(tmp_path: Path) -> None:
-    arguments = study(tmp_path / "killed", replays=("mpfa",))
+    arguments = study(tmp_path / "killed", methods=("mpfa_per",))
     arguments[-1] = "curriculum.stages=[{world: A, episodes: 30}]"
     arguments.append("checkpoint_every=1")
     process = subprocess.Popen(
@@ -63,7 +65,7 @@ def test_a_killed_study_goes_on_to_the_same_rows(tmp_path: Path) -> None:
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-    checkpoint = tmp_path / "killed" / "ddpg-mpfa-0" / "checkpoint.pt"
+    checkpoint = tmp_path / "killed" / "ddpg-mpfa_per-0" / "checkpoint.pt"
     deadline = time.monotonic() + 120
     while not checkpoint.exists():
         assert process.poll() is None and time.monotonic() < deadline
@@ -82,17 +84,17 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
 ) -> None:
     arguments = study(tmp_path, "--jobs", "1")
     # A file where the run wants its checkpoint, which is no checkpoint.
-    (tmp_path / "ddpg-mpfa-0").mkdir()
-    (tmp_path / "ddpg-mpfa-0" / "checkpoint.pt").write_bytes(b"no checkpoint")
+    (tmp_path / "ddpg-mpfa_per-0").mkdir()
+    (tmp_path / "ddpg-mpfa_per-0" / "checkpoint.pt").write_bytes(b"no checkpoint")
     assert compare.main(arguments) == 1
-    assert "ddpg-mpfa-0: failed, see" in capsys.readouterr().out
-    assert {row["replay"] for row in rows(tmp_path)} == {"uniform"}
+    assert "ddpg-mpfa_per-0: failed, see" in capsys.readouterr().out
+    assert {row["method"] for row in rows(tmp_path)} == {"uniform"}
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--replays", "pre"], "unknown replay 'pre'"),
+        (["--methods", "pre"], "unknown method 'pre'"),
         (["--learners", "ddgp"], "unknown learner 'ddgp'"),
         (["--jobs", "0"], "--jobs must be at least 1, got 0"),
     ],

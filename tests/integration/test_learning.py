@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,9 +18,9 @@ pytestmark = pytest.mark.slow
 TASKS = evaluation_pairs("A", 40, 4711)
 
 
-def settings_of(replay: str, learner: str, episodes: int) -> TrainSettings:
+def settings_of(method: str, learner: str, episodes: int) -> TrainSettings:
     settings = TrainSettings(
-        replay=GROUPS["replay"][replay](),
+        method=replace(GROUPS["method"][method]),
         learner=GROUPS["learner"][learner](),
         curriculum=Curriculum("A", [Stage("A", episodes)]),
         environment=Environment(physics="kinematic"),
@@ -45,24 +46,24 @@ def train(settings: TrainSettings, folder: Path) -> float:
 
 
 @pytest.mark.parametrize(
-    ("replay", "learner"),
-    [("mpfa", "ddpg"), ("per", "ddpg"), ("uniform", "ddpg"), ("mpfa", "td3")],
+    ("method", "learner"),
+    [("mpfa_per", "ddpg"), ("per", "ddpg"), ("uniform", "ddpg"), ("mpfa_per", "td3")],
 )
 def test_a_robot_that_trained_for_forty_episodes_finds_most_goals(
-    replay: str, learner: str, tmp_path: Path
+    method: str, learner: str, tmp_path: Path
 ) -> None:
-    assert train(settings_of(replay, learner, 40), tmp_path) >= 0.85
+    assert train(settings_of(method, learner, 40), tmp_path) >= 0.85
 
 
 def test_a_robot_that_did_not_train_finds_few_goals(tmp_path: Path) -> None:
-    run = TrainingRun(settings_of("mpfa", "ddpg", 1), tmp_path)
+    run = TrainingRun(settings_of("mpfa_per", "ddpg", 1), tmp_path)
     assert greedy_success(run) <= 0.2
     run.close()
 
 
 @pytest.mark.parametrize("broken", ["critic_lr", "gamma"])
 def test_a_broken_learner_does_not_pass_for_one_that_works(broken: str, tmp_path: Path) -> None:
-    settings = settings_of("mpfa", "ddpg", 40)
+    settings = settings_of("mpfa_per", "ddpg", 40)
     # Either leaves a critic that says nothing of what lies ahead.
     setattr(settings.learner, broken, {"critic_lr": 1e-9, "gamma": 0.0}[broken])
     assert train(settings, tmp_path) < 0.85

@@ -23,20 +23,20 @@ def write(path: Path, rows: list[dict[str, Any]]) -> None:
 
 @pytest.fixture
 def study(tmp_path: Path) -> Path:
-    """Two replays, two seeds, four pairs: the first replay fails once, the other always."""
+    """Two methods, two seeds, four pairs: the first method fails once, the other always."""
     evaluation = []
-    for replay, failures in (("mpfa", {(1, 3)}), ("per", None)):
+    for method, failures in (("mpfa_per", {(1, 3)}), ("per", None)):
         for seed in (0, 1):
             for episode in range(4):
                 good = failures is not None and (seed, episode) not in failures
                 evaluation.append(
                     {
-                        **{"learner": "ddpg", "replay": replay, "seed": seed, "episode": episode},
+                        **{"learner": "ddpg", "method": method, "seed": seed, "episode": episode},
                         **{"success": good, "collision": not good, "timeout": False},
                         **{"time_s": 20.0 + seed, "spl": 0.8 * good},
                     }
                 )
-            folder = tmp_path / f"ddpg-{replay}-{seed}"
+            folder = tmp_path / f"ddpg-{method}-{seed}"
             training = [
                 {"total_steps": 10 * (n + 1), "success": n > 1, "average_reward": 0.1 * n}
                 for n in range(5)
@@ -53,12 +53,12 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
     text = (study / "tables.md").read_text(encoding="utf-8")
     assert text.strip() == capsys.readouterr().out.strip()
     # Seven of eight pairs, of which four took 20 s and three 21 s.
-    assert "| ddpg | mpfa | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |" in text
+    assert "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |" in text
     assert "| ddpg | per | 0.0% | 0.0%, 0.0% | 100.0% | 0.0% | 0.000 |  |" in text
     assert "| paper | MPFA-PER | 90.5% |" in text
     # From zero to 0.5 in 5,000 steps, then to 1 in 4,000: (1250 + 3000) / 9000.
-    assert "| ddpg | mpfa | 9,000; 9,000 | 0.472 | 0.472, 0.472 |" in text
-    assert "| ddpg/mpfa > ddpg/per | 0.938 [" in text
+    assert "| ddpg | mpfa_per | 9,000; 9,000 | 0.472 | 0.472, 0.472 |" in text
+    assert "| ddpg/mpfa_per > ddpg/per | 0.938 [" in text
     for name in ("training.png", "progress.png"):
         assert (study / name).stat().st_size > 5000
 

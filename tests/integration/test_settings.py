@@ -25,7 +25,7 @@ def test_the_defaults_are_table_1_of_the_paper() -> None:
     settings = as_settings(compose("train"))
     assert (settings.learner.actor_lr, settings.learner.critic_lr) == (1e-4, 1e-4)
     assert (settings.learner.gamma, settings.learner.tau) == (0.99, 0.01)
-    assert (settings.replay.capacity, settings.replay.batch_size) == (100_000, 256)
+    assert (settings.method.capacity, settings.method.batch_size) == (100_000, 256)
 
 
 def test_the_paper_curriculum_has_a_thousand_episodes() -> None:
@@ -40,8 +40,8 @@ def test_every_choice_of_every_group_composes(group: str, choice: str) -> None:
 
 
 def test_an_override_reaches_the_typed_settings() -> None:
-    settings = as_settings(compose("train", ["replay=per", "replay.alpha=0.7", "seed=5"]))
-    assert (settings.replay.name, settings.replay.alpha, settings.seed) == ("per", 0.7, 5)
+    settings = as_settings(compose("train", ["method=per", "method.alpha=0.7", "seed=5"]))
+    assert (settings.method.name, settings.method.alpha, settings.seed) == ("per", 0.7, 5)
 
 
 @pytest.mark.parametrize(
@@ -49,8 +49,8 @@ def test_an_override_reaches_the_typed_settings() -> None:
     [
         ("sede=1", r"unknown setting 'sede': did you mean 'seed'\?"),
         ("learner.widht=64", r"unknown setting 'learner.widht': did you mean 'learner.width'\?"),
-        ("alpha=0.5", r"unknown setting 'alpha': did you mean 'replay.alpha'\?"),
-        ("replay=prr", r"unknown choice 'prr' of 'replay': did you mean 'per'\?"),
+        ("alpha=0.5", r"unknown setting 'alpha': did you mean 'method.alpha'\?"),
+        ("method=prr", r"unknown choice 'prr' of 'method': did you mean 'per'\?"),
         ("+extra=1", r"unknown setting 'extra'"),
     ],
 )
@@ -62,4 +62,6 @@ def test_an_unknown_setting_is_an_error_that_suggests_the_nearest(
 
 
 def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
-    check_overrides(["-m", "seed=0,1,2", "replay=mpfa,per", "hydra.verbose=true", "--cfg", "job"])
+    check_overrides(
+        ["-m", "seed=0,1,2", "method=mpfa_per,per", "hydra.verbose=true", "--cfg", "job"]
+    )

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,17 +28,17 @@ STAGES = [Stage("A", 3), Stage("B", 3)]
 
 
 def tiny(
-    replay: str = "mpfa", episodes: list[Stage] | None = None, learner: str = "ddpg"
+    method: str = "mpfa_per", episodes: list[Stage] | None = None, learner: str = "ddpg"
 ) -> TrainSettings:
     settings = TrainSettings(
-        replay=GROUPS["replay"][replay](),
+        method=replace(GROUPS["method"][method]),
         learner=GROUPS["learner"][learner](),
         curriculum=Curriculum("tiny", episodes or STAGES),
         environment=Environment(physics="kinematic", max_steps=25),
         checkpoint_every=1000,
         seed=3,
     )
-    settings.replay.capacity, settings.replay.batch_size = 100, 16
+    settings.method.capacity, settings.method.batch_size = 100, 16
     settings.learner.width = 16
     settings.exploration.random_steps = 20
     settings.exploration.annealing_steps = 60
@@ -86,17 +86,27 @@ def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -
     assert not (tmp_path / "plain" / "progress.csv").exists()
 
 
-@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+@pytest.mark.parametrize(
+    ("method", "learner"),
+    [
+        ("mpfa_per", "ddpg"),
+        ("mpfa_per", "td3"),
+        *((method, "ddpg") for method in ("averaged_ddpg", "cer", "ddpg_radam", "hvper")),
+        *((method, "ddpg") for method in ("klper", "mw", "rank_per")),
+        ("la3p", "td3"),
+        ("mpfa_per", "sac"),
+    ],
+)
 def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
-    tmp_path: Path, learner: str
+    tmp_path: Path, method: str, learner: str
 ) -> None:
-    whole = train(tmp_path / "whole", tiny(learner=learner))
-    part = TrainingRun(tiny(learner=learner), tmp_path)
+    whole = train(tmp_path / "whole", tiny(method, learner=learner))
+    part = TrainingRun(tiny(method, learner=learner), tmp_path)
     part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 3))
     part.close()
     assert part.episode == 4
 
-    resumed = TrainingRun(tiny(learner=learner), tmp_path)
+    resumed = TrainingRun(tiny(method, learner=learner), tmp_path)
     resumed.load(read_checkpoint(tmp_path))
     assert resumed.train()
     resumed.close()
@@ -110,7 +120,8 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
         assert torch.equal(mine, other)
     mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()
     assert torch.equal(mine["_rng"][0], other["_rng"][0])
-    assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
+    if "_sum_tree" in other["_sampler"]:
+        assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
     signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
     # NaN marks what is not known yet.
     torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)
@@ -124,18 +135,50 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Pat
     assert rows(first) != rows(train(tmp_path / "c", other))
 
 
-@pytest.mark.parametrize("replay", sorted(GROUPS["replay"]))
-def test_every_replay_trains_and_uses_its_own_signals(tmp_path: Path, replay: str) -> None:
-    settings = tiny(replay)
+@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
+def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: str) -> None:
+    settings = tiny(method)
     run = train(tmp_path, settings)
-    assert run.step > settings.replay.batch_size
+    assert run.step > settings.method.batch_size
     assert all(math.isfinite(record.reward) for record in run.records)
-    if replay == "uniform":
+    if not settings.method.signals:
         assert isinstance(run.buffer.sampler, RandomSampler)
     else:
         assert isinstance(run.buffer.sampler, SignalSampler)
-        assert sorted(run.buffer.sampler.weights) == sorted(settings.replay.signals)
-        assert run.buffer.sampler.beta == settings.replay.beta_end
+        assert sorted(run.buffer.sampler.weights) == sorted(settings.method.signals)
+        assert run.buffer.sampler.beta == settings.method.beta_end
+
+
+def test_no_two_methods_have_the_same_settings() -> None:
+    # But for one that has two names.
+    methods = {name: m for name, m in GROUPS["method"].items() if name != "uniform"}
+    bare = [replace(method, name="") for method in methods.values()]
+    assert all(one != other for place, one in enumerate(bare) for other in bare[:place])
+    assert all(method.name == name for name, method in methods.items())
+
+
+def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
+    settings = tiny("ddpg_radam")
+    settings.method.curiosity_scale = 1e6
+    # Nothing is learned in the first episodes, so that both runs drive the same way.
+    settings.method.batch_size = settings.method.capacity = 1000
+    without = replace(settings, method=replace(settings.method, curiosity=False))
+    curious, plain = train(tmp_path / "curious", settings), train(tmp_path / "plain", without)
+    assert [r.reward for r in curious.records] == [r.reward for r in plain.records]
+    learned = tiny("ddpg_radam")
+    learned.method.curiosity_scale = 1e6
+    run = train(tmp_path / "learned", learned)
+    assert max(abs(record.reward) for record in run.records) < 1e3
+    assert run.buffer[:]["next", "reward"].abs().max() < 1e3
+
+
+def test_a_curriculum_that_does_not_carry_starts_anew_on_each_map(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.curriculum.carry = False
+    run = train(tmp_path, settings)
+    of_second_map = sum(record.steps for record in run.records[3:])
+    assert len(run.buffer) == min(of_second_map, settings.method.capacity)
+    assert run.buffer.write_count == of_second_map
 
 
 def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
@@ -146,18 +189,19 @@ def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
     assert (tmp_path / "episodes.csv").read_text().count("\n") == 1 + len(run.records)
 
 
-def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path) -> None:
-    run = train(tmp_path, tiny())
+@pytest.mark.parametrize("learner", sorted(GROUPS["learner"]))
+def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str) -> None:
+    run = train(tmp_path, tiny(learner=learner))
     policy, state = load_policy(tmp_path)
     observation = torch.rand(5, 24)
-    trained = run.learner.policy.module(observation)[-1]
-    assert torch.equal(policy.module(observation)[-1], trained)
+    trained = run.learner.policy.outputs({"observation": observation})["action"]
+    assert torch.equal(policy.outputs({"observation": observation})["action"], trained)
     assert state["trained"]["episodes"] == 6
 
 
 def test_a_policy_file_of_something_else_is_refused(tmp_path: Path) -> None:
     save_atomically({"format": 99}, tmp_path / "policy.pt")
-    with pytest.raises(ValueError, match=r"no policy of format 1"):
+    with pytest.raises(ValueError, match=r"no policy of format 2"):
         load_policy(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"train\.py writes policy\.pt"):
         load_policy(tmp_path / "elsewhere")
@@ -165,7 +209,7 @@ def test_a_policy_file_of_something_else_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
     save_atomically({"format": 99}, tmp_path / CHECKPOINT)
-    with pytest.raises(ValueError, match=r"format 99, this version reads 1"):
+    with pytest.raises(ValueError, match=r"format 99, this version reads 2"):
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match="resume"):
         read_checkpoint(tmp_path / "elsewhere")
@@ -179,7 +223,7 @@ def test_the_learning_curve_is_drawn(tmp_path: Path) -> None:
 
 def script(folder: Path, *overrides: str) -> list[str]:
     stages = "curriculum.stages=[{world: A, episodes: 10000}]"
-    sizes = ["replay.capacity=100", "replay.batch_size=16", "learner.width=16"]
+    sizes = ["method.capacity=100", "method.batch_size=16", "learner.width=16"]
     return [
         sys.executable,
         str(EXAMPLES / "train.py"),

@@ -277,3 +277,22 @@ def test_transitions_that_bring_a_priority_of_their_own_start_with_it():
 
 def test_the_paper_signal_of_the_reward_is_its_absolute_value():
     assert REWARD.priority(torch.tensor([-2.0])).tolist() == [2.0]
+
+
+def test_a_loop_that_keeps_the_signals_to_itself_is_stopped():
+    buffer = make_buffer()
+    buffer.extend(make_transitions(10))
+    for _ in range(300):
+        buffer.sample()  # To look at batches is no mistake.
+    with pytest.raises(RuntimeError, match=r"100 batches in a row .* update_tensordict_priority"):
+        for _ in range(300):
+            write_signals(buffer.sample())
+
+
+def test_a_loop_that_updates_priorities_now_and_then_is_not_stopped():
+    buffer = make_buffer()
+    buffer.extend(make_transitions(10))
+    for number in range(300):
+        batch = write_signals(buffer.sample())
+        if number % 50 == 0:
+            buffer.update_tensordict_priority(batch)

@@ -245,3 +245,15 @@ def test_the_state_holds_tensors_and_plain_values_only(tmp_path):
     torch.save(buffer.sampler.state_dict(), tmp_path / "sampler.pt")
     assert same(load_safely(tmp_path / "sampler.pt"), buffer.sampler.state_dict())
     assert seeded(0).get_state().equal(seeded(0).get_state())
+
+
+@pytest.mark.parametrize("way", [by_state_dict, by_folder], ids=lambda way: way.__name__)
+def test_a_restored_storage_knows_the_device_that_it_was_to_find_out(tmp_path, way):
+    first, second = (
+        SignalReplayBuffer(storage=SignalTensorStorage(24, device="auto"), batch_size=4)
+        for _ in range(2)
+    )
+    first.extend(make_transitions(10))
+    way(first, second, tmp_path)
+    assert second._storage.device == torch.device("cpu")
+    assert len(second.sample()) == 4

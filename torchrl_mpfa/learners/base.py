@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
-from torchrl_mpfa.losses import SignalDDPGLoss, SignalTD3Loss
+from torchrl_mpfa.losses import SignalDDPGLoss, SignalSACLoss, SignalTD3Loss
 from torchrl_mpfa.losses.whole import WholeGradients
 
 OptimizerName = Literal["adam", "radam"]
@@ -31,6 +31,7 @@ class Learner(Protocol):
         *,
         actor_batch: TensorDictBase | None = None,
         loss_function: str | None = None,
+        new_step: bool = True,
     ) -> dict[str, torch.Tensor]:
         """Train on a batch, write the signals in it, and give values for the log.
 
@@ -38,6 +39,8 @@ class Learner(Protocol):
             batch: Transitions, batch size ``[B]``.
             actor_batch: What the actor learns from, if that is another batch.
             loss_function: Distance of the critic's loss, if not the loss's own.
+            new_step: Whether a new training step begins; false for its further batches, if it has
+                several, which a delay of the actor does not count.
 
         Returns:
             Detached values for the log.
@@ -85,7 +88,7 @@ class ActorCriticLearner:
 
     def __init__(
         self,
-        loss: SignalDDPGLoss | SignalTD3Loss,
+        loss: SignalDDPGLoss | SignalTD3Loss | SignalSACLoss,
         *,
         critic: str,
         actor_lr: float,
@@ -102,7 +105,9 @@ class ActorCriticLearner:
             raise ValueError(f"critic_weight_decay must not be negative, got {critic_weight_decay}")
         if not 0 < tau <= 1:
             raise ValueError(f"tau must be in (0, 1], got {tau}")
-        self._rates = (actor_lr, critic_lr)
+        if compile and isinstance(loss, SignalSACLoss):
+            raise ValueError(f"compile is not supported with SignalSACLoss, got {compile!r}")
+        self._rates: tuple[float, ...] = (actor_lr, critic_lr)
         self.loss = loss
         self.policy: TensorDictModule = loss.actor_network
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)
@@ -116,8 +121,13 @@ class ActorCriticLearner:
         ]
         self.optimizer = make_optimizer(optimizer, groups)
         self._whole: WholeGradients | None = None
-        if compile:
+        if compile and not isinstance(loss, SignalSACLoss):
             self._whole = WholeGradients(loss, compile=compile if isinstance(compile, dict) else {})
+
+    def _add_parameters(self, parameters: list[torch.nn.Parameter], *, lr: float) -> None:
+        """Have the optimizer move further parameters of the loss, at a rate of their own."""
+        self.optimizer.add_param_group({"params": parameters, "lr": lr})
+        self._rates = (*self._rates, lr)
 
     def _descend(
         self,

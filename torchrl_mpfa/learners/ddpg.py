@@ -62,6 +62,7 @@ class DDPGLearner(ActorCriticLearner):
         *,
         actor_batch: TensorDictBase | None = None,
         loss_function: str | None = None,
+        new_step: bool = True,
     ) -> dict[str, torch.Tensor]:
         """One step of both networks and of the target networks.
 
@@ -69,6 +70,8 @@ class DDPGLearner(ActorCriticLearner):
             batch: Transitions, batch size ``[B]``; the loss writes their signals.
             actor_batch: What the actor learns from, if that is another batch.
             loss_function: Distance of the critic's loss, if not the loss's own.
+            new_step: Whether a new training step begins; false for its further batches, if it has
+                several, which a delay of the actor does not count.
 
         Returns:
             Detached values for the log.

@@ -69,6 +69,7 @@ class TD3Learner(ActorCriticLearner):
         *,
         actor_batch: TensorDictBase | None = None,
         loss_function: str | None = None,
+        new_step: bool = True,
     ) -> dict[str, torch.Tensor]:
         """One step of the critics, and when it is due of the actor and of the target networks.
 
@@ -76,11 +77,13 @@ class TD3Learner(ActorCriticLearner):
             batch: Transitions, batch size ``[B]``; the loss writes their signals.
             actor_batch: What the actor learns from, if that is another batch.
             loss_function: Distance of the critic's loss, if not the loss's own.
+            new_step: Whether a new training step begins; false for its further batches, if it has
+                several, which a delay of the actor does not count.
 
         Returns:
             Detached values for the log.
         """
-        self.updates += 1
+        self.updates += new_step
         due = self.updates % self.policy_delay == 0
         if not due:
             actor_batch = None

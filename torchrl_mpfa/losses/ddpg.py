@@ -167,7 +167,7 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
         self._write_signals(tensordict, td_error, value, gradient)
         squared = td_error.square()
         tensordict.set(keys.priority, squared, inplace=True)
-        loss = distance(value, target, loss_function or self.loss_function)
+        loss = distance(value, target, loss_function or self.loss_function, unit=self.reward_scale)
         loss = self._reduce(loss, tensordict)
         seen = value.detach()
         metadata = {
@@ -209,9 +209,9 @@ class SignalDDPGLoss(SignalLossMixin, DDPGLoss):
             )
         return self._bound
 
-    def _target_critics(self) -> list[TensorDictModule]:
-        """Critics that hold the target parameters."""
-        params = self.target_value_network_params
+    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
+        """The critic with the parameters whose name has this prefix."""
+        params = getattr(self, f"{prefix}value_network_params").detach()
         return [bind(self.value_network, params).requires_grad_(False)]
 
     def parts(self) -> Parts:

@@ -44,13 +44,15 @@ def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
     return loss / largest.clamp_min(1.0).pow(alpha).mean()
 
 
-def distance(value: Tensor, target: Tensor, loss_function: str) -> Tensor:
+def distance(value: Tensor, target: Tensor, loss_function: str, *, unit: float = 1.0) -> Tensor:
     """Loss of each transition by the name of its distance.
 
     Args:
         value: Q, shape ``[..., B]``.
         target: Targets, of the same shape.
         loss_function: ``"l1"``, ``"l2"``, ``"smooth_l1"`` or ``"pal"``.
+        unit: Error at which the last two bend. A loss whose rewards are scaled gives its factor
+            here, so that they bend at an error of one in units of the environment's reward.
 
     Returns:
         Loss, shape ``[..., B]``.
@@ -58,9 +60,11 @@ def distance(value: Tensor, target: Tensor, loss_function: str) -> Tensor:
     Raises:
         ValueError: If the name is unknown.
     """
-    if loss_function == PAL:
-        return pal_distance(target - value)
     if loss_function not in DISTANCES:
         raise ValueError(f"loss_function must be one of {DISTANCES}, got {loss_function!r}")
+    if loss_function == PAL:
+        return pal_distance((target - value) / unit) * unit**2
+    if loss_function == "smooth_l1":
+        return torch.nn.functional.huber_loss(value, target, reduction="none", delta=unit)
     found: Tensor = distance_loss(value, target, loss_function)
     return found

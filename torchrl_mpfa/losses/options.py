@@ -81,7 +81,8 @@ class SignalLossMixin:
         # A list of modules, so that the past is saved, loaded and moved with the loss.
         self.past_critics = nn.ModuleList()
         if self.target_average > 1:
-            for network in self._target_critics():
+            # Of the current critics, which the target critics equal at the start.
+            for network in self._held_critics(""):
                 if not isinstance(network, DirectModule):
                     raise ValueError(
                         f"target_average = {self.target_average} needs a DirectModule as critic, "
@@ -93,13 +94,13 @@ class SignalLossMixin:
     def _past(self) -> list[PastCritics]:
         return [past for past in self.past_critics if isinstance(past, PastCritics)]
 
-    def _target_critics(self) -> list[TensorDictModule]:
-        """Critics that hold the target parameters."""
+    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
+        """Critics that hold the parameters whose name has this prefix, and get no gradient."""
         raise NotImplementedError
 
     def _averaged_critics(self) -> list[TensorDictModule]:
         """Target critics, each of them with its past ones if ``target_average`` is above one."""
-        critics = self._target_critics()
+        critics = self._held_critics("target_")
         if not self.past_critics:
             return critics
         return [
@@ -114,7 +115,7 @@ class SignalLossMixin:
     def keep_target_critics(self) -> None:
         """Keep the target critics as they are now for the average that later targets have."""
         if self.past_critics:
-            for critic, past in zip(self._target_critics(), self._past(), strict=True):
+            for critic, past in zip(self._held_critics("target_"), self._past(), strict=True):
                 past.push(critic.module)
 
     @property

@@ -15,18 +15,17 @@ from torchrl.objectives import TD3Loss, ValueEstimators
 
 from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bind, call, read_inputs
 from torchrl_mpfa.losses.ddpg import bootstrap_target
-from torchrl_mpfa.losses.distances import distance
 from torchrl_mpfa.losses.options import (
     DEFAULT_SIGNALS,
     VALUE,
     GradientAt,
     Importance,
-    SignalLossMixin,
 )
+from torchrl_mpfa.losses.twin import TwinCriticsMixin
 from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
 
 
-class SignalTD3Loss(SignalLossMixin, TD3Loss):
+class SignalTD3Loss(TwinCriticsMixin, TD3Loss):
     r""":class:`~torchrl.objectives.TD3Loss` that also writes the signals of Eqs. (13)-(14).
 
     Of its two critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; the
@@ -108,48 +107,6 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
         )
         self._set_options(**options)
 
-    def value_loss(
-        self,
-        tensordict: TensorDictBase,
-        *,
-        defer_gradient: bool = False,
-        loss_function: str | None = None,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
-
-        Args:
-            tensordict: A batch of transitions, batch size ``[B]``.
-            defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
-            loss_function: As there.
-
-        Returns:
-            The loss, and detached values for the log.
-        """
-        keys = self.tensor_keys
-        at_stored = self._gradient_at_stored
-        action = tensordict[keys.action].detach()
-        with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
-            if at_stored:
-                action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
-            values = self._values(tensordict, action)
-        gradient = self._stored_gradient(tensordict, action, values[0], defer=defer_gradient)
-        value = torch.stack(values)
-        if not torch.is_grad_enabled():
-            value = value.detach()
-
-        target, next_value = self._target(tensordict)
-        td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error.abs().amax(0), value[0], gradient)
-        loss = distance(value, target.expand_as(value), loss_function or self.loss_function)
-        loss = self._reduce(loss.sum(0), tensordict)
-        metadata = {
-            "td_error": td_error.square(),
-            "next_state_value": next_value,
-            "pred_value": value.detach(),
-            "target_value": target,
-        }
-        return loss, metadata
-
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor's loss by the first critic, with the penalty on saturation if there is one.
 
@@ -181,11 +138,6 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             )
         return self._bound
 
-    def _target_critics(self) -> list[TensorDictModule]:
-        """Critics that hold the target parameters."""
-        each = self.target_qvalue_network_params.unbind(0)
-        return [bind(self.qvalue_network, params).requires_grad_(False) for params in each]
-
     def parts(self) -> Parts:
         """The networks as functions of tensors."""
         networks = self._networks()
@@ -197,13 +149,6 @@ class SignalTD3Loss(SignalLossMixin, TD3Loss):
             target_critics=networks.target_critics,
             action_bounds=(self.min_action, self.max_action),
         )
-
-    def _values(self, source: TensorDictBase, action: Tensor) -> list[Tensor]:
-        """Q of the current critics, each of shape ``[B]``; the action leads to the first alone."""
-        critics, key = self._networks().critics, self.tensor_keys.action
-        actions = [action] + [action.detach()] * (self.num_qvalue_nets - 1)
-        found = critics.call([read_inputs(critics.network, source, {key: a}) for a in actions])
-        return [out[self.tensor_keys.state_action_value].squeeze(-1) for out in found]
 
     def target_noise(self, action: Tensor) -> Tensor:
         """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""

@@ -130,7 +130,7 @@ class WholeGradients:
         def critic_loss(parameters: Parameters) -> tuple[Tensor, Tensor]:
             each = [self._q(_with(module, p), state, action) for p in parts.split(parameters)]
             value = torch.stack(each)
-            loss = distance(value, target.expand_as(value), loss_function).sum(0)
+            loss = distance(value, target.expand_as(value), loss_function, unit=self._scale).sum(0)
             return (loss if weight is None else loss * weight).mean(), value
 
         of_critic, (loss_value, value) = grad_and_value(critic_loss, has_aux=True)(

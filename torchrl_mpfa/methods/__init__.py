@@ -3,6 +3,38 @@
 What is a choice of other parts has no file: it is a few lines of configuration.
 """
 
+from torchrl_mpfa.methods.cer import CombinedSampler
+from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
+from torchrl_mpfa.methods.hvper import (
+    RELATIVE_ERROR,
+    RELATIVE_VALUE,
+    ReplayPenalty,
+    relative_error,
+    relative_value,
+    value_schedule,
+)
 from torchrl_mpfa.methods.klper import LowestDivergence, gaussian_divergence
+from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
+from torchrl_mpfa.methods.lap import PriorityFloor
+from torchrl_mpfa.methods.mw import CappedSampler
+from torchrl_mpfa.methods.rank import RankSampler, rank_share
 
-__all__ = ["LowestDivergence", "gaussian_divergence"]
+__all__ = [
+    "RELATIVE_ERROR",
+    "RELATIVE_VALUE",
+    "CappedSampler",
+    "CombinedSampler",
+    "Curiosity",
+    "LA3PSampler",
+    "LowestDivergence",
+    "PriorityFloor",
+    "RankSampler",
+    "ReplayPenalty",
+    "gaussian_divergence",
+    "intrinsic_reward",
+    "rank_share",
+    "relative_error",
+    "relative_value",
+    "split_draws",
+    "value_schedule",
+]

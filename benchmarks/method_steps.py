@@ -1,0 +1,89 @@
+"""One training step of every method against one of uniform DDPG, as the examples make it."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from benchmarks.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
+from benchmarks.timing import MICROSECONDS, Call, Entry, entry, take_turns
+
+# The methods are those of the examples, which are no package.
+sys.path.insert(1, str(Path(__file__).parents[1] / "examples"))
+
+from assembly import make_curiosity, make_learner
+from methods import METHODS, Method
+from replay_assembly import make_buffer, make_selection
+from settings import Learner
+
+BASELINE = "ddpg"
+_FILL = 10_000
+_SIGMA = 0.2
+
+
+def make_step(method: Method) -> Call:
+    """A step of a method: store, choose, update, priorities.
+
+    Args:
+        method: The method.
+
+    Returns:
+        A function that takes one step.
+    """
+    torch.manual_seed(0)
+    sizes = OBSERVATION_SIZE, ACTION_SIZE
+    learner = make_learner(Learner(), method, *sizes)
+    curiosity = make_curiosity(method, *sizes)
+    buffer = make_buffer(method, seed=0)
+    buffer.extend(make_transitions(_FILL))
+    select = make_selection(method, learner.policy, lambda: _SIGMA)
+    transition = make_transitions(1)
+
+    def step() -> None:
+        buffer.extend(transition)
+        for number, draw in enumerate(select(buffer)):
+            if curiosity is not None:
+                curiosity(draw.batch)
+            learner.update(
+                draw.batch,
+                actor_batch=draw.actor_batch,
+                loss_function=draw.loss_function,
+                new_step=number == 0,
+            )
+            buffer.update_tensordict_priority(draw.batch)
+
+    return step
+
+
+def measure(*, quick: bool) -> list[Entry]:
+    """Compare a step of each method with one of uniform DDPG.
+
+    Args:
+        quick: Fewer and shorter rounds, and but a few of the methods.
+
+    Returns:
+        An entry ``step_NAME`` for each method.
+    """
+    chosen = (BASELINE, "mpfa_per", "la3p") if quick else tuple(METHODS)
+    calls = {
+        name: make_step(replace(METHODS[name]))
+        for name in chosen
+        if METHODS[name].name == name  # One of them has two names.
+    }
+    timings = take_turns(
+        calls, rounds=3 if quick else 11, seconds=0.05 if quick else 0.3, threads=1
+    )
+    other = timings[BASELINE]
+    return [
+        entry(
+            f"step_{name}",
+            timing.median * MICROSECONDS,
+            "us",
+            ratio=timing.ratio(other),
+            baseline=f"step_{BASELINE}",
+        )
+        for name, timing in timings.items()
+    ]

@@ -1,0 +1,220 @@
+"""Draw what each method trains on: how often it samples which transitions of one common buffer.
+
+    python examples/draw_sampling.py                       all methods, to docs/methods/images
+    python examples/draw_sampling.py per mpfa_per --output runs/figures
+
+The buffer is made up: a quarter of a navigation run, with few goals and collisions, TD errors and
+gradients of a wide spread, and actions that are the further from the policy the older they are.
+Its signals stay as they are, while batches are sampled and priorities updated until these have
+settled; then every draw counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from tqdm import tqdm
+
+from methods import METHODS, Method
+from replay_assembly import learned_signals, make_buffer, make_selection
+from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
+
+COUNT = 2_000
+BATCH_SIZE = 128
+ROUNDS = 600
+"""Training steps until priorities have settled, and as many again that count."""
+REPLAY_CAP = 60
+"""In place of 1,024, which so few training steps do not reach."""
+SIGMA = 0.2
+OBSERVATION_SIZE, ACTION_SIZE = 8, 2
+KINDS = ("approaching", "moving away", "goal", "collision")
+COLORS = ("tab:blue", "0.6", "tab:green", "tab:red")
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Transitions:
+    """The common buffer: transitions, and what a learner would write about them."""
+
+    data: TensorDict
+    signals: dict[str, Tensor]
+    kind: NDArray[np.int64]
+    """Number of the kind in :data:`KINDS`, shape ``[N]``."""
+
+
+def make_transitions(policy: Any, *, count: int = COUNT, seed: int = 0) -> Transitions:
+    """Make up the buffer, oldest transition first.
+
+    Args:
+        policy: What later actions are near to.
+        count: Number of transitions ``N``.
+        seed: Seed of everything random.
+
+    Returns:
+        The transitions.
+    """
+    rng = np.random.default_rng(seed)
+    kind = rng.choice(len(KINDS), size=count, p=(0.6, 0.35, 0.02, 0.03))
+    step = rng.uniform(0.02, 0.25, count) * np.array((1.0, -1.0, 0.0, 0.0))[kind]
+    reward = step + np.array((0.0, 0.0, 10.0, -5.0))[kind]
+    # Ends are rare and large, hence badly foreseen.
+    td_error = rng.lognormal(-0.7, 1.0, count) * np.array((1.0, 1.0, 3.0, 4.0))[kind]
+    gradient = rng.lognormal(-0.5, 0.7, count)
+    value = rng.normal(4.0, 2.0, count) + np.array((0.5, -1.0, 4.0, -6.0))[kind]
+    observation = torch.as_tensor(rng.normal(size=(count, OBSERVATION_SIZE)), dtype=torch.float)
+    with torch.no_grad():
+        chosen = policy.outputs({"observation": observation})["action"]
+    # From twice the present noise to the present noise, and a bias that fades.
+    age = torch.linspace(1.0, 0.0, count).unsqueeze(1)
+    noise = torch.as_tensor(rng.normal(size=(count, ACTION_SIZE)), dtype=torch.float)
+    action = (chosen + 0.3 * age + SIGMA * (1.0 + age) * noise).clamp(-1.0, 1.0)
+    data = TensorDict(
+        {
+            "observation": observation,
+            "action": action,
+            "next": {"reward": torch.as_tensor(reward, dtype=torch.float).unsqueeze(1)},
+        },
+        [count],
+    )
+    known = {"td_error": td_error, "action_gradient": gradient, "value": value}
+    signals = {name: torch.as_tensor(v, dtype=torch.float) for name, v in known.items()}
+    return Transitions(data, signals, kind)
+
+
+def count_draws(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str, Array]]:
+    """Sample with a method and count.
+
+    Args:
+        method: The method.
+        seed: Seed of the draws.
+
+    Returns:
+        The transitions, and how often each was drawn relative to uniform sampling, for the critic
+        and, if that has batches of its own, for the actor; each of shape ``[N]``.
+    """
+    torch.manual_seed(0)
+    policy = make_actor(OBSERVATION_SIZE, ACTION_SIZE, width=16, final_init=0.5)
+    transitions = make_transitions(policy)
+    method = replace(method, capacity=COUNT, batch_size=BATCH_SIZE, replay_cap=REPLAY_CAP)
+    buffer = make_buffer(method, seed=seed)
+    buffer.extend(transitions.data)
+    if isinstance(buffer.sampler, SignalSampler):
+        buffer.sampler.anneal(1.0)
+    select = make_selection(method, policy, lambda: SIGMA)
+    names = learned_signals(method)
+    counts = {"critic": torch.zeros(COUNT), "actor": torch.zeros(COUNT)}
+    own = False
+    for number in range(2 * ROUNDS):
+        for draw in select(buffer):
+            actor_batch = draw.batch if draw.actor_batch is None else draw.actor_batch
+            own = own or draw.actor_batch is not None
+            if number >= ROUNDS:
+                for who, batch in (("critic", draw.batch), ("actor", actor_batch)):
+                    counts[who] += torch.bincount(batch["index"], minlength=COUNT)
+            _update(buffer, draw.batch, transitions, names)
+    found = {who: (each / each.mean()).double().numpy() for who, each in counts.items()}
+    return transitions, found if own else {"critic": found["critic"]}
+
+
+def _update(
+    buffer: SignalReplayBuffer,
+    batch: TensorDictBase,
+    transitions: Transitions,
+    names: Sequence[str],
+) -> None:
+    """Write the signals in a batch, as a learner would, and update the priorities."""
+    if not names:
+        return
+    for name in names:
+        batch["signals", name] = transitions.signals[name][batch["index"]]
+    buffer.update_tensordict_priority(batch)
+
+
+def draw(name: str, path: Path) -> None:
+    """Draw the figure of a method.
+
+    Args:
+        name: The method.
+        path: The PNG file.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    transitions, found = count_draws(METHODS[name])
+    figure, axes = pyplot.subplots(1, 3, figsize=(10, 2.8), layout="constrained")
+    error = transitions.signals["td_error"].numpy()
+    for number, (kind, color) in enumerate(zip(KINDS, COLORS, strict=True)):
+        chosen = transitions.kind == number
+        axes[0].plot(
+            error[chosen], found["critic"][chosen], ".", ms=3, color=color, alpha=0.6, label=kind
+        )
+    axes[0].set(xscale="log", xlabel="|TD error|", ylabel="times as often as uniformly")
+    axes[0].legend(fontsize=7)
+    width = 0.8 / len(found)
+    edges = np.linspace(0, COUNT, 11).astype(int)
+    for place, (who, often) in enumerate(found.items()):
+        by_kind = [often[transitions.kind == number].mean() for number in range(len(KINDS))]
+        where = np.arange(len(KINDS)) + place * width - 0.4 + width / 2
+        shade = 1.0 if place == 0 else 0.45
+        axes[1].bar(where, by_kind, width, color=COLORS, alpha=shade)
+        by_age = [often[a:b].mean() for a, b in pairwise(edges)]
+        axes[2].plot(np.arange(10) + 0.5, by_age, "o-", ms=3, color=f"C{place}", label=who)
+    axes[1].set_xticks(np.arange(len(KINDS)), KINDS, fontsize=7)
+    axes[1].set_xlabel("kind" if len(found) == 1 else "kind; pale: the actor's batches")
+    low, high = axes[2].get_ylim()
+    axes[2].set(xlabel="tenth of the buffer, oldest first", ylim=(min(low, 0.8), max(high, 1.2)))
+    if len(found) > 1:
+        axes[2].legend(fontsize=7)
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    for axis in axes[1:]:
+        axis.axhline(1.0, color="0.3", lw=0.8, ls=":")
+    figure.suptitle(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=80)
+    pyplot.close(figure)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw the figures that are asked for.
+
+    Args:
+        arguments: The command line.
+
+    Returns:
+        Exit status.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("methods", nargs="*", help="names (default: all)")
+    parser.add_argument("--output", type=Path, default=Path("docs/methods/images"))
+    options = parser.parse_args(arguments)
+    for name in options.methods:
+        if name not in METHODS:
+            parser.error(f"unknown method {name!r}; there are: {', '.join(METHODS)}")
+    names = options.methods or [name for name, method in METHODS.items() if method.name == name]
+    torch.set_num_threads(1)
+    # TorchRL announces each storage in the middle of the progress bar.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    for name in tqdm(names, unit="figure"):
+        draw(name, options.output / f"{name}.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,126 @@
+"""How the robot acts while it learns: a policy with noise, or one that is random by itself."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import TensorSpec
+from torchrl.envs import set_exploration_type
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import AdditiveGaussianModule
+
+from settings import Exploration
+from torchrl_mpfa import DirectModule
+from torchrl_mpfa.stochastic import StochasticActor
+
+
+class Explorer(Protocol):
+    """Actions to learn from."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the actions around the policy's."""
+        ...
+
+    def act(self, observation: Tensor) -> Tensor:
+        """From an observation, shape ``[O]``, to an action, shape ``[A]``."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next action depends on, but for the policy and the random numbers."""
+        ...
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        ...
+
+
+class NoisyPolicy:
+    """Gaussian noise on the action, clipped to its range, falling linearly.
+
+    Args:
+        policy: The deterministic policy.
+        settings: The noise.
+        action_spec: Range of actions.
+    """
+
+    def __init__(
+        self, policy: DirectModule, settings: Exploration, action_spec: TensorSpec
+    ) -> None:
+        self.policy = policy
+        self.noise = AdditiveGaussianModule(
+            action_spec,
+            sigma_init=settings.sigma,
+            sigma_end=settings.sigma_end,
+            annealing_num_steps=settings.annealing_steps,
+        )
+
+    @property
+    def sigma(self) -> float:
+        """Present standard deviation of the noise."""
+        return float(self.noise.sigma)
+
+    def act(self, observation: Tensor) -> Tensor:
+        """The policy's action and noise."""
+        found = self.policy.outputs({"observation": observation})
+        with set_exploration_type(ExplorationType.RANDOM):
+            noisy = self.noise(TensorDict({"action": found["action"]}))
+        self.noise.step(1)
+        action: Tensor = noisy.get("action")
+        return action
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state of the noise."""
+        return dict(self.noise.state_dict())
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.noise.load_state_dict(state_dict)
+
+
+class RandomPolicy:
+    """A policy that is random by itself, as SAC's is.
+
+    Args:
+        policy: The stochastic policy.
+        settings: Of these, what the noise of a deterministic policy would end at stands for the
+            spread of the actions.
+    """
+
+    def __init__(self, policy: StochasticActor, settings: Exploration) -> None:
+        self.policy = policy
+        self.sigma = settings.sigma_end
+
+    def act(self, observation: Tensor) -> Tensor:
+        """An action that the policy draws."""
+        with set_exploration_type(ExplorationType.RANDOM):
+            found = self.policy.outputs({"observation": observation})
+        action: Tensor = found["action"]
+        return action
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
+
+def make_explorer(
+    policy: DirectModule | StochasticActor, settings: Exploration, action_spec: TensorSpec
+) -> Explorer:
+    """Noise for a policy without any, none for one that is random.
+
+    Args:
+        policy: The policy.
+        settings: The noise.
+        action_spec: Range of actions.
+
+    Returns:
+        The explorer.
+    """
+    if isinstance(policy, StochasticActor):
+        return RandomPolicy(policy, settings)
+    return NoisyPolicy(policy, settings, action_spec)

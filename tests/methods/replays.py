@@ -1,0 +1,58 @@
+"""Buffers and transitions that the tests of the methods share."""
+
+import torch
+from tensordict import TensorDict
+
+from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
+
+SPREAD = 4.5
+"""Standard deviations by which a frequency may miss its probability."""
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def make_transitions(count, *, seed=0):
+    return TensorDict(
+        {"next": {"reward": torch.randn(count, 1, generator=seeded(seed))}}, batch_size=[count]
+    )
+
+
+def make_buffer(sampler, capacity, batch_size, *, filled=None, signals=None, seed=0):
+    """A buffer with this many random transitions."""
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(capacity, signals=signals or ["td_error"]),
+        sampler=sampler,
+        batch_size=batch_size,
+        generator=seeded(seed),
+    )
+    if filled is None:
+        filled = capacity
+    if filled:
+        buffer.extend(make_transitions(filled, seed=seed))
+    return buffer
+
+
+def set_signals(buffer, **signals):
+    """Give every filled slot these signals, as a training step would."""
+    count = len(buffer)
+    table = buffer._storage.signal_table
+    data = TensorDict({}, [count])
+    data["index"] = torch.arange(count)
+    data["written_at"] = table.written_at(torch.arange(count))
+    for name, value in signals.items():
+        data["signals", name] = torch.as_tensor(value)
+    buffer.update_tensordict_priority(data)
+
+
+def frequencies(indices, capacity):
+    counts = torch.bincount(indices, minlength=capacity).double()
+    return counts / counts.sum()
+
+
+def assert_shares(indices, expected, *, draws):
+    """The frequencies of slots are their probabilities, as far as chance allows."""
+    found = frequencies(indices, len(expected))
+    sigma = (expected * (1 - expected) / draws).sqrt()
+    assert ((found - expected).abs() <= SPREAD * sigma + 1e-9).all(), (found, expected)

@@ -1,0 +1,51 @@
+"""Combined experience replay: the newest transition is in every batch."""
+
+import pytest
+import torch
+from replays import make_buffer, make_transitions
+
+from torchrl_mpfa.methods import CombinedSampler
+
+
+def make_combined(capacity, batch_size, filled):
+    return make_buffer(CombinedSampler(), capacity, batch_size, filled=filled)
+
+
+def test_the_newest_transition_is_in_every_batch_across_the_wrap():
+    buffer = make_combined(7, 3, 5)
+    for number in range(20):
+        slot = int(buffer.extend(make_transitions(1, seed=number))[0])
+        assert slot == (5 + number) % 7
+        assert int(buffer.sample()["index"][0]) == slot
+
+
+def test_of_several_transitions_the_last_is_the_newest():
+    buffer = make_combined(10, 3, 4)
+    assert int(buffer.sample()["index"][0]) == 3
+
+
+def test_the_others_are_drawn_uniformly():
+    buffer = make_combined(8, 4001, 8)
+    others = torch.cat([buffer.sample()["index"][1:] for _ in range(5)])
+    shares = torch.bincount(others, minlength=8) / len(others)
+    assert (shares - 1 / 8).abs().max() < 0.012
+
+
+def test_a_buffer_that_is_emptied_has_no_newest_transition():
+    buffer = make_combined(5, 2, 5)
+    buffer.empty()
+    with pytest.raises(RuntimeError, match="empty"):
+        buffer.sample()
+    buffer.extend(make_transitions(1))
+    assert buffer.sample()["index"].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("way", ["state_dict", "folder"])
+def test_the_newest_transition_is_saved(tmp_path, way):
+    first, second = make_combined(9, 2, 6), make_combined(9, 2, 0)
+    if way == "state_dict":
+        second.load_state_dict(first.state_dict())
+    else:
+        first.dumps(tmp_path / "buffer")
+        second.loads(tmp_path / "buffer")
+    assert int(second.sample()["index"][0]) == 5

@@ -1,0 +1,149 @@
+"""The intrinsic curiosity module, and RAdam, the two parts of DDPG with RAdam and curiosity."""
+
+import copy
+import math
+
+import pytest
+import torch
+from replays import seeded
+from tensordict import TensorDict
+
+from torchrl_mpfa.learners.base import make_optimizer
+from torchrl_mpfa.methods import Curiosity, intrinsic_reward
+
+
+def make_batch(count=64, *, seed=0, shift=0.0):
+    generator = seeded(seed)
+    observation = torch.randn(count, 6, generator=generator) + shift
+    action = torch.rand(count, 2, generator=generator) * 2 - 1
+    after = observation.clone()
+    after[:, :2] += action
+    return TensorDict(
+        {
+            "observation": observation,
+            "action": action,
+            "next": {
+                "observation": after,
+                "reward": torch.randn(count, 1, generator=generator),
+            },
+        },
+        [count],
+    )
+
+
+def test_the_bonus_is_its_formula():
+    foreseen, found = torch.randn(2, 5, 3, generator=seeded(1)).unbind(0)
+    expected = [
+        0.5 * 0.01 * sum((a - b) ** 2 for a, b in zip(x, y, strict=True))
+        for x, y in zip(foreseen.tolist(), found.tolist(), strict=True)
+    ]
+    assert intrinsic_reward(foreseen, found, scale=0.01).tolist() == pytest.approx(expected)
+
+
+def test_the_losses_are_their_formulas():
+    curiosity, batch = Curiosity(6, 2, forward_share=0.2), make_batch(4)
+    encode = curiosity.encoder
+    inverse = forward = 0.0
+    with torch.no_grad():
+        for row in batch:
+            phi, then = encode(row["observation"]), encode(row["next", "observation"])
+            told = curiosity.inverse_model(torch.cat((phi, then)))
+            foreseen = curiosity.forward_model(torch.cat((phi, row["action"])))
+            inverse += float((told - row["action"]).square().sum()) / 4
+            forward += 0.5 * float((foreseen - then).square().sum()) / 4
+    log = curiosity(batch)
+    assert log["inverse_loss"].item() == pytest.approx(inverse, rel=1e-4)
+    assert log["forward_loss"].item() == pytest.approx(forward, rel=1e-4)
+
+
+def test_the_bonus_falls_on_what_is_seen_often_and_less_so_on_what_is_not():
+    torch.manual_seed(0)
+    curiosity = Curiosity(6, 2)
+    often, rare = make_batch(seed=1), make_batch(seed=2, shift=5.0)
+
+    def bonus(batch):
+        parts = (batch["observation"], batch["action"], batch["next", "observation"])
+        return curiosity.bonus(*parts).mean().item()
+
+    before = bonus(often), bonus(rare)
+    for _ in range(400):
+        curiosity(often.clone())
+    after = bonus(often), bonus(rare)
+    assert after[0] < 0.5 * before[0]
+    assert after[0] / before[0] < 0.5 * after[1] / before[1]
+
+
+def test_the_bonus_is_new_whenever_a_transition_is_sampled_and_the_reward_is_kept():
+    curiosity, stored = Curiosity(6, 2), make_batch()
+    first, second = stored.clone(), stored.clone()
+    curiosity(first)
+    for seed in range(20):
+        curiosity(make_batch(seed=seed))
+    curiosity(second)
+    assert not torch.equal(first["next", "intrinsic_reward"], second["next", "intrinsic_reward"])
+    for batch in (first, second):
+        assert torch.equal(batch["next", "extrinsic_reward"], stored["next", "reward"])
+        torch.testing.assert_close(
+            batch["next", "reward"],
+            stored["next", "reward"] + batch["next", "intrinsic_reward"],
+        )
+
+
+def test_the_models_go_on_from_a_state_that_is_loaded():
+    first, second = Curiosity(6, 2), Curiosity(6, 2)
+    for seed in range(3):
+        first(make_batch(seed=seed))
+    second.restore(copy.deepcopy(first.checkpoint()))
+    logs = [each(make_batch(seed=9)) for each in (first, second)]
+    assert all(logs[0][key].equal(logs[1][key]) for key in logs[0])
+    assert all(
+        torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("features", 0), ("width", 0), ("scale", -1.0), ("lr", 0.0), ("forward_share", 2.0)],
+)
+def test_what_is_out_of_range_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"{name} must be .* got {value}"):
+        Curiosity(6, 2, **{name: value})
+
+
+def radam_by_hand(gradients, *, lr, first=0.9, second=0.999, eps=1e-8):
+    """Liu et al. (2020), Algorithm 2, for one number."""
+    limit = 2 / (1 - second) - 1
+    place, mean, square = 0.0, 0.0, 0.0
+    for t, gradient in enumerate(gradients, 1):
+        mean = first * mean + (1 - first) * gradient
+        square = second * square + (1 - second) * gradient**2
+        unbiased = mean / (1 - first**t)
+        length = limit - 2 * t * second**t / (1 - second**t)
+        if length > 5:
+            rectified = math.sqrt(
+                (length - 4) * (length - 2) * limit / ((limit - 4) * (limit - 2) * length)
+            )
+            adaptive = math.sqrt(1 - second**t) / (math.sqrt(square) + eps)
+            place -= lr * unbiased * rectified * adaptive
+        else:
+            place -= lr * unbiased
+    return place
+
+
+def test_radam_takes_its_first_steps_without_the_second_moment():
+    """The variance of five gradients says nothing yet: momentum alone, as large as they are."""
+    gradients = [3.0, -1.0, 0.5, 2.0, 0.1, -0.7, 1.3, 0.2]
+    for count in range(1, len(gradients) + 1):
+        parameter = torch.nn.Parameter(torch.zeros((), dtype=torch.double))
+        optimizer = make_optimizer("radam", [{"params": [parameter], "lr": 0.1}])
+        for gradient in gradients[:count]:
+            parameter.grad = torch.tensor(gradient, dtype=torch.double)
+            optimizer.step()
+        assert parameter.item() == pytest.approx(radam_by_hand(gradients[:count], lr=0.1))
+    # Adam's first step is as large as the rate, whatever the gradient; RAdam's is not.
+    assert radam_by_hand([3.0], lr=0.1) == pytest.approx(-0.3)
+
+
+def test_an_unknown_optimizer_is_refused_by_name():
+    with pytest.raises(ValueError, match="optimizer must be 'adam' or 'radam', got 'sgd'"):
+        make_optimizer("sgd", [])

@@ -1,0 +1,107 @@
+"""HVPER (reconstruction): value, error and replays in one priority whose weights move."""
+
+import math
+
+import pytest
+import torch
+from replays import make_buffer, make_transitions, seeded
+
+from torchrl_mpfa import BatchFacts, SignalSampler
+from torchrl_mpfa.methods import (
+    RELATIVE_ERROR,
+    RELATIVE_VALUE,
+    ReplayPenalty,
+    relative_error,
+    relative_value,
+    value_schedule,
+)
+
+KAPPA, EPS = 0.25, 0.01
+
+
+def by_hand(values, errors, counts, progress):
+    """Priorities in plain loops."""
+    mean = sum(values) / len(values)
+    spread = math.sqrt(sum((v - mean) ** 2 for v in values) / len(values))
+    share = 0.5 * progress
+    found = []
+    for value, error, count in zip(values, errors, counts, strict=True):
+        high = 1 / (1 + math.exp(-(value - mean) / spread))
+        fused = share * high + (1 - share) * error / max(errors) + EPS
+        found.append(max(fused - KAPPA * count / max(counts), EPS))
+    return found
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
+def test_priorities_are_those_of_the_formula(progress):
+    sampler = SignalSampler(
+        6,
+        0.6,
+        0.4,
+        EPS,
+        signals=[RELATIVE_VALUE, RELATIVE_ERROR],
+        fusion=value_schedule(),
+        adjustments=[ReplayPenalty(penalty=KAPPA, floor=EPS)],
+    )
+    buffer = make_buffer(sampler, 6, 9, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
+    sampler.anneal(progress)
+    batch = buffer.sample()
+    # A row for each slot that was drawn, as of a slot that is in a batch twice the last counts.
+    index, first = batch["index"].unique(), {}
+    for row, slot in enumerate(batch["index"].tolist()):
+        first.setdefault(slot, row)
+    batch = batch[torch.tensor([first[slot] for slot in index.tolist()])]
+    count = len(batch)
+    values = torch.randn(count, generator=seeded(1)) * 4 - 2
+    errors = torch.rand(count, generator=seeded(2)) * 3
+    batch["signals", "value"], batch["signals", "td_error"] = values, errors
+    table = buffer._storage.signal_table
+    counts = table.rows[index, table.count_column]
+    buffer.update_tensordict_priority(batch)
+    found = -torch.as_tensor(sampler._max_tree[index])
+    expected = by_hand(values.tolist(), errors.tolist(), counts.tolist(), progress)
+    assert found.tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def test_at_first_the_value_does_not_count_and_later_it_does():
+    fusion = value_schedule()
+    names = [RELATIVE_VALUE.name, RELATIVE_ERROR.name]
+    assert fusion.weights(names, None, None).tolist() == [0.0, 1.0]
+    fusion.anneal(1.0)
+    assert fusion.weights(names, None, None).tolist() == [0.5, 0.5]
+
+
+def test_value_and_error_are_between_zero_and_one():
+    for function in (relative_value, relative_error):
+        for data in (torch.rand(9, generator=seeded(3)) * 100, torch.zeros(4), torch.ones(1)):
+            found = function(data)
+            assert ((found >= 0) & (found <= 1)).all()
+
+
+def test_of_equal_transitions_the_more_often_replayed_has_the_lower_priority():
+    facts = BatchFacts(torch.zeros(3), torch.tensor([1.0, 10.0, 100.0]), torch.arange(3))
+    found = ReplayPenalty()(torch.full((3,), 0.5), facts)
+    assert found[0] > found[1] > found[2] >= EPS
+
+
+def test_a_negative_value_is_no_error_as_only_its_place_is_kept():
+    sampler = SignalSampler(
+        4, 0.6, 0.4, EPS, signals=[RELATIVE_VALUE, RELATIVE_ERROR], fusion=value_schedule()
+    )
+    buffer = make_buffer(sampler, 4, 4, filled=0, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
+    buffer.extend(make_transitions(4))
+    batch = buffer.sample()
+    batch["signals", "value"] = torch.full((4,), -50.0)
+    batch["signals", "td_error"] = torch.ones(4)
+    buffer.update_tensordict_priority(batch)
+
+
+def test_what_is_out_of_range_is_refused():
+    with pytest.raises(ValueError, match="penalty must be finite and not negative, got -1"):
+        ReplayPenalty(penalty=-1)
+    with pytest.raises(ValueError, match="floor must be positive"):
+        ReplayPenalty(floor=0)
+    with pytest.raises(ValueError, match=r"final_share must be in \[0, 1\], got 2"):
+        value_schedule(final_share=2)
+    with pytest.raises(ValueError, match=r"progress must be in \[0, 1\], got 1.5"):
+        value_schedule().anneal(1.5)

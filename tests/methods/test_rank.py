@@ -1,0 +1,90 @@
+"""Rank-based PER: the place counts, not the size."""
+
+import pytest
+import torch
+from replays import assert_shares, make_buffer, seeded, set_signals
+
+from torchrl_mpfa.methods import RankSampler, rank_share
+
+ALPHA = 0.7
+
+
+def make_sampler(capacity, **kwargs):
+    return RankSampler(capacity, ALPHA, 0.5, 0.01, signals=["td_error"], **kwargs)
+
+
+def shares_by_hand(errors):
+    """Probabilities by a plain sort."""
+    order = sorted(range(len(errors)), key=lambda slot: -errors[slot])
+    leaf = [0.0] * len(errors)
+    for place, slot in enumerate(order):
+        leaf[slot] = (1.0 / (place + 1)) ** ALPHA
+    return torch.tensor([value / sum(leaf) for value in leaf], dtype=torch.double)
+
+
+def test_the_share_of_a_rank_is_its_formula():
+    found = rank_share(torch.tensor([1.0, 2.0, 10.0]), alpha=ALPHA)
+    assert found.tolist() == pytest.approx([1.0, 2.0**-ALPHA, 10.0**-ALPHA])
+
+
+def test_transitions_are_drawn_by_their_rank():
+    errors = torch.rand(20, generator=seeded(1)) * 5
+    buffer = make_buffer(make_sampler(20, rank_refresh=0), 20, 50_000)
+    set_signals(buffer, td_error=errors)
+    expected = shares_by_hand(errors.tolist())
+    assert_shares(buffer.sample()["index"], expected, draws=50_000)
+
+
+def test_an_outlier_changes_nothing_but_its_own_rank():
+    errors = torch.arange(1.0, 9.0)
+    buffers = [make_buffer(make_sampler(8, rank_refresh=0), 8, 1000) for _ in range(2)]
+    set_signals(buffers[0], td_error=errors)
+    errors[-1] = 1e6
+    set_signals(buffers[1], td_error=errors)
+    assert torch.equal(*(buffer.sample()["index"] for buffer in buffers))
+
+
+def test_between_two_sortings_a_priority_gets_the_rank_that_it_would_have_had():
+    sampler = make_sampler(10, rank_refresh=100.0)
+    buffer = make_buffer(sampler, 10, 4)
+    set_signals(buffer, td_error=torch.arange(10.0, 0.0, -1.0))
+    sampler._sort()
+    # Slot 9 had the lowest priority; now it would stand third.
+    sampler.update_signals(
+        torch.tensor([9]), {"td_error": torch.tensor([8.5])}, storage=buffer._storage
+    )
+    leaves = torch.as_tensor(sampler._sum_tree[torch.arange(10)])
+    expected = torch.arange(1.0, 11.0).pow(-ALPHA)
+    expected[9] = 3.0**-ALPHA
+    torch.testing.assert_close(leaves, expected)
+
+
+def test_all_are_sorted_when_enough_priorities_are_new():
+    sampler = make_sampler(10, rank_refresh=0.5)
+    buffer = make_buffer(sampler, 10, 4)
+    set_signals(buffer, td_error=torch.arange(10.0, 0.0, -1.0))
+    ranks = [torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values]
+    for slot in range(6):
+        sampler.update_signals(
+            torch.tensor([slot]), {"td_error": torch.tensor([0.1])}, storage=buffer._storage
+        )
+        ranks.append(torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values)
+    whole = torch.arange(10.0, 0.0, -1.0).pow(-ALPHA)
+    torch.testing.assert_close(ranks[0], whole)
+    assert not torch.allclose(ranks[4], whole)
+    torch.testing.assert_close(ranks[6], whole)
+
+
+def test_weights_are_those_of_the_shares():
+    errors = torch.arange(1.0, 11.0)
+    buffer = make_buffer(make_sampler(10, rank_refresh=0), 10, 200)
+    set_signals(buffer, td_error=errors)
+    batch = buffer.sample()
+    shares = shares_by_hand(errors.tolist())
+    expected = (shares[batch["index"]] / shares.min()).pow(-0.5)
+    torch.testing.assert_close(batch["priority_weight"].double(), expected)
+
+
+def test_a_negative_refresh_is_refused():
+    with pytest.raises(ValueError, match="rank_refresh must be finite and at least 0, got -1"):
+        make_sampler(4, rank_refresh=-1)

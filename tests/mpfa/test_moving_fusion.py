@@ -1,0 +1,68 @@
+"""Fusions whose weights move with the training or with the scale of the signals."""
+
+import pytest
+from transitions import make_buffer, make_transitions, train_rounds
+
+from torchrl_mpfa import Annealed, FixedFusion, Fusion, ScaledFusion, ScheduledFusion
+from torchrl_mpfa.signals import SignalTable
+
+NAMES = ["td_error", "reward"]
+
+
+def make_table(rows):
+    """A table of two signals, reward unknown where it is None."""
+    table = SignalTable(10, ["td_error", "reward"])
+    table.size = len(rows)
+    for slot, (error, reward) in enumerate(rows):
+        table.rows[slot, table.column["td_error"]] = float("nan") if error is None else error
+        table.rows[slot, table.column["reward"]] = reward
+    return table
+
+
+def test_scheduled_weights_go_in_a_line_from_start_to_end():
+    fusion = ScheduledFusion({"td_error": 1.0}, {"td_error": 0.2, "reward": 0.8})
+    found = []
+    for progress in (0.0, 0.25, 1.0):
+        fusion.anneal(progress)
+        found.append(fusion.weights(NAMES, None, None).tolist())
+    assert found == [pytest.approx(w) for w in ([1.0, 0.0], [0.8, 0.2], [0.2, 0.8])]
+    assert isinstance(fusion, Fusion)
+    assert isinstance(fusion, Annealed)
+
+
+def test_scaled_signals_have_the_shares_that_their_weights_say():
+    table = make_table([(1.0, 100.0), (3.0, 300.0), (None, 800.0)])
+    weights = ScaledFusion(FixedFusion(dict.fromkeys(NAMES, 1.0))).weights(NAMES, table, None)
+    # Means of what is known: 2 and 400.
+    assert weights.tolist() == pytest.approx([1 / 2, 1 / 400])
+
+
+def test_a_signal_that_is_zero_everywhere_or_known_of_nothing_is_left_as_it_is():
+    table = make_table([(None, 0.0), (None, 0.0)])
+    weights = ScaledFusion(FixedFusion(dict.fromkeys(NAMES, 1.0))).weights(NAMES, table, None)
+    assert weights.tolist() == [1.0, 1.0]
+
+
+def test_a_scaled_fusion_passes_on_what_the_other_needs_to_know():
+    inner = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
+    fusion = ScaledFusion(inner)
+    assert fusion.every_batch
+    fusion.anneal(1.0)
+    assert inner.weights(NAMES, None, None).tolist() == [0.0, 1.0]
+    ScaledFusion(FixedFusion()).anneal(0.5)  # Nothing to tell, and no error.
+
+
+def test_a_sampler_tells_its_fusion_how_much_of_the_training_is_done():
+    fusion = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
+    buffer = make_buffer(24, 6, fusion=fusion)
+    buffer.extend(make_transitions(24))
+    for progress, expected in ((0.0, 1.0), (1.0, 0.0)):
+        buffer.sampler.anneal(progress)
+        train_rounds(buffer, 1)
+        assert buffer.sampler.weights["td_error"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("progress", [-0.1, 1.1])
+def test_a_progress_outside_of_the_training_is_refused(progress):
+    with pytest.raises(ValueError, match=rf"progress must be in \[0, 1\], got {progress}"):
+        ScheduledFusion({"td_error": 1.0}, {"td_error": 1.0}).anneal(progress)

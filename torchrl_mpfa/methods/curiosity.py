@@ -1,0 +1,163 @@
+r"""Curiosity: a bonus for transitions whose outcome the robot cannot foresee yet.
+
+Intrinsic curiosity module of Pathak et al. (2017), https://arxiv.org/abs/1705.05363, which Li et
+al. (2021), https://doi.org/10.1155/2021/5169460, add to DDPG with RAdam and PER. Features
+:math:`\phi` of observations are learned such that the action can be told from those before and
+after it; the bonus is the error of foreseeing the latter from the former and the action.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+
+def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
+    r"""Bonus of a transition, :math:`\tfrac{\eta}{2} \lVert \hat\phi' - \phi' \rVert^2`.
+
+    Args:
+        foreseen: Features that the forward model expects, shape ``[B, F]``.
+        found: Features of what came, shape ``[B, F]``.
+        scale: :math:`\eta`.
+
+    Returns:
+        Bonuses, shape ``[B]``.
+
+    Examples:
+        >>> intrinsic_reward(torch.zeros(1, 2), torch.ones(1, 2), scale=0.5).tolist()
+        [0.5]
+    """
+    return 0.5 * scale * (foreseen - found).square().sum(-1)
+
+
+def _network(*sizes: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class Curiosity(nn.Module):
+    r"""Adds the bonus to the rewards of a sampled batch, and trains its models on it.
+
+    The bonus is computed anew whenever a transition is sampled, so that it fades as the models
+    learn; what the buffer keeps is the reward of the environment. To be called on a batch before
+    the learner is: ``("next", "reward")`` gets the bonus on top, the reward alone stays at
+    ``("next", "extrinsic_reward")``, and the bonus is at ``("next", "intrinsic_reward")``. The
+    losses of the models are :math:`(1 - b) L_{inverse} + b L_{forward}`.
+
+    Args:
+        observation_size: ``O``.
+        action_size: ``A``.
+        features: Size ``F`` of the features.
+        width: Units of the hidden layers.
+        scale: :math:`\eta` of the bonus.
+        forward_share: :math:`b`.
+        lr: Learning rate of the models, by default ten times the actor's in Table 1, as in the
+            public code of the module.
+        reward_key: Where the reward of a transition is, within ``"next"``.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> curiosity = Curiosity(24, 2)
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.rand(8, 24),
+        ...         "action": torch.rand(8, 2),
+        ...         "next": {"observation": torch.rand(8, 24), "reward": torch.zeros(8, 1)},
+        ...     },
+        ...     [8],
+        ... )
+        >>> sorted(curiosity(batch))
+        ['forward_loss', 'intrinsic_reward', 'inverse_loss']
+        >>> bool((batch["next", "reward"] > 0).all())
+        True
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_size: int,
+        *,
+        features: int = 32,
+        width: int = 64,
+        scale: float = 0.01,
+        forward_share: float = 0.2,
+        lr: float = 1e-3,
+        reward_key: NestedKey = "reward",
+    ) -> None:
+        super().__init__()
+        for name, size in (("features", features), ("width", width)):
+            if size < 1:
+                raise ValueError(f"{name} must be at least 1, got {size}")
+        for name, value in (("scale", scale), ("lr", lr)):
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        if not 0.0 <= forward_share <= 1.0:
+            raise ValueError(f"forward_share must be in [0, 1], got {forward_share}")
+        self.scale, self.forward_share, self.reward_key = scale, forward_share, reward_key
+        self.encoder = _network(observation_size, width, features)
+        self.inverse_model = _network(2 * features, width, action_size)
+        self.forward_model = _network(features + action_size, width, features)
+        self.optimizer = torch.optim.RAdam(self.parameters(), lr=lr)
+
+    def bonus(self, observation: Tensor, action: Tensor, after: Tensor) -> Tensor:
+        """Bonus of transitions by the present models, shape ``[B]``.
+
+        Args:
+            observation: Shape ``[B, O]``.
+            action: Shape ``[B, A]``.
+            after: The next observation, shape ``[B, O]``.
+        """
+        with torch.no_grad():
+            foreseen = self.forward_model(torch.cat((self.encoder(observation), action), -1))
+            return intrinsic_reward(foreseen, self.encoder(after), scale=self.scale)
+
+    def forward(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Add the bonus to a batch, and take one step of the models.
+
+        Args:
+            batch: Transitions as a buffer gave them, batch size ``[B]``.
+
+        Returns:
+            Detached values for the log.
+        """
+        observation, action = batch.get("observation"), batch.get("action")
+        following = batch.get("next")
+        after, reward = following.get("observation"), following.get(self.reward_key)
+        bonus = self.bonus(observation, action, after).reshape(reward.shape).to(reward.dtype)
+        following.set("extrinsic_reward", reward)
+        following.set("intrinsic_reward", bonus)
+        following.set(self.reward_key, reward + bonus)
+        return {**self._learn(observation, action, after), "intrinsic_reward": bonus}
+
+    def _learn(self, observation: Tensor, action: Tensor, after: Tensor) -> dict[str, Tensor]:
+        """One step of both models; the features learn from the inverse one and follow."""
+        before, then = self.encoder(observation), self.encoder(after)
+        told = self.inverse_model(torch.cat((before, then), -1))
+        inverse_loss = (told - action).square().sum(-1).mean()
+        foreseen = self.forward_model(torch.cat((before, action), -1))
+        forward_loss = intrinsic_reward(foreseen, then, scale=1.0).mean()
+        self.optimizer.zero_grad(set_to_none=True)
+        share = self.forward_share
+        ((1.0 - share) * inverse_loss + share * forward_loss).backward()
+        self.optimizer.step()
+        return {"inverse_loss": inverse_loss.detach(), "forward_loss": forward_loss.detach()}
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Models and optimizer; tensors and plain values only."""
+        return {"models": self.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what :meth:`checkpoint` gave."""
+        self.load_state_dict(state["models"])
+        self.optimizer.load_state_dict(state["optimizer"])

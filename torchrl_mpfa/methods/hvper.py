@@ -1,0 +1,122 @@
+r"""HVPER: TD error, Q value and number of replays, with weights that move with the training.
+
+Cao et al. (2019), "High-value prioritized experience replay for off-policy reinforcement
+learning", ICTAI 2019. **A reconstruction**: its abstract says that
+priorities combine TD error and state-action value, and the MPFA-PER paper adds that the amount of
+data counts and that the weights vary with the phase of the training. That both terms are brought
+to [0, 1] within a batch, the schedule of the weights and the penalty on replays are our reading:
+
+.. math::
+
+    p_i = \max(\lambda V_i + (1 - \lambda) T_i - \kappa U_i, \epsilon)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.moving_fusion import ScheduledFusion
+from torchrl_mpfa.signals import Signal
+
+
+def relative_value(value: Tensor) -> Tensor:
+    """How high Q is within its batch, ``V``: the sigmoid of its standard score.
+
+    Args:
+        value: Q, shape ``[B]``.
+
+    Returns:
+        Numbers in (0, 1), shape ``[B]``; 1/2 is the mean.
+
+    Examples:
+        >>> relative_value(torch.tensor([-3.0, -3.0])).tolist()
+        [0.5, 0.5]
+    """
+    centered = value - value.mean()
+    spread = centered.square().mean().sqrt()
+    return torch.sigmoid(centered / torch.where(spread > 0, spread, 1.0))
+
+
+def relative_error(td_error: Tensor) -> Tensor:
+    r"""How large the TD error is within its batch, ``T``: its share of the largest.
+
+    Args:
+        td_error: :math:`|\delta|`, shape ``[B]``.
+
+    Returns:
+        Numbers in [0, 1], shape ``[B]``.
+
+    Examples:
+        >>> relative_error(torch.tensor([1.0, 4.0])).tolist()
+        [0.25, 1.0]
+    """
+    largest = td_error.max()
+    return td_error / torch.where(largest > 0, largest, 1.0)
+
+
+RELATIVE_VALUE = Signal("relative_value", key=("signals", "value"), priority=relative_value)
+"""V: the loss writes ``"value"``, and the table keeps its place within the batch."""
+RELATIVE_ERROR = Signal("relative_td_error", key=("signals", "td_error"), priority=relative_error)
+"""T, likewise."""
+
+
+def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
+    r"""Weights that go from the TD error alone to an equal part of Q, which is wrong at first.
+
+    Args:
+        final_share: :math:`\lambda` at the end of the training.
+
+    Returns:
+        The fusion.
+
+    Raises:
+        ValueError: If the share is outside [0, 1].
+
+    Examples:
+        >>> value_schedule().end
+        {'relative_value': 0.5, 'relative_td_error': 0.5}
+    """
+    if not 0.0 <= final_share <= 1.0:
+        raise ValueError(f"final_share must be in [0, 1], got {final_share}")
+    value, error = RELATIVE_VALUE.name, RELATIVE_ERROR.name
+    return ScheduledFusion({value: 0.0, error: 1.0}, {value: final_share, error: 1.0 - final_share})
+
+
+@dataclass(frozen=True)
+class ReplayPenalty:
+    r"""Less for what was replayed often, :math:`\max(p_i - \kappa U_i, \epsilon)`.
+
+    ``U`` is the number of replays as a share of the largest one in the batch.
+
+    Args:
+        penalty: :math:`\kappa`.
+        floor: :math:`\epsilon`, so that nothing is lost for good.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> facts = BatchFacts(torch.zeros(2), torch.tensor([1.0, 4.0]), torch.arange(2))
+        >>> ReplayPenalty(penalty=0.4)(torch.tensor([1.0, 1.0]), facts).tolist()
+        [0.8999999761581421, 0.6000000238418579]
+    """
+
+    penalty: float = 0.25
+    floor: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.penalty < math.inf:
+            raise ValueError(f"penalty must be finite and not negative, got {self.penalty}")
+        if not 0.0 < self.floor < math.inf:
+            raise ValueError(f"floor must be positive and finite, got {self.floor}")
+
+    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Lower priorities by the replays of their transitions, shape ``[B]``."""
+        count = batch.replay_count.to(priority.dtype)
+        share = count / count.max().clamp_min(1.0)
+        return (priority - self.penalty * share).clamp_min(self.floor)

@@ -1,0 +1,44 @@
+r"""LAP: priorities that do not fall below the bend of the Huber loss, and no importance weights.
+
+Fujimoto et al. (2020), "An equivalence between loss functions and non-uniform sampling in
+experience replay", https://arxiv.org/abs/2007.06049. Its uniform twin PAL is a loss:
+:func:`~torchrl_mpfa.losses.distances.pal_distance`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchrl_mpfa.adjustment import BatchFacts
+
+
+@dataclass(frozen=True)
+class PriorityFloor:
+    r"""No priority below a floor, :math:`\max(|\delta_i|, 1)`.
+
+    Args:
+        floor: The floor in the units of the environment's reward. LAP's 1 is where its Huber loss
+            bends: of a loss with rewards scaled by ``s`` it is ``1 / s``.
+
+    Raises:
+        ValueError: If the floor is not positive and finite.
+
+    Examples:
+        >>> import torch
+        >>> facts = BatchFacts(torch.zeros(2), torch.ones(2), torch.arange(2))
+        >>> PriorityFloor(1.0)(torch.tensor([0.2, 3.0]), facts).tolist()
+        [1.0, 3.0]
+    """
+
+    floor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.floor < math.inf:
+            raise ValueError(f"floor must be positive and finite, got {self.floor}")
+
+    def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
+        """Raise what is below the floor, shape ``[B]``."""
+        return priority.clamp_min(self.floor)

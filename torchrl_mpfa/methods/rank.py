@@ -1,0 +1,100 @@
+r"""Rank-based prioritized replay: a transition counts by its place, not by its size.
+
+Schaul et al. (2016), "Prioritized experience replay", https://arxiv.org/abs/1511.05952
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.tree import check_range
+
+
+def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
+    r"""What a transition is drawn in proportion to, :math:`(1 / \mathrm{rank}(i))^\alpha`.
+
+    Args:
+        rank: Places by falling priority, counted from 1, shape ``[B]``.
+        alpha: Priority exponent :math:`\alpha`.
+
+    Returns:
+        Shares, shape ``[B]``.
+
+    Examples:
+        >>> rank_share(torch.tensor([1.0, 4.0]), alpha=0.5).tolist()
+        [1.0, 0.5]
+    """
+    return rank.pow(-alpha)
+
+
+class RankSampler(SignalSampler):
+    r"""Sampling by :math:`P(i) \propto (1 / \mathrm{rank}(i))^\alpha`, insensitive to outliers.
+
+    Ranks are by the fused and adjusted priority; with the TD error alone this is the rank-based
+    variant of PER. All transitions are sorted from time to time; in between, the new priority of
+    a transition gets the rank that it would have had in the last order, as the original, too,
+    sorts but now and then.
+
+    Args:
+        *args: As :class:`~torchrl_mpfa.SignalSampler`.
+        rank_refresh: Share of the buffer whose priority may be written anew before all are
+            sorted; 0 sorts at every update.
+        **kwargs: As :class:`~torchrl_mpfa.SignalSampler`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> RankSampler(1000, 0.7, 0.5, signals=["td_error"]).rank_refresh
+        0.25
+    """
+
+    def __init__(self, *args: Any, rank_refresh: float = 0.25, **kwargs: Any) -> None:
+        check_range("rank_refresh", rank_refresh, low=0)
+        self.rank_refresh = rank_refresh
+        super().__init__(*args, **kwargs)
+
+    def _init(self) -> None:
+        super()._init()
+        # Priorities at the last sorting, negated, so that they rise with the rank.
+        self._order = torch.empty(0)
+        self._written = 0
+
+    def _leaf(self, priority: Tensor) -> Tensor:
+        rank = torch.searchsorted(self._order, -priority) + 1
+        return rank_share(rank.to(self.dtype), alpha=self._alpha)
+
+    def _write(self, index: Tensor, priority: Tensor) -> None:
+        super()._write(index, priority)
+        self._written += len(index)
+        if self._written > self.rank_refresh * len(self._order):
+            self._sort()
+
+    def _sort(self) -> None:
+        """Give every written slot its true rank."""
+        negated = torch.as_tensor(self._max_tree[torch.arange(self._max_capacity)]).reshape(-1)
+        slots = (negated <= 0).nonzero().squeeze(1)
+        self._order, places = negated[slots].sort(stable=True)
+        ranks = torch.arange(1, len(slots) + 1, dtype=self.dtype)
+        leaf = rank_share(ranks, alpha=self._alpha)
+        ordered = slots[places]
+        self._sum_tree[ordered] = leaf
+        self._min_tree[ordered] = leaf
+        self._written = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next batches depend on; tensors and plain values only."""
+        return {**super().state_dict(), "_order": self._order.clone(), "_written": self._written}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: See :meth:`check_state`.
+        """
+        super().load_state_dict(state_dict)
+        self._order, self._written = state_dict["_order"].clone(), state_dict["_written"]

@@ -1,0 +1,101 @@
+"""Fusions whose weights move: with the training, or with the scale of the signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from torchrl_mpfa.fusion import FixedFusion, Fusion
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.signals import SignalTable
+
+
+@runtime_checkable
+class Annealed(Protocol):
+    """What changes as the training goes on."""
+
+    def anneal(self, progress: float) -> None:
+        """Say how much of the training is done, from 0 to 1."""
+        ...
+
+
+@dataclass
+class ScheduledFusion:
+    """Weights that move in a line from one set to another as the training goes on.
+
+    Args:
+        start: Weight of each signal at the start, by name; a signal without one is not counted.
+        end: Weight of each signal at the end.
+
+    Raises:
+        ValueError: As :class:`FixedFusion`.
+
+    Examples:
+        >>> fusion = ScheduledFusion({"td_error": 1.0}, {"td_error": 0.5, "value": 0.5})
+        >>> fusion.anneal(0.5)
+        >>> fusion.weights(["td_error", "value"], None, None).tolist()
+        [0.75, 0.25]
+    """
+
+    start: dict[str, float]
+    end: dict[str, float]
+    every_batch: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        self._ends = FixedFusion(self.start), FixedFusion(self.end)
+        self._progress = 0.0
+
+    def anneal(self, progress: float) -> None:
+        """Say how much of the training is done, from 0 to 1.
+
+        Raises:
+            ValueError: If ``progress`` is outside.
+        """
+        if not 0.0 <= progress <= 1.0:
+            raise ValueError(f"progress must be in [0, 1], got {progress}")
+        self._progress = progress
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """The present weights in the order of ``names``, shape ``[K]``."""
+        start, end = (each.weights(names, table, index) for each in self._ends)
+        return start.lerp(end, self._progress)
+
+
+@dataclass(frozen=True)
+class ScaledFusion:
+    """Weights of another fusion for signals that are first divided by their mean in the buffer.
+
+    Signals of different units then have the shares in a priority that their weights say.
+
+    Args:
+        fusion: Where the weights come from.
+
+    Examples:
+        >>> ScaledFusion(FixedFusion({"reward": 0.5, "td_error": 0.5})).every_batch
+        False
+    """
+
+    fusion: Fusion
+
+    @property
+    def every_batch(self) -> bool:
+        """As the other fusion."""
+        return bool(getattr(self.fusion, "every_batch", False))
+
+    def anneal(self, progress: float) -> None:
+        """Tell the other fusion how much of the training is done, if it wants to know."""
+        if isinstance(self.fusion, Annealed):
+            self.fusion.anneal(progress)
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """Weights divided by the means of the signals, shape ``[K]``."""
+        weights = self.fusion.weights(names, table, index)
+        signals = table.rows[: table.size, [table.column[name] for name in names]]
+        mean = signals.nanmean(0).to(weights.dtype)
+        # A signal that is zero everywhere, or known of no transition yet, has no scale.
+        return weights / torch.where(mean > 0, mean, 1.0)

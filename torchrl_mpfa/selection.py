@@ -1,0 +1,63 @@
+"""Selection: from a replay buffer to the batches of one training step.
+
+Most methods sample one batch, of which critic and actor learn both. A method that chooses among
+several batches, or gives the actor one of its own, is another callable of the same form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from tensordict import TensorDictBase
+from torchrl.data import TensorDictReplayBuffer
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What one update of a learner is made from.
+
+    Attributes:
+        batch: What the critic learns from, and whose signals are updated, batch size ``[B]``.
+        actor_batch: What the actor learns from; None: the same.
+        loss_function: Distance of the critic's loss; None: the loss's own.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> Draw(TensorDict({}, [4])).actor_batch is None
+        True
+    """
+
+    batch: TensorDictBase
+    actor_batch: TensorDictBase | None = None
+    loss_function: str | None = None
+
+
+@runtime_checkable
+class Selection(Protocol):
+    """How the batches of a training step are chosen; any callable of this form will do."""
+
+    def __call__(self, buffer: TensorDictReplayBuffer) -> Sequence[Draw]:
+        """Draw the batches of one training step."""
+        ...
+
+
+def one_batch(buffer: TensorDictReplayBuffer) -> Sequence[Draw]:
+    """One batch for critic and actor, as the buffer samples it.
+
+    Args:
+        buffer: The replay buffer.
+
+    Returns:
+        One draw.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=4)
+        >>> index = buffer.extend(TensorDict({"reward": [[0.0]] * 10}, [10]))
+        >>> [len(draw.batch) for draw in one_batch(buffer)]
+        [4]
+    """
+    return [Draw(buffer.sample())]
