@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import TensorSpec
@@ -24,6 +25,10 @@ class Explorer(Protocol):
         """Standard deviation of the actions around the policy's."""
         ...
 
+    def begin_episode(self) -> None:
+        """Take note that an episode begins."""
+        ...
+
     def act(self, observation: Tensor) -> Tensor:
         """From an observation, shape ``[O]``, to an action, shape ``[A]``."""
         ...
@@ -40,6 +45,9 @@ class Explorer(Protocol):
 class NoisyPolicy:
     """Gaussian noise on the action, clipped to its range, falling linearly.
 
+    With ``varied`` each episode has a share of it that is drawn uniformly from [0, 1]: what the
+    policy does without noise, circling included, is then in the data as well.
+
     Args:
         policy: The deterministic policy.
         settings: The noise.
@@ -50,6 +58,8 @@ class NoisyPolicy:
         self, policy: DirectModule, settings: Exploration, action_spec: TensorSpec
     ) -> None:
         self.policy = policy
+        self.varied = settings.varied
+        self.share = 1.0
         self.noise = AdditiveGaussianModule(
             action_spec,
             sigma_init=settings.sigma,
@@ -59,16 +69,21 @@ class NoisyPolicy:
 
     @property
     def sigma(self) -> float:
-        """Present standard deviation of the noise."""
+        """Present standard deviation of the noise, of an episode that has all of it."""
         return float(self.noise.sigma)
+
+    def begin_episode(self) -> None:
+        """Draw the share of the noise that the episode has."""
+        if self.varied:
+            self.share = float(torch.rand(()))
 
     def act(self, observation: Tensor) -> Tensor:
         """The policy's action and noise."""
-        found = self.policy.outputs({"observation": observation})
+        chosen = self.policy.outputs({"observation": observation})["action"]
         with set_exploration_type(ExplorationType.RANDOM):
-            noisy = self.noise(TensorDict({"action": found["action"]}))
+            noisy = self.noise(TensorDict({"action": chosen})).get("action")
         self.noise.step(1)
-        action: Tensor = noisy.get("action")
+        action: Tensor = noisy if self.share == 1.0 else chosen.lerp(noisy, self.share)
         return action
 
     def state_dict(self) -> dict[str, Any]:
@@ -92,6 +107,9 @@ class RandomPolicy:
     def __init__(self, policy: StochasticActor, settings: Exploration) -> None:
         self.policy = policy
         self.sigma = settings.sigma_end
+
+    def begin_episode(self) -> None:
+        """Nothing changes."""
 
     def act(self, observation: Tensor) -> Tensor:
         """An action that the policy draws."""

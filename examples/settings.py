@@ -114,6 +114,8 @@ class Exploration:
     """Standard deviation at the end; it does not vanish, as narrow data makes DDPG forget."""
     annealing_steps: int = 5_000
     """Steps from one to the other."""
+    varied: bool = False
+    """Whether each episode has a share of the noise, drawn uniformly from [0, 1]."""
 
 
 @dataclass

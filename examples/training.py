@@ -154,6 +154,7 @@ class TrainingRun:
         seed = episode_seed(self.settings.seed, self.episode)
         self.env.set_seed(seed)
         torch.manual_seed(seed)
+        self.explorer.begin_episode()
         self._anneal()
         start, total_reward, steps = time.perf_counter(), 0.0, 0
         state = self.env.reset()
