@@ -15,7 +15,7 @@ from benchmarks.timing import MICROSECONDS, Call, Entry, entry, take_turns
 sys.path.insert(1, str(Path(__file__).parents[1] / "examples"))
 
 from assembly import make_curiosity, make_learner
-from methods import METHODS, Method
+from methods import ALIASES, METHODS, Method
 from replay_assembly import make_buffer, make_selection
 from settings import Learner
 
@@ -68,11 +68,7 @@ def measure(*, quick: bool) -> list[Entry]:
         An entry ``step_NAME`` for each method.
     """
     chosen = (BASELINE, "mpfa_per", "la3p") if quick else tuple(METHODS)
-    calls = {
-        name: make_step(replace(METHODS[name]))
-        for name in chosen
-        if METHODS[name].name == name  # One of them has two names.
-    }
+    calls = {name: make_step(replace(METHODS[name])) for name in chosen if name not in ALIASES}
     timings = take_turns(
         calls, rounds=3 if quick else 11, seconds=0.05 if quick else 0.3, threads=1
     )

@@ -27,7 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from methods import METHODS, Method
+from methods import ALIASES, METHODS, Method
 from replay_assembly import learned_signals, make_buffer, make_selection
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 
@@ -54,7 +54,7 @@ class Transitions:
     """Number of the kind in :data:`KINDS`, shape ``[N]``."""
 
 
-def make_transitions(policy: Any, *, count: int = COUNT, seed: int = 0) -> Transitions:
+def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
     """Make up the buffer, oldest transition first.
 
     Args:
@@ -106,7 +106,7 @@ def count_draws(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str
     """
     torch.manual_seed(0)
     policy = make_actor(OBSERVATION_SIZE, ACTION_SIZE, width=16, final_init=0.5)
-    transitions = make_transitions(policy)
+    transitions = make_transitions(policy, count=COUNT)
     method = replace(method, capacity=COUNT, batch_size=BATCH_SIZE, replay_cap=REPLAY_CAP)
     buffer = make_buffer(method, seed=seed)
     buffer.extend(transitions.data)
@@ -207,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.methods:
         if name not in METHODS:
             parser.error(f"unknown method {name!r}; there are: {', '.join(METHODS)}")
-    names = options.methods or [name for name, method in METHODS.items() if method.name == name]
+    names = options.methods or [name for name in METHODS if name not in ALIASES]
     torch.set_num_threads(1)
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)

@@ -123,3 +123,6 @@ METHODS: dict[str, Method] = {
     "uniform": Method("uniform", **_UNIFORM),
 }
 """Every method by name."""
+
+ALIASES = {"uniform": "ddpg"}
+"""Second names, which pages and figures leave out."""

@@ -16,6 +16,7 @@ import pytest
 import torch
 from torchrl.data import RandomSampler
 
+from methods import ALIASES
 from records import draw_learning_curve, load_policy
 from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
 from torchrl_mpfa import SignalSampler, save_atomically
@@ -150,8 +151,7 @@ def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: st
 
 
 def test_no_two_methods_have_the_same_settings() -> None:
-    # But for one that has two names.
-    methods = {name: m for name, m in GROUPS["method"].items() if name != "uniform"}
+    methods = {name: m for name, m in GROUPS["method"].items() if name not in ALIASES}
     bare = [replace(method, name="") for method in methods.values()]
     assert all(one != other for place, one in enumerate(bare) for other in bare[:place])
     assert all(method.name == name for name, method in methods.items())

@@ -1,0 +1,91 @@
+"""The figures of the methods: what is counted, and that every page has one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import draw_sampling
+from draw_sampling import KINDS, count_draws, main
+from methods import ALIASES, METHODS
+
+DOCS = Path(__file__).parents[2] / "docs" / "methods"
+NAMES = sorted(set(METHODS) - set(ALIASES))
+
+
+@pytest.fixture(autouse=True)
+def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(draw_sampling, "COUNT", 400)
+    monkeypatch.setattr(draw_sampling, "ROUNDS", 60)
+
+
+def means_by_kind(name: str, who: str = "critic") -> dict[str, float]:
+    transitions, found = count_draws(METHODS[name])
+    return {
+        kind: float(found[who][transitions.kind == number].mean())
+        for number, kind in enumerate(KINDS)
+    }
+
+
+def test_uniform_replay_favors_nothing() -> None:
+    transitions, found = count_draws(METHODS["ddpg"])
+    assert list(found) == ["critic"]
+    assert found["critic"].mean() == pytest.approx(1.0)
+    error = transitions.signals["td_error"].numpy()
+    high = error > np.median(error)
+    assert found["critic"][high].mean() == pytest.approx(1.0, abs=0.08)
+
+
+def test_per_favors_large_errors_and_mpfa_per_goals_as_well() -> None:
+    transitions, found = count_draws(METHODS["per"])
+    error = transitions.signals["td_error"].numpy()
+    high = error > np.median(error)
+    assert found["critic"][high].mean() > 1.3 * found["critic"][~high].mean()
+    per, mpfa = means_by_kind("per"), means_by_kind("mpfa_per")
+    assert mpfa["goal"] > 1.3 * per["goal"]
+    assert mpfa["approaching"] > mpfa["moving away"]
+
+
+def test_la3p_gives_the_actor_small_errors_and_the_critic_large_ones() -> None:
+    transitions, found = count_draws(METHODS["la3p"])
+    error = transitions.signals["td_error"].numpy()
+    large = error > np.quantile(error, 0.95)
+    assert found["critic"][large].mean() > 1.1 > 0.97 > found["actor"][large].mean()
+
+
+def test_combined_replay_has_the_newest_in_every_batch() -> None:
+    _, found = count_draws(METHODS["cer"])
+    assert found["critic"].argmax() == len(found["critic"]) - 1
+
+
+def test_the_capped_replay_lets_go_of_what_it_drew_most() -> None:
+    capped, per = means_by_kind("mw"), means_by_kind("td_reward")
+    assert capped["goal"] < per["goal"]
+
+
+def test_a_figure_is_drawn_and_an_unknown_method_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["per", "--output", str(tmp_path)]) == 0
+    assert (tmp_path / "per.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(SystemExit):
+        main(["prr"])
+    assert "unknown method 'prr'; there are: mpfa_per" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_method_has_a_page_with_its_figure_its_command_and_its_source(name: str) -> None:
+    page = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    assert f"(images/{name}.png)" in page
+    assert (DOCS / "images" / f"{name}.png").exists()
+    assert f"train.py method={name} " in page
+    for part in ("## Formula", "## Source, and what is verified", "## Settings"):
+        assert part in page
+    assert f"[`{name}`]({name}.md)" in (DOCS / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["klper", "averaged_ddpg", "hvper", "mw"])
+def test_a_reconstruction_is_called_one(name: str) -> None:
+    assert "reconstruction" in (DOCS / f"{name}.md").read_text(encoding="utf-8").lower()
