@@ -1,9 +1,11 @@
 """Evaluate a trained policy on fixed start and goal pairs of a map.
 
     python examples/evaluate.py runs/demo --world A --episodes 100
+    python examples/evaluate.py examples/policies/td3-mpfa_per.pt    one that comes with the project
 
-Writes beside the policy, or to --output: evaluation.json (the estimates), evaluation.csv (a row an
-episode), trajectories.png (the map with every path) and episode.gif (one episode from above).
+Writes to the folder of the run, of another file to runs/evaluation-NAME, or to --output:
+evaluation.json (the estimates), evaluation.csv (a row an episode), trajectories.png (the map with
+every path) and episode.gif (one episode from above).
 """
 
 from __future__ import annotations
@@ -44,10 +46,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--world", default="test", help="map or world file (default: test)")
     parser.add_argument("--episodes", type=int, default=200, help="number of pairs (default: 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
-    parser.add_argument("--output", type=Path, help="folder (default: beside the policy)")
+    parser.add_argument("--output", type=Path, help="folder (default: that of the run)")
     parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
     parser.add_argument("--no-gif", action="store_true", help="write no animation")
     return parser.parse_args(arguments)
+
+
+def output_folder(policy: Path) -> Path:
+    """Where results go unless the command line says: to the run that the policy is of."""
+    if policy.is_dir():
+        return policy
+    return (
+        policy.parent if policy.name == "policy.pt" else Path("runs") / f"evaluation-{policy.stem}"
+    )
 
 
 def print_table(summary: dict[str, Interval]) -> None:
@@ -98,9 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
     options = parse(arguments)
     torch.set_num_threads(1)  # One observation at a time: a second thread only costs.
     policy, state = load_policy(options.policy)
-    folder = options.output or (
-        options.policy if options.policy.is_dir() else options.policy.parent
-    )
+    folder = options.output or output_folder(options.policy)
     folder.mkdir(parents=True, exist_ok=True)
     settings = {**state["environment"]}
     settings["physics"] = options.physics or settings["physics"]

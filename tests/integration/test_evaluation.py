@@ -13,9 +13,17 @@ from PIL import Image
 
 import evaluate
 from assembly import make_policy
-from evaluation import EpisodeResult, bootstrap, run_episode, run_episodes, summarize, wilson
+from evaluation import (
+    EpisodeResult,
+    bootstrap,
+    greedy,
+    run_episode,
+    run_episodes,
+    summarize,
+    wilson,
+)
 from mpfa_envs import NavigationEnv, evaluation_pairs
-from records import save_policy
+from records import load_policy, save_policy
 from settings import TrainSettings
 
 
@@ -112,3 +120,27 @@ def test_the_script_writes_its_table_its_rows_and_its_pictures(
     printed = capsys.readouterr().out
     assert "success" in printed
     assert "95 % interval" in printed
+
+
+POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.pt"))
+
+
+def test_there_is_a_policy_to_start_from() -> None:
+    assert POLICIES
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
+def test_a_policy_of_the_project_drives_around_obstacles(path: Path) -> None:
+    assert path.stat().st_size < 3_000_000
+    policy, state = load_policy(path)
+    assert state["trained"]["method"] == "mpfa_per"
+    env = NavigationEnv(world="D", physics="kinematic", collision_distance="contact")
+    results, _ = run_episodes(env, greedy(policy), evaluation_pairs("D", 10, 4711), progress=False)
+    env.close()
+    assert sum(found.success for found in results) >= 9
+
+
+def test_results_go_to_the_run_that_a_policy_is_of(tmp_path: Path) -> None:
+    assert evaluate.output_folder(tmp_path) == tmp_path
+    assert evaluate.output_folder(tmp_path / "policy.pt") == tmp_path
+    assert evaluate.output_folder(Path("some/td3.pt")) == Path("runs/evaluation-td3")
