@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from itertools import accumulate
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -132,6 +133,11 @@ class TrainingRun:
             episode -= stage.episodes
         return self.stages[-1]
 
+    def _begins_stage(self) -> bool:
+        """Whether the next episode is the first one on a map, but for the first map."""
+        lengths = [stage.episodes for stage in self.stages]
+        return self.episode in list(accumulate(lengths))[:-1]
+
     def _make_env(self, episode: int) -> EnvBase:
         settings = self.settings.environment
         self.world = self._stage(episode).world
@@ -149,11 +155,11 @@ class TrainingRun:
         if self._stage(self.episode).world != self.world:
             self.env.close()
             self.env = self._make_env(self.episode)
-            if not self.settings.curriculum.carry:
-                self._build()
         seed = episode_seed(self.settings.seed, self.episode)
         self.env.set_seed(seed)
         torch.manual_seed(seed)
+        if not self.settings.curriculum.carry and self._begins_stage():
+            self._build()
         self.explorer.begin_episode()
         self._anneal()
         start, total_reward, steps = time.perf_counter(), 0.0, 0

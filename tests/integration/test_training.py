@@ -180,6 +180,17 @@ def test_a_curriculum_that_does_not_carry_starts_anew_on_each_map(tmp_path: Path
     assert len(run.buffer) == min(of_second_map, settings.method.capacity)
     assert run.buffer.write_count == of_second_map
 
+    part = TrainingRun(settings, tmp_path / "part")
+    (tmp_path / "part").mkdir()
+    # Stopped between the maps.
+    part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 2))
+    part.close()
+    resumed = TrainingRun(settings, tmp_path / "part")
+    resumed.load(read_checkpoint(tmp_path / "part"))
+    assert resumed.train()
+    resumed.close()
+    assert rows(resumed) == rows(run)
+
 
 def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
