@@ -1,0 +1,27 @@
+"""The results that the documentation reports follow from the rows that are kept beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import report
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def test_every_table_of_the_results_is_made_of_the_rows_that_are_kept(tmp_path: Path) -> None:
+    report.main([str(DOCS / "results"), "--output", str(tmp_path)])
+    page = (DOCS / "results.md").read_text(encoding="utf-8")
+    tables = (tmp_path / "tables.md").read_text(encoding="utf-8").strip().splitlines()
+    assert len([line for line in tables if line.startswith("|")]) > 20
+    assert [line for line in tables if line and line not in page] == []
+
+
+def test_every_run_of_the_study_was_tested_on_the_same_two_hundred_pairs() -> None:
+    methods = report.by_method(report.read_rows(DOCS / "results" / "episodes.csv"))
+    assert len(methods) >= 4
+    runs = [rows for seeds in methods.values() for rows in seeds.values()]
+    assert all(len(seeds) == 3 for seeds in methods.values())
+    assert all(len(rows) == 200 for rows in runs)
+    pairs = [[row["shortest_path"] for row in rows] for rows in runs]
+    assert all(each == pairs[0] for each in pairs)
