@@ -150,6 +150,15 @@ def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: st
         assert run.buffer.sampler.beta == settings.method.beta_end
 
 
+@pytest.mark.parametrize("learner", ["sac", "td3"])
+@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
+def test_every_method_works_with_every_learner(tmp_path: Path, method: str, learner: str) -> None:
+    run = train(tmp_path, tiny(method, [Stage("A", 3)], learner))
+    weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
+    assert run.step > run.settings.method.batch_size
+    assert all(value.isfinite().all() for value in weights)
+
+
 def test_no_two_methods_have_the_same_settings() -> None:
     methods = {name: m for name, m in GROUPS["method"].items() if name not in ALIASES}
     bare = [replace(method, name="") for method in methods.values()]
