@@ -129,6 +129,32 @@ class ActorCriticLearner:
         self.optimizer.add_param_group({"params": parameters, "lr": lr})
         self._rates = (*self._rates, lr)
 
+    def update(
+        self,
+        batch: TensorDictBase,
+        *,
+        actor_batch: TensorDictBase | None = None,
+        loss_function: str | None = None,
+        new_step: bool = True,
+    ) -> dict[str, torch.Tensor]:
+        """One step of all networks and of the target networks.
+
+        Args:
+            batch: Transitions, batch size ``[B]``; the loss writes their signals.
+            actor_batch: What the actor learns from, if that is another batch.
+            loss_function: Distance of the critic's loss, if not the loss's own.
+            new_step: Whether a new training step begins; false for its further batches, if it has
+                several, which a delay of the actor does not count.
+
+        Returns:
+            Detached values for the log.
+        """
+        if actor_batch is None:
+            actor_batch = batch
+        log = self._descend(batch, actor_batch=actor_batch, loss_function=loss_function)
+        self.targets.step()
+        return log
+
     def _descend(
         self,
         batch: TensorDictBase,

@@ -65,31 +65,6 @@ class SACLearner(ActorCriticLearner):
         if not loss.fixed_alpha:
             self._add_parameters([loss.log_alpha], lr=alpha_lr)
 
-    def update(
-        self,
-        batch: TensorDictBase,
-        *,
-        actor_batch: TensorDictBase | None = None,
-        loss_function: str | None = None,
-        new_step: bool = True,
-    ) -> dict[str, torch.Tensor]:
-        """One step of all networks, of the temperature and of the target critics.
-
-        Args:
-            batch: Transitions, batch size ``[B]``; the loss writes their signals.
-            actor_batch: What actor and temperature learn from, if that is another batch.
-            loss_function: Distance of the critics' loss, if not the loss's own.
-            new_step: Whether a new training step begins; nothing here depends on it.
-
-        Returns:
-            Detached values for the log.
-        """
-        if actor_batch is None:
-            actor_batch = batch
-        log = self._descend(batch, actor_batch=actor_batch, loss_function=loss_function)
-        self.targets.step()
-        return log
-
     def _losses(
         self,
         batch: TensorDictBase,
