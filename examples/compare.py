@@ -27,10 +27,11 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from evaluation import EpisodeResult, greedy, make_evaluation_env, run_episodes
+from environments import make_evaluation_env
+from evaluation import EpisodeResult, greedy, run_episodes
 from mpfa_envs import evaluation_pairs
 from records import load_policy, write_rows
-from settings import GROUPS
+from settings import GROUPS, Environment
 
 HERE = Path(__file__).parent
 DONE = "test.csv"
@@ -157,7 +158,7 @@ class Running:
 def evaluate(job: Job, *, world: str, episodes: int) -> None:
     """Drive the last policy of a run on the fixed pairs of a map, and keep every episode."""
     policy, state = load_policy(job.path)
-    env = make_evaluation_env(world, state["environment"])
+    env = make_evaluation_env(world, Environment(**state["environment"]))
     tasks = evaluation_pairs(world, episodes, 0, robot=env.robot)
     results, _ = run_episodes(env, greedy(policy), tasks, progress=False)
     env.close()

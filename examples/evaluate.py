@@ -21,17 +21,18 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from environments import make_evaluation_env
 from evaluation import (
     EpisodeResult,
     Interval,
     greedy,
-    make_evaluation_env,
     run_episode,
     run_episodes,
     summarize,
 )
 from mpfa_envs import NavigationEnv, Task, draw_trajectories, evaluation_pairs
 from records import load_policy, write_rows, write_text_atomically
+from settings import Environment
 
 _UNITS = {"time_s": "s", "path_length": "m", "min_clearance": "m"}
 _GIF_FRAMES = 120
@@ -111,10 +112,10 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
     policy, state = load_policy(options.policy)
     folder = options.output or output_folder(options.policy)
     folder.mkdir(parents=True, exist_ok=True)
-    settings = {**state["environment"]}
-    settings["physics"] = options.physics or settings["physics"]
+    settings = Environment(**state["environment"])
+    settings.physics = options.physics or settings.physics
     env = make_evaluation_env(options.world, settings, render_mode="rgb_array")
-    tasks = evaluation_pairs(options.world, options.episodes, options.seed, robot=settings["robot"])
+    tasks = evaluation_pairs(options.world, options.episodes, options.seed, robot=settings.robot)
     act = greedy(policy)
     results, trajectories = run_episodes(env, act, tasks)
     summary = summarize(results)
@@ -127,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
         "intervals": {name: [_plain(i.low), _plain(i.high)] for name, i in summary.items()},
         "world": str(options.world),
         "seed": options.seed,
-        "physics": settings["physics"],
+        "physics": settings.physics,
         "trained": state["trained"],
     }
     write_text_atomically(json.dumps(document, indent=2) + "\n", folder / "evaluation.json")

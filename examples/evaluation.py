@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,30 +45,6 @@ class Interval:
     value: float
     low: float
     high: float
-
-
-def make_evaluation_env(
-    world: str, settings: dict[str, Any], *, render_mode: Literal["rgb_array"] | None = None
-) -> NavigationEnv:
-    """The environment that a policy was trained in, with contact as the only collision.
-
-    Args:
-        world: Map or world file.
-        settings: The environment's settings in training.
-        render_mode: As in :class:`~mpfa_envs.NavigationEnv`.
-
-    Returns:
-        The environment.
-    """
-    return NavigationEnv(
-        world=world,
-        robot=settings["robot"],
-        physics=settings["physics"],
-        max_steps=settings["max_steps"],
-        action_repeat=settings["action_repeat"],
-        collision_distance="contact",
-        render_mode=render_mode,
-    )
 
 
 def greedy(policy: TensorDictModule) -> Action:

@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule
 from settings import Learner, TrainSettings
 from torchrl_mpfa import load_safely, save_atomically
 
-POLICY_FORMAT = 2
+POLICY_FORMAT = 3
 
 
 @dataclass

@@ -18,18 +18,18 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from assembly import make_curiosity, make_learner
-from evaluation import greedy, make_evaluation_env, run_episodes
+from environments import INFO, make_evaluation_env, make_training_env
+from evaluation import greedy, run_episodes
 from exploration import make_explorer
-from mpfa_envs import evaluation_pairs, make_navigation_env
+from mpfa_envs import RandomMirror, evaluation_pairs
 from records import EpisodeRecord, ProgressRecord, save_policy, write_records
 from replay_assembly import make_buffer, make_selection
 from settings import Stage, TrainSettings
 from torchrl_mpfa import Draw, SignalSampler, load_safely, save_atomically
 from tracking import Tracker
 
-FORMAT = 2
+FORMAT = 3
 CHECKPOINT = "checkpoint.pt"
-_INFO = ("success", "collision", "time_out", "path_length", "shortest_path")
 _TRANSITION = (
     "observation",
     "action",
@@ -74,6 +74,8 @@ class TrainingRun:
         settings, spec = self.settings, self.env.action_spec
         sizes = self.env.observation_spec["observation"].shape[-1], spec.shape[-1]
         self.buffer = make_buffer(settings.method, seed=settings.seed)
+        if settings.environment.mirror:
+            self.buffer.append_transform(RandomMirror())
         self.learner = make_learner(
             settings.learner, settings.method, *sizes, device=settings.device
         )
@@ -139,17 +141,8 @@ class TrainingRun:
         return self.episode in list(accumulate(lengths))[:-1]
 
     def _make_env(self, episode: int) -> EnvBase:
-        settings = self.settings.environment
         self.world = self._stage(episode).world
-        return make_navigation_env(
-            self.world,
-            info_keys=_INFO,
-            robot=settings.robot,
-            physics=settings.physics,
-            max_steps=settings.max_steps,
-            action_repeat=settings.action_repeat,
-            progress_scale=settings.progress_scale,
-        )
+        return make_training_env(self.world, self.settings.environment)
 
     def _run_episode(self) -> EpisodeRecord:
         if self._stage(self.episode).world != self.world:
@@ -177,7 +170,7 @@ class TrainingRun:
                 self._update()
             last, state = after, step_mdp(state)
         self.learner.end_episode()
-        info = {name: last["info", name].item() for name in _INFO}
+        info = {name: last["info", name].item() for name in INFO}
         return EpisodeRecord(
             episode=self.episode,
             world=self.world,
@@ -242,7 +235,7 @@ class TrainingRun:
         if settings.every <= 0 or self.step // settings.every == since // settings.every:
             return
         start = time.perf_counter()
-        env = make_evaluation_env(settings.world, asdict(self.settings.environment))
+        env = make_evaluation_env(settings.world, self.settings.environment)
         tasks = evaluation_pairs(settings.world, settings.episodes, _PROGRESS_SEED, robot=env.robot)
         results, _ = run_episodes(env, greedy(self.learner.policy), tasks, progress=False)
         env.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from mpfa_envs.world_file import WorldFileError, load_world, save_world
 from mpfa_envs.worlds import Box, Cylinder, World
 
 if TYPE_CHECKING:
+    from mpfa_envs.mirror import Mirror, RandomMirror
     from mpfa_envs.tensordict import NavigationTorchEnv, make_navigation_env
 
 ENV_IDS = tuple(f"mpfa/Navigation-{name}-v0" for name in WORLDS)
@@ -37,9 +39,11 @@ __all__ = [
     "Box",
     "Cylinder",
     "Lidar",
+    "Mirror",
     "NavigationEnv",
     "NavigationTorchEnv",
     "PathPlanner",
+    "RandomMirror",
     "RewardTerms",
     "RobotModel",
     "StepOutcome",
@@ -64,10 +68,16 @@ for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
         )
 
 
-def __getattr__(name: str) -> Any:
-    """Import the TorchRL part when it is first asked for: the rest needs no torch."""
-    if name in ("NavigationTorchEnv", "make_navigation_env"):
-        from mpfa_envs import tensordict
+_TORCH_PARTS = {
+    "Mirror": "mirror",
+    "NavigationTorchEnv": "tensordict",
+    "RandomMirror": "mirror",
+    "make_navigation_env": "tensordict",
+}
 
-        return getattr(tensordict, name)
+
+def __getattr__(name: str) -> Any:
+    """Import the TorchRL parts when they are first asked for: the rest needs no torch."""
+    if name in _TORCH_PARTS:
+        return getattr(import_module(f"mpfa_envs.{_TORCH_PARTS[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

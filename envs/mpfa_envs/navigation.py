@@ -14,7 +14,12 @@ from gymnasium.spaces import Box as BoxSpace
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.lidar import Lidar, Reduction
 from mpfa_envs.maps import resolve_world
-from mpfa_envs.observation import observation_bounds, observation_slices, observe
+from mpfa_envs.observation import (
+    CLOSENESS_DISTANCE,
+    observation_bounds,
+    observation_slices,
+    observe,
+)
 from mpfa_envs.path import planner_for
 from mpfa_envs.reward import RewardFunction, RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
@@ -37,8 +42,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     ====== ================ ==================================================== ==========
     index  name             meaning                                              range
     ====== ================ ==================================================== ==========
-    0-17   lidar            closeness ``clip(0.35 / range, 0, 1)`` of 18 sectors [0, 1]
-                            of 10 degrees over the front, left to right
+    0-17   lidar            closeness ``min(closeness_distance / range, 1)`` of  [0, 1]
+                            18 sectors of 10 degrees, left to right over the front
     18-19  goal_direction   cosine and sine of the goal's direction in the       [-1, 1]
                             robot's frame: an angle would jump at ±π
     20     goal_closeness   ``clip(0.3 / d, 0, 1)`` for the goal's distance d    [0, 1]
@@ -93,7 +98,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         max_range: Longest range of the lidar [m]. The default is a side of the room; farther
             away the closeness is below 0.035 and changes by less than 0.01.
         lidar_noise: Standard deviation of the noise of a ray [m].
+        closeness_distance: A range of this or less has closeness one [m].
         min_goal_distance: Least distance between a drawn start and goal [m].
+        detour_chance: Chance that a drawn task must have an obstacle in its way; 0: as it comes.
         render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
 
     Raises:
@@ -135,7 +142,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         reduction: Reduction = "min",
         max_range: float = 10.0,
         lidar_noise: float = 0.0,
+        closeness_distance: float = CLOSENESS_DISTANCE,
         min_goal_distance: float = 2.0,
+        detour_chance: float = 0.0,
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         self.world = resolve_world(world)
@@ -145,7 +154,12 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         for name, count in (("max_steps", max_steps), ("action_repeat", action_repeat)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} must be a positive integer, got {count!r}")
-        for name, value in (("time_step", time_step), ("goal_radius", goal_radius)):
+        lengths = {
+            "time_step": time_step,
+            "goal_radius": goal_radius,
+            "closeness_distance": closeness_distance,
+        }
+        for name, value in lengths.items():
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive, got {value}")
         if not min_goal_distance > goal_radius:
@@ -153,6 +167,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
                 f"min_goal_distance must be above goal_radius = {goal_radius}, "
                 f"got {min_goal_distance}"
             )
+        if not 0.0 <= detour_chance <= 1.0:
+            raise ValueError(f"detour_chance must be in [0, 1], got {detour_chance}")
         scales = {
             "progress_scale": progress_scale,
             "goal_reward": goal_reward,
@@ -179,7 +195,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self.time_step = float(time_step)
         self.action_repeat = action_repeat
         self.goal_radius = float(goal_radius)
+        self.closeness_distance = float(closeness_distance)
         self.min_goal_distance = float(min_goal_distance)
+        self.detour_chance = float(detour_chance)
         self.render_mode = render_mode
         self._reward = reward
         self._reward_scales = {name: float(value) for name, value in scales.items()}
@@ -187,8 +205,6 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         low, high = observation_bounds(sectors, self.world.diagonal)
         self.observation_space = BoxSpace(low, high, dtype=np.float32)
         self.action_space = BoxSpace(-1.0, 1.0, (2,), np.float32)
-        slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
-        self._middle_speed, self._speed_span = (fast + slow) / 2, (fast - slow) / 2
         self._task: Task | None = None
         self._running = False
         self._trail: list[tuple[float, float]] = []
@@ -232,6 +248,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
                 self.np_random,
                 collision_distance=self.collision_distance,
                 min_goal_distance=self.min_goal_distance,
+                detour_chance=self.detour_chance,
             )
         self._task = task
         self._goal = task.goal
@@ -264,7 +281,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         """
         if not self._running:
             raise ResetNeeded("no episode is running: call reset() before step()")
-        left, right = self._wheel_speeds(action)
+        left, right = self.robot.wheel_speeds(action)
         success, collision, truncated, terms = self._advance(left, right)
         for _ in range(self.action_repeat - 1):
             if not self._running:
@@ -336,24 +353,13 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self._running = False
         self._drive.close()
 
-    def _wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
-        """Speeds of the left and the right wheel [m/s]."""
-        values = np.asarray(action, dtype=np.float64)
-        if values.shape != (2,):
-            raise ValueError(f"action must have shape (2,), got {values.shape}")
-        left, right = values.tolist()
-        if math.isnan(left) or math.isnan(right):
-            raise ValueError(f"action must not hold NaN, got {action!r}")
-        left, right = min(max(left, -1.0), 1.0), min(max(right, -1.0), 1.0)
-        middle, span = self._middle_speed, self._speed_span
-        return middle + span * left, middle + span * right
-
     def _observe(self) -> NDArray[np.float32]:
         """Sense the world and build the observation."""
         motion = self._motion
         x, y, heading = motion[:3]
         ranges = self.lidar.scan(x, y, heading, rng=self.np_random if self.lidar.noise else None)
-        return observe(ranges, motion, self._goal, self._distance, self.robot)
+        near = self.closeness_distance
+        return observe(ranges, motion, self._goal, self._distance, self.robot, near)
 
     def _info(
         self, success: bool, collision: bool, time_out: bool, terms: RewardTerms

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mpfa_envs.robot import RobotModel
 
 CLOSENESS_DISTANCE: Final = 0.35
-"""A range of this or less has closeness one [m]."""
+"""By default a range of this or less has closeness one [m]."""
 GOAL_CLOSENESS_DISTANCE: Final = 0.3
 """A goal at this distance or nearer has closeness one [m]."""
 DISTANCE_SCALE: Final = 10.0
@@ -101,6 +101,7 @@ def observe(
     goal: tuple[float, float],
     distance: float,
     robot: RobotModel,
+    closeness_distance: float = CLOSENESS_DISTANCE,
 ) -> NDArray[np.float32]:
     """Build an observation.
 
@@ -110,6 +111,7 @@ def observe(
         goal: Where it should go (x, y) [m].
         distance: Distance between the two [m].
         robot: Whose greatest speeds scale the speeds.
+        closeness_distance: A range of this or less has closeness one [m].
 
     Returns:
         The observation, shape ``[sectors + 6]``; :func:`observation_slices` names its parts.
@@ -117,7 +119,8 @@ def observe(
     x, y, heading, linear_speed, angular_speed = motion
     sectors = ranges.size
     observation = np.empty(sectors + 6, dtype=np.float32)
-    np.divide(CLOSENESS_DISTANCE, np.maximum(ranges, CLOSENESS_DISTANCE), out=observation[:sectors])
+    near = closeness_distance
+    np.divide(near, np.maximum(ranges, near), out=observation[:sectors])
     # A robot on the goal sees it ahead.
     bearing = math.atan2(goal[1] - y, goal[0] - x) - heading if distance else 0.0
     bound = SPEED_BOUND

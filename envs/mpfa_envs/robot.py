@@ -7,8 +7,12 @@ from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final, Literal
 
+import numpy as np
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +91,30 @@ class RobotModel:
         The TurtleBot2's 0.35 m are its radius and 0.17 m; the other robots keep the 0.17 m.
         """
         return round(self.radius + 0.17, 9)
+
+    def wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
+        """Read an action.
+
+        Args:
+            action: Left and right wheel, shape ``[2]``; -1 is the slowest, 1 the fastest speed,
+                and what is beyond is clipped.
+
+        Returns:
+            Speeds of the left and the right wheel [m/s].
+
+        Raises:
+            ValueError: If the action is not two numbers.
+        """
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != (2,):
+            raise ValueError(f"action must have shape (2,), got {values.shape}")
+        left, right = values.tolist()
+        if math.isnan(left) or math.isnan(right):
+            raise ValueError(f"action must not hold NaN, got {action!r}")
+        left, right = min(max(left, -1.0), 1.0), min(max(right, -1.0), 1.0)
+        slow, fast = self.min_wheel_speed, self.max_wheel_speed
+        middle, span = (fast + slow) / 2, (fast - slow) / 2
+        return middle + span * left, middle + span * right
 
     def urdf(self) -> str:
         """Write the robot as URDF text made of primitives.

@@ -42,6 +42,7 @@ def sample_task(
     *,
     collision_distance: float,
     min_goal_distance: float = 2.0,
+    detour_chance: float = 0.0,
 ) -> Task:
     """Draw a start and a goal uniformly over the free space of their regions.
 
@@ -52,6 +53,8 @@ def sample_task(
         rng: Source of the draw.
         collision_distance: Distance of the center from an obstacle that is a collision [m].
         min_goal_distance: Least distance between start and goal [m].
+        detour_chance: Chance that the straight line between them must come too near to an obstacle,
+            in a world that has any; 0: as it comes.
 
     Returns:
         The task; its heading is uniform.
@@ -69,14 +72,22 @@ def sample_task(
     planner = planner_for(world, collision_distance)
     start_clearance = collision_distance + START_SLACK
     goal_clearance = max(GOAL_CLEARANCE, collision_distance)
+    obstacles = bool(world.boxes or world.cylinders)
+    detour = detour_chance > 0.0 and obstacles and rng.random() < detour_chance
+    straight: Task | None = None
     for _ in range(_STARTS):
         start = _draw_point(world, rng, world.start_regions, start_clearance, "start")
         for _ in range(_GOALS_PER_START):
             goal = _draw_point(world, rng, world.goal_regions, goal_clearance, "goal")
             far = math.dist(start, goal) >= min_goal_distance
-            if far and planner.is_reachable(start, goal):
-                heading = float(rng.uniform(-math.pi, math.pi))
-                return Task((*start, heading), goal)
+            if not (far and planner.is_reachable(start, goal)):
+                continue
+            task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
+            if not (detour and planner.is_straight(start, goal)):
+                return task
+            straight = straight or task
+    if straight is not None:  # Nothing in this world stands in anyone's way.
+        return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
         f"{min_goal_distance} m apart with a path between them"

@@ -295,6 +295,9 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
         ("time_step", 0.0, "time_step must be positive, got 0.0"),
         ("goal_radius", math.nan, "goal_radius must be positive, got nan"),
         ("min_goal_distance", 0.3, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
+        ("closeness_distance", 0.0, "closeness_distance must be positive, got 0.0"),
+        ("detour_chance", 1.1, r"detour_chance must be in \[0, 1\], got 1.1"),
+        ("detour_chance", math.nan, r"detour_chance must be in \[0, 1\], got nan"),
         ("progress_scale", math.inf, "progress_scale must be finite, got inf"),
         ("collision_distance", 0.1, "collision_distance must be .*0.18, got 0.1"),
         ("collision_distance", "touch", "collision_distance must be .*got 'touch'"),
@@ -309,6 +312,17 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
 def test_a_bad_argument_is_named_with_its_value(argument: str, value: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         NavigationEnv(**{"physics": "kinematic", argument: value})
+
+
+def test_closeness_is_one_at_its_distance_and_falls_beyond() -> None:
+    world = World(name="post", boxes=(Box(1.0, -0.5, 2.0, 0.5),))
+    task = {"start": (0.6, 0.0, 0.0), "goal": (3.0, 0.0)}
+    ahead = []
+    for distance in (0.25, 0.4, 0.8):
+        env = NavigationEnv(world=world, physics="kinematic", closeness_distance=distance)
+        ahead.append(float(env.reset(options=task)[0][9]))
+    # The sector's nearest ray is a little off the axis.
+    assert ahead == pytest.approx([0.25 / 0.4, 1.0, 1.0], abs=0.01)
 
 
 def test_lidar_noise_is_drawn_from_the_seed() -> None:

@@ -73,6 +73,25 @@ def test_starts_and_goals_keep_their_margins(name: str) -> None:
     assert min(headings) < -2.5 and max(headings) > 2.5
 
 
+@pytest.mark.parametrize("name", ["B", "C", "D"])
+def test_a_detour_has_something_in_its_way(name: str) -> None:
+    world, rng = WORLDS[name], np.random.default_rng(0)
+    planner = planner_for(world, 0.25)
+    for chance, low, high in ((1.0, 1.0, 1.0), (0.5, 0.6, 0.95), (0.0, 0.3, 0.8)):
+        drawn = [
+            sample_task(world, rng, collision_distance=0.25, detour_chance=chance)
+            for _ in range(80)
+        ]
+        blocked = [not planner.is_straight(start[:2], goal) for start, goal in drawn]
+        assert low <= sum(blocked) / len(blocked) <= high
+
+
+def test_a_world_without_detours_has_tasks_all_the_same() -> None:
+    corner = World(name="corner", boxes=(Box(4.9, 4.9, 5.0, 5.0),))
+    for world in (WORLDS["A"], corner):
+        sample_task(world, np.random.default_rng(0), collision_distance=0.25, detour_chance=1.0)
+
+
 def test_evaluation_pairs_are_reproducible_and_a_longer_list_starts_the_same() -> None:
     assert evaluation_pairs("test", 5, seed=1) == evaluation_pairs("test", 8, seed=1)[:5]
     assert evaluation_pairs("test", 5, seed=1) != evaluation_pairs("test", 5, seed=2)

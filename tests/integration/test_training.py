@@ -221,7 +221,7 @@ def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str
 
 def test_a_policy_file_of_something_else_is_refused(tmp_path: Path) -> None:
     save_atomically({"format": 99}, tmp_path / "policy.pt")
-    with pytest.raises(ValueError, match=r"no policy of format 2"):
+    with pytest.raises(ValueError, match=r"no policy of format 3"):
         load_policy(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"train\.py writes policy\.pt"):
         load_policy(tmp_path / "elsewhere")

@@ -1,0 +1,115 @@
+"""Mirror images of transitions: for a symmetric robot left and right are alike."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import Transform
+
+from mpfa_envs.observation import observation_slices
+
+
+class Mirror(nn.Module):
+    """Swaps left and right, as if the world were seen in a mirror.
+
+    Args:
+        sectors: Number of sectors of the lidar.
+
+    Examples:
+        >>> mirror = Mirror()
+        >>> mirror.action(torch.tensor([1.0, -0.5]))
+        tensor([-0.5000,  1.0000])
+    """
+
+    order: Tensor
+    sign: Tensor
+
+    def __init__(self, *, sectors: int = 18) -> None:
+        super().__init__()
+        parts = observation_slices(sectors)
+        order = torch.arange(sectors + 6)
+        order[parts["lidar"]] = order[parts["lidar"]].flip(0)
+        sign = torch.ones(sectors + 6)
+        sign[parts["goal_direction"].start + 1] = -1.0  # The sine, positive to the left.
+        sign[parts["angular_speed"]] = -1.0
+        self.register_buffer("order", order, persistent=False)
+        self.register_buffer("sign", sign, persistent=False)
+
+    def observation(self, observation: Tensor) -> Tensor:
+        """What the robot would see in the mirrored world.
+
+        Args:
+            observation: Observations, shape ``[..., sectors + 6]``.
+
+        Returns:
+            Their mirror images, of the same shape.
+        """
+        return observation[..., self.order] * self.sign.to(observation.device)
+
+    def action(self, action: Tensor) -> Tensor:
+        """What drives the mirrored path: the wheels change places.
+
+        Args:
+            action: Actions, shape ``[..., 2]``.
+
+        Returns:
+            Their mirror images, of the same shape.
+        """
+        return action.flip(-1)
+
+
+class RandomMirror(Transform):
+    """Shows a learner each sampled transition as it was, or in the mirror.
+
+    The mirror image of a transition is as true as the transition itself: reward, end and with them
+    every signal of its priority are the same. A learner that sees both has twice the maps to learn
+    from, and no favorite side. Append it to a replay buffer; what is stored stays as it was.
+
+    Args:
+        chance: Share of the transitions that are mirrored, in [0, 1].
+        sectors: Number of sectors of the lidar.
+        generator: Source of the draws; None: PyTorch's own.
+
+    Raises:
+        ValueError: If chance is not in [0, 1].
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from mpfa_envs import RandomMirror, make_navigation_env
+        >>> env = make_navigation_env("A", physics="kinematic", seed=0)
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=32)
+        >>> buffer = buffer.append_transform(RandomMirror())
+        >>> index = buffer.extend(env.rollout(10))
+        >>> buffer.sample()["observation"].shape
+        torch.Size([32, 24])
+        >>> env.close()
+    """
+
+    def __init__(
+        self, *, chance: float = 0.5, sectors: int = 18, generator: torch.Generator | None = None
+    ) -> None:
+        if not 0.0 <= chance <= 1.0:
+            raise ValueError(f"chance must be in [0, 1], got {chance!r}")
+        super().__init__()
+        self.chance = float(chance)
+        self.mirror = Mirror(sectors=sectors)
+        self.generator = generator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Mirror some of a batch.
+
+        Args:
+            tensordict: Transitions, batch size ``[B]``, changed in place.
+
+        Returns:
+            The same.
+        """
+        drawn = torch.rand(tensordict.batch_size, generator=self.generator)
+        chosen = (drawn < self.chance).unsqueeze(-1).to(tensordict.get("action").device)
+        for key in ("observation", ("next", "observation")):
+            seen = tensordict.get(key)
+            tensordict.set(key, torch.where(chosen, self.mirror.observation(seen), seen))
+        done = tensordict.get("action")
+        return tensordict.set("action", torch.where(chosen, self.mirror.action(done), done))

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from mpfa_envs import WORLDS, Box, Mirror, NavigationEnv, RandomMirror, World, make_navigation_env
+
+
+def mirrored(world: World) -> World:
+    boxes = tuple(Box(box.x_min, -box.y_max, box.x_max, -box.y_min) for box in world.boxes)
+    return World(name="mirrored", boxes=boxes)
+
+
+def test_the_mirror_shows_what_a_robot_in_the_mirrored_world_sees(physics: str) -> None:
+    world, mirror = WORLDS["D"], Mirror()
+    env = NavigationEnv(world=world, physics=physics)
+    other = NavigationEnv(world=mirrored(world), physics=physics)
+    # A physics engine solves its contacts one after the other, and so not quite alike.
+    tolerance = 1e-5 if physics == "kinematic" else 0.02
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        seen, info = env.reset(seed=int(rng.integers(100)))
+        (x, y, heading), (goal_x, goal_y) = env.task
+        task = {"start": (x, -y, -heading), "goal": (goal_x, -goal_y)}
+        image, other_info = other.reset(options=task)
+        done = False
+        for _ in range(15):
+            expected = mirror.observation(torch.from_numpy(seen)).numpy()
+            # One ray may just pass a corner in one world that it hits in the other.
+            assert np.sort(np.abs(image - expected))[-2] < tolerance
+            assert other_info["distance"] == pytest.approx(info["distance"], abs=tolerance)
+            if done:
+                break
+            action = rng.uniform(-1.0, 1.0, 2).astype(np.float32)
+            seen, reward, done, _, info = env.step(action)
+            action = mirror.action(torch.from_numpy(action)).numpy()
+            image, other_reward, other_done, _, other_info = other.step(action)
+            assert other_done == done
+            assert other_reward == pytest.approx(reward, abs=tolerance)
+    env.close()
+    other.close()
+
+
+def test_an_image_of_an_image_is_the_original() -> None:
+    mirror, generator = Mirror(sectors=8), torch.Generator().manual_seed(0)
+    observation = torch.rand(5, 14, generator=generator)
+    assert mirror.observation(mirror.observation(observation)).equal(observation)
+    assert not mirror.observation(observation).equal(observation)
+
+
+def sample(chance: float, *, seed: int = 0) -> tuple[TensorDict, TensorDict]:
+    """Rollout, and a batch sampled from a buffer with the transform."""
+    env = make_navigation_env("C", physics="kinematic", seed=0)
+    torch.manual_seed(0)
+    rollout = env.rollout(30)
+    env.close()
+    transform = RandomMirror(chance=chance, generator=torch.Generator().manual_seed(seed))
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(100), batch_size=400, transform=transform
+    )
+    buffer.extend(rollout)
+    return rollout, buffer.sample()
+
+
+def test_each_transition_is_mirrored_as_a_whole_and_half_of_them_are() -> None:
+    rollout, batch = sample(0.5)
+    mirror, stored = Mirror(), rollout[batch["index"]]
+    images = stored.clone()
+    for key in ("observation", ("next", "observation")):
+        images[key] = mirror.observation(stored[key])
+    images["action"] = mirror.action(stored["action"])
+    keys = ("observation", "action", ("next", "observation"))
+    same = {key: (batch[key] == stored[key]).all(-1) for key in keys}
+    swapped = {key: (batch[key] == images[key]).all(-1) for key in keys}
+    as_it_was = torch.stack(list(same.values())).all(0)
+    in_the_mirror = torch.stack(list(swapped.values())).all(0)
+    assert (as_it_was ^ in_the_mirror).all()
+    # 400 draws of one half: five standard deviations are 50.
+    assert 150 < in_the_mirror.sum() < 250
+    assert batch["next", "reward"].equal(stored["next", "reward"])
+
+
+def test_what_is_stored_stays_as_it_was_and_draws_follow_the_seed() -> None:
+    rollout, batch = sample(0.0)
+    assert batch["observation"].equal(rollout["observation"][batch["index"]])
+    torch.manual_seed(1)
+    first = sample(0.5, seed=3)[1]
+    torch.manual_seed(1)
+    assert first["observation"].equal(sample(0.5, seed=3)[1]["observation"])
+
+
+@pytest.mark.parametrize("chance", [-0.1, 1.5, float("nan")])
+def test_a_chance_out_of_range_is_refused(chance: float) -> None:
+    with pytest.raises(ValueError, match=r"chance must be in \[0, 1\]"):
+        RandomMirror(chance=chance)
