@@ -154,11 +154,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         for name, count in (("max_steps", max_steps), ("action_repeat", action_repeat)):
             if isinstance(count, bool) or not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} must be a positive integer, got {count!r}")
-        lengths = {
-            "time_step": time_step,
-            "goal_radius": goal_radius,
-            "closeness_distance": closeness_distance,
-        }
+        lengths = {"time_step": time_step, "goal_radius": goal_radius}
+        lengths["closeness_distance"] = closeness_distance
         for name, value in lengths.items():
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive, got {value}")
@@ -299,8 +296,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         """
         motion = self._drive.move(left, right)
         self._steps += 1
-        before = self._motion
-        self._path_length += math.hypot(motion.x - before.x, motion.y - before.y)
+        self._path_length += math.dist(motion[:2], self._motion[:2])
         self._motion = motion
         self._trail.append((motion.x, motion.y))
         previous = self._distance
@@ -356,8 +352,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     def _observe(self) -> NDArray[np.float32]:
         """Sense the world and build the observation."""
         motion = self._motion
-        x, y, heading = motion[:3]
-        ranges = self.lidar.scan(x, y, heading, rng=self.np_random if self.lidar.noise else None)
+        ranges = self.lidar.scan(*motion[:3], rng=self.np_random if self.lidar.noise else None)
         near = self.closeness_distance
         return observe(ranges, motion, self._goal, self._distance, self.robot, near)
 

@@ -43,7 +43,7 @@ def test_every_episode_has_its_own_share_of_the_noise_if_that_is_varied() -> Non
 
 
 def test_without_varying_the_noise_is_the_same_in_all_episodes() -> None:
-    explorer = NoisyPolicy(make_actor(5, 2), Exploration(sigma=0.2, sigma_end=0.2), SPEC)
+    explorer = NoisyPolicy(make_actor(5, 2), Exploration(varied=False), SPEC)
     explorer.begin_episode()
     assert explorer.share == 1.0
 

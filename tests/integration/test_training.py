@@ -229,7 +229,7 @@ def test_a_policy_file_of_something_else_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
     save_atomically({"format": 99}, tmp_path / CHECKPOINT)
-    with pytest.raises(ValueError, match=r"format 99, this version reads 2"):
+    with pytest.raises(ValueError, match=r"format 99, this version reads 3"):
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match="resume"):
         read_checkpoint(tmp_path / "elsewhere")
