@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from torchrl.envs import EnvBase
 
-from mpfa_envs import ROBOTS, NavigationEnv, make_navigation_env
+from mpfa_envs import NavigationEnv, make_navigation_env
+from mpfa_envs.robot import resolve_robot
 from settings import Environment
 
 INFO = ("success", "collision", "time_out", "path_length", "shortest_path")
@@ -26,7 +27,7 @@ def _senses(settings: Environment) -> dict[str, Any]:
 
 def training_distance(settings: Environment) -> float:
     """Distance of the robot's center from an obstacle that training counts as a collision [m]."""
-    return ROBOTS[settings.robot].radius + settings.margin
+    return resolve_robot(settings.robot).radius + settings.margin
 
 
 def make_training_env(world: str, settings: Environment) -> EnvBase:

@@ -62,8 +62,8 @@ class Mirror(nn.Module):
 class RandomMirror(Transform):
     """Shows a learner each sampled transition as it was, or in the mirror.
 
-    The mirror image of a transition is as true as the transition itself: reward, end and with them
-    every signal of its priority are the same. A learner that sees both has twice the maps to learn
+    The mirror image of a transition is as true as the transition itself, with the same reward and
+    end. What a loss then writes, say the TD error, is that of what it was shown. A learner that sees both has twice the maps to learn
     from, and no favorite side. Append it to a replay buffer; what is stored stays as it was.
 
     Args:

@@ -19,6 +19,11 @@ def test_a_robot_learns_with_a_margin_and_is_judged_by_contact(robot: str, radiu
     judging.close()
 
 
+def test_an_unknown_robot_is_named() -> None:
+    with pytest.raises(ValueError, match="robot must be .*got 'burgr'"):
+        make_training_env("C", Environment(robot="burgr"))
+
+
 def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     settings = Environment(physics="kinematic", margin=0.1, max_steps=40, action_repeat=3)
     training, judging = make_training_env("D", settings), make_evaluation_env("D", settings)
