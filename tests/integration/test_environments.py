@@ -20,7 +20,7 @@ def test_a_robot_learns_with_a_margin_and_is_judged_by_contact(robot: str, radiu
 
 
 def test_an_unknown_robot_is_named() -> None:
-    with pytest.raises(ValueError, match="robot must be .*got 'burgr'"):
+    with pytest.raises(ValueError, match=r"robot must be .*got 'burgr'"):
         make_training_env("C", Environment(robot="burgr"))
 
 
