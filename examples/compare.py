@@ -155,14 +155,14 @@ class Running:
         self.ended()
 
 
-def evaluate(job: Job, *, world: str, episodes: int) -> None:
-    """Drive the last policy of a run on the fixed pairs of a map, and keep every episode."""
-    policy, state = load_policy(job.path)
+def drive(run: Path, *, world: str, episodes: int) -> list[EpisodeResult]:
+    """Drive the last policy of a run greedily between the fixed pairs of a map."""
+    policy, state = load_policy(run)
     env = make_evaluation_env(world, Environment(**state["environment"]))
     tasks = evaluation_pairs(world, episodes, 0, robot=env.robot)
     results, _ = run_episodes(env, greedy(policy), tasks, progress=False)
     env.close()
-    write_rows([asdict(result) for result in results], RESULT_FIELDS, job.path / DONE)
+    return results
 
 
 def collect(jobs: Sequence[Job], path: Path) -> None:
@@ -212,7 +212,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     continue
                 running.remove(each)
                 if status == 0:
-                    evaluate(each.job, world=options.world, episodes=options.episodes)
+                    path = each.job.path
+                    results = drive(path, world=options.world, episodes=options.episodes)
+                    write_rows([asdict(r) for r in results], RESULT_FIELDS, path / DONE)
                     tqdm.write(f"{each.job.name}: trained and evaluated")
                 else:
                     failed.append(each.job)

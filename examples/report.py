@@ -6,6 +6,7 @@
 Writes ``tables.md``, ``training.png`` (success and average reward over episodes and steps) and
 ``progress.png`` (greedy success on the validation map over steps). Interquartile means, stratified
 bootstrap intervals and probabilities of improvement have a task for each pair of start and goal.
+After ``rooms.py`` there is a table of the random rooms, too.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import argparse
 import csv
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
-def outcome_table(methods: dict[Method, dict[int, list[dict[str, str]]]]) -> str:
-    """Success of each seed, and means over the seeds, beside the paper's."""
+def outcome_table(
+    methods: dict[Method, dict[int, list[dict[str, str]]]],
+    *,
+    beside: Mapping[Method, tuple[float, int, float]],
+) -> str:
+    """Success of each seed, and means over the seeds, beside those of another source."""
     rows = []
     for (learner, name), seeds in methods.items():
         success, time = matrix(seeds, "success"), matrix(seeds, "time_s")
@@ -86,7 +91,7 @@ def outcome_table(methods: dict[Method, dict[int, list[dict[str, str]]]]) -> str
                 f"{reached.mean():.1f}" if reached.size else "",
             ]
         )
-    for (source, name), (rate, collisions, seconds) in PAPER.items():
+    for (source, name), (rate, collisions, seconds) in beside.items():
         of_200 = f"{collisions / 200:.1%}"
         rows.append([source, name, f"{rate:.1%}", "", of_200, "", "", f"{seconds:.1f}"])
     head = ["learner", "method", "success", "of each seed", "collision", "time-out", "SPL"]
@@ -244,10 +249,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in ("episodes.csv", "progress.csv")
     )
     output.mkdir(parents=True, exist_ok=True)
-    tables = [outcome_table(methods)]
+    tables = [outcome_table(methods, beside=PAPER)]
     if any(rows for seeds in curves.values() for rows in seeds.values()):
         tables.append(speed_table(curves))
         draw_progress(curves, output / "progress.png")
+    rooms = by_method(read_rows(options.folder / "rooms.csv"))
+    if rooms:
+        tables.append(outcome_table(rooms, beside={}))
     tables.append(interval_tables(methods))
     draw_training(training, output / "training.png")
     text = "\n\n".join(tables)

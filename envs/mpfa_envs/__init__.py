@@ -13,6 +13,7 @@ from mpfa_envs.maps import WORLDS
 from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
+from mpfa_envs.random_worlds import random_world
 from mpfa_envs.render import draw_trajectories
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
@@ -56,6 +57,7 @@ __all__ = [
     "make_navigation_env",
     "navigation_reward",
     "observation_slices",
+    "random_world",
     "sample_task",
     "save_world",
 ]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from mpfa_envs.random_worlds import random_world
 from mpfa_envs.worlds import Box, World
 
 if TYPE_CHECKING:
@@ -90,7 +92,8 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
     """Find a world by name or read it from a file; a :class:`World` is returned as it is.
 
     Args:
-        world: A name in :data:`WORLDS`, the path of a YAML file, or a world of your own.
+        world: A name in :data:`WORLDS`, ``"random-7"`` for :func:`random_world` of 7, the path of a
+            YAML file, or a world of your own.
 
     Returns:
         The world.
@@ -103,6 +106,8 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         return world
     if isinstance(world, str) and world in WORLDS:
         return WORLDS[world]
+    if isinstance(world, str) and (room := re.fullmatch(r"random-([0-9]{1,9})", world)):
+        return random_world(int(room[1]))
     if isinstance(world, (str, os.PathLike)) and Path(world).suffix.lower() in (".yaml", ".yml"):
         # Imported here because most programs never read a world from a file.
         from mpfa_envs.world_file import load_world
@@ -111,6 +116,6 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
     near = get_close_matches(str(world), WORLDS, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     raise ValueError(
-        f"world must be a World, the path of a .yaml file or one of {list(WORLDS)}, "
-        f"got {world!r}{hint}"
+        f"world must be a World, the path of a .yaml file, 'random-SEED' or one of "
+        f"{list(WORLDS)}, got {world!r}{hint}"
     )

@@ -1,0 +1,100 @@
+"""Random rooms: as many unseen worlds as one likes, the same ones for everyone."""
+
+from __future__ import annotations
+
+import math
+import random
+from functools import lru_cache
+from typing import Final
+
+from mpfa_envs.worlds import Box, World
+
+_HALF: Final = 5.0
+"""Half of a room's side [m]."""
+_THICKNESS: Final = 0.5
+_LENGTHS: Final = (0.5, 2.6)
+"""Sides of a box [m], as those of the validation and the test map."""
+_AT_WALL: Final = 0.3
+"""Share of the draws that are at a wall; such boxes find a place more easily than others."""
+_DRAWS: Final = 200_000
+
+
+@lru_cache(maxsize=256)
+def random_world(seed: int, *, boxes: int = 13, passage: float = 0.9) -> World:
+    """Draw a room of 10 x 10 m with boxes that leave a way between any two of them.
+
+    The name ``"random-7"`` stands for ``random_world(7)`` wherever a world is asked for.
+
+    Args:
+        seed: Seed of the draw, at least 0.
+        boxes: Number of boxes, 0.5 m thick and 0.5 to 2.6 m long. About half of them touch a wall,
+            where they make dead ends.
+        passage: Least width of the way between two boxes, or a box and a wall that it does not
+            touch [m]. Robots narrower than this reach every free place.
+
+    Returns:
+        The world.
+
+    Raises:
+        ValueError: If an argument is out of range, or so many boxes find no place.
+
+    Examples:
+        >>> from mpfa_envs import NavigationEnv, random_world
+        >>> world = random_world(7)
+        >>> world.name, len(world.boxes)
+        ('random-7', 13)
+        >>> NavigationEnv(world="random-7").world == world
+        True
+    """
+    for name, value, least in (("seed", seed, 0), ("boxes", boxes, 1)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+    if not 0.0 < passage < 2 * _HALF:
+        raise ValueError(f"passage must be between 0 and {2 * _HALF} m, got {passage!r}")
+    rng = random.Random(seed)
+    placed: list[Box] = []
+    for _ in range(_DRAWS):
+        box = _draw(rng)
+        if _leaves_way(box, placed, passage):
+            placed.append(box)
+            if len(placed) == boxes:
+                return World(name=f"random-{seed}", boxes=tuple(placed))
+    raise ValueError(
+        f"boxes = {boxes} with passage = {passage} m between them do not fit the room: after "
+        f"{_DRAWS} draws there are {len(placed)}"
+    )
+
+
+def _draw(rng: random.Random) -> Box:
+    """A box somewhere in the room or at one of its walls."""
+    width, depth = rng.uniform(*_LENGTHS), _THICKNESS
+    if rng.random() < 0.5:
+        width, depth = depth, width
+    x = rng.uniform(width / 2 - _HALF, _HALF - width / 2)
+    y = rng.uniform(depth / 2 - _HALF, _HALF - depth / 2)
+    if rng.random() < _AT_WALL:
+        left, right, low, high = range(4)
+        side = rng.choice((left, right, low, high))
+        if side == left:
+            return Box(-_HALF, y - depth / 2, width - _HALF, y + depth / 2)
+        if side == right:
+            return Box(_HALF - width, y - depth / 2, _HALF, y + depth / 2)
+        if side == low:
+            return Box(x - width / 2, -_HALF, x + width / 2, depth - _HALF)
+        return Box(x - width / 2, _HALF - depth, x + width / 2, _HALF)
+    return Box(x - width / 2, y - depth / 2, x + width / 2, y + depth / 2)
+
+
+def _leaves_way(box: Box, others: list[Box], passage: float) -> bool:
+    """Whether a box touches a wall or leaves a passage to it, and one to every other box."""
+    walls = (box.x_min + _HALF, _HALF - box.x_max, box.y_min + _HALF, _HALF - box.y_max)
+    return not any(0.0 < way < passage for way in walls) and all(
+        _gap(box, other) >= passage for other in others
+    )
+
+
+def _gap(one: Box, other: Box) -> float:
+    """Distance between two boxes [m]."""
+    across = max(one.x_min - other.x_max, other.x_min - one.x_max, 0.0)
+    up = max(one.y_min - other.y_max, other.y_min - one.y_max, 0.0)
+    return math.hypot(across, up)
