@@ -3,9 +3,9 @@
     python examples/rooms.py runs/compare                      rooms 100 to 109, 40 pairs each
     python examples/rooms.py runs/compare --rooms 7 8 --pairs 10
 
-Every run in the folder (LEARNER-METHOD-SEED) drives greedily between the same fixed pairs of start
-and goal, collision at contact. Writes rooms.csv there, a row per episode, which ``report.py`` makes
-a table of.
+Every finished run in the folder (LEARNER-METHOD-SEED) drives greedily between the same fixed pairs
+of start and goal, collision at contact. Writes rooms.csv there, a row per episode, which
+``report.py`` makes a table of.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from compare import RESULT_FIELDS, drive
+from compare import DONE, RESULT_FIELDS, drive
 from mpfa_envs import random_world
 from records import write_rows
 
@@ -55,9 +55,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def runs_of(folder: Path) -> list[tuple[Path, dict[str, str]]]:
-    """Runs with a policy in the folder of a study, and what their names say."""
+    """Finished runs in the folder of a study, and what their names say."""
     found = []
-    for path in sorted(folder.glob("*/policy.pt")):
+    for path in sorted(folder.glob(f"*/{DONE}")):
         name = re.fullmatch(r"([^-]+)-([^-]+)-(\d+)", path.parent.name)
         if name:
             learner, method, seed = name.groups()
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     runs = runs_of(options.folder)
     if not runs:
-        print(f"{options.folder} has no LEARNER-METHOD-SEED/policy.pt: compare.py makes them")
+        print(f"{options.folder} has no LEARNER-METHOD-SEED/{DONE}, a finished run of compare.py")
         return 1
     tasks = [
         (path, which, f"random-{seed}", options.pairs)

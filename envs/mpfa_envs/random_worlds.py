@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from functools import lru_cache
 from typing import Final
 
 from mpfa_envs.worlds import Box, World
@@ -16,14 +15,16 @@ _LENGTHS: Final = (0.5, 2.6)
 """Sides of a box [m], as those of the validation and the test map."""
 _AT_WALL: Final = 0.3
 """Share of the draws that are at a wall; such boxes find a place more easily than others."""
+_BOXES: Final = 13
+_PASSAGE: Final = 0.9
 _DRAWS: Final = 200_000
 
 
-@lru_cache(maxsize=256)
-def random_world(seed: int, *, boxes: int = 13, passage: float = 0.9) -> World:
+def random_world(seed: int, *, boxes: int = _BOXES, passage: float = _PASSAGE) -> World:
     """Draw a room of 10 x 10 m with boxes that leave a way between any two of them.
 
-    The name ``"random-7"`` stands for ``random_world(7)`` wherever a world is asked for.
+    The name ``"random-7"`` stands for ``random_world(7)`` wherever a world is asked for; with other
+    arguments than the defaults a room says so in its own name.
 
     Args:
         seed: Seed of the draw, at least 0.
@@ -46,11 +47,13 @@ def random_world(seed: int, *, boxes: int = 13, passage: float = 0.9) -> World:
         >>> NavigationEnv(world="random-7").world == world
         True
     """
-    for name, value, least in (("seed", seed, 0), ("boxes", boxes, 1)):
+    for argument, value, least in (("seed", seed, 0), ("boxes", boxes, 1)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+            raise ValueError(f"{argument} must be an integer of at least {least}, got {value!r}")
     if not 0.0 < passage < 2 * _HALF:
         raise ValueError(f"passage must be between 0 and {2 * _HALF} m, got {passage!r}")
+    usual = (boxes, passage) == (_BOXES, _PASSAGE)
+    name = f"random-{seed}" if usual else f"random-{seed}, {boxes} boxes, {passage:g} m"
     rng = random.Random(seed)
     placed: list[Box] = []
     for _ in range(_DRAWS):
@@ -58,7 +61,7 @@ def random_world(seed: int, *, boxes: int = 13, passage: float = 0.9) -> World:
         if _leaves_way(box, placed, passage):
             placed.append(box)
             if len(placed) == boxes:
-                return World(name=f"random-{seed}", boxes=tuple(placed))
+                return World(name=name, boxes=tuple(placed))
     raise ValueError(
         f"boxes = {boxes} with passage = {passage} m between them do not fit the room: after "
         f"{_DRAWS} draws there are {len(placed)}"

@@ -59,13 +59,26 @@ def test_each_side_of_random_rooms_has_boxes_that_make_dead_ends() -> None:
     assert min(touching) > 15
 
 
-def test_a_seed_is_one_room_for_ever_and_another_seed_another_one() -> None:
-    # Results refer to rooms by their seed. These numbers change only if all rooms do.
-    first = random_world(7).boxes[0]
-    assert (first.x_min, first.y_min, first.x_max, first.y_max) == pytest.approx(
-        (4.5, 2.733799, 5.0, 3.380495), abs=1e-6
-    )
+@pytest.mark.parametrize(
+    ("seed", "place", "edges"),
+    [(7, 0, (4.5, 2.733799, 5.0, 3.380495)), (100, -1, (2.476928, 4.5, 3.871075, 5.0))],
+)
+def test_a_seed_is_one_room_for_ever(
+    seed: int, place: int, edges: tuple[float, float, float, float]
+) -> None:
+    # Results refer to rooms by their seed. The last box depends on all that were drawn before.
+    box = random_world(seed).boxes[place]
+    assert (box.x_min, box.y_min, box.x_max, box.y_max) == pytest.approx(edges, abs=2e-6)
+
+
+def test_another_seed_is_another_room() -> None:
     assert len({random_world(seed).boxes for seed in SEEDS}) == len(SEEDS)
+
+
+def test_only_the_room_that_a_name_stands_for_has_that_name() -> None:
+    assert random_world(7).name == random_world(7, boxes=13, passage=0.9).name == "random-7"
+    assert random_world(7, boxes=6, passage=1.5).name == "random-7, 6 boxes, 1.5 m"
+    assert random_world(7, passage=0.8).name != "random-7"
 
 
 def test_every_free_place_of_a_random_room_can_be_reached() -> None:
@@ -105,5 +118,6 @@ def test_a_name_that_is_no_random_room_is_refused(name: str) -> None:
     ],
 )
 def test_a_room_that_cannot_be_is_refused(arguments: dict[str, float], message: str) -> None:
+    random_world(seed=1)  # A seed of True is refused even after one of 1, which equals it.
     with pytest.raises(ValueError, match=message):
         random_world(**arguments)

@@ -13,15 +13,18 @@ import report
 import rooms
 
 POLICY = Path(rooms.__file__).parent / "policies" / "td3-mpfa_per.pt"
+UNFINISHED = "ddpg-uniform-0"
 RUNS = ("ddpg-per-3", "td3-mpfa_per-10")
 
 
 @pytest.fixture
 def study(tmp_path: Path) -> Path:
-    for name in (*RUNS, "no-run"):
+    for name in (*RUNS, "no-run", UNFINISHED):
         (tmp_path / name).mkdir()
+        # A run that is on its way has a policy, too, that of its last checkpoint.
         shutil.copy(POLICY, tmp_path / name / "policy.pt")
-    (tmp_path / "ddpg-uniform-0").mkdir()  # Trained, but not to the end.
+        if name != UNFINISHED:
+            (tmp_path / name / compare.DONE).touch()
     return tmp_path
 
 
@@ -77,4 +80,4 @@ def test_numbers_that_cannot_be_are_named_before_anything_drives(
 
 def test_a_folder_without_runs_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert rooms.main([str(tmp_path)]) == 1
-    assert f"{tmp_path} has no LEARNER-METHOD-SEED/policy.pt" in capsys.readouterr().out
+    assert f"{tmp_path} has no LEARNER-METHOD-SEED/test.csv" in capsys.readouterr().out
