@@ -20,6 +20,9 @@ from torchrl_mpfa.stochastic import StochasticActor
 class Explorer(Protocol):
     """Actions to learn from."""
 
+    policy: DirectModule | StochasticActor
+    """What it explores around."""
+
     @property
     def sigma(self) -> float:
         """Standard deviation of the actions around the policy's."""

@@ -224,6 +224,9 @@ class TrainSettings:
     """Where the networks are; the buffer stays in main memory."""
     threads: int = 1
     """Threads of PyTorch; with networks this small a second one gains nothing."""
+    overlap: bool = False
+    """Drive in a second process while the networks learn, with a policy that is one update older.
+    A run takes a quarter less time where a second core is free."""
     overwrite: bool = False
     """Whether to start anew in a folder that holds a run."""
     resume: str | None = None

@@ -49,6 +49,8 @@ class Tracker:
             dir=folder,
             config=asdict(settings),
         )
+        # An evaluation beside a run is done some steps later.
+        self._run.define_metric("evaluation/*", step_metric="evaluation/step")
 
     def log_episode(self, record: EpisodeRecord, step: int) -> None:
         """Log one episode."""
@@ -69,13 +71,14 @@ class Tracker:
             step=step,
         )
 
-    def log_progress(self, record: ProgressRecord) -> None:
-        """Log an evaluation."""
+    def log_progress(self, record: ProgressRecord, step: int) -> None:
+        """Log an evaluation, at the step it is known at."""
         if self._run is None:
             return
         rates = ("success", "collision", "timeout", "spl")
         entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
-        self._run.log(entries, step=record.total_steps)
+        entries["evaluation/step"] = record.total_steps
+        self._run.log(entries, step=step)
 
     def log_update(
         self,

@@ -11,18 +11,16 @@
 
 from __future__ import annotations
 
-import logging
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from overrides import check_overrides
+from process import prepare_process
 from records import draw_learning_curve
 from settings import TrainSettings, register
 from training import CHECKPOINT, TrainingRun, read_checkpoint
@@ -42,18 +40,6 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     settings = OmegaConf.to_object(merged)
     assert isinstance(settings, TrainSettings)
     return settings
-
-
-def prepare_process(settings: TrainSettings) -> None:
-    """Set what holds for the whole process."""
-    torch.set_num_threads(settings.threads)
-    # Weights that no gradient reaches decay until they are denormal numbers; after some five
-    # thousand updates a CPU takes twice as long for each because of them.
-    torch.set_flush_denormal(True)
-    # By default a pool of processes would wait for programs to compile, of which there are two.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
-    # TorchRL announces each storage in the middle of the progress bar.
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
 def run(config: DictConfig) -> None:

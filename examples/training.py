@@ -13,15 +13,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from assembly import make_curiosity, make_learner
-from environments import INFO, make_evaluation_env, make_training_env
-from evaluation import greedy, run_episodes
+from collection import Collector, LocalCollector, RemoteCollector, Start
 from exploration import make_explorer
-from mpfa_envs import RandomMirror, evaluation_pairs
+from mpfa_envs import RandomMirror
+from progress import Progress
 from records import EpisodeRecord, ProgressRecord, save_policy, write_records
 from replay_assembly import make_buffer, make_selection
 from settings import Stage, TrainSettings
@@ -30,16 +28,7 @@ from tracking import Tracker
 
 FORMAT = 3
 CHECKPOINT = "checkpoint.pt"
-_TRANSITION = (
-    "observation",
-    "action",
-    ("next", "observation"),
-    ("next", "reward"),
-    ("next", "done"),
-    ("next", "terminated"),
-)
 _RECENT = 20
-_PROGRESS_SEED = 1
 
 
 class TrainingRun:
@@ -59,20 +48,30 @@ class TrainingRun:
         self.stages: list[Stage] = list(settings.curriculum.stages)
         self.total_episodes = sum(stage.episodes for stage in self.stages)
         torch.manual_seed(settings.seed)
-        self.env = self._make_env(0)
+        local = LocalCollector(settings, device=settings.device)
+        env = local.environment(self.stages[0].world)
+        self._action_spec = env.action_spec
+        self._observation_size = env.observation_spec["observation"].shape[-1]
         self._build()
+        self.collector: Collector = local
+        if settings.overlap:
+            local.close()
+            self.collector = RemoteCollector(
+                settings, self.learner.policy, example=env.fake_tensordict()
+            )
         self._waiting: list[TensorDictBase] = []
         self.episode = 0
         self.step = 0
         self.records: list[EpisodeRecord] = []
         self.progress: list[ProgressRecord] = []
+        self.evaluations = Progress(settings)
         self.tracker = Tracker(settings, folder)
         self._stop = False
 
     def _build(self) -> None:
         """Make the parts that learn, and the buffer."""
-        settings, spec = self.settings, self.env.action_spec
-        sizes = self.env.observation_spec["observation"].shape[-1], spec.shape[-1]
+        settings, spec = self.settings, self._action_spec
+        sizes = self._observation_size, spec.shape[-1]
         self.buffer = make_buffer(settings.method, seed=settings.seed)
         if settings.environment.mirror:
             self.buffer.append_transform(RandomMirror())
@@ -140,62 +139,47 @@ class TrainingRun:
         lengths = [stage.episodes for stage in self.stages]
         return self.episode in list(accumulate(lengths))[:-1]
 
-    def _make_env(self, episode: int) -> EnvBase:
-        self.world = self._stage(episode).world
-        return make_training_env(self.world, self.settings.environment)
-
     def _run_episode(self) -> EpisodeRecord:
-        if self._stage(self.episode).world != self.world:
-            self.env.close()
-            self.env = self._make_env(self.episode)
         seed = episode_seed(self.settings.seed, self.episode)
-        self.env.set_seed(seed)
         torch.manual_seed(seed)
         if not self.settings.curriculum.carry and self._begins_stage():
             self._build()
-        self.explorer.begin_episode()
         self._anneal()
+        world = self._stage(self.episode).world
         start, total_reward, steps = time.perf_counter(), 0.0, 0
-        state = self.env.reset()
+        self.collector.begin(Start(world, seed, self.step), self.explorer)
         done = False
         while not done:
-            state = self.env.step(self._act(state))
+            transition = self.collector.collect()
             self.step += 1
             steps += 1
-            after = state["next"]
+            after = transition["next"]
             total_reward += after["reward"].item()
             done = after["done"].item()
-            self._store(state, flush=done)
+            if not done:
+                self.collector.proceed()
+            self._store(transition, flush=done)
             if self.step % self.settings.learner.update_every == 0:
                 self._update()
-            last, state = after, step_mdp(state)
         self.learner.end_episode()
-        info = {name: last["info", name].item() for name in INFO}
         return EpisodeRecord(
             episode=self.episode,
-            world=self.world,
+            world=world,
             steps=steps,
             total_steps=self.step,
             reward=total_reward,
             average_reward=total_reward / steps,
             seconds=time.perf_counter() - start,
-            **info,
+            **self.collector.info(),
         )
 
-    @torch.no_grad()
-    def _act(self, state: TensorDictBase) -> TensorDictBase:
-        if self.step < self.settings.exploration.random_steps:
-            return self.env.rand_action(state)
-        observation = state.get("observation").to(self.settings.device)
-        return state.set("action", self.explorer.act(observation).cpu())
-
-    def _store(self, state: TensorDictBase, *, flush: bool) -> None:
+    def _store(self, transition: TensorDictBase, *, flush: bool) -> None:
         """Keep a step; those between two updates are written together, at the price of one."""
-        self._waiting.append(state.select(*_TRANSITION))
+        self._waiting.append(transition)
         if flush or self.step % self.settings.learner.update_every == 0:
             first, *more = self._waiting
-            # Most often there is one alone, for which stacking takes twice the time.
-            self.buffer.extend(torch.stack(self._waiting) if more else first.unsqueeze(0))
+            # Most often there is one alone.
+            self.buffer.extend(torch.cat(self._waiting) if more else first)
             self._waiting.clear()
 
     def _update(self) -> None:
@@ -231,33 +215,22 @@ class TrainingRun:
 
     def _evaluate(self, *, since: int) -> None:
         """Evaluate if that fell due after step ``since``; nothing of the training is touched."""
-        settings = self.settings.evaluation
-        if settings.every <= 0 or self.step // settings.every == since // settings.every:
-            return
-        start = time.perf_counter()
-        env = make_evaluation_env(settings.world, self.settings.environment)
-        tasks = evaluation_pairs(settings.world, settings.episodes, _PROGRESS_SEED, robot=env.robot)
-        results, _ = run_episodes(env, greedy(self.learner.policy), tasks, progress=False)
-        env.close()
+        every = self.settings.evaluation.every
+        if every > 0 and self.step // every != since // every:
+            self.evaluations.start(self.learner.policy, total_steps=self.step, episode=self.episode)
+        self._take_evaluations()
 
-        def mean(name: str) -> float:
-            return sum(getattr(result, name) for result in results) / len(results)
-
-        rates = {name: mean(name) for name in ("success", "collision", "timeout", "spl")}
-        record = ProgressRecord(
-            total_steps=self.step,
-            episode=self.episode,
-            world=settings.world,
-            seconds=time.perf_counter() - start,
-            **rates,
-        )
-        self.progress.append(record)
-        self.tracker.log_progress(record)
+    def _take_evaluations(self, *, wait: bool = False) -> None:
+        for record in self.evaluations.finished(wait=wait):
+            self.progress.append(record)
+            self.tracker.log_progress(record, self.step)
 
     # Saving ----------------------------------------------------------------------------------
 
     def save(self) -> None:
         """Write checkpoint, policy and records, each of them whole or not at all."""
+        # A run that is killed goes on behind these, and would not evaluate them again.
+        self._take_evaluations(wait=True)
         state = {
             "format": FORMAT,
             "settings": asdict(self.settings),
@@ -286,13 +259,11 @@ class TrainingRun:
         self.episode, self.step = state["episode"], state["step"]
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.progress = [ProgressRecord(**record) for record in state["progress"]]
-        if self.episode < self.total_episodes:
-            self.env.close()
-            self.env = self._make_env(self.episode)
 
     def close(self) -> None:
         """Release the simulation and finish the log."""
-        self.env.close()
+        self.collector.close()
+        self.evaluations.close()
         self.tracker.close()
 
 

@@ -45,7 +45,8 @@ class Mirror(nn.Module):
         Returns:
             Their mirror images, of the same shape.
         """
-        return observation[..., self.order] * self.sign.to(observation.device)
+        order, sign = self.order.to(observation.device), self.sign.to(observation.device)
+        return observation.index_select(-1, order) * sign
 
     def action(self, action: Tensor) -> Tensor:
         """What drives the mirrored path: the wheels change places.

@@ -8,55 +8,23 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
+from tiny_runs import rows, tiny, train
 from torchrl.data import RandomSampler
 
 from methods import ALIASES
+from process import prepare_process
 from records import draw_learning_curve, load_policy
-from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
+from settings import GROUPS, Stage, TrainSettings
 from torchrl_mpfa import SignalSampler, save_atomically
-from train import prepare_process
 from training import CHECKPOINT, TrainingRun, read_checkpoint
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-# Two maps, so that a change of map lies between the checkpoints too.
-STAGES = [Stage("A", 3), Stage("B", 3)]
-
-
-def tiny(
-    method: str = "mpfa_per", episodes: list[Stage] | None = None, learner: str = "ddpg"
-) -> TrainSettings:
-    settings = TrainSettings(
-        method=replace(GROUPS["method"][method]),
-        learner=GROUPS["learner"][learner](),
-        curriculum=Curriculum("tiny", episodes or STAGES),
-        environment=Environment(physics="kinematic", max_steps=25),
-        checkpoint_every=1000,
-        seed=3,
-    )
-    settings.method.capacity, settings.method.batch_size = 100, 16
-    settings.learner.width = 16
-    settings.exploration.random_steps = 20
-    settings.exploration.annealing_steps = 60
-    settings.tracking.mode = "off"
-    return settings
-
-
-def rows(run: TrainingRun) -> list[dict[str, object]]:
-    return [{k: v for k, v in asdict(r).items() if k != "seconds"} for r in run.records]
-
-
-def train(folder: Path, settings: TrainSettings) -> TrainingRun:
-    folder.mkdir(parents=True, exist_ok=True)
-    run = TrainingRun(settings, folder)
-    run.train()
-    run.close()
-    return run
 
 
 def test_training_treats_denormal_numbers_as_zero() -> None:
@@ -266,12 +234,14 @@ def wait_for(file: Path, process: subprocess.Popen[str], seconds: float = 120) -
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-def test_a_killed_run_goes_on_and_ctrl_c_says_how(tmp_path: Path) -> None:
+@pytest.mark.parametrize("overlap", ["false", "true"])
+def test_a_killed_run_goes_on_and_ctrl_c_says_how(tmp_path: Path, overlap: str) -> None:
     folder = tmp_path / "run"
-    killed = start(script(folder))
+    killed = start(script(folder, f"overlap={overlap}"))
     wait_for(folder / CHECKPOINT, killed)
     killed.send_signal(signal.SIGKILL)
-    killed.communicate()
+    # Returns when nobody holds the other end anymore: a second process must have ended, too.
+    killed.communicate(timeout=60)
     episode = read_checkpoint(folder)["episode"]
     assert episode >= 1
 

@@ -1,0 +1,109 @@
+"""A run that drives in a second process: what it does, and what happens when that fails."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from tiny_runs import rows, tiny, train
+
+from collection import LocalCollector, RemoteCollector, Start
+from exploration import Explorer, NoisyPolicy
+from settings import TrainSettings
+from training import TrainingRun, read_checkpoint
+
+
+def overlapping(method: str = "mpfa_per", learner: str = "ddpg") -> TrainSettings:
+    settings = tiny(method, learner=learner)
+    settings.overlap = True
+    return settings
+
+
+def without_noise(settings: TrainSettings) -> TrainSettings:
+    """Two processes draw from two streams of random numbers; this leaves none to draw from."""
+    settings.exploration.random_steps = 0
+    settings.exploration.sigma = settings.exploration.sigma_end = 1e-30
+    settings.learner.actor_lr = 1e-2
+    settings.environment.mirror = False
+    return settings
+
+
+class Delayed(LocalCollector):
+    """Acts by the policy as it was when the episode was told to begin or to go on."""
+
+    def begin(self, start: Start, explorer: Explorer) -> None:
+        assert isinstance(explorer, NoisyPolicy)
+        self._live, self._old = explorer.policy, copy.deepcopy(explorer.policy)
+        super().begin(start, explorer)
+
+    def collect(self) -> TensorDictBase:
+        self._explorer.policy = self._old
+        transition = super().collect()
+        self._explorer.policy = self._live
+        return transition
+
+    def proceed(self) -> None:
+        self._old = copy.deepcopy(self._live)
+
+
+def test_the_policy_that_acts_is_one_update_older(tmp_path: Path) -> None:
+    settings = without_noise(overlapping())
+    settings.evaluation.every, settings.evaluation.episodes = 20, 2
+    remote = train(tmp_path / "remote", settings)
+
+    settings.overlap = False
+    serial = train(tmp_path / "serial", settings)
+    assert rows(remote) != rows(serial)
+
+    (tmp_path / "delayed").mkdir()
+    delayed = TrainingRun(settings, tmp_path / "delayed")
+    delayed.collector.close()
+    delayed.collector = Delayed(settings, device="cpu")
+    delayed.train()
+    delayed.close()
+    assert rows(remote) == rows(delayed)
+    # Evaluations beside a run find what they find between two episodes.
+    assert len(remote.progress) == len(delayed.progress) > 1
+    for beside, between in zip(remote.progress, delayed.progress, strict=True):
+        assert {**vars(beside), "seconds": 0.0} == {**vars(between), "seconds": 0.0}
+
+
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path) -> None:
+    # Of all methods this one asks how much noise there is.
+    settings = overlapping("klper", "td3")
+    whole = train(tmp_path / "whole", settings)
+    part = TrainingRun(settings, tmp_path)
+    part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 3))
+    part.close()
+    resumed = TrainingRun(settings, tmp_path)
+    resumed.load(read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    assert rows(resumed) == rows(whole)
+    assert resumed.explorer.sigma == whole.explorer.sigma < settings.exploration.sigma
+    for mine, other in zip(
+        resumed.learner.loss.state_dict().values(),
+        whole.learner.loss.state_dict().values(),
+        strict=True,
+    ):
+        assert torch.equal(mine, other)
+
+
+def test_a_failure_in_the_second_process_is_told_in_the_first(tmp_path: Path) -> None:
+    run = TrainingRun(overlapping(learner="sac"), tmp_path)
+    collector = run.collector
+    assert isinstance(collector, RemoteCollector)
+    try:
+        collector.begin(Start("A", 0, 0), run.explorer)
+        assert collector.collect().batch_size == (1,)
+        collector.begin(Start("no-such-map", 0, 0), run.explorer)
+        with pytest.raises(RuntimeError, match=r"(?s)environment failed .*no-such-map"):
+            collector.collect()
+        # It has ended then, and says so.
+        with pytest.raises(RuntimeError, match=r"process of the environment has ended"):
+            collector.collect()
+    finally:
+        run.close()

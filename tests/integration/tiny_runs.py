@@ -1,0 +1,43 @@
+"""Runs of the training script that take a second, and what they are compared by."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
+from training import TrainingRun
+
+# Two maps, so that a change of map lies between the checkpoints too.
+STAGES = [Stage("A", 3), Stage("B", 3)]
+
+
+def tiny(
+    method: str = "mpfa_per", episodes: list[Stage] | None = None, learner: str = "ddpg"
+) -> TrainSettings:
+    settings = TrainSettings(
+        method=replace(GROUPS["method"][method]),
+        learner=GROUPS["learner"][learner](),
+        curriculum=Curriculum("tiny", episodes or STAGES),
+        environment=Environment(physics="kinematic", max_steps=25),
+        checkpoint_every=1000,
+        seed=3,
+    )
+    settings.method.capacity, settings.method.batch_size = 100, 16
+    settings.learner.width = 16
+    settings.exploration.random_steps = 20
+    settings.exploration.annealing_steps = 60
+    settings.tracking.mode = "off"
+    return settings
+
+
+def rows(run: TrainingRun) -> list[dict[str, object]]:
+    return [{k: v for k, v in asdict(r).items() if k != "seconds"} for r in run.records]
+
+
+def train(folder: Path, settings: TrainSettings) -> TrainingRun:
+    folder.mkdir(parents=True, exist_ok=True)
+    run = TrainingRun(settings, folder)
+    run.train()
+    run.close()
+    return run
