@@ -95,8 +95,11 @@ def test_without_the_actor_only_the_critics_get_gradients():
     loss, whole = make_loss("td3"), make_loss("td3")
     torch.manual_seed(5)
     gradients, _ = by_losses("td3", loss, make_batch())
+    gradients_of = WholeGradients(whole, compile=None)
+    # The actor's gradients of an earlier batch must not move it again.
+    gradients_of(make_batch(), actor_batch=make_batch())
     torch.manual_seed(5)
-    log = WholeGradients(whole, compile=None)(make_batch(), actor_batch=None)
+    log = gradients_of(make_batch(), actor_batch=None)
     assert "loss_actor" not in log
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()

@@ -172,10 +172,10 @@ class ActorCriticLearner:
         Returns:
             Detached values for the log.
         """
-        self.optimizer.zero_grad(set_to_none=True)
         if self._whole is not None:
             log = self._whole(batch, actor_batch=actor_batch, loss_function=loss_function)
         else:
+            self.optimizer.zero_grad(set_to_none=True)
             loss, log = self._losses(batch, actor_batch, loss_function)
             loss.backward()
             self.loss.write_action_gradient(batch)

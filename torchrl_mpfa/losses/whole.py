@@ -95,8 +95,8 @@ class WholeGradients:
             (parts.critic_parameters, of_critic),
             (self._actor_parameters, of_actor),
         ):
-            for name, gradient in gradients.items():
-                parameters[name].grad = gradient
+            for name, parameter in parameters.items():
+                parameter.grad = gradients.get(name)
         for name, key in (
             (TD_ERROR.name, keys.td_error_signal),
             (ACTION_GRADIENT.name, keys.action_gradient_signal),
