@@ -1,10 +1,9 @@
 """Where transitions come from: an environment and how it is explored, here or in a second process.
 
 In a second process the robot drives while the networks learn. The two go hand in hand, so that a
-run can be repeated and resumed to the bit: an action waits for the update that follows the action
-before the last one, and is chosen by the policy that came of it. Serially it would have been that
-of one update more. TorchRL's collectors in processes of their own send batches of many steps, or
-let the policy be as old as it happens to be.
+run can be repeated and resumed to the bit: action t is chosen by the policy that was updated after
+transition t - 2, where a serial run has the one updated after t - 1. TorchRL's collectors in
+processes of their own send batches of many steps, or let the policy be as old as it happens to be.
 """
 
 from __future__ import annotations

@@ -226,7 +226,7 @@ class TrainSettings:
     """Threads of PyTorch; with networks this small a second one gains nothing."""
     overlap: bool = False
     """Drive in a second process while the networks learn, with a policy that is one update older.
-    A run takes a quarter less time where a second core is free."""
+    Where a second core is free, a run takes a fifth less time; see ``docs/results.md``."""
     overwrite: bool = False
     """Whether to start anew in a folder that holds a run."""
     resume: str | None = None

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tiny_runs import rows, tiny, train
 
 from collection import LocalCollector, RemoteCollector, Start
-from exploration import Explorer, NoisyPolicy
+from exploration import Explorer
 from settings import TrainSettings
 from training import TrainingRun, read_checkpoint
 
@@ -22,26 +22,24 @@ def overlapping(method: str = "mpfa_per", learner: str = "ddpg") -> TrainSetting
     return settings
 
 
-def without_noise(settings: TrainSettings) -> TrainSettings:
-    """Two processes draw from two streams of random numbers; this leaves none to draw from."""
-    settings.exploration.random_steps = 0
-    settings.exploration.sigma = settings.exploration.sigma_end = 1e-30
-    settings.learner.actor_lr = 1e-2
-    settings.environment.mirror = False
-    return settings
-
-
 class Delayed(LocalCollector):
-    """Acts by the policy as it was when the episode was told to begin or to go on."""
+    """Acts by the policy as it was when the episode was told to begin or to go on.
+
+    It has random numbers of its own, as a process has.
+    """
 
     def begin(self, start: Start, explorer: Explorer) -> None:
-        assert isinstance(explorer, NoisyPolicy)
         self._live, self._old = explorer.policy, copy.deepcopy(explorer.policy)
-        super().begin(start, explorer)
+        with torch.random.fork_rng(devices=[]):
+            super().begin(start, explorer)
+            self._random = torch.get_rng_state()
 
     def collect(self) -> TensorDictBase:
         self._explorer.policy = self._old
-        transition = super().collect()
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._random)
+            transition = super().collect()
+            self._random = torch.get_rng_state()
         self._explorer.policy = self._live
         return transition
 
@@ -50,7 +48,8 @@ class Delayed(LocalCollector):
 
 
 def test_the_policy_that_acts_is_one_update_older(tmp_path: Path) -> None:
-    settings = without_noise(overlapping())
+    settings = overlapping()
+    settings.learner.actor_lr = 1e-2
     settings.evaluation.every, settings.evaluation.episodes = 20, 2
     remote = train(tmp_path / "remote", settings)
 
