@@ -25,6 +25,22 @@ def test_every_table_of_the_results_is_made_of_the_rows_that_are_kept(
     assert [line for line in tables if line and line not in text] == []
 
 
+@pytest.mark.parametrize("runs", ["results/more", "results/overlap"])
+def test_the_tables_of_the_further_runs_are_made_of_their_rows(runs: str, tmp_path: Path) -> None:
+    report.main([str(DOCS / runs), "--output", str(tmp_path)])
+    text = (DOCS / "results.md").read_text(encoding="utf-8")
+    tables = (tmp_path / "tables.md").read_text(encoding="utf-8").splitlines()
+    found = [line for line in tables if line.startswith("| ddpg | mpfa_per |")]
+    assert len(found) == 2
+    assert [line for line in found if line not in text] == []
+    (further,) = report.by_method(report.read_rows(DOCS / runs / "episodes.csv")).values()
+    study = report.by_method(report.read_rows(DOCS / "results/episodes.csv"))
+    of_study = next(iter(next(iter(study.values())).values()))
+    assert len(further) == 3
+    for rows in further.values():
+        assert [r["shortest_path"] for r in rows] == [r["shortest_path"] for r in of_study]
+
+
 @pytest.mark.parametrize("study", STUDIES.values())
 def test_every_run_of_a_study_was_tested_on_the_same_two_hundred_pairs(study: str) -> None:
     methods = report.by_method(report.read_rows(DOCS / study / "episodes.csv"))
