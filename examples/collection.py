@@ -136,6 +136,9 @@ class LocalCollector:
 class RemoteCollector:
     """Drives in a second process, while this one learns.
 
+    The explorer in this process, which a method may ask how much noise there is, is as it was at
+    the end of the episode before.
+
     Args:
         settings: Of the run.
         policy: The policy; what acts is a copy of it in shared memory.
