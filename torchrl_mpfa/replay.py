@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 
+from torchrl_mpfa.checks import seeded_generator
 from torchrl_mpfa.sampler import SignalSampler, signal_table_of
-from torchrl_mpfa.tree import seeded_generator
 
 _UNRETURNED = 100
 """Batches in a row with signals that were not handed back, after which sampling is refused."""

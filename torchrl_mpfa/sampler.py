@@ -11,11 +11,12 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
+from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion, fuse
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal, SignalTable, as_signals
 from torchrl_mpfa.statistics import batch_statistics
-from torchrl_mpfa.tree import TreeSampler, bounds, check_finite, check_index, check_range
+from torchrl_mpfa.tree import TreeSampler
 
 _ENTROPY_REFRESH = 1 / 256
 

@@ -12,9 +12,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
+from torchrl_mpfa.checks import bounds
 from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal, SignalTable
-from torchrl_mpfa.tree import bounds
 
 _FORMAT = 1
 _FILE = "signals.pt"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from torch import Tensor
 from torchrl.data import Storage
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from torchrl_mpfa.checks import check_finite, check_index, check_range, seeded_generator
 from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.saving import load_safely, save_atomically
 
@@ -286,38 +286,3 @@ class TreeSampler(PrioritizedSampler):
             ValueError: See :meth:`check_state`.
         """
         self.load_state_dict(self.check_dump(path))
-
-
-def seeded_generator() -> torch.Generator:
-    """A generator of its own, seeded by the global one so that ``torch.manual_seed`` rules it."""
-    generator = torch.Generator()
-    generator.manual_seed(int(torch.randint(2**62, ())))
-    return generator
-
-
-def check_range(name: str, value: float, *, low: float) -> None:
-    """Refuse a number below ``low`` or not finite."""
-    if not low <= value < math.inf:
-        raise ValueError(f"{name} must be finite and at least {low}, got {value}")
-
-
-def bounds(values: Tensor) -> tuple[float, float]:
-    """Lowest and highest value; both NaN if any is."""
-    low, high = values.aminmax()
-    # Comparing tensors would cost five times what comparing numbers does.
-    return low.item(), high.item()
-
-
-def check_index(index: Tensor, size: int) -> Tensor:
-    """The slots without -1, by which TorchRL's writers mark what was not stored."""
-    low, high = bounds(index) if len(index) else (0, -1)
-    if low < -1 or high >= size:
-        raise IndexError(f"index must be in [0, {size}), got {low if low < -1 else high}")
-    return index[index >= 0] if low == -1 else index
-
-
-def check_finite(name: str, value: Tensor) -> None:
-    """Refuse values that are negative or not finite, naming the first."""
-    wrong = ~((value >= 0) & (value < math.inf))
-    if bool(wrong.any()):
-        raise ValueError(f"{name} must be finite and not negative, got {value[wrong][0].item()}")

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.sampler import SignalSampler
-from torchrl_mpfa.tree import check_range
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
