@@ -61,7 +61,6 @@ lint: $(STAMP)
 
 types: $(STAMP)
 	$(BIN)/python -m mypy
-	$(BIN)/python -m mypy --explicit-package-bases benchmarks .ci
 
 doctest: $(STAMP)
 	$(PYTEST) --doctest-modules torchrl_mpfa envs
@@ -71,7 +70,7 @@ format: $(STAMP) ## Format the code and mend what ruff can mend
 	$(BIN)/python -m ruff check --fix .
 
 bench: $(STAMP) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
-	$(BIN)/python benchmarks/run.py $(ARGS)
+	$(BIN)/python -m benchmarks $(ARGS)
 
 wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and use it
 	$(BIN)/python .ci/wheel_test.py

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
+from assembly import make_curiosity, make_learner
 from benchmarks.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
 from benchmarks.timing import MICROSECONDS, Call, Entry, entry, take_turns
-
-# The methods are those of the examples, which are no package.
-sys.path.insert(1, str(Path(__file__).parents[1] / "examples"))
-
-from assembly import make_curiosity, make_learner
 from methods import ALIASES, METHODS, Method
 from replay_assembly import make_buffer, make_selection
 from settings import Learner

@@ -1,9 +1,9 @@
 """Run the benchmarks: print one table, write one file.
 
-    python benchmarks/run.py                 all of them, some minutes
-    python benchmarks/run.py --quick         all of them, with fewer and shorter rounds
-    python benchmarks/run.py --only loss     one of them
-    python benchmarks/run.py --check         exit with 1 if a ratio is above its target
+    python -m benchmarks                 all of them, some minutes
+    python -m benchmarks --quick         all of them, with fewer and shorter rounds
+    python -m benchmarks --only loss     one of them
+    python -m benchmarks --check         exit with 1 if a ratio is above its target
 
 The file, ``benchmarks/latest.json``, holds what this run measured: a list of objects with ``name``,
 ``value``, ``unit``, ``ratio`` and ``baseline``. A ratio is this package's time over TorchRL's, both
@@ -107,7 +107,9 @@ def write_atomically(entries: Sequence[Entry], path: Path) -> None:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m benchmarks",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter rounds")
     parser.add_argument(
@@ -140,7 +142,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for sentence in missed:
         print(sentence, file=sys.stderr)
     return 1 if missed else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

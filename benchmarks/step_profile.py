@@ -1,7 +1,7 @@
 """Where the time of a training step goes, as a table in Markdown.
 
-    python benchmarks/step_profile.py             networks of 2 x 64 and 2 x 256, eager and compiled
-    python benchmarks/step_profile.py --widths 128
+    python -m benchmarks.step_profile             networks of 2 x 64 and 2 x 256, eager and compiled
+    python -m benchmarks.step_profile --widths 128
 
 MPFA-PER on an environment that does nothing. CPU time of one thread; each part is the median of as
 many steps as are asked for.

@@ -102,7 +102,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["check"],
             ["ruff format --check .", "ruff check .", "mypy", "--doctest-modules"],
         ),
-        (["bench", "ARGS=--quick"], ["python benchmarks/run.py --quick"]),
+        (["bench", "ARGS=--quick"], ["python -m benchmarks --quick"]),
         (["wheel-test"], ["python .ci/wheel_test.py"]),
     ],
 )

@@ -90,13 +90,9 @@ def test_the_first_step_is_the_same_bits_after_a_reset(physics: str) -> None:
 
 
 def test_the_same_seed_gives_the_same_bits_in_another_process(physics: str) -> None:
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); from test_navigation import rolled; "
-        "print(rolled(sys.argv[2]))"
-    )
-    here = str(__import__("pathlib").Path(__file__).parent)
+    code = "import sys; from tests.envs.test_navigation import rolled; print(rolled(sys.argv[1]))"
     result = subprocess.run(
-        [sys.executable, "-c", code, here, physics],
+        [sys.executable, "-c", code, physics],
         check=True,
         capture_output=True,
         text=True,

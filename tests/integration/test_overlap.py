@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDictBase
-from tiny_runs import rows, tiny, train
 
 from collection import LocalCollector, RemoteCollector, Start
 from exploration import Explorer
 from settings import TrainSettings
+from tests.integration.tiny_runs import rows, tiny, train
 from training import TrainingRun, read_checkpoint
 
 

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_runs import rows, tiny, train
 from torchrl.data import RandomSampler
 
 from methods import ALIASES
 from process import prepare_process
 from records import draw_learning_curve, load_policy
 from settings import GROUPS, Stage, TrainSettings
+from tests.integration.tiny_runs import rows, tiny, train
 from torchrl_mpfa import SignalSampler, save_atomically
 from training import CHECKPOINT, TrainingRun, read_checkpoint
 

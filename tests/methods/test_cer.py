@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from replays import make_buffer, make_transitions
 
+from tests.methods.replays import make_buffer, make_transitions
 from torchrl_mpfa.methods import CombinedSampler
 
 

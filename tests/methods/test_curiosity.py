@@ -5,9 +5,9 @@ import math
 
 import pytest
 import torch
-from replays import seeded
 from tensordict import TensorDict
 
+from tests.methods.replays import seeded
 from torchrl_mpfa.learners.base import make_optimizer
 from torchrl_mpfa.methods import Curiosity, intrinsic_reward
 

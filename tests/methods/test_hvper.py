@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from replays import make_buffer, make_transitions, seeded
 
+from tests.methods.replays import make_buffer, make_transitions, seeded
 from torchrl_mpfa import BatchFacts, SignalSampler
 from torchrl_mpfa.methods import (
     RELATIVE_ERROR,

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
 
+from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
 from torchrl_mpfa import DDPGLearner, SignalSampler, TD3Learner, make_actor, make_critic
 from torchrl_mpfa.losses import make_ddpg_loss, make_td3_loss
 from torchrl_mpfa.methods import LA3PSampler, PriorityFloor, split_draws

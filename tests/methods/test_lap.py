@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from replays import assert_shares, make_buffer, seeded, set_signals
 
+from tests.methods.replays import assert_shares, make_buffer, seeded, set_signals
 from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods import PriorityFloor
 

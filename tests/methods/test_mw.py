@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from replays import make_buffer, make_transitions, set_signals
 
+from tests.methods.replays import make_buffer, make_transitions, set_signals
 from torchrl_mpfa import FixedFusion, ScaledFusion
 from torchrl_mpfa.methods import CappedSampler
 

@@ -2,8 +2,8 @@
 
 import torch
 from tensordict import TensorDict
-from transitions import seeded
 
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
 
 GAMMA = 0.9

@@ -3,10 +3,10 @@
 from copy import deepcopy
 
 import torch
-from losses import GAMMA
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
+from tests.mpfa.losses import GAMMA
 from torchrl_mpfa import SACLearner, make_critic, make_sac_loss, make_stochastic_actor
 
 

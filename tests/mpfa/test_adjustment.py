@@ -2,11 +2,11 @@
 
 import math
 
-import oracles
 import pytest
 import torch
-from transitions import seeded
 
+from tests import oracles
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
 from torchrl_mpfa.adjustment import boost_positive, decay_factor, decay_threshold
 

@@ -4,8 +4,8 @@ import copy
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, make_networks
 
+from tests.mpfa.losses import GAMMA, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from transitions import seeded
 
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa.losses.distances import distance, pal_distance
 
 ALPHA = 0.4

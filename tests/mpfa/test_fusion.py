@@ -2,11 +2,11 @@
 
 import math
 
-import oracles
 import pytest
 import torch
-from transitions import make_transitions, seeded
 
+from tests import oracles
+from tests.mpfa.transitions import make_transitions, seeded
 from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion, SignalTable
 from torchrl_mpfa.fusion import (
     binary_entropy,

@@ -4,9 +4,9 @@ import io
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, make_loss, make_networks
 from torchrl.objectives import SoftUpdate
 
+from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks
 from torchrl_mpfa import DDPGLearner, Learner, make_ddpg_loss
 from torchrl_mpfa.learners import MultiTensorSoftUpdate
 

@@ -4,12 +4,12 @@ from copy import deepcopy
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
+from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
 from torchrl_mpfa import SignalDDPGLoss, make_ddpg_loss
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.

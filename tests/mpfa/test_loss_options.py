@@ -6,11 +6,11 @@ from copy import deepcopy
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import ValueEstimators
 
+from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
 from torchrl_mpfa import SignalDDPGLoss, make_ddpg_loss
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.

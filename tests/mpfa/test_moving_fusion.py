@@ -1,8 +1,8 @@
 """Fusions whose weights move with the training or with the scale of the signals."""
 
 import pytest
-from transitions import make_buffer, make_transitions, train_rounds
 
+from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
 from torchrl_mpfa import Annealed, FixedFusion, Fusion, ScaledFusion, ScheduledFusion
 from torchrl_mpfa.signals import SignalTable
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from transitions import seeded
 
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa import make_actor, make_critic
 
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from transitions import make_transitions, same, seeded
 
+from tests.mpfa.transitions import make_transitions, same, seeded
 from torchrl_mpfa import (
     REWARD,
     TD_ERROR,

@@ -2,11 +2,11 @@
 
 import math
 
-import oracles
 import pytest
 import torch
-from transitions import seeded
 
+from tests import oracles
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa.priorities import (
     action_gradient_priority,
     importance_weights,

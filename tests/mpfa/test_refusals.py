@@ -4,8 +4,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
-from transitions import make_buffer, make_transitions, same, snapshot, train_rounds, write_signals
 
+from tests.mpfa.transitions import (
+    make_buffer,
+    make_transitions,
+    same,
+    snapshot,
+    train_rounds,
+    write_signals,
+)
 from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
 
 

@@ -7,8 +7,15 @@ from torchrl.data import LazyTensorStorage
 from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.transforms import Compose, DoubleToFloat, RewardScaling
-from transitions import make_buffer, make_transitions, same, seeded, train_rounds, write_signals
 
+from tests.mpfa.transitions import (
+    make_buffer,
+    make_transitions,
+    same,
+    seeded,
+    train_rounds,
+    write_signals,
+)
 from torchrl_mpfa import (
     REWARD,
     MPFASampler,

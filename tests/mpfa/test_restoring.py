@@ -7,8 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 from torchrl.checkpoint import Checkpoint
-from transitions import make_buffer, make_transitions, same, seeded, snapshot, train_rounds
 
+from tests.mpfa.transitions import (
+    make_buffer,
+    make_transitions,
+    same,
+    seeded,
+    snapshot,
+    train_rounds,
+)
 from torchrl_mpfa import (
     MPFASampler,
     SignalMemmapStorage,

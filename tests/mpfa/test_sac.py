@@ -4,10 +4,10 @@ from copy import deepcopy
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, parameter_gradients
-from sac_networks import critics_of, evaluate, make_loss, make_networks, without_shortcut
 from torchrl.objectives import SACLoss, ValueEstimators
 
+from tests.mpfa.losses import GAMMA, make_batch, parameter_gradients
+from tests.mpfa.sac_networks import critics_of, evaluate, make_loss, make_networks, without_shortcut
 from torchrl_mpfa import make_actor, make_critic, make_sac_loss
 
 # TorchRL warns at every loss whose target networks nothing moves.

@@ -6,11 +6,11 @@ from copy import deepcopy
 
 import pytest
 import torch
-from losses import make_batch
-from sac_networks import critics_of, make_learner, make_networks
 from tensordict import TensorDict
-from transitions import make_buffer, seeded
 
+from tests.mpfa.losses import make_batch
+from tests.mpfa.sac_networks import critics_of, make_learner, make_networks
+from tests.mpfa.transitions import make_buffer, seeded
 from torchrl_mpfa import Learner, SACLearner, make_sac_loss
 
 

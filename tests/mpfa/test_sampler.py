@@ -2,14 +2,20 @@
 
 import math
 
-import oracles
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 from torchrl.data.replay_buffers import PrioritizedSampler
-from transitions import make_buffer, make_transitions, seeded, train_rounds, write_signals
 
+from tests import oracles
+from tests.mpfa.transitions import (
+    make_buffer,
+    make_transitions,
+    seeded,
+    train_rounds,
+    write_signals,
+)
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,

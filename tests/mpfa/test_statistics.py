@@ -2,11 +2,11 @@
 
 import math
 
-import oracles
 import pytest
 import torch
-from transitions import make_buffer, make_transitions, train_rounds, write_signals
 
+from tests import oracles
+from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds, write_signals
 from torchrl_mpfa import FixedFusion
 from torchrl_mpfa.statistics import effective_sample_size, signal_shares
 

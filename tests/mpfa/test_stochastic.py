@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from losses import make_batch
-from sac_networks import make_networks
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
+from tests.mpfa.losses import make_batch
+from tests.mpfa.sac_networks import make_networks
 from torchrl_mpfa import make_stochastic_actor
 from torchrl_mpfa.stochastic import draw_tanh_normal
 

@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictMaxValueWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
-from transitions import make_buffer, make_transitions, same, seeded, write_signals
 
+from tests.mpfa.transitions import make_buffer, make_transitions, same, seeded, write_signals
 from torchrl_mpfa import Signal, SignalMemmapStorage, SignalTensorStorage
 
 KINDS = ["memory", "memmap", "memmap_scratch"]

@@ -4,10 +4,10 @@ from copy import deepcopy
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, make_networks, parameter_gradients
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import TD3Loss, ValueEstimators
 
+from tests.mpfa.losses import GAMMA, make_batch, make_networks, parameter_gradients
 from torchrl_mpfa import SignalTD3Loss, TD3Learner, make_ddpg_loss, make_td3_loss
 
 # TorchRL warns at every loss whose target networks nothing moves.

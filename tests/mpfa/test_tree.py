@@ -3,14 +3,14 @@
 import math
 
 import numpy as np
-import oracles
 import pytest
 import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.data.replay_buffers.scheduler import LinearScheduler
-from transitions import make_transitions, same, seeded
 
+from tests import oracles
+from tests.mpfa.transitions import make_transitions, same, seeded
 from torchrl_mpfa import TreeSampler
 
 

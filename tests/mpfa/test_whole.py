@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from losses import GAMMA, make_batch, make_networks
 from tensordict.nn import TensorDictModule
 
+from tests.mpfa.losses import GAMMA, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
 from torchrl_mpfa.losses.whole import WholeGradients
 

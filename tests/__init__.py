@@ -1,0 +1,1 @@
+"""The tests, a package so that their shared parts are imported by one name."""
