@@ -25,8 +25,8 @@ from mpfa_envs import (
     NavigationEnv,
     PathPlanner,
     World,
-    draw_trajectories,
     evaluation_pairs,
+    render_trajectories,
 )
 from mpfa_envs.simulation import Simulation
 
@@ -199,7 +199,7 @@ def drive_straight(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, li
 
 
 def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, list[Any]]:
-    """Follow the shortest path that keeps the training margin where it can, knowing the map.
+    """Follow the shortest path, at the paper's collision distance where there is one.
 
     Args:
         env: The environment.
@@ -209,8 +209,8 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
         How the episode ended and the way of the robot.
     """
     start, goal = options["start"][:2], options["goal"]
-    for margin in (env.robot.margin, env.robot.radius):
-        path = PathPlanner(env.world, margin=margin).find(start, goal)
+    for radius in (env.robot.collision_distance, env.robot.radius):
+        path = PathPlanner(env.world, radius=radius).find(start, goal)
         if path is not None:
             return _follow(env, options, path[1:])
     raise ValueError(f"there is no path from {start} to {goal}")
@@ -233,7 +233,7 @@ def _follow(
         action = np.array([1.0 - 2.0 * max(turn, 0.0), 1.0 + 2.0 * min(turn, 0.0)])
         _, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
-            outcomes = ("success", "collision", "time_out")
+            outcomes = ("success", "collision", "timeout")
             return next(name for name in outcomes if info[name]), env.trail
 
 
@@ -252,7 +252,7 @@ def describe_world(world: World) -> dict[str, float]:
     """
     pairs = evaluation_pairs(world, PAIRS, seed=0)
     clearances = [world.clearance(x, y) for x in GRID for y in GRID]
-    tight, wide = PathPlanner(world, margin=0.18), PathPlanner(world, margin=0.35)
+    tight, wide = PathPlanner(world, radius=0.18), PathPlanner(world, radius=0.35)
     lengths = [tight.length(pair.start[:2], pair.goal) for pair in pairs]
     direct = [math.dist(pair.start[:2], pair.goal) for pair in pairs]
     row = {
@@ -285,7 +285,7 @@ def draw_worlds(*, size: int = 320) -> np.ndarray[Any, Any]:
         Picture of shape ``[height, width, 3]``.
     """
     pictures = [
-        draw_trajectories(world, [], [], [], title=name, size=size)
+        render_trajectories(world, [], [], [], title=name, size=size)
         for name, world in WORLDS.items()
     ]
     rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]

@@ -10,7 +10,7 @@ from mpfa_envs import NavigationEnv, make_navigation_env
 from mpfa_envs.robot import resolve_robot
 from settings import Environment
 
-INFO = ("success", "collision", "time_out", "path_length", "shortest_path")
+INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
 def _senses(settings: Environment) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from evaluation import (
     run_episodes,
     summarize,
 )
-from mpfa_envs import NavigationEnv, Task, draw_trajectories, evaluation_pairs
+from mpfa_envs import NavigationEnv, Task, evaluation_pairs, render_trajectories
 from records import load_policy, write_rows, write_text_atomically
 from settings import Environment
 
@@ -80,9 +80,9 @@ def write_pictures(
 ) -> None:
     """Draw every path into one picture of the map."""
     outcomes = [
-        "success" if r.success else "collision" if r.collision else "time_out" for r in results
+        "success" if r.success else "collision" if r.collision else "timeout" for r in results
     ]
-    picture = draw_trajectories(
+    picture = render_trajectories(
         env.world,
         trajectories,
         [task.goal for task in tasks],

@@ -95,7 +95,7 @@ def run_episode(
             episode=number,
             success=success,
             collision=bool(info["collision"]),
-            timeout=bool(info["time_out"]),
+            timeout=bool(info["timeout"]),
             time_s=float(info["sim_time"]),
             path_length=driven,
             shortest_path=shortest,

@@ -30,7 +30,7 @@ def evaluate_progress(
         episode: Episodes so far.
 
     Returns:
-        Rates of success, collision and time-out, and the mean SPL.
+        Rates of success, collision and timeout, and the mean SPL.
     """
     start = time.perf_counter()
     wanted = settings.evaluation

@@ -35,7 +35,7 @@ class EpisodeRecord:
     """Wall-clock time [s]."""
     success: bool
     collision: bool
-    time_out: bool
+    timeout: bool
     path_length: float
     """Distance driven [m]."""
     shortest_path: float

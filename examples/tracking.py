@@ -60,7 +60,7 @@ class Tracker:
             {
                 "train/success": float(record.success),
                 "train/collision": float(record.collision),
-                "train/time_out": float(record.time_out),
+                "train/timeout": float(record.timeout),
                 "train/reward": record.reward,
                 "train/average_reward": record.average_reward,
                 "train/steps": record.steps,

@@ -14,7 +14,7 @@ from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
 from mpfa_envs.random_worlds import random_world
-from mpfa_envs.render import draw_trajectories
+from mpfa_envs.render import render_trajectories
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
 from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
@@ -23,7 +23,7 @@ from mpfa_envs.worlds import Box, Cylinder, World
 
 if TYPE_CHECKING:
     from mpfa_envs.mirror import Mirror, RandomMirror
-    from mpfa_envs.tensordict import NavigationTorchEnv, make_navigation_env
+    from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
 
 ENV_IDS = tuple(f"mpfa/Navigation-{name}-v0" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
@@ -51,13 +51,13 @@ __all__ = [
     "Task",
     "World",
     "WorldFileError",
-    "draw_trajectories",
     "evaluation_pairs",
     "load_world",
     "make_navigation_env",
     "navigation_reward",
     "observation_slices",
     "random_world",
+    "render_trajectories",
     "sample_task",
     "save_world",
 ]
@@ -72,9 +72,9 @@ for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
 
 _TORCH_PARTS = {
     "Mirror": "mirror",
-    "NavigationTorchEnv": "tensordict",
+    "NavigationTorchEnv": "torchrl_env",
     "RandomMirror": "mirror",
-    "make_navigation_env": "tensordict",
+    "make_navigation_env": "torchrl_env",
 }
 
 

@@ -64,7 +64,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     success, as the cases of Eq. (25) are ordered.
 
     **Info**, the same keys after every reset and step (:data:`INFO_TYPES`): ``success``,
-    ``collision``, ``time_out``; ``sim_time`` [s]; ``path_length`` driven so far [m];
+    ``collision``, ``timeout``; ``sim_time`` [s]; ``path_length`` driven so far [m];
     ``shortest_path`` [m], the shortest path that ends the episode: from the start to the goal's
     center for a disc of the robot's radius, less the goal's radius, so that
     ``success * shortest_path / max(path_length, shortest_path)`` is the SPL; ``min_clearance`` [m],
@@ -85,7 +85,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             may end after any of them.
         goal_radius: Distance of the robot's center from the goal that reaches it [m].
         collision_distance: Distance of the robot's center from an obstacle or wall that is a
-            collision [m]. None: the robot's training margin, its radius and 0.17 m, which is 0.35 m
+            collision [m]. None: that of the paper, the robot's radius and 0.17 m, which is 0.35 m
             for the TurtleBot2. ``"contact"``: the robot's radius.
         progress_scale: The paper's ε_p in Eq. (25), reward per meter of approach [1/m].
         goal_reward: Reward for the goal.
@@ -331,10 +331,10 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         if self._task is None:
             raise ResetNeeded("there is nothing to draw: call reset() before render()")
         # Imported here because training does not draw.
-        from mpfa_envs.render import draw_scene
+        from mpfa_envs.render import render_scene
 
         motion = self._motion
-        return draw_scene(
+        return render_scene(
             self.world,
             robot=self.robot,
             pose=motion[:3],
@@ -357,14 +357,14 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         return observe(ranges, motion, self._goal, self._distance, self.robot, near)
 
     def _info(
-        self, success: bool, collision: bool, time_out: bool, terms: RewardTerms
+        self, success: bool, collision: bool, timeout: bool, terms: RewardTerms
     ) -> dict[str, Any]:
         """Build the info dictionary; its keys are those of :data:`INFO_TYPES`."""
         motion = self._motion
         return {
             "success": success,
             "collision": collision,
-            "time_out": time_out,
+            "timeout": timeout,
             "reward_goal": terms.goal,
             "reward_collision": terms.collision,
             "reward_progress": terms.progress,

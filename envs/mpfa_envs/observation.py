@@ -22,7 +22,7 @@ DISTANCE_SCALE: Final = 10.0
 SPEED_BOUND: Final = 2.0
 """Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
 
-_FLAGS = ("success", "collision", "time_out")
+_FLAGS = ("success", "collision", "timeout")
 _NUMBERS = (
     "reward_goal",
     "reward_collision",

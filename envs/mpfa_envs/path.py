@@ -1,9 +1,9 @@
 """Shortest paths of a disc-shaped robot among the obstacles of a world.
 
-Obstacles are grown by a margin, and A* searches the graph of lines of sight between their corners.
-Where a path bends around a corner the true optimum is an arc; ours follows a polygon around it, at
-most 3 % longer on that arc: 7 mm per right angle at a margin of 0.18 m. All else is exact, so there
-is no grid and no resolution, and where the straight line is free it is the answer.
+Obstacles are grown by the robot's radius, and A* searches the graph of lines of sight between
+their corners. Where a path bends around a corner the true optimum is an arc; ours follows a polygon
+around it, at most 3 % longer on that arc: 7 mm per right angle at a radius of 0.18 m. All else is
+exact, so there is no grid and no resolution, and where the straight line is free it is the answer.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ _CIRCLE_CORNERS = 16
 
 
 class PathPlanner:
-    """Finds shortest paths that keep a margin to every obstacle and wall.
+    """Finds shortest paths of a disc's center that keep its radius from obstacles and walls.
 
     Lines of sight are found when a search first needs them and kept, so the first paths in a world
     take milliseconds and later ones less.
 
     Args:
         world: The room and its obstacles.
-        margin: Distance to keep [m].
+        radius: Radius of the disc [m].
 
     Raises:
-        ValueError: If the margin is not a positive length.
+        ValueError: If the radius is not a positive length.
 
     Examples:
         >>> from mpfa_envs import WORLDS, PathPlanner
-        >>> planner = PathPlanner(WORLDS["B"], margin=0.18)
+        >>> planner = PathPlanner(WORLDS["B"], radius=0.18)
         >>> planner.is_straight((0.0, 0.0), (2.0, 3.0)), planner.is_straight((0.0, 0.0), (4.0, 0.0))
         (True, False)
         >>> round(planner.length((0.0, 0.0), (4.0, 0.0)), 2)  # [m]
         6.39
     """
 
-    def __init__(self, world: World, *, margin: float) -> None:
-        if not (math.isfinite(margin) and margin > 0):
-            raise ValueError(f"margin must be a positive length, got {margin}")
+    def __init__(self, world: World, *, radius: float) -> None:
+        if not (math.isfinite(radius) and radius > 0):
+            raise ValueError(f"radius must be a positive length, got {radius}")
         self.world = world
-        self.margin = float(margin)
-        reach = self.margin - _TOUCH
+        self.radius = float(radius)
+        reach = self.radius - _TOUCH
         boxes: list[tuple[float, float, float, float]] = []
         circles: list[tuple[float, float, float]] = []
         corners: list[NDArray[np.float64]] = []
@@ -74,24 +74,24 @@ class PathPlanner:
             ):
                 circles.append((x, y, reach))
                 angles = _CORNER_ANGLES + quarter * math.pi / 2
-                corners.append(_polygon(x, y, self.margin / math.cos(math.radians(15)), angles))
+                corners.append(_polygon(x, y, self.radius / math.cos(math.radians(15)), angles))
         for cylinder in world.cylinders:
-            radius = cylinder.radius + self.margin
-            circles.append((cylinder.x, cylinder.y, radius - _TOUCH))
+            grown = cylinder.radius + self.radius
+            circles.append((cylinder.x, cylinder.y, grown - _TOUCH))
             around = np.arange(_CIRCLE_CORNERS) * (2 * math.pi / _CIRCLE_CORNERS)
-            outer = radius / math.cos(math.pi / _CIRCLE_CORNERS)
+            outer = grown / math.cos(math.pi / _CIRCLE_CORNERS)
             corners.append(_polygon(cylinder.x, cylinder.y, outer, around))
         # Sides, rectangles in the last axis; centers and squared radii, circles in the last axis.
         self._low, self._high = np.array(boxes).reshape(-1, 2, 2).transpose(1, 2, 0)
         *self._centers, radii = np.array(circles).reshape(-1, 3).T
         self._squares = radii * radii
         nodes = np.concatenate([np.empty((0, 2)), *corners])
-        free = [world.clearance(x, y) >= self.margin - _TOUCH for x, y in nodes]
+        free = [world.clearance(x, y) >= self.radius - _TOUCH for x, y in nodes]
         self._nodes = nodes[np.array(free, dtype=np.bool_)]
         self._neighbors: dict[int, list[tuple[int, float]]] = {}
 
     def is_straight(self, start: Point, goal: Point) -> bool:
-        """Tell whether the straight line keeps the margin.
+        """Tell whether the disc can take the straight line.
 
         Args:
             start: Position (x, y) [m].
@@ -113,7 +113,7 @@ class PathPlanner:
             Corners of the path from start to goal [m], or None if there is none.
         """
         for point in (start, goal):
-            if self.world.clearance(*point) < self.margin - _TOUCH:
+            if self.world.clearance(*point) < self.radius - _TOUCH:
                 return None
         if self.is_straight(start, goal):
             return [start, goal]
@@ -127,10 +127,10 @@ class PathPlanner:
             goal: Position (x, y) [m].
 
         Returns:
-            Whether a path keeps the margin.
+            Whether there is one.
         """
         for point in (start, goal):
-            if self.world.clearance(*point) < self.margin - _TOUCH:
+            if self.world.clearance(*point) < self.radius - _TOUCH:
                 return False
         if self.is_straight(start, goal):
             return True
@@ -221,8 +221,8 @@ class PathPlanner:
     def _visible(self, origin: Point, targets: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which targets ``[N, 2]`` are joined to the origin by a free line, shape ``[N]``.
 
-        All of these points keep the margin themselves, so that a line comes too near to a box only
-        by crossing it or by passing one of its corners.
+        All of these points are far enough from obstacles themselves, so that a line comes too near
+        to a box only by crossing it or by passing one of its corners.
         """
         x, y = origin
         step_x, step_y = np.ascontiguousarray((targets - origin).T)
@@ -259,14 +259,14 @@ def _polygon(
 
 
 @lru_cache(maxsize=64)
-def planner_for(world: World, margin: float) -> PathPlanner:
+def planner_for(world: World, radius: float) -> PathPlanner:
     """Share one planner, and the lines of sight it has found, among the users of a world.
 
     Args:
         world: The room and its obstacles.
-        margin: Distance to keep [m].
+        radius: Radius of the disc [m].
 
     Returns:
         The planner.
     """
-    return PathPlanner(world, margin=margin)
+    return PathPlanner(world, radius=radius)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mpfa_envs.robot import RobotModel
     from mpfa_envs.worlds import World
 
-Outcome = Literal["success", "collision", "time_out"]
+Outcome = Literal["success", "collision", "timeout"]
 """How an episode ended."""
 
 Color = tuple[int, int, int, int]
@@ -41,7 +41,7 @@ TEXT: Final = (40, 44, 52, 255)
 OUTCOMES: Final[dict[str, Color]] = {
     "success": (37, 99, 186, 190),
     "collision": (222, 82, 32, 230),
-    "time_out": (150, 120, 190, 230),
+    "timeout": (150, 120, 190, 230),
 }
 """Colors of the lines of an episode; they differ in lightness too."""
 
@@ -181,7 +181,7 @@ class _Layer:
         self._canvas.draw = ImageDraw.Draw(self._below)
 
 
-def draw_scene(
+def render_scene(
     world: World,
     *,
     robot: RobotModel,
@@ -212,8 +212,8 @@ def draw_scene(
 
     Examples:
         >>> from mpfa_envs import ROBOTS, WORLDS
-        >>> from mpfa_envs.render import draw_scene
-        >>> draw_scene(
+        >>> from mpfa_envs.render import render_scene
+        >>> render_scene(
         ...     WORLDS["B"], robot=ROBOTS["turtlebot2"], pose=(0.0, 0.0, 0.0), goal=(2.0, 3.0),
         ...     goal_radius=0.5,
         ... ).shape
@@ -239,7 +239,7 @@ def draw_scene(
     return canvas.pixels()
 
 
-def draw_trajectories(
+def render_trajectories(
     world: str | os.PathLike[str] | World,
     trajectories: Sequence[Sequence[Point] | NDArray[np.float64]],
     goals: Sequence[Point],
@@ -257,7 +257,7 @@ def draw_trajectories(
         world: A name, the path of a YAML file or a world.
         trajectories: Positions of each episode, each of shape ``[steps, 2]`` [m].
         goals: Goal of each episode (x, y) [m].
-        outcomes: ``"success"``, ``"collision"`` or ``"time_out"`` for each episode.
+        outcomes: ``"success"``, ``"collision"`` or ``"timeout"`` for each episode.
         title: What to write in the strip.
         size: Longer side of the picture without the strip [px].
 
@@ -269,8 +269,8 @@ def draw_trajectories(
             an integer of at least 32.
 
     Examples:
-        >>> from mpfa_envs import draw_trajectories
-        >>> draw_trajectories("A", [[(0, 0), (1, 1), (2, 3)]], [(2, 3)], ["success"]).shape
+        >>> from mpfa_envs import render_trajectories
+        >>> render_trajectories("A", [[(0, 0), (1, 1), (2, 3)]], [(2, 3)], ["success"]).shape
         (508, 480, 3)
     """
     world = resolve_world(world)

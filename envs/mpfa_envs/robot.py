@@ -85,8 +85,8 @@ class RobotModel:
         return (self.max_wheel_speed - self.min_wheel_speed) / self.wheel_base
 
     @property
-    def margin(self) -> float:
-        """Distance of the center from an obstacle that training counts as a collision [m].
+    def collision_distance(self) -> float:
+        """Distance of the center from an obstacle that the paper's training calls a collision [m].
 
         The TurtleBot2's 0.35 m are its radius and 0.17 m; the other robots keep the 0.17 m.
         """
@@ -255,7 +255,7 @@ def resolve_collision_distance(
 
     Args:
         value: A distance of the robot's center from an obstacle [m], ``"contact"`` for the robot's
-            radius, or None for its training margin.
+            radius, or None for that of the paper's training.
         robot: The robot.
 
     Returns:
@@ -265,7 +265,7 @@ def resolve_collision_distance(
         ValueError: If the value is neither, or below the radius.
     """
     if value is None:
-        return robot.margin
+        return robot.collision_distance
     if value == "contact":
         return robot.radius
     if isinstance(value, str) or not (math.isfinite(value) and value >= robot.radius):

@@ -186,8 +186,8 @@ def evaluation_pairs(
         world: A name, the path of a YAML file or a world.
         n: Number of tasks.
         seed: Seed of the draw; the first tasks of a longer list are those of a shorter one.
-        robot: Whose margin counts.
-        collision_distance: Margin that the start, the goal and a path between them keep [m];
+        robot: Whose radius and collision distance count.
+        collision_distance: What the start, the goal and a path between them keep [m];
             None: the robot's own, for the TurtleBot2 0.35 m; ``"contact"``: its radius.
         min_goal_distance: Least distance between start and goal [m].
 
@@ -208,10 +208,10 @@ def evaluation_pairs(
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise ValueError(f"n must be a positive integer, got {n!r}")
     world = resolve_world(world)
-    margin = resolve_collision_distance(collision_distance, resolve_robot(robot))
+    distance = resolve_collision_distance(collision_distance, resolve_robot(robot))
     # A stream of its own: an environment with the same seed must not train on these tasks.
     rng = np.random.default_rng((_EVALUATION_STREAM, seed))
     return [
-        sample_task(world, rng, collision_distance=margin, min_goal_distance=min_goal_distance)
+        sample_task(world, rng, collision_distance=distance, min_goal_distance=min_goal_distance)
         for _ in range(n)
     ]

@@ -155,7 +155,7 @@ def test_the_goal_ends_an_episode_with_success() -> None:
         assert reward == info["reward_progress"] == pytest.approx(15 * 0.05)
     _, reward, terminated, truncated, info = env.step([1.0, 1.0])
     assert (reward, terminated, truncated) == (10.0, True, False)
-    assert (info["success"], info["collision"], info["time_out"]) == (True, False, False)
+    assert (info["success"], info["collision"], info["timeout"]) == (True, False, False)
     assert info["path_length"] == pytest.approx(2.5)
     assert info["shortest_path"] == pytest.approx(2.48)
     assert info["sim_time"] == pytest.approx(5.0)
@@ -188,16 +188,16 @@ def test_the_time_limit_truncates_and_does_not_terminate() -> None:
     ends = [env.step([1.0, 1.0]) for _ in range(3)]
     assert [end[2] for end in ends] == [False, False, False]
     assert [end[3] for end in ends] == [False, False, True]
-    assert [end[4]["time_out"] for end in ends] == [False, False, True]
+    assert [end[4]["timeout"] for end in ends] == [False, False, True]
     assert ends[-1][1] == pytest.approx(0.75)
 
 
-def test_a_goal_in_the_last_step_is_no_time_out() -> None:
+def test_a_goal_in_the_last_step_is_no_timeout() -> None:
     env = NavigationEnv(physics="kinematic", max_steps=50)
     env.reset(options=STRAIGHT)
     for _ in range(50):
         _, _, terminated, truncated, info = env.step([1.0, 1.0])
-    assert (terminated, truncated, info["time_out"]) == (True, False, False)
+    assert (terminated, truncated, info["timeout"]) == (True, False, False)
 
 
 def test_the_info_has_the_same_keys_and_types_always(physics: str) -> None:

@@ -11,25 +11,25 @@ from mpfa_envs import WORLDS, Box, Cylinder, PathPlanner, World
 BLOCK = World(name="block", boxes=(Box(-1.0, -2.0, 1.0, 2.0),))
 
 
-def around_a_corner(margin: float) -> float:
+def around_a_corner(radius: float) -> float:
     """Length from (-3, 0) to (3, 0) around the block: tangents, two arcs and a straight [m]."""
     reach = math.hypot(2.0, 2.0)
-    tangent = math.sqrt(reach**2 - margin**2)
+    tangent = math.sqrt(reach**2 - radius**2)
     # The tangent leaves at this angle from the x axis and the arc turns it into the x axis.
-    turn = math.atan2(2.0, 2.0) + math.asin(margin / reach)
-    return 2 * tangent + 2 * margin * turn + 2.0
+    turn = math.atan2(2.0, 2.0) + math.asin(radius / reach)
+    return 2 * tangent + 2 * radius * turn + 2.0
 
 
 def test_a_free_line_is_the_path_and_its_length_is_exact() -> None:
-    planner = PathPlanner(WORLDS["A"], margin=0.18)
+    planner = PathPlanner(WORLDS["A"], radius=0.18)
     assert planner.find((0.0, 0.0), (3.0, 4.0)) == [(0.0, 0.0), (3.0, 4.0)]
     assert planner.length((0.0, 0.0), (3.0, 4.0)) == 5.0
 
 
-@pytest.mark.parametrize("margin", [0.05, 0.18, 0.35])
-def test_the_way_around_a_box_is_within_a_percent_of_the_optimum(margin: float) -> None:
-    optimum = around_a_corner(margin)
-    length = PathPlanner(BLOCK, margin=margin).length((-3.0, 0.0), (3.0, 0.0))
+@pytest.mark.parametrize("radius", [0.05, 0.18, 0.35])
+def test_the_way_around_a_box_is_within_a_percent_of_the_optimum(radius: float) -> None:
+    optimum = around_a_corner(radius)
+    length = PathPlanner(BLOCK, radius=radius).length((-3.0, 0.0), (3.0, 0.0))
     assert optimum - 1e-9 <= length <= 1.01 * optimum
 
 
@@ -37,14 +37,14 @@ def test_the_way_around_a_cylinder_is_within_a_percent_of_the_optimum() -> None:
     world = World(name="pillar", cylinders=(Cylinder(0.0, 0.0, 1.0),))
     reach = 1.18
     optimum = 2 * math.sqrt(9 - reach**2) + reach * (math.pi - 2 * math.acos(reach / 3))
-    length = PathPlanner(world, margin=0.18).length((-3.0, 0.0), (3.0, 0.0))
+    length = PathPlanner(world, radius=0.18).length((-3.0, 0.0), (3.0, 0.0))
     assert optimum - 1e-9 <= length <= 1.01 * optimum
 
 
 @pytest.mark.parametrize("name", ["D", "validation", "test"])
 def test_no_point_of_a_path_comes_nearer_than_the_margin(name: str) -> None:
     world = WORLDS[name]
-    planner = PathPlanner(world, margin=0.35)
+    planner = PathPlanner(world, radius=0.35)
     rng = np.random.default_rng(1)
     found = 0
     while found < 15:
@@ -63,16 +63,16 @@ def test_no_point_of_a_path_comes_nearer_than_the_margin(name: str) -> None:
 def test_a_narrow_passage_is_open_to_a_thin_robot_only() -> None:
     world = World(name="door", boxes=(Box(-0.2, -5.0, 0.2, -0.3), Box(-0.2, 0.3, 0.2, 5.0)))
     ends = (-2.0, 1.0), (2.0, -1.0)
-    assert PathPlanner(world, margin=0.18).length(*ends) < 5.0
-    assert PathPlanner(world, margin=0.35).length(*ends) == math.inf
-    assert PathPlanner(world, margin=0.35).find(*ends) is None
-    assert not PathPlanner(world, margin=0.35).is_reachable(*ends)
+    assert PathPlanner(world, radius=0.18).length(*ends) < 5.0
+    assert PathPlanner(world, radius=0.35).length(*ends) == math.inf
+    assert PathPlanner(world, radius=0.35).find(*ends) is None
+    assert not PathPlanner(world, radius=0.35).is_reachable(*ends)
 
 
 def test_there_is_no_path_from_within_a_margin() -> None:
-    assert PathPlanner(BLOCK, margin=0.18).find((-1.1, 0.0), (3.0, 0.0)) is None
+    assert PathPlanner(BLOCK, radius=0.18).find((-1.1, 0.0), (3.0, 0.0)) is None
 
 
 def test_a_bad_margin_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"margin must be a positive length, got 0"):
-        PathPlanner(BLOCK, margin=0)
+    with pytest.raises(ValueError, match=r"radius must be a positive length, got 0"):
+        PathPlanner(BLOCK, radius=0)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpfa_envs import WORLDS, NavigationEnv, World, draw_trajectories
+from mpfa_envs import WORLDS, NavigationEnv, World, render_trajectories
 from mpfa_envs.render import FLOOR, GOAL, OBSTACLE, OUTCOMES, TRAIL, WALL
 
 
@@ -38,7 +38,7 @@ def test_without_a_render_mode_nothing_is_drawn() -> None:
 
 
 def test_trajectories_have_the_color_of_their_outcome() -> None:
-    picture = draw_trajectories(
+    picture = render_trajectories(
         "A",
         [np.array([(-4.0, 0.03), (4.0, 0.03)]), [(-4.0, -2.97), (4.0, -2.97)]],
         [(4.0, 0.0), (4.0, 3.0)],
@@ -52,7 +52,7 @@ def test_trajectories_have_the_color_of_their_outcome() -> None:
 
 def test_a_long_room_gives_a_long_picture() -> None:
     world = World(name="hall", size=(9.6, 4.6))
-    assert draw_trajectories(world, [], [], [], size=200).shape == (128, 200, 3)
+    assert render_trajectories(world, [], [], [], size=200).shape == (128, 200, 3)
 
 
 @pytest.mark.parametrize(
@@ -64,9 +64,9 @@ def test_a_long_room_gives_a_long_picture() -> None:
 )
 def test_bad_lists_are_refused(arguments: tuple[list, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        draw_trajectories(WORLDS["A"], *arguments)
+        render_trajectories(WORLDS["A"], *arguments)
 
 
 def test_a_bad_size_is_refused() -> None:
     with pytest.raises(ValueError, match="size must be an integer of at least 32, got 3"):
-        draw_trajectories("A", [], [], [], size=3)
+        render_trajectories("A", [], [], [], size=3)

@@ -172,7 +172,7 @@ def test_a_curriculum_that_does_not_carry_starts_anew_on_each_map(tmp_path: Path
 def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
     assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
-    assert all(r.success + r.collision + r.time_out == 1 for r in run.records)
+    assert all(r.success + r.collision + r.timeout == 1 for r in run.records)
     assert sum(r.steps for r in run.records) == run.step == run.records[-1].total_steps
     assert (tmp_path / "episodes.csv").read_text().count("\n") == 1 + len(run.records)
 
