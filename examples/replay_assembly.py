@@ -129,7 +129,7 @@ def make_buffer(method: Method, *, seed: int) -> SignalReplayBuffer:
             method.capacity, signals=signals_of(method) or MPFA_SIGNALS, device="auto"
         ),
         sampler=sampler,
-        batch_size=sampler.drawn(size) if isinstance(sampler, LA3PSampler) else size,
+        batch_size=size,
         generator=torch.Generator().manual_seed(seed),
     )
 
@@ -148,5 +148,5 @@ def make_selection(
         return split_draws
     if method.candidates > 1:
         choose = LowestDivergence(policy, batches=method.candidates, sigma=sigma)
-        return lambda buffer: [Draw(choose(buffer.sample()))]
+        return lambda buffer: iter([Draw(choose(buffer.sample()))])
     return one_batch

@@ -6,7 +6,7 @@ several batches, or gives the actor one of its own, is another callable of the s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -22,6 +22,8 @@ class Draw:
         batch: What the critic learns from, and whose signals are updated, batch size ``[B]``.
         actor_batch: What the actor learns from; None: the same.
         loss_function: Distance of the critic's loss; None: the loss's own.
+        new_step: Whether a new training step begins; false for the further draws of one, which a
+            delay of the actor does not count.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -32,24 +34,32 @@ class Draw:
     batch: TensorDictBase
     actor_batch: TensorDictBase | None = None
     loss_function: str | None = None
+    new_step: bool = True
 
 
 @runtime_checkable
 class Selection(Protocol):
-    """How the batches of a training step are chosen; any callable of this form will do."""
+    """How the batches of a training step are chosen; any callable of this form will do.
 
-    def __call__(self, buffer: TensorDictReplayBuffer) -> Sequence[Draw]:
-        """Draw the batches of one training step."""
+    The draws come one by one, so that a later one can depend on what an earlier one taught::
+
+        for draw in select(buffer):
+            losses = learner.update(draw)
+            buffer.update_tensordict_priority(draw.batch)
+    """
+
+    def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+        """Sample the batches of one training step, each when it is asked for."""
         ...
 
 
-def one_batch(buffer: TensorDictReplayBuffer) -> Sequence[Draw]:
+def one_batch(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
     """One batch for critic and actor, as the buffer samples it.
 
     Args:
         buffer: The replay buffer.
 
-    Returns:
+    Yields:
         One draw.
 
     Examples:
@@ -60,4 +70,4 @@ def one_batch(buffer: TensorDictReplayBuffer) -> Sequence[Draw]:
         >>> [len(draw.batch) for draw in one_batch(buffer)]
         [4]
     """
-    return [Draw(buffer.sample())]
+    yield Draw(buffer.sample())

@@ -21,7 +21,7 @@ def make_la3p(capacity, batch_size, *, filled=None, **kwargs):
         adjustments=[PriorityFloor(1.0)],
         **kwargs,
     )
-    return make_buffer(sampler, capacity, sampler.drawn(batch_size), filled=filled)
+    return make_buffer(sampler, capacity, batch_size, filled=filled)
 
 
 def shares_by_hand(errors):
@@ -135,8 +135,33 @@ def whole_transitions(count):
 def test_what_cannot_be_parted_is_refused():
     with pytest.raises(ValueError, match=r"uniform_fraction must be in \(0, 1\), got 1.0"):
         make_la3p(4, 4, uniform_fraction=1.0)
-    with pytest.raises(ValueError, match=r"batch_size must be one that drawn\(\) gives, got 1"):
-        make_la3p(30, 4).sampler.parts(1)
+    with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
+        make_la3p(30, 4).sampler.sizes(1)
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)
     with pytest.raises(TypeError, match="buffer must have an LA3PSampler, got SignalSampler"):
-        split_draws(other)
+        next(split_draws(other))
+
+
+def test_the_second_part_knows_the_priorities_that_the_first_one_learned():
+    """Where the uniform part finds one large error, the prioritized part finds it as well."""
+    errors = torch.zeros(2000)
+    buffer = make_la3p(2000, 400)
+    set_signals(buffer, td_error=errors)
+    draws = split_draws(buffer)
+    first = next(draws)
+    assert first.new_step
+    slot = int(first.batch["index"][0])
+    learned = (first.batch["index"] == slot).float() * 1e9  # To the power of 0.4: 4,000.
+    first.batch["signals", "td_error"] = learned
+    buffer.update_tensordict_priority(first.batch)
+    second = next(draws)
+    assert not second.new_step
+    assert (second.batch["index"] == slot).sum() > 60
+    assert (second.actor_batch["index"] != slot).all()
+
+
+def test_a_whole_batch_outside_of_a_training_step_is_by_priority():
+    errors = torch.rand(15, generator=seeded(3)) * 10
+    buffer = make_la3p(15, 20_000)
+    set_signals(buffer, td_error=errors)
+    assert_shares(buffer.sample()["index"], shares_by_hand(errors.tolist())[1], draws=20_000)

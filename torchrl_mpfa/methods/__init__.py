@@ -3,6 +3,8 @@
 What is a choice of other parts has no file: it is a few lines of configuration.
 """
 
+from torchrl_mpfa.methods.assembly import Replay, loss_options, make_replay
+from torchrl_mpfa.methods.catalogue import ALIASES, METHODS, Method
 from torchrl_mpfa.methods.cer import CombinedSampler
 from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
 from torchrl_mpfa.methods.hvper import (
@@ -20,6 +22,8 @@ from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler, rank_share
 
 __all__ = [
+    "ALIASES",
+    "METHODS",
     "RELATIVE_ERROR",
     "RELATIVE_VALUE",
     "CappedSampler",
@@ -27,11 +31,15 @@ __all__ = [
     "Curiosity",
     "LA3PSampler",
     "LowestDivergence",
+    "Method",
     "PriorityFloor",
     "RankSampler",
+    "Replay",
     "ReplayPenalty",
     "gaussian_divergence",
     "intrinsic_reward",
+    "loss_options",
+    "make_replay",
     "rank_share",
     "relative_error",
     "relative_value",

@@ -7,8 +7,9 @@ is wrong learns little: it gets transitions in proportion to the *inverse* of th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -17,17 +18,18 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl_mpfa.sampler import SignalSampler
 from torchrl_mpfa.selection import Draw
 
+Part = Literal["uniform", "prioritized", "inverse"]
+
 
 class LA3PSampler(SignalSampler):
-    r"""Draws three parts: uniformly, by priority, and by the inverse of the priority.
+    r"""Samples a part of a batch: uniformly, by priority, or by the inverse of the priority.
 
-    A batch of ``T`` slots is ``U`` uniform ones, then ``P`` by priority, then ``P`` by its inverse;
-    :meth:`drawn` says how many slots a batch of a given size takes, and :meth:`parts` where the
-    parts end. All weights are 1.
+    Within :meth:`part`, which :func:`split_draws` uses, a batch has the size of that part, see
+    :meth:`sizes`; outside of it, it is a whole one by priority. All weights are 1.
 
     Args:
         *args: As :class:`~torchrl_mpfa.SignalSampler`.
-        uniform_fraction: Share :math:`1 - \lambda` of a batch that is drawn uniformly.
+        uniform_fraction: Share :math:`1 - \lambda` of a batch that is sampled uniformly.
         **kwargs: As :class:`~torchrl_mpfa.SignalSampler`.
 
     Raises:
@@ -35,14 +37,15 @@ class LA3PSampler(SignalSampler):
 
     Examples:
         >>> sampler = LA3PSampler(1000, 0.4, 0.0, signals=["td_error"])
-        >>> sampler.drawn(256)
-        384
+        >>> sampler.sizes(256)
+        (128, 128)
     """
 
     def __init__(self, *args: Any, uniform_fraction: float = 0.5, **kwargs: Any) -> None:
         if not 0.0 < uniform_fraction < 1.0:
             raise ValueError(f"uniform_fraction must be in (0, 1), got {uniform_fraction}")
         self.uniform_fraction = uniform_fraction
+        self._part: Part | None = None
         super().__init__(*args, **kwargs)
 
     def _init(self) -> None:
@@ -53,35 +56,39 @@ class LA3PSampler(SignalSampler):
         super()._write(index, priority)
         self._inverse_tree[index] = 1.0 / self._leaf(priority)
 
-    def drawn(self, batch_size: int) -> int:
-        """Number of slots that a training step with batches of this size takes."""
-        uniform = round(batch_size * self.uniform_fraction)
-        return uniform + 2 * (batch_size - uniform)
-
-    def parts(self, count: int) -> tuple[int, int]:
-        """Where the uniform and the prioritized part of so many slots end.
+    def sizes(self, batch_size: int) -> tuple[int, int]:
+        """Size of the uniform part of a batch, and of the other two.
 
         Raises:
-            ValueError: If the slots cannot be parted.
+            ValueError: If a part would be empty.
         """
-        uniform = round(count * self.uniform_fraction / (2.0 - self.uniform_fraction))
-        if uniform < 1 or uniform >= count or (count - uniform) % 2:
+        uniform = round(batch_size * self.uniform_fraction)
+        if not 0 < uniform < batch_size:
             raise ValueError(
-                f"batch_size must be one that drawn() gives, got {count} for a uniform_fraction "
-                f"of {self.uniform_fraction}"
+                f"batch_size must leave no part empty, got {batch_size} for a uniform_fraction of "
+                f"{self.uniform_fraction}"
             )
-        return uniform, (count + uniform) // 2
+        return uniform, batch_size - uniform
+
+    @contextmanager
+    def part(self, part: Part) -> Iterator[None]:
+        """Sample this part alone for as long as this is open."""
+        before, self._part = self._part, part
+        try:
+            yield
+        finally:
+            self._part = before
 
     def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
-        uniform, prioritized = self.parts(batch_size)
-        index = torch.cat(
-            (
-                torch.randint(size, (uniform,), generator=self._rng),
-                self._proportional(self._sum_tree, size, prioritized - uniform),
-                self._proportional(self._inverse_tree, size, batch_size - prioritized),
-            )
-        )
-        return index, torch.ones(batch_size)
+        count = batch_size
+        if self._part is not None:
+            count = self.sizes(batch_size)[self._part != "uniform"]
+        if self._part == "uniform":
+            index = torch.randint(size, (count,), generator=self._rng)
+        else:
+            tree = self._inverse_tree if self._part == "inverse" else self._sum_tree
+            index = self._proportional(tree, size, count)
+        return index, torch.ones(count)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -95,31 +102,33 @@ class LA3PSampler(SignalSampler):
             self._inverse_tree[written] = 1.0 / state_dict["_sum_tree"][written]
 
 
-def split_draws(buffer: TensorDictReplayBuffer) -> Sequence[Draw]:
-    """The two updates of an LA3P step, out of one sample of a buffer with :class:`LA3PSampler`.
+def split_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+    """The two updates of an LA3P step, in the order of the authors' code.
 
-    Critic and actor learn from the uniform part, with the loss PAL; then the critic from the
-    prioritized part, with the Huber loss, and the actor from the inverse one.
+    Critic and actor learn from a uniform part of the batch, with the loss PAL. Its priorities are
+    to be updated before the second draw is asked for: there the critic learns from a part by
+    priority, with the Huber loss, and the actor from one by the inverse.
 
     Args:
-        buffer: The buffer, whose batch size is one that :meth:`LA3PSampler.drawn` gives.
+        buffer: The buffer, with an :class:`LA3PSampler` and a batch size.
 
-    Returns:
+    Yields:
         Two draws.
 
     Raises:
         TypeError: If the buffer has another sampler.
+        ValueError: If the buffer prefetches: it would sample before the priorities are updated.
     """
     sampler = buffer.sampler
     if not isinstance(sampler, LA3PSampler):
         raise TypeError(f"buffer must have an LA3PSampler, got {type(sampler).__name__}")
-    batch = buffer.sample()
-    uniform, prioritized = sampler.parts(len(batch))
-    return [
-        Draw(batch[:uniform], loss_function="pal"),
-        Draw(
-            batch[uniform:prioritized],
-            actor_batch=batch[prioritized:],
-            loss_function="smooth_l1",
-        ),
-    ]
+    if getattr(buffer, "_prefetch", False):
+        raise ValueError("prefetch must be None with LA3P, whose parts depend on each other")
+    with sampler.part("uniform"):
+        batch = buffer.sample()
+    yield Draw(batch, loss_function="pal")
+    with sampler.part("prioritized"):
+        batch = buffer.sample()
+    with sampler.part("inverse"):
+        actor_batch = buffer.sample()
+    yield Draw(batch, actor_batch=actor_batch, loss_function="smooth_l1", new_step=False)

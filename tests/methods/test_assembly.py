@@ -1,0 +1,111 @@
+"""make_replay: every method from its name, and a sentence for every mistake."""
+
+from dataclasses import asdict
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.methods.replays import make_transitions, seeded
+from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
+from torchrl_mpfa.methods import ALIASES, METHODS, Method, loss_options, make_replay
+
+
+def more(name):
+    """What KLPER needs besides."""
+    return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if name == "klper" else {}
+
+
+def make_whole_transitions(count):
+    made = make_transitions(count)
+    made["observation"] = torch.randn(count, 6, generator=seeded(1))
+    made["action"] = torch.rand(count, 2, generator=seeded(2)) * 2 - 1
+    return made
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_gives_batches_and_takes_what_its_loss_writes(name):
+    replay = make_replay(name, capacity=64, batch_size=8, generator=seeded(0), **more(name))
+    assert isinstance(replay.buffer, SignalReplayBuffer)
+    assert replay.method.name == ALIASES.get(name, name) or name in ALIASES
+    assert replay.signals == tuple(loss_options(name)["signals"])
+    replay.buffer.extend(make_whole_transitions(64))
+    for _ in range(3):
+        draws = 0
+        for draw in replay.select(replay.buffer):
+            count = len(draw.batch)
+            assert draw.new_step == (draws == 0)
+            draws += 1
+            for signal in replay.signals:
+                draw.batch["signals", signal] = torch.rand(count)
+            if replay.signals:
+                replay.buffer.update_tensordict_priority(draw.batch)
+        assert draws == (2 if name == "la3p" else 1)
+        assert count == (4 if name == "la3p" else 8)
+
+
+def test_a_setting_reaches_its_part():
+    replay = make_replay("mpfa_per", capacity=50, batch_size=5, alpha=0.3, boost_factor=2.0)
+    assert replay.buffer.sampler.alpha == 0.3
+    assert replay.buffer.sampler.adjustments[0].boost == 2.0
+    assert asdict(METHODS["mpfa_per"]) == asdict(Method())
+
+
+def test_a_method_of_ones_own_is_made_alike():
+    mine = Method("mine", ["td_error", "novelty"], fusion="scaled", boost=False, decay=False)
+    assert make_replay(mine, capacity=10).signals == ("novelty", "td_error")
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_a_storage_may_be_given_and_its_size_is_that_of_the_sampler(kind):
+    storage = kind(77, signals=["td_error"])
+    replay = make_replay("per", storage=storage)
+    assert replay.buffer.sampler.max_size == 77
+    assert replay.method.capacity == 77
+
+
+def test_batches_follow_the_generator():
+    def drawn():
+        replay = make_replay("per", capacity=100, batch_size=20, generator=seeded(5))
+        replay.buffer.extend(make_transitions(100))
+        return replay.buffer.sample()["index"]
+
+    assert drawn().equal(drawn())
+
+
+def test_the_exponent_of_pal_is_that_of_the_method():
+    assert loss_options("pal")["pal_alpha"] == 0.4
+    assert loss_options("la3p")["pal_alpha"] == 0.4
+    assert loss_options(Method("mine", loss_function="pal", alpha=0.7))["pal_alpha"] == 0.7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"method": "mpfa-per"}, "unknown method 'mpfa-per': did you mean 'mpfa_per'?"),
+        ({"boost_facter": 2}, "unknown setting 'boost_facter': did you mean 'boost_factor'?"),
+        ({"selection": "ranked"}, "unknown selection 'ranked': did you mean 'rank'?"),
+        ({"fusion": "x"}, r"unknown fusion 'x': must be one of \['entropy', 'fixed'"),
+        ({"decay_position": "row"}, "unknown decay_position 'row'"),
+        ({"capacity": 0}, "capacity must be a positive integer, got 0"),
+        ({"batch_size": 2.5}, "batch_size must be a positive integer, got 2.5"),
+        ({"alpha": -1.0}, "alpha must be finite and at least 0, got -1"),
+        ({"method": "klper"}, "method 'klper' needs policy and sigma"),
+        ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
+    ],
+)
+def test_a_mistake_is_refused_in_one_sentence(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_replay(**arguments)
+
+
+def test_a_storage_that_lacks_a_signal_is_refused():
+    with pytest.raises(ValueError, match=r"signals .*action_gradient.* are not in the storage"):
+        make_replay("mpfa_per", storage=SignalTensorStorage(10, signals=["td_error", "reward"]))
+
+
+def test_a_batch_holds_what_was_written():
+    replay = make_replay("ddpg", capacity=10, batch_size=4)
+    replay.buffer.extend(TensorDict({"next": {"reward": torch.ones(10, 1)}}, [10]))
+    (draw,) = replay.select(replay.buffer)
+    assert draw.batch["next", "reward"].shape == (4, 1)

@@ -1,0 +1,257 @@
+"""From a method to its replay: buffer, selection, and what the loss has to write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.data import RandomSampler, Storage
+
+from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
+from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
+from torchrl_mpfa.methods.catalogue import METHODS, Method
+from torchrl_mpfa.methods.cer import CombinedSampler
+from torchrl_mpfa.methods.hvper import (
+    RELATIVE_ERROR,
+    RELATIVE_VALUE,
+    ReplayPenalty,
+    value_schedule,
+)
+from torchrl_mpfa.methods.klper import LowestDivergence
+from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
+from torchrl_mpfa.methods.lap import PriorityFloor
+from torchrl_mpfa.methods.mw import CappedSampler
+from torchrl_mpfa.methods.rank import RankSampler
+from torchrl_mpfa.moving_fusion import ScaledFusion
+from torchrl_mpfa.replay import SignalReplayBuffer
+from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.selection import Draw, Selection, one_batch
+from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
+from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.storage import SignalTensorStorage
+
+_SIGNALS = {signal.name: signal for signal in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)}
+_FUSIONS: dict[str, Callable[[Method], Fusion]] = {
+    "entropy": lambda method: EntropyFusion(population=method.population),  # type: ignore[arg-type]
+    "fixed": lambda method: _equal(method),
+    "scaled": lambda method: ScaledFusion(_equal(method)),
+    "value_schedule": lambda method: value_schedule(),
+}
+_UNIFORM: dict[str, Callable[[], RandomSampler]] = {
+    "uniform": RandomSampler,
+    "newest": CombinedSampler,
+}
+_PRIORITIZED: dict[str, type[SignalSampler]] = {
+    "prioritized": SignalSampler,
+    "rank": RankSampler,
+    "capped": CappedSampler,
+    "split": LA3PSampler,
+}
+_WORDS: dict[str, set[str]] = {
+    "selection": {*_UNIFORM, *_PRIORITIZED},
+    "fusion": set(_FUSIONS),
+    "boost_bound": {"floor", "cap", "none"},
+    "decay_position": {"batch", "rank", "count"},
+    "population": {"buffer", "batch"},
+    "importance": {"critic", "torchrl", "none"},
+    "loss_function": {"l2", "smooth_l1", "pal"},
+    "optimizer": {"adam", "radam"},
+}
+"""The settings that are one of several words."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The replay of a method.
+
+    Attributes:
+        buffer: Where transitions are stored and sampled.
+        select: From the buffer to what the updates of one training step are made from.
+        signals: The signals that the loss has to write, by name.
+        method: The settings that it was made from.
+    """
+
+    buffer: SignalReplayBuffer
+    select: Selection
+    signals: tuple[str, ...]
+    method: Method
+
+
+def make_replay(
+    method: str | Method = "mpfa_per",
+    *,
+    capacity: int | None = None,
+    batch_size: int | None = None,
+    generator: torch.Generator | None = None,
+    storage: Storage | None = None,
+    device: torch.device | str = "auto",
+    policy: TensorDictModule | None = None,
+    sigma: float | Callable[[], float] | None = None,
+    **settings: Any,
+) -> Replay:
+    """The replay of a method: buffer, selection, and the signals that the loss has to write.
+
+    Args:
+        method: A name out of :data:`~torchrl_mpfa.methods.METHODS`, or settings of your own.
+        capacity: Slots of the buffer; by default those of the storage, or of the method.
+        batch_size: Transitions of a batch; by default the method's.
+        generator: Source of all randomness; by default a new one that ``torch.manual_seed`` rules.
+        storage: Where the transitions lie; by default a new
+            :class:`~torchrl_mpfa.SignalTensorStorage`. It must keep the signals of the method.
+        device: Device of a new storage; ``"auto"``: that of the first transition.
+        policy: The policy in training, which KLPER asks what it would do.
+        sigma: Standard deviation of the exploration noise in units of the action, for KLPER; a
+            function tells that of the episode that acts.
+        **settings: Other values for fields of :class:`~torchrl_mpfa.methods.Method`.
+
+    Returns:
+        The replay.
+
+    Raises:
+        ValueError: If a method, a setting or its value is unknown or out of its range, or if KLPER
+            gets no ``policy`` or ``sigma``.
+        TypeError: If the storage keeps no signals.
+
+    Examples:
+        >>> replay = make_replay("la3p", capacity=10_000, batch_size=256)
+        >>> replay.signals
+        ('td_error',)
+        >>> type(replay.buffer.sampler).__name__
+        'LA3PSampler'
+    """
+    if capacity is None and storage is not None:
+        capacity = storage.max_size
+    given = {"capacity": capacity, "batch_size": batch_size}
+    given = {name: value for name, value in given.items() if value is not None}
+    made = _settled(method, {**given, **settings})
+    if made.candidates > 1 and (policy is None or sigma is None):
+        missing = " and ".join(n for n, v in (("policy", policy), ("sigma", sigma)) if v is None)
+        raise ValueError(f"method {made.name!r} needs {missing}: it chooses on-policy batches")
+    signals = signals_of(made)
+    if storage is None:
+        storage = SignalTensorStorage(made.capacity, signals=signals or MPFA_SIGNALS, device=device)
+    buffer = SignalReplayBuffer(
+        storage=storage,
+        sampler=make_sampler(made),
+        batch_size=made.batch_size * made.candidates,
+        generator=generator,
+    )
+    select = _make_selection(made, policy, sigma)
+    return Replay(buffer, select, tuple(learned_signals(made)), made)
+
+
+def loss_options(method: str | Method) -> dict[str, Any]:
+    """What a method asks of the loss, as keyword arguments of ``make_ddpg_loss`` and its like.
+
+    Args:
+        method: A name, or settings of your own.
+
+    Returns:
+        ``signals``, ``importance``, ``loss_function``, ``target_average`` and ``pal_alpha``.
+
+    Raises:
+        ValueError: If the method is unknown.
+
+    Examples:
+        >>> loss_options("lap")["loss_function"]
+        'smooth_l1'
+    """
+    made = _settled(method, {})
+    return {
+        "signals": learned_signals(made),
+        "importance": made.importance,
+        "loss_function": made.loss_function,
+        "target_average": made.target_average,
+        "pal_alpha": made.alpha,
+    }
+
+
+def signals_of(method: Method) -> list[Signal]:
+    """The signals that a method names; an unknown name is one that the loss learns."""
+    return [_SIGNALS.get(name, Signal(name)) for name in method.signals]
+
+
+def learned_signals(method: Method) -> list[str]:
+    """What the loss has to write for the signals of a method."""
+    keys = [signal.key for signal in signals_of(method) if signal.known_at == "update"]
+    return sorted({key[-1] if isinstance(key, tuple) else key for key in keys})
+
+
+def make_sampler(method: Method) -> SignalSampler | RandomSampler:
+    """The sampler that the settings describe: signals, fusion, adjustments, selection."""
+    if method.selection in _UNIFORM:
+        return _UNIFORM[method.selection]()
+    more: dict[str, Any] = {}
+    if method.selection == "capped":
+        more["replay_cap"] = method.replay_cap
+    return _PRIORITIZED[method.selection](
+        method.capacity,
+        method.alpha,
+        method.beta,
+        method.eps,
+        max_priority_within_buffer=True,
+        signals=signals_of(method),
+        fusion=_FUSIONS[method.fusion](method),
+        adjustments=make_adjustments(method),
+        **more,
+    )
+
+
+def make_adjustments(method: Method) -> list[Adjustment]:
+    """What the method does to fused priorities, in this order."""
+    made: list[Adjustment] = []
+    if method.boost:
+        boost = PositiveBoost(boost=method.boost_factor, bound=method.boost_bound)  # type: ignore[arg-type]
+        made.append(boost)
+    if method.decay:
+        decay = PositiveDecay(
+            sharpness=method.decay_sharpness,
+            position=method.decay_position,  # type: ignore[arg-type]
+        )
+        made.append(decay)
+    if method.priority_floor > 0:
+        made.append(PriorityFloor(method.priority_floor))
+    if method.replay_penalty > 0:
+        made.append(ReplayPenalty(penalty=method.replay_penalty, floor=method.eps))
+    return made
+
+
+def _make_selection(
+    method: Method, policy: TensorDictModule | None, sigma: float | Callable[[], float] | None
+) -> Selection:
+    if method.selection == "split":
+        return split_draws
+    if policy is not None and sigma is not None and method.candidates > 1:
+        choose = LowestDivergence(policy, batches=method.candidates, sigma=sigma)
+        return lambda buffer: (
+            replace(draw, batch=choose(draw.batch)) for draw in one_batch(buffer)
+        )
+    return one_batch
+
+
+def _equal(method: Method) -> FixedFusion:
+    return FixedFusion(dict.fromkeys(method.signals, 1.0))
+
+
+def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
+    """The settings of a method with some of them changed, all of them checked."""
+    if isinstance(method, str):
+        if method not in METHODS:
+            raise ValueError(unknown("method", method, METHODS))
+        method = METHODS[method]
+    known = [field.name for field in fields(Method)]
+    for name in settings:
+        if name not in known:
+            raise ValueError(unknown("setting", name, known))
+    made = replace(method, **settings)
+    for name, words in _WORDS.items():
+        if getattr(made, name) not in words:
+            raise ValueError(unknown(name, getattr(made, name), words))
+    for name in ("capacity", "batch_size", "candidates", "target_average"):
+        value = getattr(made, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    return made

@@ -1,0 +1,134 @@
+"""The methods, each a choice at five places: signals, fusion, adjustment, selection, learner.
+
+``docs/methods/`` has a page for each. A method of your own is a :class:`Method` with other
+settings, or one more entry in :data:`METHODS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass
+class Method:
+    """MPFA-PER, and what every method can choose.
+
+    Examples:
+        >>> Method("mine", ["td_error", "novelty"], fusion="scaled", boost=False).alpha
+        0.6
+    """
+
+    name: str = "mpfa_per"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
+    """Signals of the priority."""
+    fusion: str = "entropy"
+    """``entropy`` (Eqs. 15-20), ``fixed`` (equal weights), ``scaled`` (equal shares: each signal
+    is divided by its mean) or ``value_schedule`` (HVPER)."""
+    boost: bool = True
+    """Raise positive transitions, Eq. 22."""
+    decay: bool = True
+    """Decay positive transitions above the batch mean, Eqs. 23-24."""
+    priority_floor: float = 0.0
+    """Least priority, in units of the reward (LAP's 1); 0: none."""
+    replay_penalty: float = 0.0
+    """Penalty on replays (HVPER); 0: none."""
+    selection: str = "prioritized"
+    """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
+    ``rank``, ``capped`` (MW) or ``split`` (LA3P)."""
+    candidates: int = 1
+    """Batches of which the most on-policy one is trained on (KLPER)."""
+    replay_cap: int = 1024
+    """Replays after which ``capped`` excludes a transition."""
+    capacity: int = 100_000
+    """Table 1."""
+    batch_size: int = 256
+    """Table 1."""
+    alpha: float = 0.6
+    """Priority exponent, Eq. 8, and the exponent of PAL."""
+    beta: float = 0.4
+    """Importance exponent at the start, Eq. 10."""
+    beta_end: float = 1.0
+    """Importance exponent at the end; between the two it rises with the episodes."""
+    eps: float = 0.05
+    """Added to every priority, Eq. 21."""
+    boost_factor: float = 3.0
+    """phi of Eq. 22."""
+    boost_bound: str = "floor"
+    """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
+    decay_sharpness: float = 0.01
+    """sigma of Eq. 23."""
+    decay_position: str = "batch"
+    """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
+    population: str = "buffer"
+    """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
+    importance: str = "critic"
+    """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
+    loss_function: str = "l2"
+    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``."""
+    target_average: int = 1
+    """Critics of which the target is the mean, one more kept at each end of an episode."""
+    optimizer: str = "adam"
+    """``adam`` or ``radam``."""
+    curiosity: bool = False
+    """Whether rewards get a bonus for what the robot could not foresee (ICM)."""
+    curiosity_scale: float = 0.01
+    """eta of that bonus."""
+
+
+_PLAIN: dict[str, Any] = {"fusion": "fixed", "boost": False, "decay": False}
+_PER: dict[str, Any] = {**_PLAIN, "signals": ["td_error"]}
+_UNIFORM: dict[str, Any] = {**_PLAIN, "signals": [], "selection": "uniform"}
+_LAP: dict[str, Any] = {
+    **_PER,
+    "eps": 0.0,
+    "alpha": 0.4,
+    "priority_floor": 1.0,
+    "importance": "none",
+    "loss_function": "smooth_l1",
+}
+
+METHODS: dict[str, Method] = {
+    # The paper's method, and its ablations.
+    "mpfa_per": Method(),
+    "mpf_per": Method("mpf_per", boost=False, decay=False),
+    "td_reward": Method("td_reward", ["reward", "td_error"], boost=False, decay=False),
+    "td_loss": Method("td_loss", ["td_error", "action_gradient"], boost=False, decay=False),
+    "per": Method("per", **_PER),
+    "raise": Method("raise", **{**_PER, "boost": True}),
+    "decay": Method("decay", **{**_PER, "decay": True}),
+    # What the paper compares with.
+    "ddpg": Method("ddpg", **_UNIFORM),
+    "klper": Method("klper", **_UNIFORM, candidates=3),
+    "averaged_ddpg": Method("averaged_ddpg", **_UNIFORM, target_average=5),
+    "hvper": Method(
+        "hvper",
+        ["relative_value", "relative_td_error"],
+        fusion="value_schedule",
+        boost=False,
+        decay=False,
+        replay_penalty=0.25,
+        eps=0.01,
+    ),
+    "ddpg_radam": Method("ddpg_radam", **_PER, optimizer="radam", curiosity=True),
+    "mw": Method(
+        "mw",
+        ["reward", "td_error"],
+        fusion="scaled",
+        boost=False,
+        decay=False,
+        selection="capped",
+    ),
+    # What else there is today.
+    "rank_per": Method("rank_per", **_PER, selection="rank", alpha=0.7, beta=0.5),
+    "lap": Method("lap", **_LAP),
+    "pal": Method("pal", **_UNIFORM, loss_function="pal", alpha=0.4),
+    "la3p": Method("la3p", **_LAP, selection="split"),
+    "cer": Method("cer", **{**_UNIFORM, "selection": "newest"}),
+    # Another word for uniform replay, for learners that are not DDPG.
+    "uniform": Method("uniform", **_UNIFORM),
+}
+"""Every method by name."""
+
+ALIASES = {"uniform": "ddpg"}
+"""Second names, which pages and figures leave out."""
