@@ -15,7 +15,7 @@ from torchrl_mpfa.moving_fusion import Annealed, ScaledFusion, ScheduledFusion
 from torchrl_mpfa.networks import DirectModule, make_actor, make_critic
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.sampler import MPFASampler, SignalSampler
-from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 from torchrl_mpfa.selection import Draw, Selection, one_batch
 from torchrl_mpfa.signals import (
     ACTION_GRADIENT,
@@ -73,4 +73,5 @@ __all__ = [
     "make_td3_loss",
     "one_batch",
     "save_atomically",
+    "write_text_atomically",
 ]

@@ -218,9 +218,9 @@ def test_a_harmed_folder_is_refused_and_nothing_changes(file, harm, tmp_path):
     if harm == "truncated":
         path.write_bytes(path.read_bytes()[:300])
     else:
-        torch.save({"_format": 1, "x": Trap(str(trap))}, path)
+        save_atomically({"_format": 1, "x": Trap(str(trap))}, path)
     before = snapshot(second)
-    with pytest.raises(Exception, match=r"(?i)weights_only|zip|central directory|truncated"):
+    with pytest.raises(Exception, match=f"{path.name} is cut short|{path.name} holds more than"):
         second.loads(tmp_path / "buffer")
     assert not trap.exists()
     assert same(before, snapshot(second))
@@ -249,7 +249,7 @@ def test_the_state_holds_tensors_and_plain_values_only(tmp_path):
     buffer = make_kind("memory", tmp_path)
     buffer.extend(make_transitions(24))
     train_rounds(buffer, 2)
-    torch.save(buffer.sampler.state_dict(), tmp_path / "sampler.pt")
+    save_atomically(buffer.sampler.state_dict(), tmp_path / "sampler.pt")
     assert same(load_safely(tmp_path / "sampler.pt"), buffer.sampler.state_dict())
     assert seeded(0).get_state().equal(seeded(0).get_state())
 

@@ -2,11 +2,15 @@
 
 import os
 import pickle
+import random
+import subprocess
+import sys
 
 import pytest
 import torch
 
-from torchrl_mpfa import load_safely, save_atomically
+from tests.mpfa.transitions import same
+from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 
 
 def test_what_is_saved_is_read_again(tmp_path):
@@ -46,6 +50,26 @@ def test_a_crash_before_the_rename_leaves_the_old_file(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["state.pt"]
 
 
+def test_what_a_killed_save_left_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / f".state.pt.{gone.pid}.tmp").write_bytes(b"half")
+    alive = tmp_path / f".state.pt.{os.getppid()}.tmp"
+    alive.write_bytes(b"being written")
+    save_atomically({"step": 1}, tmp_path / "state.pt")
+    assert sorted(os.listdir(tmp_path)) == [alive.name, "state.pt"]
+
+
+def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "table.md"
+    write_text_atomically("α\n", path)
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_text_atomically("β\n", path)
+    assert path.read_text(encoding="utf-8") == "α\n"
+    assert os.listdir(tmp_path) == ["table.md"]
+
+
 class Malicious:
     def __init__(self, path):
         self.path = path
@@ -54,28 +78,57 @@ class Malicious:
         return os.mkdir, (self.path,)
 
 
-@pytest.mark.parametrize("writer", ["pickle", "torch"])
-def test_a_file_with_code_in_it_is_refused_and_not_executed(tmp_path, writer):
+def test_a_file_with_code_in_it_is_refused_by_name_and_not_executed(tmp_path):
     trap, path = tmp_path / "trap", tmp_path / "state.pt"
-    if writer == "torch":
-        torch.save({"a": Malicious(str(trap))}, path)
-    else:
-        path.write_bytes(pickle.dumps({"a": Malicious(str(trap))}, protocol=2))
-    with pytest.raises(pickle.UnpicklingError):
+    save_atomically({"a": Malicious(str(trap))}, path)
+    with pytest.raises(pickle.UnpicklingError, match=r"state\.pt holds more than tensors"):
         load_safely(path)
     assert not trap.exists()
     # The trap works: without the safe reader it would have snapped.
-    torch.load(path, weights_only=False) if writer == "torch" else pickle.loads(path.read_bytes())
+    torch.load(path, weights_only=False)
     assert trap.exists()
 
 
-@pytest.mark.parametrize("size", [0, 10, 200])
-def test_a_truncated_file_is_an_error(tmp_path, size):
+def test_every_file_that_something_else_wrote_is_refused_by_name(tmp_path):
+    trap, path = tmp_path / "trap", tmp_path / "state.pt"
+    for content in (pickle.dumps({"a": Malicious(str(trap))}, protocol=2), b"", b"a,b\n1,2\n" * 50):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"state\.pt is cut short, or was not written by"):
+            load_safely(path)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("size", [0, 10, 200, -1])
+def test_a_truncated_file_is_an_error_with_its_name(tmp_path, size):
     path = tmp_path / "state.pt"
     save_atomically({"a": torch.arange(100)}, path)
     path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises((RuntimeError, EOFError, pickle.UnpicklingError)):
+    with pytest.raises(ValueError, match=r"state\.pt is cut short"):
         load_safely(path)
+
+
+def test_every_bit_that_flips_is_noticed_or_harmless(tmp_path):
+    path = tmp_path / "state.pt"
+    state = {"a": torch.rand(300), "b": {"c": [1, 2.5, None, "text"]}, "d": torch.arange(99)}
+    save_atomically(state, path)
+    whole = path.read_bytes()
+    noticed = 0
+    for bit in random.Random(0).sample(range(len(whole) * 8), 300):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        try:
+            assert same(load_safely(path), state)
+        except ValueError as error:
+            assert "state.pt is" in str(error)
+            noticed += 1
+    assert noticed > 290
+
+
+def test_tensors_may_stay_in_the_file_until_they_are_read(tmp_path):
+    path = tmp_path / "state.pt"
+    save_atomically({"a": torch.arange(100)}, path)
+    assert load_safely(path, mmap=True)["a"].tolist() == list(range(100))
 
 
 def test_a_file_that_is_not_there_is_an_error(tmp_path):
