@@ -19,6 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("torchrl_mpfa", "mpfa_envs")
+POLICY = ROOT / "examples" / "policies" / "td3-mpfa_per.npz"
 
 USE = """
 import importlib.metadata
@@ -33,7 +34,7 @@ from tensordict import TensorDict
 
 import mpfa_envs
 import torchrl_mpfa
-from mpfa_envs import make_navigation_env
+from mpfa_envs import evaluate, load_policy, make_navigation_env, summarize
 from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
 
 installed, version = Path(sys.argv[1]).resolve(), sys.argv[2]
@@ -60,6 +61,11 @@ batch["signals"] = TensorDict(
 )
 buffer.update_tensordict_priority(batch)
 print("weights of the signals:", buffer.sampler.weights)
+
+policy = load_policy(sys.argv[3])
+results = evaluate(policy, "random-100", episodes=10, physics="kinematic")
+print("success of the shipped policy:", summarize(results)["success"])
+assert sum(result.success for result in results) >= 8, results
 """
 
 
@@ -136,7 +142,7 @@ def main() -> None:
         elsewhere = folder / "elsewhere"
         elsewhere.mkdir()
         version = wheel.name.split("-")[1]
-        _run(str(python), "-c", USE, str(packages), version, cwd=elsewhere)
+        _run(str(python), "-c", USE, str(packages), version, str(POLICY), cwd=elsewhere)
     print("wheel test passed")
 
 

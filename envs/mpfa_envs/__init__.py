@@ -8,11 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from mpfa_envs.evaluation import (
+    EpisodeResult,
+    Interval,
+    evaluate,
+    run_episodes,
+    spl,
+    summarize,
+)
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.maps import WORLDS
 from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
+from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
 from mpfa_envs.random_worlds import random_world
 from mpfa_envs.render import render_trajectories
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
@@ -39,11 +48,15 @@ __all__ = [
     "WORLDS",
     "Box",
     "Cylinder",
+    "EpisodeResult",
+    "Interval",
     "Lidar",
     "Mirror",
     "NavigationEnv",
     "NavigationTorchEnv",
     "PathPlanner",
+    "Policy",
+    "PolicyFileError",
     "RandomMirror",
     "RewardTerms",
     "RobotModel",
@@ -51,15 +64,21 @@ __all__ = [
     "Task",
     "World",
     "WorldFileError",
+    "evaluate",
     "evaluation_pairs",
+    "load_policy",
     "load_world",
     "make_navigation_env",
     "navigation_reward",
     "observation_slices",
     "random_world",
     "render_trajectories",
+    "run_episodes",
     "sample_task",
+    "save_policy",
     "save_world",
+    "spl",
+    "summarize",
 ]
 
 for _id, _name in zip(ENV_IDS, WORLDS, strict=True):

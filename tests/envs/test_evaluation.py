@@ -1,0 +1,227 @@
+"""Evaluation: known answers for the estimates, and controllers whose success is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mpfa_envs import (
+    EpisodeResult,
+    NavigationEnv,
+    Policy,
+    evaluate,
+    evaluation_pairs,
+    load_policy,
+    run_episodes,
+    spl,
+    summarize,
+)
+from mpfa_envs.evaluation import bootstrap, wilson
+from mpfa_envs.layers import Linear, Tanh
+
+POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.npz"))
+
+
+def steer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Turn towards the goal, as a policy on an empty map has to; for one or many robots."""
+    turn = np.arctan2(observation[..., 19], observation[..., 18])
+    return np.clip(np.stack((1.0 - 2.0 * turn, 1.0 + 2.0 * turn), axis=-1), -1, 1)
+
+
+def circle(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.broadcast_to(np.array([-1.0, 1.0]), (*observation.shape[:-1], 2))
+
+
+def steering_policy(**env_arguments: object) -> Policy:
+    """Turns to the goal by its sine."""
+    weight = np.zeros((2, 24), np.float32)
+    weight[0, 19], weight[1, 19] = -3.0, 3.0
+    layers = [Linear(weight, np.full(2, 0.8, np.float32)), Tanh()]
+    return Policy(layers, env_arguments={"physics": "kinematic", **env_arguments})
+
+
+def result(**changes: float) -> EpisodeResult:
+    fields = {
+        "episode": 0, "success": True, "collision": False, "timeout": False, "time_s": 10.0,
+        "path_length": 4.0, "shortest_path": 3.0, "min_clearance": 0.5, "spl": 0.75,
+    }  # fmt: skip
+    return EpisodeResult(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def test_a_rate_has_the_interval_of_wilson() -> None:
+    rate, total, z = 0.905, 200, 1.959964
+    center = (rate + z * z / (2 * total)) / (1 + z * z / total)
+    half = z * math.sqrt(rate * (1 - rate) / total + z * z / (4 * total**2)) / (1 + z * z / total)
+    interval = wilson([True] * 181 + [False] * 19)
+    expected = (rate, center - half, center + half)
+    assert (interval.value, interval.low, interval.high) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_rate_of_one_has_an_interval_that_is_not_a_point() -> None:
+    interval = wilson([True] * 100)
+    assert interval.high == 1.0
+    assert 0.95 < interval.low < 0.97
+
+
+def test_the_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(200):
+        interval = bootstrap(list(rng.normal(3.0, 1.0, 40)), rng)
+        covered += interval.low <= 3.0 <= interval.high
+    assert 175 <= covered <= 199
+
+
+@pytest.mark.parametrize("values", [[], [2.0]])
+def test_without_two_values_there_is_no_interval(values: list[float]) -> None:
+    interval = bootstrap(values, np.random.default_rng(0))
+    assert math.isnan(interval.low) and math.isnan(interval.high)
+    assert interval.value == pytest.approx(values[0] if values else math.nan, nan_ok=True)
+
+
+def test_outcomes_sum_to_one_and_times_count_successes_alone() -> None:
+    failed = {"success": False, "spl": 0.0, "time_s": 50.0}
+    summary = summarize(
+        [result(), result(**failed, collision=True), result(**failed, timeout=True), result()]
+    )
+    assert summary["success"].value == 0.5
+    assert sum(summary[k].value for k in ("success", "collision", "timeout")) == 1.0
+    assert summary["time_s"].value == 10.0
+    assert summary["spl"].value == pytest.approx(0.375)
+
+
+def test_no_results_are_refused() -> None:
+    with pytest.raises(ValueError, match="results must hold at least one episode"):
+        summarize([])
+
+
+@pytest.mark.parametrize(
+    ("success", "driven", "expected"), [(True, 4.0, 0.75), (True, 2.9, 1.0), (False, 3.0, 0.0)]
+)
+def test_spl_is_the_shortest_path_over_the_driven_one(
+    success: bool, driven: float, expected: float
+) -> None:
+    assert spl(success, path_length=driven, shortest_path=3.0) == expected
+
+
+@pytest.mark.parametrize("envs_at_once", [1, 4])
+def test_turning_to_the_goal_succeeds_on_the_empty_map_and_circling_never_does(
+    envs_at_once: int,
+) -> None:
+    settings = {"episodes": 10, "seed": 1, "physics": "kinematic", "envs_at_once": envs_at_once}
+    summary = summarize(evaluate(steer, "A", max_steps=300, **settings))
+    assert summary["success"].value == 1.0
+    assert 0.8 < summary["spl"].value <= 1.0
+    results = evaluate(circle, "A", max_steps=50, **settings)
+    assert all(r.timeout and r.time_s == pytest.approx(5.0) and r.spl == 0.0 for r in results)
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
+def test_results_do_not_depend_on_how_many_run_at_once(physics: str) -> None:
+    policy = steering_policy(max_steps=60, lidar_noise=0.01)
+    alone, three, eight = (
+        evaluate(policy, "B", episodes=9, physics=physics, envs_at_once=count)
+        for count in (1, 3, 8)
+    )
+    assert alone == three == eight
+    assert {(r.success, r.collision, r.timeout) for r in alone} >= {(0, 1, 0), (0, 0, 1)}
+
+
+def test_several_worlds_give_rows_that_name_theirs() -> None:
+    policy = steering_policy(max_steps=20)
+    both = evaluate(policy, ["C", "random-100"], episodes=3)
+    assert [(r.world, r.episode) for r in both] == [
+        (world, episode) for world in ("C", "random-100") for episode in range(3)
+    ]
+    assert both[3:] == evaluate(policy, "random-100", episodes=3)
+    assert list(asdict(both[0]))[-1] == "world"
+
+
+def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[NavigationEnv] = []
+    original = NavigationEnv.__init__
+
+    def remember(self: NavigationEnv, **arguments: object) -> None:
+        original(self, **arguments)  # type: ignore[arg-type]
+        made.append(self)
+
+    monkeypatch.setattr(NavigationEnv, "__init__", remember)
+    learned = {"robot": "burger", "max_steps": 7, "action_repeat": 2, "closeness_distance": 0.2}
+    policy = steering_policy(**learned)
+    evaluate(policy, "A", episodes=1)
+    evaluate(policy, "A", episodes=1, action_repeat=3, collision_distance=0.3)
+    first, second = made
+    assert (first.robot.name, first.max_steps, first.closeness_distance) == ("burger", 7, 0.2)
+    assert (first.action_repeat, second.action_repeat) == (2, 3)
+    assert (first.collision_distance, second.collision_distance) == (first.robot.radius, 0.3)
+
+
+def test_a_trajectory_starts_at_the_start_and_ends_at_the_goal() -> None:
+    env = NavigationEnv(world="A", physics="kinematic")
+    task = evaluation_pairs("A", 1, seed=2)[0]
+    seen: list[tuple[float, float]] = []
+    trails: list[list[tuple[float, float]]] = []
+    (episode,) = run_episodes(
+        env,
+        steer,
+        [task],
+        on_step=lambda env: seen.append(env.trail[-1]),
+        on_end=lambda env, _: trails.append(env.trail),
+    )
+    (trail,) = trails
+    assert trail[0] == pytest.approx(task.start[:2])
+    assert math.dist(trail[-1], task.goal) <= env.goal_radius
+    assert seen == trail
+    driven = np.linalg.norm(np.diff(trail, axis=0), axis=1).sum()
+    assert episode.path_length == pytest.approx(driven)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"episodes": 0}, "episodes must be a positive integer, got 0"),
+        ({"envs_at_once": 1.5}, r"envs_at_once must be a positive integer, got 1\.5"),
+        ({"world": "tets"}, "world must be .*did you mean 'test'"),
+        ({"world": ["A", "tets"]}, "world must be .*did you mean 'test'"),
+        ({"physics": "magic"}, "physics must be one of .*got 'magic'"),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        evaluate(steer, **{"physics": "kinematic", **arguments})
+
+
+def test_a_policy_of_one_observation_is_told_what_to_do() -> None:
+    def single(observation: NDArray[np.float32]) -> NDArray[np.float64]:
+        return np.zeros(2)
+
+    with pytest.raises(ValueError, match=r"shape \(2, 2\) for observations of shape \(2, 24\)"):
+        evaluate(single, "A", episodes=2, physics="kinematic", envs_at_once=2)
+
+
+def test_no_environments_are_refused() -> None:
+    with pytest.raises(ValueError, match="envs must hold at least one environment"):
+        run_episodes([], steer, evaluation_pairs("A", 1, seed=0))
+
+
+def test_there_is_a_policy_to_start_from() -> None:
+    assert POLICIES
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
+def test_a_policy_of_the_project_drives_around_obstacles(path: Path) -> None:
+    assert path.stat().st_size < 100_000
+    policy = load_policy(path)
+    assert policy.card["method"] == "mpfa_per"
+    assert set(policy.env_arguments) == {
+        "robot", "physics", "max_steps", "action_repeat", "closeness_distance",
+    }  # fmt: skip
+    results = evaluate(policy, "D", episodes=10, seed=4711, physics="kinematic")
+    assert sum(found.success for found in results) >= 9
