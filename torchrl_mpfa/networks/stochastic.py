@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from itertools import chain, pairwise
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
-from torchrl.data import Bounded
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_mpfa.networks import DirectModule, _check_sizes, _last, _layer
+from torchrl_mpfa.networks.bounds import ActionScale, action_scale
+from torchrl_mpfa.networks.direct import DirectModule, check_sizes, hidden_layers, last_layer
 
 _SCALE_BIAS = math.log(math.e - 1.0)
 """The softplus of this is one."""
 _LEAST_SCALE = 1e-4
 
 
-def draw_tanh_normal(loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Draw actions :math:`a = \tanh(u)`, :math:`u \sim N(\mu, \sigma)`, with their log-density.
+def sample_tanh_normal(
+    loc: Tensor, scale: Tensor, action_scale: ActionScale | None = None
+) -> tuple[Tensor, Tensor]:
+    r"""Sample actions :math:`a = c + h \tanh(u)`, :math:`u \sim N(\mu, \sigma)`, with log-densities.
 
     .. math::
 
-        \ln \pi(a) = \sum_j \ln N(u_j; \mu_j, \sigma_j) - \ln(1 - \tanh^2 u_j)
+        \ln \pi(a) = \sum_j \ln N(u_j; \mu_j, \sigma_j) - \ln(1 - \tanh^2 u_j) - \ln h_j
 
     The same numbers as from :class:`~torchrl.modules.TanhNormal` in half the time. Both results
     can be differentiated by mean and scale.
@@ -36,12 +38,13 @@ def draw_tanh_normal(loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         loc: Means :math:`\mu`, shape ``[..., A]``.
         scale: Standard deviations :math:`\sigma`, shape ``[..., A]``.
+        action_scale: The map to the bounds of actions; None: they are in [-1, 1].
 
     Returns:
         Actions, shape ``[..., A]``, and their log-densities, shape ``[...]``.
 
     Examples:
-        >>> action, log_density = draw_tanh_normal(torch.zeros(3, 2), torch.ones(3, 2))
+        >>> action, log_density = sample_tanh_normal(torch.zeros(3, 2), torch.ones(3, 2))
         >>> action.shape, log_density.shape
         (torch.Size([3, 2]), torch.Size([3]))
     """
@@ -50,7 +53,10 @@ def draw_tanh_normal(loc: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     of_normal = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi)
     # The logarithm of 1 - tanh(u)^2, which would be that of zero for a large u.
     of_tanh = 2.0 * (math.log(2.0) - before - softplus(-2.0 * before))
-    return torch.tanh(before), (of_normal - of_tanh).sum(-1)
+    action, log_density = torch.tanh(before), (of_normal - of_tanh).sum(-1)
+    if action_scale is None:
+        return action, log_density
+    return action_scale(action), log_density - action_scale.half.log().sum()
 
 
 class StochasticNetwork(nn.Module):
@@ -67,11 +73,10 @@ class StochasticNetwork(nn.Module):
         final_init: float | None,
     ) -> None:
         super().__init__()
-        sizes = [observation_size, *[width] * layers]
-        hidden = [_layer(a, b, layer_norm) for a, b in pairwise(sizes)]
-        self.body = nn.Sequential(*chain(*hidden))
-        self.head = _last(width, action_size, final_init)
-        self.scale_head = _last(width, action_size, final_init)
+        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
+        self.body = nn.Sequential(*hidden)
+        self.head = last_layer(width, action_size, final_init)
+        self.scale_head = last_layer(width, action_size, final_init)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """From ``[..., O]`` to mean and scale, each ``[..., A]``."""
@@ -90,6 +95,7 @@ class StochasticActor(ProbabilisticActor):
     Args:
         network: Function from observations to mean and scale of the action before its tanh.
         action_size: ``A``.
+        scale: The map to the bounds of actions; None: they are in [-1, 1].
 
     Examples:
         >>> policy = make_stochastic_actor(24, 2)
@@ -97,21 +103,33 @@ class StochasticActor(ProbabilisticActor):
         ['action', 'preactivation', 'scale']
     """
 
-    def __init__(self, network: nn.Module, *, action_size: int) -> None:
+    def __init__(
+        self, network: nn.Module, *, action_size: int, scale: ActionScale | None = None
+    ) -> None:
+        one = torch.ones(action_size)
+        low, high = (-one, one) if scale is None else (scale(-one), scale(one))
         super().__init__(
             DirectModule(network, in_keys=["observation"], out_keys=["preactivation", "scale"]),
             in_keys={"loc": "preactivation", "scale": "scale"},
-            spec=Bounded(-1.0, 1.0, (action_size,)),
+            spec=Bounded(low, high, (action_size,)),
             distribution_class=TanhNormal,
+            distribution_kwargs={} if scale is None else {"low": low, "high": high},
         )
+        self.action_scale = scale
+
+    def layers(self) -> list[nn.Module]:
+        """All layers in their order, from observation to the action that is not random."""
+        network = self.module[0].module
+        scale = [] if self.action_scale is None else [self.action_scale]
+        return [*network.body, network.head, nn.Tanh(), *scale]
 
     def outputs(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> dict[NestedKey, Tensor]:
         """Compute the outputs and leave the inputs as they are.
 
-        The action is drawn under ``set_exploration_type(ExplorationType.RANDOM)``; otherwise it is
-        the tanh of the mean.
+        The action is random under ``set_exploration_type(ExplorationType.RANDOM)``; otherwise it
+        is the tanh of the mean, scaled to the bounds of actions.
 
         Args:
             inputs: Tensors by key, in a mapping or a tensordict.
@@ -121,15 +139,18 @@ class StochasticActor(ProbabilisticActor):
         """
         found: dict[NestedKey, Tensor] = self.module[0].outputs(inputs)
         if (exploration_type() or self.default_interaction_type) is ExplorationType.RANDOM:
-            action, _ = draw_tanh_normal(found["preactivation"], found["scale"])
+            action, _ = sample_tanh_normal(
+                found["preactivation"], found["scale"], self.action_scale
+            )
         else:
             action = torch.tanh(found["preactivation"])
+            action = action if self.action_scale is None else self.action_scale(action)
         return {**found, "action": action}
 
-    def draw(
+    def sample(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw actions, whatever the exploration type is.
+        """Sample actions, whatever the exploration type is.
 
         Args:
             inputs: Tensors by key, in a mapping or a tensordict.
@@ -140,13 +161,14 @@ class StochasticActor(ProbabilisticActor):
         """
         found = self.module[0].outputs(inputs)
         loc: Tensor = found["preactivation"]
-        return *draw_tanh_normal(loc, found["scale"]), loc
+        return *sample_tanh_normal(loc, found["scale"], self.action_scale), loc
 
 
 def make_stochastic_actor(
     observation_size: int,
     action_size: int,
     *,
+    action_spec: TensorSpec | None = None,
     width: int = 256,
     layers: int = 2,
     layer_norm: bool = True,
@@ -154,13 +176,14 @@ def make_stochastic_actor(
 ) -> StochasticActor:
     """Policy from ``"observation"`` to ``"preactivation"``, ``"scale"`` and ``"action"``.
 
-    The action is the tanh of a Gaussian with this mean (the preactivation) and scale. It is drawn
+    The action is the tanh of a Gaussian with this mean (the preactivation) and scale. It is random
     under ``set_exploration_type(ExplorationType.RANDOM)``, as in TorchRL's collectors; otherwise it
     is the tanh of the mean.
 
     Args:
         observation_size: ``O``.
         action_size: ``A``.
+        action_spec: As in :func:`~torchrl_mpfa.make_actor`.
         width: Units of each hidden layer.
         layers: Number of hidden layers.
         layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
@@ -171,7 +194,7 @@ def make_stochastic_actor(
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
 
     Raises:
-        ValueError: If a size is below one.
+        ValueError: If a size is below one, or the spec not one of bounded actions of this size.
 
     Examples:
         >>> policy = make_stochastic_actor(24, 2)
@@ -180,7 +203,7 @@ def make_stochastic_actor(
         >>> torch.allclose(found["action"], found["preactivation"].tanh())
         True
     """
-    _check_sizes(
+    check_sizes(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     network = StochasticNetwork(
@@ -191,4 +214,5 @@ def make_stochastic_actor(
         layer_norm=layer_norm,
         final_init=final_init,
     )
-    return StochasticActor(network, action_size=action_size)
+    scale = action_scale(action_spec, action_size)
+    return StochasticActor(network, action_size=action_size, scale=scale)

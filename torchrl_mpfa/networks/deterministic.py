@@ -1,4 +1,4 @@
-"""Actor and critic for DDPG, with what keeps them from collapsing as arguments.
+"""Actor and critic for DDPG and TD3, with what keeps them from collapsing as arguments.
 
 Plain multi-layer perceptrons were seen to saturate the actor's tanh within some fifty episodes:
 the robot then circles. The defaults follow the original DDPG paper (Lillicrap et al. 2016,
@@ -8,74 +8,16 @@ start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import chain, pairwise
-
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 
-
-class DirectModule(TensorDictModule):
-    """A :class:`~tensordict.nn.TensorDictModule` that is a plain function of its inputs as well.
-
-    A loss that calls a network through tensordicts spends half as much time on them as on the
-    network, if that is small. :class:`~torchrl_mpfa.SignalDDPGLoss` calls these directly; any
-    other module works there, too, but slower.
-
-    Args:
-        module: Function of one tensor per key of ``in_keys``, in their order.
-        in_keys: What it reads.
-        out_keys: What it gives.
-
-    Examples:
-        >>> double = DirectModule(lambda x: 2 * x, in_keys=["x"], out_keys=["y"])
-        >>> double.outputs({"x": torch.ones(2)})["y"]
-        tensor([2., 2.])
-    """
-
-    def __init__(
-        self, module: nn.Module, in_keys: list[NestedKey], out_keys: list[NestedKey]
-    ) -> None:
-        super().__init__(module, in_keys=in_keys, out_keys=out_keys)
-
-    def outputs(
-        self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
-    ) -> dict[NestedKey, Tensor]:
-        """Compute the outputs and leave the inputs as they are.
-
-        Args:
-            inputs: Tensors by key, in a mapping or a tensordict.
-
-        Returns:
-            Outputs by key.
-        """
-        return self.by_key(self.module(*[inputs.get(key) for key in self.in_keys]))
-
-    def by_key(self, found: Tensor | tuple[Tensor, ...]) -> dict[NestedKey, Tensor]:
-        """Name what the module gave."""
-        return dict(
-            zip(self.out_keys, found if isinstance(found, tuple) else (found,), strict=True)
-        )
-
-
-def _layer(inputs: int, outputs: int, layer_norm: bool) -> list[nn.Module]:
-    norm = [nn.LayerNorm(outputs)] if layer_norm else []
-    return [nn.Linear(inputs, outputs), *norm, nn.ReLU()]
-
-
-def _last(inputs: int, outputs: int, final_init: float | None) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
-    if final_init is not None:
-        nn.init.uniform_(layer.weight, -final_init, final_init)
-        nn.init.uniform_(layer.bias, -final_init, final_init)
-    return layer
+from torchrl_mpfa.networks.bounds import ActionScale, action_scale
+from torchrl_mpfa.networks.direct import DirectModule, check_sizes, hidden_layers, last_layer
 
 
 class Actor(nn.Module):
-    """Deterministic policy with actions in [-1, 1]; gives the action before its tanh as well."""
+    """Deterministic policy; gives the action before its tanh as well."""
 
     def __init__(
         self,
@@ -86,18 +28,25 @@ class Actor(nn.Module):
         layers: int,
         layer_norm: bool,
         final_init: float | None,
+        scale: ActionScale | None = None,
     ) -> None:
         super().__init__()
-        sizes = [observation_size, *[width] * layers]
-        hidden = [_layer(a, b, layer_norm) for a, b in pairwise(sizes)]
         # One flat sequence: in small networks each nested call is felt.
-        self.body = nn.Sequential(*chain(*hidden))
-        self.head = _last(width, action_size, final_init)
+        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
+        self.body = nn.Sequential(*hidden)
+        self.head = last_layer(width, action_size, final_init)
+        self.scale = scale
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """From ``[..., O]`` to the preactivation and the action, each ``[..., A]``."""
         before = self.head(self.body(observation))
-        return before, torch.tanh(before)
+        action = torch.tanh(before)
+        return before, action if self.scale is None else self.scale(action)
+
+    def layers(self) -> list[nn.Module]:
+        """All layers in their order, from observation to action."""
+        scale = [] if self.scale is None else [self.scale]
+        return [*self.body, self.head, nn.Tanh(), *scale]
 
 
 class Critic(nn.Module):
@@ -118,10 +67,10 @@ class Critic(nn.Module):
         self.late_action = late_action
         first = observation_size if late_action else observation_size + action_size
         second = width + action_size if late_action else width
-        self.first = nn.Sequential(*_layer(first, width, layer_norm))
+        self.first = nn.Sequential(*hidden_layers(first, width, layer_norm=layer_norm))
         sizes = [second, *[width] * (layers - 1)]
-        rest = [_layer(a, b, layer_norm) for a, b in pairwise(sizes)]
-        self.rest = nn.Sequential(*chain(*rest), _last(sizes[-1], 1, final_init))
+        rest = hidden_layers(*sizes, layer_norm=layer_norm)
+        self.rest = nn.Sequential(*rest, last_layer(sizes[-1], 1, final_init))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """From ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``."""
@@ -133,16 +82,11 @@ class Critic(nn.Module):
         return value
 
 
-def _check_sizes(**sizes: int) -> None:
-    for name, value in sizes.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-
-
 def make_actor(
     observation_size: int,
     action_size: int,
     *,
+    action_spec: TensorSpec | None = None,
     width: int = 256,
     layers: int = 2,
     layer_norm: bool = True,
@@ -153,6 +97,8 @@ def make_actor(
     Args:
         observation_size: ``O``.
         action_size: ``A``.
+        action_spec: A bounded spec, such as ``env.action_spec``: actions are the tanh, scaled to
+            its bounds. None: actions are in [-1, 1].
         width: Units of each hidden layer.
         layers: Number of hidden layers.
         layer_norm: Normalize each hidden layer, so that no feature grows without bound.
@@ -163,15 +109,16 @@ def make_actor(
         A module for TorchRL's losses and collectors.
 
     Raises:
-        ValueError: If a size is below one.
+        ValueError: If a size is below one, or the spec not one of bounded actions of this size.
 
     Examples:
-        >>> actor = make_actor(24, 2)
         >>> from tensordict import TensorDict
-        >>> actor(TensorDict({"observation": torch.rand(5, 24)}, [5]))["action"].shape
-        torch.Size([5, 2])
+        >>> from torchrl.data import Bounded
+        >>> actor = make_actor(3, 1, action_spec=Bounded(low=-2.0, high=2.0, shape=(1,)))
+        >>> actor(TensorDict({"observation": torch.rand(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 1])
     """
-    _check_sizes(
+    check_sizes(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     actor = Actor(
@@ -181,6 +128,7 @@ def make_actor(
         layers=layers,
         layer_norm=layer_norm,
         final_init=final_init,
+        scale=action_scale(action_spec, action_size),
     )
     return DirectModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
 
@@ -216,7 +164,7 @@ def make_critic(
         >>> make_critic(24, 2).out_keys
         ['state_action_value']
     """
-    _check_sizes(
+    check_sizes(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     if late_action and layers < 2:

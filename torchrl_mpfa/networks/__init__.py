@@ -1,0 +1,25 @@
+"""Actors and critics, with what keeps them from collapsing as arguments."""
+
+from torchrl_mpfa.networks.bounds import ActionScale, action_bounds
+from torchrl_mpfa.networks.deterministic import Actor, Critic, make_actor, make_critic
+from torchrl_mpfa.networks.direct import DirectModule
+from torchrl_mpfa.networks.stochastic import (
+    StochasticActor,
+    StochasticNetwork,
+    make_stochastic_actor,
+    sample_tanh_normal,
+)
+
+__all__ = [
+    "ActionScale",
+    "Actor",
+    "Critic",
+    "DirectModule",
+    "StochasticActor",
+    "StochasticNetwork",
+    "action_bounds",
+    "make_actor",
+    "make_critic",
+    "make_stochastic_actor",
+    "sample_tanh_normal",
+]

@@ -1,0 +1,106 @@
+"""Bounds of actions, from the action spec of an environment to the last layer of a policy."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, TensorSpec
+
+
+def action_bounds(action_spec: TensorSpec, action_size: int) -> tuple[Tensor, Tensor]:
+    """Least and greatest action of a spec.
+
+    Args:
+        action_spec: A :class:`~torchrl.data.Bounded` spec, or a :class:`~torchrl.data.Composite`
+            with one entry that is; of a batch of environments, all have the same bounds.
+        action_size: ``A``.
+
+    Returns:
+        Lower and upper bounds, each of shape ``[A]``.
+
+    Raises:
+        ValueError: If the spec is not bounded on both sides, of another size, of whole numbers,
+            or not the same for all environments of a batch.
+
+    Examples:
+        >>> low, high = action_bounds(Bounded(low=-2.0, high=2.0, shape=(1,)), 1)
+        >>> low.tolist(), high.tolist()
+        ([-2.0], [2.0])
+    """
+    given = action_spec
+    if isinstance(action_spec, Composite):
+        leaves = list(action_spec.values(include_nested=True, leaves_only=True))
+        if len(leaves) != 1:
+            raise ValueError(f"action_spec must have one entry, got {len(leaves)}: {given}")
+        (action_spec,) = leaves
+    if not isinstance(action_spec, Bounded):
+        raise ValueError(f"action_spec must be Bounded, got {type(action_spec).__name__}")
+    low, high = action_spec.space.low, action_spec.space.high
+    if not low.is_floating_point():
+        raise ValueError(f"action_spec must be of real numbers, got {action_spec.dtype}")
+    if low.shape[-1:] != (action_size,):
+        raise ValueError(
+            f"action_spec must have action_size = {action_size} entries, got shape "
+            f"{tuple(action_spec.shape)}"
+        )
+    rows = [bound.reshape(-1, action_size) for bound in (low, high)]
+    if not all(bool((each == each[:1]).all()) for each in rows):
+        raise ValueError("action_spec must have the same bounds for all environments of a batch")
+    low, high = (each[0].float().clone() for each in rows)
+    if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
+        raise ValueError(
+            f"action_spec must have finite bounds, low < high, got {low.tolist()} and "
+            f"{high.tolist()}"
+        )
+    return low, high
+
+
+class ActionScale(nn.Module):
+    r"""Affine map from [-1, 1] to the bounds of actions, :math:`a = c + h \tanh u`.
+
+    Args:
+        low: Least action, shape ``[A]``.
+        high: Greatest action, shape ``[A]``.
+
+    Examples:
+        >>> scale = ActionScale(torch.tensor([0.0]), torch.tensor([10.0]))
+        >>> scale(torch.tensor([[-1.0], [0.0], [1.0]])).flatten().tolist()
+        [0.0, 5.0, 10.0]
+    """
+
+    center: Tensor
+    half: Tensor
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("center", (high + low) / 2)
+        self.register_buffer("half", (high - low) / 2)
+
+    def forward(self, action: Tensor) -> Tensor:
+        """From [-1, 1] to the bounds, each of shape ``[..., A]``."""
+        return torch.addcmul(self.center, self.half, action)
+
+
+def action_scale(action_spec: TensorSpec | None, action_size: int) -> ActionScale | None:
+    """The last layer that a policy needs after its tanh; None if actions are in [-1, 1].
+
+    Args:
+        action_spec: Spec of the actions; None: they are in [-1, 1].
+        action_size: ``A``.
+
+    Returns:
+        The layer, if one is needed.
+
+    Raises:
+        ValueError: As of :func:`action_bounds`.
+
+    Examples:
+        >>> action_scale(Bounded(low=-1.0, high=1.0, shape=(2,)), 2) is None
+        True
+    """
+    if action_spec is None:
+        return None
+    low, high = action_bounds(action_spec, action_size)
+    if bool((low == -1.0).all() and (high == 1.0).all()):
+        return None
+    return ActionScale(low, high)
