@@ -5,6 +5,7 @@ from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.learners import DDPGLearner, Learner, SACLearner, TD3Learner
 from torchrl_mpfa.losses import (
     SignalDDPGLoss,
+    SignalLoss,
     SignalSACLoss,
     SignalTD3Loss,
     make_ddpg_loss,
@@ -12,7 +13,12 @@ from torchrl_mpfa.losses import (
     make_td3_loss,
 )
 from torchrl_mpfa.moving_fusion import Annealed, ScaledFusion, ScheduledFusion
-from torchrl_mpfa.networks import DirectModule, make_actor, make_critic
+from torchrl_mpfa.networks import (
+    DirectModule,
+    make_actor,
+    make_critic,
+    make_stochastic_actor,
+)
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.sampler import MPFASampler, SignalSampler
 from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
@@ -25,7 +31,6 @@ from torchrl_mpfa.signals import (
     Signal,
     SignalTable,
 )
-from torchrl_mpfa.stochastic import make_stochastic_actor
 from torchrl_mpfa.storage import SignalMemmapStorage, SignalTensorStorage
 from torchrl_mpfa.tree import TreeSampler
 
@@ -55,6 +60,7 @@ __all__ = [
     "Selection",
     "Signal",
     "SignalDDPGLoss",
+    "SignalLoss",
     "SignalMemmapStorage",
     "SignalReplayBuffer",
     "SignalSACLoss",

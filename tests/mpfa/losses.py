@@ -7,6 +7,7 @@ from tests.mpfa.transitions import seeded
 from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
 
 GAMMA = 0.9
+BOUNDS = (-1.0, 1.0)
 
 
 def make_networks(seed=0, **kwargs):

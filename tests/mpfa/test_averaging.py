@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from tests.mpfa.losses import GAMMA, make_batch, make_networks
+from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -19,7 +19,8 @@ MAKE = {
 
 def make_learner(name, average, seed=0, **kwargs):
     make, learner, _ = MAKE[name]
-    loss = make(*make_networks(seed), gamma=GAMMA, target_average=average)
+    more = {"bounds": BOUNDS} if name == "td3" else {}
+    loss = make(*make_networks(seed), gamma=GAMMA, target_average=average, **more)
     return learner(loss, critic_lr=1e-2, actor_lr=1e-2, tau=0.5, **kwargs)
 
 

@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 
-from tests.mpfa.losses import GAMMA, make_batch, make_networks
+from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -17,7 +17,8 @@ SIGNAL = ("signals", "action_gradient")
 def critic_loss(name, **kwargs):
     """A loss, and its method that computes the critic's loss."""
     make, method = LOSSES[name]
-    loss = make(*make_networks(), gamma=GAMMA, **kwargs)
+    more = {"bounds": BOUNDS} if name == "td3" else {}
+    loss = make(*make_networks(), gamma=GAMMA, **more, **kwargs)
     return loss, getattr(loss, method)
 
 
@@ -30,7 +31,6 @@ def critic_loss(name, **kwargs):
         {"gradient_order": 1.0},
         {"loss_function": "smooth_l1"},
         {"importance": "torchrl"},
-        {"gradient_at": "policy"},
     ],
     ids=str,
 )

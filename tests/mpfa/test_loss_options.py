@@ -57,36 +57,16 @@ def test_the_gradient_signal_equals_finite_differences():
     )
 
 
-def test_the_gradient_may_be_taken_at_the_action_of_the_policy():
-    actor, critic = make_networks()
-    plain_actor, plain_critic = deepcopy(actor), deepcopy(critic)
-    loss = make_ddpg_loss(actor, critic, gamma=GAMMA, gradient_at="policy")
-    batch = make_batch()
-    stored = batch["action"].clone()
-    loss(batch)
-    action = plain_actor.module(batch["observation"])[1].detach().requires_grad_(True)
-    (gradient,) = torch.autograd.grad(q_of(plain_critic, batch, action).sum(), action)
-    torch.testing.assert_close(batch["signals", "action_gradient"], gradient.norm(dim=1))
-    assert batch["action"].equal(stored)
-    with torch.no_grad():
-        again = make_batch()
-        loss(again)
-    torch.testing.assert_close(
-        again["signals", "action_gradient"], batch["signals", "action_gradient"]
-    )
-
-
 def test_an_actor_may_observe_what_the_critic_does_not():
     actor = TensorDictModule(nn.Linear(5, 2), ["image"], ["action"])
     _, critic = make_networks()
-    for at in ("stored", "policy"):
-        loss = make_ddpg_loss(deepcopy(actor), deepcopy(critic), gamma=GAMMA, gradient_at=at)
-        batch = make_batch()
-        batch["image"] = torch.randn(6, 5)
-        batch["next", "image"] = torch.randn(6, 5)
-        losses = loss(batch)
-        assert losses["loss_value"].isfinite()
-        assert batch["signals", "action_gradient"].shape == (6,)
+    loss = make_ddpg_loss(actor, critic, gamma=GAMMA)
+    batch = make_batch()
+    batch["image"] = torch.randn(6, 5)
+    batch["next", "image"] = torch.randn(6, 5)
+    losses = loss(batch)
+    assert losses["loss_value"].isfinite()
+    assert batch["signals", "action_gradient"].shape == (6,)
 
 
 def test_the_gradient_signal_does_not_change_the_gradients_of_the_parameters():
@@ -263,11 +243,15 @@ def test_a_copied_or_converted_loss_uses_its_own_parameters(way):
     [
         ("signals", ["novelty"]),
         ("gradient_order", 0.0),
-        ("gradient_at", "target"),
         ("importance", "actor"),
         ("reward_scale", -1.0),
         ("saturation_penalty", -0.1),
         ("saturation_limit", -1.0),
+        ("saturation_penalty", math.nan),
+        ("reward_scale", math.nan),
+        ("pal_alpha", -0.1),
+        ("target_average", 0),
+        ("loss_function", "l3"),
     ],
 )
 def test_arguments_out_of_range_are_refused(argument, value):

@@ -78,16 +78,13 @@ def test_the_error_and_the_value_are_those_of_a_soft_target_row_by_row(scale):
 
 
 @pytest.mark.parametrize("defer", [False, True])
-@pytest.mark.parametrize("at", ["stored", "policy"])
-def test_the_gradient_is_that_of_the_first_critic_row_by_row(at, defer):
-    loss, batch = make_loss(reward_scale=0.1, gradient_at=at), make_batch()
+def test_the_gradient_is_that_of_the_first_critic_row_by_row(defer):
+    loss, batch = make_loss(reward_scale=0.1), make_batch()
     first = critics_of(loss, loss.qvalue_network_params)[0]
     loss.value_loss(batch, defer_gradient=defer)[0].backward()
     loss.write_action_gradient(batch)
     for row, observation in enumerate(batch["observation"]):
         action = batch["action"][row]
-        if at == "policy":
-            action = loss.actor_network.module[0].module(observation)[0].tanh()
         action = action.detach().clone().requires_grad_(True)
         (slope,) = torch.autograd.grad(first(observation, action).sum(), action)
         torch.testing.assert_close(

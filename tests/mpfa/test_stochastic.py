@@ -8,7 +8,7 @@ from torchrl.modules import TanhNormal
 from tests.mpfa.losses import make_batch
 from tests.mpfa.sac_networks import make_networks
 from torchrl_mpfa import make_stochastic_actor
-from torchrl_mpfa.stochastic import draw_tanh_normal
+from torchrl_mpfa.networks import sample_tanh_normal
 
 
 def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
@@ -38,7 +38,7 @@ def test_the_sizes_of_a_policy_can_be_read_from_its_weights():
 def test_drawn_actions_and_densities_are_torchrls(loc):
     means, deviations = torch.full((100, 2), loc), torch.linspace(0.01, 2, 200).reshape(100, 2)
     torch.manual_seed(0)
-    action, log_density = draw_tanh_normal(means, deviations)
+    action, log_density = sample_tanh_normal(means, deviations)
     torch.manual_seed(0)
     expected = TanhNormal(means, deviations).rsample_and_log_prob()
     torch.testing.assert_close(action, expected[0])

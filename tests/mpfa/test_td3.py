@@ -7,7 +7,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import TD3Loss, ValueEstimators
 
-from tests.mpfa.losses import GAMMA, make_batch, make_networks, parameter_gradients
+from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks, parameter_gradients
 from torchrl_mpfa import SignalTD3Loss, TD3Learner, make_ddpg_loss, make_td3_loss
 
 # TorchRL warns at every loss whose target networks nothing moves.
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 
 def make_loss(seed=0, **kwargs):
-    return make_td3_loss(*make_networks(seed), gamma=GAMMA, **kwargs)
+    return make_td3_loss(*make_networks(seed), gamma=GAMMA, bounds=BOUNDS, **kwargs)
 
 
 def make_learner(**kwargs):
@@ -45,7 +45,9 @@ def test_losses_and_gradients_equal_torchrls(direct, weighted, loss_function):
         networks = tuple(without_shortcut(network) for network in networks)
     theirs = TD3Loss(*deepcopy(networks), bounds=(-1.0, 1.0), loss_function=loss_function)
     theirs.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-    ours = make_td3_loss(*networks, gamma=GAMMA, importance="torchrl", loss_function=loss_function)
+    ours = make_td3_loss(
+        *networks, gamma=GAMMA, bounds=BOUNDS, importance="torchrl", loss_function=loss_function
+    )
     separate_targets(ours, theirs)
     found = []
     for loss in (ours, theirs):
@@ -105,12 +107,6 @@ def test_signals_stay_in_the_units_of_the_reward():
     torch.testing.assert_close(found[0], make_batch()["next", "reward"].squeeze(1).abs())
 
 
-def test_the_gradient_may_be_taken_at_the_action_of_the_policy():
-    stored, policy = make_batch(), make_batch()
-    make_loss()(stored), make_loss(gradient_at="policy")(policy)
-    assert not stored["signals", "action_gradient"].equal(policy["signals", "action_gradient"])
-
-
 def test_the_penalty_on_saturation_is_added_to_the_actors_loss():
     plain, penalized = (
         make_loss(saturation_penalty=factor, saturation_limit=0.1)(make_batch())
@@ -124,7 +120,6 @@ def test_the_penalty_on_saturation_is_added_to_the_actors_loss():
     ("name", "value"),
     [
         ("signals", ["novelty"]),
-        ("gradient_at", "mean"),
         ("importance", "all"),
         ("reward_scale", 0.0),
         ("saturation_penalty", -1.0),

@@ -6,7 +6,7 @@ networks of a hundred units both take longer than the network itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -123,8 +123,10 @@ class Parts:
     """Policy that holds the target parameters."""
     target_critics: Sequence[DirectModule]
     """``C`` critics that hold the target parameters."""
-    action_bounds: tuple[Any, Any] = (-1.0, 1.0)
-    """Least and greatest action of a smoothed target."""
+    action_bounds: tuple[Any, Any] | None = None
+    """Least and greatest action of a smoothed target; None: targets are not smoothed."""
+    target_noise: Callable[[Tensor], Tensor] | None = None
+    """Noise of a smoothed target, for actions of the same shape."""
 
     def split(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:
         """Parameters of each critic."""

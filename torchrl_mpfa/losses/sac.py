@@ -2,60 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import SACLoss, ValueEstimators
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from torchrl_mpfa.losses.calling import StackedNetworks, bind, read_inputs
-from torchrl_mpfa.losses.ddpg import bootstrap_target
-from torchrl_mpfa.losses.options import DEFAULT_SIGNALS, VALUE, GradientAt, Importance
-from torchrl_mpfa.losses.twin import TwinCriticsMixin
-from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
-from torchrl_mpfa.stochastic import StochasticActor
+from torchrl_mpfa.losses.functional import least_value, soft_value
+from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.losses.twin import TwinCritics
+from torchrl_mpfa.losses.writing import SignalKeys
+from torchrl_mpfa.networks import StochasticActor
 
 
-class SignalSACLoss(TwinCriticsMixin, SACLoss):
+class SignalSACLoss(TwinCritics, SACLoss):
     r""":class:`~torchrl.objectives.SACLoss` that also writes the signals of Eqs. (13)-(14).
 
     The target of both critics is :math:`y_i = r_i + \gamma (\min_k Q'_k(s_{i+1}, a') - \alpha
-    \ln\pi(a' | s_{i+1}))` with an action :math:`a'` drawn from the current policy; the actor's loss
+    \ln\pi(a' | s_{i+1}))` with an action :math:`a'` of the current policy; the actor's loss
     is the mean of :math:`\alpha \ln\pi(a | s_i) - \min_k Q_k(s_i, a)`. The temperature
     :math:`\alpha` is tuned until the policy has the entropy ``target_entropy``, minus the number of
     action dimensions unless told otherwise.
 
     Of the critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; gradient
-    and value are those of the first critic. Importance weights are used as in
-    :class:`SignalDDPGLoss`: neither the actor's nor the temperature's loss has them unless
-    ``importance`` is ``"torchrl"``. Q contains the entropy of what follows, hence so do the
-    signals.
+    and value are those of the first critic. Neither the actor's nor the temperature's loss has
+    importance weights unless ``importance`` is ``"torchrl"``. Q contains the entropy of what
+    follows, hence so do the signals. The temperature belongs to scaled rewards: in units of the
+    environment's reward it is :math:`\alpha` divided by ``reward_scale``, so that a smaller factor
+    needs a smaller ``alpha_init`` for the same policy.
 
     Haarnoja et al. (2018), https://arxiv.org/abs/1812.05905
+
+    Options: see :class:`~torchrl_mpfa.losses.SignalLoss`.
 
     Args:
         actor_network: Stochastic policy, such as :func:`~torchrl_mpfa.make_stochastic_actor` makes;
             reads observations, writes ``"action"``.
         qvalue_network: Critic, of which two are made; reads observations and action, writes
             ``"state_action_value"``.
-        signals: As in :class:`SignalDDPGLoss`, as are the following.
-        gradient_order: Order of the norm in Eq. (14).
-        gradient_at: ``"stored"``, or ``"policy"``: at the policy's deterministic action.
-        importance: ``"critic"``, ``"torchrl"`` or ``"none"``.
-        reward_scale: Factor of the rewards in the loss. The temperature belongs to scaled rewards:
-            in units of the environment's reward it is :math:`\alpha` divided by this factor, so
-            that a smaller one needs a smaller ``alpha_init`` for the same policy.
-        saturation_penalty: Factor of the penalty on means in the flat ends of the tanh, where the
-            actor writes them as ``"preactivation"``.
-        saturation_limit: Where these begin.
-        target_average: As in :class:`SignalDDPGLoss`, of each of the target critics.
-        **kwargs: Passed to :class:`~torchrl.objectives.SACLoss`; ``alpha_init``,
+        **kwargs: Options of :class:`~torchrl_mpfa.losses.SignalLoss`: ``signals``,
+            ``gradient_order``, ``importance``, ``reward_scale``, ``saturation_penalty`` (of means,
+            where the actor writes them as ``"preactivation"``), ``saturation_limit``,
+            ``target_average``, ``pal_alpha``; and of TorchRL's loss: ``alpha_init``,
             ``target_entropy`` and ``fixed_alpha`` among them.
 
     Raises:
@@ -70,13 +63,8 @@ class SignalSACLoss(TwinCriticsMixin, SACLoss):
     """
 
     @dataclass
-    class _AcceptedKeys(SACLoss._AcceptedKeys):
-        """Keys of TorchRL's loss, and those that this one reads or writes beside them."""
-
-        preactivation: NestedKey = "preactivation"
-        td_error_signal: NestedKey = TD_ERROR.key
-        action_gradient_signal: NestedKey = ACTION_GRADIENT.key
-        value_signal: NestedKey = (SIGNALS_KEY, VALUE)
+    class _AcceptedKeys(SignalKeys, SACLoss._AcceptedKeys):
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.writing.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -85,28 +73,8 @@ class SignalSACLoss(TwinCriticsMixin, SACLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule,
-        *,
-        signals: Sequence[str] = DEFAULT_SIGNALS,
-        gradient_order: float = 2.0,
-        gradient_at: GradientAt = "stored",
-        importance: Importance = "critic",
-        reward_scale: float = 1.0,
-        saturation_penalty: float = 0.0,
-        saturation_limit: float = 1.5,
-        target_average: int = 1,
         **kwargs: Any,
     ) -> None:
-        options = {
-            "signals": signals,
-            "gradient_order": gradient_order,
-            "gradient_at": gradient_at,
-            "importance": importance,
-            "reward_scale": reward_scale,
-            "saturation_penalty": saturation_penalty,
-            "saturation_limit": saturation_limit,
-            "target_average": target_average,
-        }
-        self._check_options(**options)  # type: ignore[arg-type]
         if not isinstance(actor_network, ProbabilisticTensorDictSequential):
             raise TypeError(
                 "actor_network must be a ProbabilisticTensorDictSequential, got "
@@ -115,13 +83,7 @@ class SignalSACLoss(TwinCriticsMixin, SACLoss):
         for name in ("value_network", "skip_done_states"):
             if kwargs.get(name):
                 raise ValueError(f"{name} is not supported, got {kwargs[name]!r}")
-        super().__init__(
-            actor_network,
-            qvalue_network,
-            use_prioritized_weights="auto" if importance == "torchrl" else False,
-            **kwargs,
-        )
-        self._set_options(**options)
+        super().__init__(actor_network, qvalue_network, **kwargs)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """What TorchRL's ``forward`` asks for: :meth:`value_loss`, and ``|TD error|``.
@@ -146,18 +108,14 @@ class SignalSACLoss(TwinCriticsMixin, SACLoss):
             :meth:`temperature_loss`.
         """
         keys, critics = self.tensor_keys, self._networks().frozen_critics
-        action, log_prob, preactivation = self._draw(tensordict)
+        action, log_prob, preactivation = self._sample(tensordict)
         inputs = read_inputs(critics.network, tensordict, {keys.action: action})
         found = critics.call([inputs] * self.num_qvalue_nets)
-        values = [out[keys.state_action_value].squeeze(-1) for out in found]
-        value = torch.stack(values).amin(0)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(
-            self._alpha * log_prob - value, tensordict=tensordict, weights=weights
-        )
+        values = torch.stack([out[keys.state_action_value].squeeze(-1) for out in found])
+        loss = self._reduce(-soft_value(values, log_prob, alpha=self._alpha), tensordict)
         loss, metadata = self._penalize_saturation(loss, preactivation)
-        seen = {"log_prob": log_prob.detach(), "state_action_value_actor": value.detach()}
-        return loss, {**seen, **metadata}
+        least = least_value(values.detach())
+        return loss, {"log_prob": log_prob.detach(), "state_action_value_actor": least, **metadata}
 
     def temperature_loss(self, tensordict: TensorDictBase, log_prob: Tensor) -> Tensor:
         r"""Loss of the temperature, the mean of :math:`-\ln\alpha (\ln\pi(a | s_i) + \bar H)`.
@@ -169,11 +127,15 @@ class SignalSACLoss(TwinCriticsMixin, SACLoss):
         Returns:
             The loss.
         """
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss: Tensor = self._reduce_loss(
-            self.alpha_loss(log_prob), tensordict=tensordict, weights=weights
-        )
-        return loss
+        return self._reduce(self.alpha_loss(log_prob), tensordict)
+
+    def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        loss, log = self.actor_loss(batch)
+        log_prob = log.pop("log_prob")
+        losses = {"loss_actor": loss, "loss_alpha": self.temperature_loss(batch, log_prob)}
+        # A new tensor: the step will change the logarithm in place.
+        alpha = self.log_alpha.detach().exp()
+        return losses, {"alpha": alpha, "entropy": -log_prob.mean(), **log}
 
     def _networks(self) -> _Networks:
         """The networks with their parameters in place, held for good."""
@@ -189,36 +151,20 @@ class SignalSACLoss(TwinCriticsMixin, SACLoss):
             )
         return self._bound
 
-    def _draw(self, source: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _sample(self, source: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Actions of the current policy, ``[B, A]``, their log-densities, ``[B]``, and means."""
         actor = self._networks().actor
         inputs = read_inputs(actor, source)
         if isinstance(actor, StochasticActor):
-            return actor.draw(inputs)
+            return actor.sample(inputs)
         found = actor.get_dist_params(TensorDict(inputs))
         action, log_prob = compute_rsample_log_prob(actor.build_dist_from_params(found))
         return action, log_prob, found.get(self.tensor_keys.preactivation, None)
 
-    def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Soft targets, and the values of the next state in them, each ``[B]``."""
-        keys, critics = self.tensor_keys, self._networks().target_critics
-        after = tensordict.get("next")
-        with torch.no_grad():
-            action, log_prob, _ = self._draw(after)
-            values = [self._value(critic, after, {keys.action: action}) for critic in critics]
-            next_value = torch.stack(values).amin(0) - self._alpha * log_prob
-            reward = after.get(keys.reward) * self.reward_scale
-            if self.value_type is not ValueEstimators.TD0:
-                known = tensordict.copy().set(("next", keys.value), next_value.unsqueeze(-1))
-                known.set(("next", keys.reward), reward)
-                return self.value_estimator.value_estimate(known).squeeze(-1), next_value
-            target = bootstrap_target(
-                reward.reshape(next_value.shape),
-                next_value,
-                after.get(keys.terminated).reshape(next_value.shape),
-                gamma=self.value_estimator.gamma,
-            )
-        return target, next_value
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        action, log_prob, _ = self._sample(after)
+        values = self._target_values(after, {self.tensor_keys.action: action})
+        return soft_value(values, log_prob, alpha=self._alpha)
 
 
 @dataclass
@@ -247,7 +193,7 @@ def make_sac_loss(
     Args:
         actor: Stochastic policy.
         critic: Critic, of which two are made, with new weights.
-        gamma: Discount.
+        gamma: Discount, in [0, 1].
         loss_function: Distance between value and target; TorchRL's own default is smoothed.
         **kwargs: Passed to :class:`SignalSACLoss`.
 
@@ -264,6 +210,7 @@ def make_sac_loss(
         >>> float(make_sac_loss(actor, critic, target_entropy=-1.0).target_entropy)
         -1.0
     """
+    check_gamma(gamma)
     loss = SignalSACLoss(actor, critic, loss_function=loss_function, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

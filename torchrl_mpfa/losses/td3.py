@@ -2,71 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 
+from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bind, call, read_inputs
-from torchrl_mpfa.losses.ddpg import bootstrap_target
-from torchrl_mpfa.losses.options import (
-    DEFAULT_SIGNALS,
-    VALUE,
-    GradientAt,
-    Importance,
-)
-from torchrl_mpfa.losses.twin import TwinCriticsMixin
-from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
+from torchrl_mpfa.losses.functional import least_value, smoothed_action, smoothing_noise
+from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.losses.twin import TwinCritics
+from torchrl_mpfa.losses.writing import SignalKeys
+from torchrl_mpfa.networks import action_bounds
 
 
-class SignalTD3Loss(TwinCriticsMixin, TD3Loss):
+class SignalTD3Loss(TwinCritics, TD3Loss):
     r""":class:`~torchrl.objectives.TD3Loss` that also writes the signals of Eqs. (13)-(14).
 
     Of its two critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; the
-    gradient is that of the first critic, the one that the actor climbs. Importance weights are
-    used as in :class:`SignalDDPGLoss`.
+    gradient is that of the first critic, the one that the actor climbs.
 
     Fujimoto et al. (2018), https://arxiv.org/abs/1802.09477
+
+    Options: see :class:`~torchrl_mpfa.losses.SignalLoss`.
 
     Args:
         actor_network: Policy; reads observations, writes ``"action"``.
         qvalue_network: Critic, of which two are made; reads observations and action, writes
             ``"state_action_value"``.
-        bounds: Least and greatest action.
-        signals: As in :class:`SignalDDPGLoss`, as are the following.
-        gradient_order: Order of the norm in Eq. (14).
-        gradient_at: ``"stored"`` or ``"policy"``.
-        importance: ``"critic"``, ``"torchrl"`` or ``"none"``.
-        reward_scale: Factor of the rewards in the loss.
-        saturation_penalty: Factor of the penalty on actions in the flat ends of the tanh.
-        saturation_limit: Where these begin.
-        target_average: As in :class:`SignalDDPGLoss`, of each of the target critics.
-        **kwargs: Passed to :class:`~torchrl.objectives.TD3Loss`.
+        action_spec: Bounded spec of the actions, such as ``env.action_spec``.
+        bounds: Least and greatest action, numbers or tensors of shape ``[A]``, in place of the
+            spec. One of the two must be given.
+        **kwargs: Options of :class:`~torchrl_mpfa.losses.SignalLoss`: ``signals``,
+            ``gradient_order``, ``importance``, ``reward_scale``, ``saturation_penalty``,
+            ``saturation_limit``, ``target_average``, ``pal_alpha``; and of TorchRL's loss:
+            ``policy_noise`` and ``noise_clip``, in units of the action, among them.
 
     Raises:
-        ValueError: If an argument is out of its range.
+        TypeError: If a network is no module of tensordicts.
+        ValueError: If an argument is out of its range, both or none of ``action_spec`` and
+            ``bounds`` are given, or the networks are in the wrong order.
 
     Examples:
         >>> from torchrl_mpfa import make_actor, make_critic
-        >>> loss = make_td3_loss(make_actor(24, 2), make_critic(24, 2))
+        >>> loss = SignalTD3Loss(make_actor(24, 2), make_critic(24, 2), bounds=(-1.0, 1.0))
         >>> loss.num_qvalue_nets
         2
     """
 
     @dataclass
-    class _AcceptedKeys(TD3Loss._AcceptedKeys):
-        """Keys of TorchRL's loss, and those that this one reads or writes beside them."""
-
-        preactivation: NestedKey = "preactivation"
-        td_error_signal: NestedKey = TD_ERROR.key
-        action_gradient_signal: NestedKey = ACTION_GRADIENT.key
-        value_signal: NestedKey = (SIGNALS_KEY, VALUE)
+    class _AcceptedKeys(SignalKeys, TD3Loss._AcceptedKeys):
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.writing.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -76,36 +66,23 @@ class SignalTD3Loss(TwinCriticsMixin, TD3Loss):
         actor_network: TensorDictModule,
         qvalue_network: TensorDictModule,
         *,
-        bounds: tuple[float, float] | None = (-1.0, 1.0),
-        signals: Sequence[str] = DEFAULT_SIGNALS,
-        gradient_order: float = 2.0,
-        gradient_at: GradientAt = "stored",
-        importance: Importance = "critic",
-        reward_scale: float = 1.0,
-        saturation_penalty: float = 0.0,
-        saturation_limit: float = 1.5,
-        target_average: int = 1,
+        action_spec: Any = None,
+        bounds: Any = None,
         **kwargs: Any,
     ) -> None:
-        options = {
-            "signals": signals,
-            "gradient_order": gradient_order,
-            "gradient_at": gradient_at,
-            "importance": importance,
-            "reward_scale": reward_scale,
-            "saturation_penalty": saturation_penalty,
-            "saturation_limit": saturation_limit,
-            "target_average": target_average,
-        }
-        self._check_options(**options)  # type: ignore[arg-type]
-        super().__init__(
-            actor_network,
-            qvalue_network,
-            bounds=None if "action_spec" in kwargs else bounds,
-            use_prioritized_weights="auto" if importance == "torchrl" else False,
-            **kwargs,
-        )
-        self._set_options(**options)
+        if (action_spec is None) == (bounds is None):
+            raise ValueError(
+                "one of action_spec and bounds must be given, got "
+                f"action_spec={action_spec} and bounds={bounds}"
+            )
+        if action_spec is not None:
+            bounds = action_bounds(action_spec)
+        low, high = map(torch.as_tensor, bounds)
+        if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
+            raise ValueError(f"bounds must be finite, low < high, got {bounds}")
+        check_range("policy_noise", kwargs.get("policy_noise", 0.0), low=0.0)
+        check_range("noise_clip", kwargs.get("noise_clip", 0.0), low=0.0)
+        super().__init__(actor_network, qvalue_network, bounds=(low, high), **kwargs)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor's loss by the first critic, with the penalty on saturation if there is one.
@@ -116,13 +93,24 @@ class SignalTD3Loss(TwinCriticsMixin, TD3Loss):
         Returns:
             The loss, and detached values for the log.
         """
-        networks = self._networks()
-        chosen = call(networks.actor, read_inputs(networks.actor, tensordict))
-        value = self._value(networks.frozen_critic, tensordict, chosen)
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(-value, tensordict=tensordict, weights=weights)
-        loss, metadata = self._penalize_saturation(loss, chosen.get(self.tensor_keys.preactivation))
-        return loss, {"state_action_value_actor": value.detach(), **metadata}
+        loss, value, metadata = self._policy_loss(tensordict)
+        return loss, {"state_action_value_actor": value, **metadata}
+
+    def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        loss, log = self.actor_loss(batch)
+        return {"loss_actor": loss}, log
+
+    def target_noise(self, action: Tensor) -> Tensor:
+        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
+        return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
+
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        actor, key = self._networks().target_actor, self.tensor_keys.action
+        action = call(actor, read_inputs(actor, after))[key]
+        action = smoothed_action(
+            action, self.target_noise(action), low=self.min_action, high=self.max_action
+        )
+        return least_value(self._target_values(after, {key: action}))
 
     def _networks(self) -> _Networks:
         """The networks with their parameters in place, held for good."""
@@ -148,32 +136,8 @@ class SignalTD3Loss(TwinCriticsMixin, TD3Loss):
             target_actor=networks.target_actor,
             target_critics=networks.target_critics,
             action_bounds=(self.min_action, self.max_action),
+            target_noise=self.target_noise,
         )
-
-    def target_noise(self, action: Tensor) -> Tensor:
-        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
-        noise = torch.randn_like(action).mul_(self.policy_noise)
-        return noise.clamp_(-self.noise_clip, self.noise_clip)
-
-    def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Clipped double-Q targets at smoothed actions, and the values in them, each ``[B]``."""
-        keys, networks = self.tensor_keys, self._networks()
-        after = tensordict.get("next")
-        with torch.no_grad():
-            action = call(networks.target_actor, read_inputs(networks.target_actor, after))[
-                keys.action
-            ]
-            smoothed = action + self.target_noise(action)
-            chosen = {keys.action: torch.clamp(smoothed, self.min_action, self.max_action)}
-            values = [self._value(critic, after, chosen) for critic in networks.target_critics]
-            next_value = torch.stack(values).amin(0)
-            target = bootstrap_target(
-                after.get(keys.reward).reshape(next_value.shape) * self.reward_scale,
-                next_value,
-                after.get(keys.terminated).reshape(next_value.shape),
-                gamma=self.value_estimator.gamma,
-            )
-        return target, next_value
 
 
 @dataclass
@@ -201,21 +165,27 @@ def make_td3_loss(
     Args:
         actor: Policy.
         critic: Critic, of which two are made, the second with new weights.
-        gamma: Discount.
+        gamma: Discount, in [0, 1].
         loss_function: Distance between value and target; TorchRL's own default is smoothed.
-        **kwargs: Passed to :class:`SignalTD3Loss`.
+        **kwargs: Passed to :class:`SignalTD3Loss`; ``action_spec`` or ``bounds`` must be there.
 
     Returns:
         The loss.
 
     Raises:
-        ValueError: If an argument is out of its range.
+        ValueError: If an argument is out of its range, or the bounds of actions are missing.
 
     Examples:
+        >>> from torchrl.data import Bounded
         >>> from torchrl_mpfa import make_actor, make_critic
-        >>> make_td3_loss(make_actor(24, 2), make_critic(24, 2), policy_noise=0.1).policy_noise
-        0.1
+        >>> spec = Bounded(low=-2.0, high=2.0, shape=(1,))
+        >>> loss = make_td3_loss(
+        ...     make_actor(3, 1, action_spec=spec), make_critic(3, 1), action_spec=spec
+        ... )
+        >>> loss.max_action.item()
+        2.0
     """
+    check_gamma(gamma)
     loss = SignalTD3Loss(actor, critic, loss_function=loss_function, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

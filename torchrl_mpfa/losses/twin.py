@@ -9,23 +9,20 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_mpfa.losses.calling import bind, read_inputs
-from torchrl_mpfa.losses.distances import distance
-from torchrl_mpfa.losses.options import SignalLossMixin
+from torchrl_mpfa.losses.base import SignalLoss
+from torchrl_mpfa.losses.calling import Tensors, bind, read_inputs
 
 
-class TwinCriticsMixin(SignalLossMixin):
-    """The loss of stacked critics, of which the larger error counts and the first one's slope.
+class TwinCritics(SignalLoss):
+    """The loss of stacked critics, of which the largest error counts and the first one's slope.
 
-    Mixed into a :class:`~torchrl.objectives.LossModule` with ``qvalue_network``; the options are
-    documented at :class:`~torchrl_mpfa.SignalDDPGLoss`.
+    Mixed into a :class:`~torchrl.objectives.LossModule` with ``qvalue_network``; options: see
+    :class:`~torchrl_mpfa.losses.SignalLoss`.
     """
 
     qvalue_network: Any
-    qvalue_network_params: Any
-    target_qvalue_network_params: Any
     num_qvalue_nets: int
-    loss_function: str
+    _critic_name = "qvalue_network"
 
     def value_loss(
         self,
@@ -44,48 +41,31 @@ class TwinCriticsMixin(SignalLossMixin):
         Returns:
             The loss, and detached values for the log.
         """
-        keys = self.tensor_keys
-        at_stored = self._gradient_at_stored
-        action = tensordict[keys.action].detach()
-        with torch.set_grad_enabled(at_stored or torch.is_grad_enabled()):
-            if at_stored:
-                action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
-            values = self._values(tensordict, action)
-        gradient = self._stored_gradient(tensordict, action, values[0], defer=defer_gradient)
-        value = torch.stack(values)
-        if not torch.is_grad_enabled():
-            value = value.detach()
-
-        target, next_value = self._target(tensordict)
-        td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error.abs().amax(0), value[0], gradient)
-        name = loss_function or self.loss_function
-        loss = distance(value, target.expand_as(value), name, unit=self.reward_scale)
-        loss = self._reduce(loss.sum(0), tensordict)
+        step = self._critic_step(
+            tensordict, defer_gradient=defer_gradient, loss_function=loss_function
+        )
         metadata = {
-            "td_error": td_error.square(),
-            "next_state_value": next_value,
-            "pred_value": value.detach(),
-            "target_value": target,
+            "td_error": step.td_error.square(),
+            "next_state_value": step.next_value,
+            "pred_value": step.value.detach(),
+            "target_value": step.target,
         }
-        return loss, metadata
+        return step.loss, metadata
 
-    def _networks(self) -> Any:
-        """The networks with their parameters in place, held for good."""
-        raise NotImplementedError
+    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
+        return self.value_loss(batch, **options)
 
-    def _target(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Targets, and the values of the next state in them, each ``[B]``."""
-        raise NotImplementedError
-
-    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
-        """The critics with the parameters whose name has this prefix."""
-        each = getattr(self, f"{prefix}qvalue_network_params").detach().unbind(0)
-        return [bind(self.qvalue_network, params).requires_grad_(False) for params in each]
-
-    def _values(self, source: TensorDictBase, action: Tensor) -> list[Tensor]:
-        """Q of the current critics, each of shape ``[B]``; the action leads to the first alone."""
+    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         critics, key = self._networks().critics, self.tensor_keys.action
         actions = [action] + [action.detach()] * (self.num_qvalue_nets - 1)
-        found = critics.call([read_inputs(critics.network, source, {key: a}) for a in actions])
-        return [out[self.tensor_keys.state_action_value].squeeze(-1) for out in found]
+        found = critics.call([read_inputs(critics.network, tensordict, {key: a}) for a in actions])
+        return torch.stack([out[self.tensor_keys.state_action_value].squeeze(-1) for out in found])
+
+    def _target_values(self, after: TensorDictBase, chosen: Tensors) -> Tensor:
+        """Q of the target critics at the next state, shape ``[C, B]``."""
+        critics = self._networks().target_critics
+        return torch.stack([self._value(critic, after, chosen) for critic in critics])
+
+    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
+        each = getattr(self, f"{prefix}qvalue_network_params").detach().unbind(0)
+        return [bind(self.qvalue_network, params).requires_grad_(False) for params in each]

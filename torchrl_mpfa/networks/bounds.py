@@ -7,13 +7,13 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
 
 
-def action_bounds(action_spec: TensorSpec, action_size: int) -> tuple[Tensor, Tensor]:
+def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tuple[Tensor, Tensor]:
     """Least and greatest action of a spec.
 
     Args:
         action_spec: A :class:`~torchrl.data.Bounded` spec, or a :class:`~torchrl.data.Composite`
             with one entry that is; of a batch of environments, all have the same bounds.
-        action_size: ``A``.
+        action_size: ``A``, if it is known.
 
     Returns:
         Lower and upper bounds, each of shape ``[A]``.
@@ -38,12 +38,12 @@ def action_bounds(action_spec: TensorSpec, action_size: int) -> tuple[Tensor, Te
     low, high = action_spec.space.low, action_spec.space.high
     if not low.is_floating_point():
         raise ValueError(f"action_spec must be of real numbers, got {action_spec.dtype}")
-    if low.shape[-1:] != (action_size,):
+    if low.ndim == 0 or low.shape[-1] != (action_size or low.shape[-1]):
         raise ValueError(
-            f"action_spec must have action_size = {action_size} entries, got shape "
-            f"{tuple(action_spec.shape)}"
+            f"action_spec must have action_size = {action_size} entries in its last dimension, "
+            f"got shape {tuple(action_spec.shape)}"
         )
-    rows = [bound.reshape(-1, action_size) for bound in (low, high)]
+    rows = [bound.reshape(-1, low.shape[-1]) for bound in (low, high)]
     if not all(bool((each == each[:1]).all()) for each in rows):
         raise ValueError("action_spec must have the same bounds for all environments of a batch")
     low, high = (each[0].float().clone() for each in rows)
@@ -69,16 +69,16 @@ class ActionScale(nn.Module):
     """
 
     center: Tensor
-    half: Tensor
+    half_width: Tensor
 
     def __init__(self, low: Tensor, high: Tensor) -> None:
         super().__init__()
         self.register_buffer("center", (high + low) / 2)
-        self.register_buffer("half", (high - low) / 2)
+        self.register_buffer("half_width", (high - low) / 2)
 
     def forward(self, action: Tensor) -> Tensor:
         """From [-1, 1] to the bounds, each of shape ``[..., A]``."""
-        return torch.addcmul(self.center, self.half, action)
+        return torch.addcmul(self.center, self.half_width, action)
 
 
 def action_scale(action_spec: TensorSpec | None, action_size: int) -> ActionScale | None:

@@ -26,7 +26,7 @@ _LEAST_SCALE = 1e-4
 def sample_tanh_normal(
     loc: Tensor, scale: Tensor, action_scale: ActionScale | None = None
 ) -> tuple[Tensor, Tensor]:
-    r"""Sample actions :math:`a = c + h \tanh(u)`, :math:`u \sim N(\mu, \sigma)`, with log-densities.
+    r"""Sample :math:`a = c + h \tanh(u)`, :math:`u \sim N(\mu, \sigma)`, with its log-density.
 
     .. math::
 
@@ -56,7 +56,7 @@ def sample_tanh_normal(
     action, log_density = torch.tanh(before), (of_normal - of_tanh).sum(-1)
     if action_scale is None:
         return action, log_density
-    return action_scale(action), log_density - action_scale.half.log().sum()
+    return action_scale(action), log_density - action_scale.half_width.log().sum()
 
 
 class StochasticNetwork(nn.Module):

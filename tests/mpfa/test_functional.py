@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa.losses.distances import distance, pal_distance
+from torchrl_mpfa.losses.functional import distance, pal_distance
 
 ALPHA = 0.4
 
