@@ -38,15 +38,10 @@ def make_step(method: Method) -> Call:
 
     def step() -> None:
         buffer.extend(transition)
-        for number, draw in enumerate(select(buffer)):
+        for draw in select(buffer):
             if curiosity is not None:
                 curiosity(draw.batch)
-            learner.update(
-                draw.batch,
-                actor_batch=draw.actor_batch,
-                loss_function=draw.loss_function,
-                new_step=number == 0,
-            )
+            learner.update(draw)
             buffer.update_tensordict_priority(draw.batch)
 
     return step

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
-from torchrl_mpfa import DDPGLearner, SignalSampler, TD3Learner, make_actor, make_critic
+from torchrl_mpfa import DDPGLearner, Draw, SignalSampler, TD3Learner, make_actor, make_critic
 from torchrl_mpfa.losses import make_ddpg_loss, make_td3_loss
 from torchrl_mpfa.methods import LA3PSampler, PriorityFloor, split_draws
 
@@ -87,11 +87,12 @@ def test_both_halves_of_the_critics_batch_update_priorities():
 
 
 def test_a_delayed_actor_counts_training_steps_and_not_their_batches():
-    loss = make_td3_loss(make_actor(24, 2, width=8), make_critic(24, 2, width=8))
+    networks = make_actor(24, 2, width=8), make_critic(24, 2, width=8)
+    loss = make_td3_loss(*networks, bounds=(-1.0, 1.0))
     learner = TD3Learner(loss, policy_delay=2)
     batch = whole_transitions(12)
     logs = [
-        learner.update(batch[:4], actor_batch=batch[8:], new_step=new)
+        learner.update(Draw(batch[:4], actor_batch=batch[8:], new_step=new))
         for new in (True, False, True, False)
     ]
     assert ["loss_actor" in log for log in logs] == [False, False, True, True]
@@ -105,7 +106,7 @@ def test_the_actor_learns_from_its_own_batch():
         torch.manual_seed(0)
         loss = make_ddpg_loss(make_actor(24, 2, width=8), make_critic(24, 2, width=8))
         learner = DDPGLearner(loss)
-        learner.update((whole[:6] if kwargs else whole[6:]).clone(), **kwargs)
+        learner.update(Draw((whole[:6] if kwargs else whole[6:]).clone(), **kwargs))
         steps.append([value.clone() for value in learner.policy.parameters()])
     # Adam's first step has the sign of the gradient alone: compare its direction.
     for one, other in zip(*steps, strict=True):

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from tests.mpfa.losses import make_batch
 from tests.mpfa.sac_networks import critics_of, make_learner, make_networks
 from tests.mpfa.transitions import make_buffer, seeded
-from torchrl_mpfa import Learner, SACLearner, make_sac_loss
+from torchrl_mpfa import Draw, Learner, SACLearner, make_sac_loss
 
 
 def test_the_target_may_average_over_earlier_critics():
@@ -22,7 +22,7 @@ def test_the_target_may_average_over_earlier_critics():
     states.append(learner.loss.target_qvalue_network_params)
     after = make_batch()["next", "observation"]
     torch.manual_seed(3)
-    action, log_density, _ = learner.policy.draw({"observation": after})
+    action, log_density, _ = learner.policy.sample({"observation": after})
     each = [[q(after, action) for q in critics_of(learner.loss, state)] for state in states]
     least = torch.stack([torch.stack(pair) for pair in each]).mean(0).amin(0).squeeze(-1)
     torch.manual_seed(3)
@@ -72,7 +72,7 @@ def test_an_update_moves_everything_but_the_target_critics_follow_by_tau():
 
 
 def test_actor_and_temperature_may_learn_from_a_batch_of_their_own():
-    log = make_learner().update(make_batch(6), actor_batch=make_batch(4), loss_function="pal")
+    log = make_learner().update(Draw(make_batch(6), actor_batch=make_batch(4), loss_function="pal"))
     assert log["state_action_value_actor"].shape == (4,)
     assert log["pred_value"].shape == (2, 6)
 
@@ -141,7 +141,7 @@ def test_its_signals_are_what_a_replay_of_several_signals_reads():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("alpha_lr", 0.0), ("actor_lr", 0.0), ("tau", 0.0), ("compile", True)],
+    [("alpha_lr", 0.0), ("actor_lr", 0.0), ("tau", 0.0)],
 )
 def test_a_bad_argument_of_the_learner_is_named(name, value):
     with pytest.raises(ValueError, match=f"{name} .*got {value}"):

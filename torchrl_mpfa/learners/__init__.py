@@ -1,6 +1,7 @@
 """Learners: networks, loss, optimizers and target networks behind one ``update``."""
 
 from torchrl_mpfa.learners.base import ActorCriticLearner, Learner
+from torchrl_mpfa.learners.compiled import CompilableLearner
 from torchrl_mpfa.learners.ddpg import DDPGLearner
 from torchrl_mpfa.learners.sac import SACLearner
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
@@ -8,6 +9,7 @@ from torchrl_mpfa.learners.td3 import TD3Learner
 
 __all__ = [
     "ActorCriticLearner",
+    "CompilableLearner",
     "DDPGLearner",
     "Learner",
     "MultiTensorSoftUpdate",

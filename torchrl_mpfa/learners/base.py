@@ -6,15 +6,19 @@ learner has the same methods and takes its place.
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol, runtime_checkable
+import math
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor
 
+from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.learners.states import check_state, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
-from torchrl_mpfa.losses import SignalDDPGLoss, SignalSACLoss, SignalTD3Loss
-from torchrl_mpfa.losses.whole import WholeGradients
+from torchrl_mpfa.losses import SignalLoss
+from torchrl_mpfa.selection import Draw
 
 OptimizerName = Literal["adam", "radam"]
 
@@ -25,22 +29,11 @@ class Learner(Protocol):
 
     policy: TensorDictModule
 
-    def update(
-        self,
-        batch: TensorDictBase,
-        *,
-        actor_batch: TensorDictBase | None = None,
-        loss_function: str | None = None,
-        new_step: bool = True,
-    ) -> dict[str, torch.Tensor]:
-        """Train on a batch, write the signals in it, and give values for the log.
+    def update(self, draw: Draw | TensorDictBase) -> dict[str, Tensor]:
+        """Train on a draw, write the signals in its batch, and give values for the log.
 
         Args:
-            batch: Transitions, batch size ``[B]``.
-            actor_batch: What the actor learns from, if that is another batch.
-            loss_function: Distance of the critic's loss, if not the loss's own.
-            new_step: Whether a new training step begins; false for its further batches, if it has
-                several, which a delay of the actor does not count.
+            draw: The batches of an update; a batch of size ``[B]`` alone is ``Draw(batch)``.
 
         Returns:
             Detached values for the log.
@@ -65,131 +58,122 @@ class Learner(Protocol):
 
 
 class ActorCriticLearner:
-    r"""One optimizer for actor and critic, target networks, and rates that can be lowered.
+    r"""One optimizer for actor and critics, target networks, and rates that can be lowered.
+
+    All gradients of an update are taken at the same networks, by one backward pass; then all
+    networks take their step. A kind of learner says which loss it takes.
 
     Args:
         loss: The loss with its networks in it.
-        critic: Name of the critic's parameters in the loss.
         actor_lr: Learning rate of the actor, Table 1.
-        critic_lr: Learning rate of the critic, Table 1.
-        critic_weight_decay: L2 decay of the critic's weights, as in the original DDPG paper; it
-            keeps Q and its slope from growing without bound.
+        critic_lr: Learning rate of the critics, Table 1.
+        critic_weight_decay: L2 decay of the critics' weights. A decay of 1e-2, as in the original
+            DDPG paper, was seen to hold Q below the returns.
         tau: :math:`\tau` of Eqs. (6)-(7), Table 1.
         optimizer: ``"adam"`` (the paper), or ``"radam"``, which warms up by itself (Liu et al.
             2020, https://arxiv.org/abs/1908.03265).
-        compile: Whether ``torch.compile`` makes one program of an update, or the arguments for it.
-            It needs a C++ compiler and half a minute, and takes a third of the time for networks of
-            64 units. The networks must stay on their device.
 
     Raises:
-        ValueError: If a rate is not positive, the decay negative, ``tau`` not in (0, 1], the
-            optimizer unknown, or the loss cannot be compiled.
+        TypeError: If the loss is another learner's.
+        ValueError: If a rate is not positive, the decay negative, ``tau`` not in (0, 1], or the
+            optimizer unknown.
     """
+
+    loss_type: ClassVar[type] = SignalLoss
+    """The loss that this kind of learner takes."""
+    policy_delay: int = 1
+    """Updates of the critics for one of the actor and of the target networks."""
 
     def __init__(
         self,
-        loss: SignalDDPGLoss | SignalTD3Loss | SignalSACLoss,
+        loss: Any,
         *,
-        critic: str,
-        actor_lr: float,
-        critic_lr: float,
-        critic_weight_decay: float,
-        tau: float,
-        optimizer: OptimizerName,
-        compile: bool | dict[str, Any],
+        actor_lr: float = 1e-4,
+        critic_lr: float = 1e-4,
+        critic_weight_decay: float = 1e-4,
+        tau: float = 0.01,
+        optimizer: OptimizerName = "adam",
     ) -> None:
-        for name, rate in (("actor_lr", actor_lr), ("critic_lr", critic_lr)):
-            if not rate > 0:
-                raise ValueError(f"{name} must be positive, got {rate}")
-        if critic_weight_decay < 0:
-            raise ValueError(f"critic_weight_decay must not be negative, got {critic_weight_decay}")
+        if not isinstance(loss, SignalLoss) or not isinstance(loss, self.loss_type):
+            raise TypeError(
+                f"loss of a {type(self).__name__} must be a {self.loss_type.__name__}, got "
+                f"{type(loss).__name__}"
+            )
+        check_rate("actor_lr", actor_lr)
+        check_rate("critic_lr", critic_lr)
+        check_range("critic_weight_decay", critic_weight_decay, low=0.0)
         if not 0 < tau <= 1:
             raise ValueError(f"tau must be in (0, 1], got {tau}")
-        if compile and isinstance(loss, SignalSACLoss):
-            raise ValueError(f"compile is not supported with SignalSACLoss, got {compile!r}")
-        self._rates: tuple[float, ...] = (actor_lr, critic_lr)
-        self.loss = loss
-        self.policy: TensorDictModule = loss.actor_network
-        self.targets = MultiTensorSoftUpdate(loss, tau=tau)
-        actors, critics = (
-            list(getattr(loss, name).flatten_keys().values())
-            for name in ("actor_network_params", critic)
-        )
         groups = [
-            {"params": actors, "lr": actor_lr},
-            {"params": critics, "lr": critic_lr, "weight_decay": critic_weight_decay},
+            {"params": loss.actor_parameters(), "lr": actor_lr},
+            {
+                "params": loss.critic_parameters(),
+                "lr": critic_lr,
+                "weight_decay": critic_weight_decay,
+            },
         ]
         self.optimizer = make_optimizer(optimizer, groups)
-        self._whole: WholeGradients | None = None
-        if compile and not isinstance(loss, SignalSACLoss):
-            self._whole = WholeGradients(loss, compile=compile if isinstance(compile, dict) else {})
+        self._rates: tuple[float, ...] = (actor_lr, critic_lr)
+        self.loss: Any = loss
+        self.policy: TensorDictModule = getattr(loss, "actor_network")  # noqa: B009
+        self.targets = MultiTensorSoftUpdate(loss, tau=tau)
+        self.updates = 0
+        """Training steps taken."""
 
     def _add_parameters(self, parameters: list[torch.nn.Parameter], *, lr: float) -> None:
         """Have the optimizer move further parameters of the loss, at a rate of their own."""
         self.optimizer.add_param_group({"params": parameters, "lr": lr})
         self._rates = (*self._rates, lr)
 
-    def update(
-        self,
-        batch: TensorDictBase,
-        *,
-        actor_batch: TensorDictBase | None = None,
-        loss_function: str | None = None,
-        new_step: bool = True,
-    ) -> dict[str, torch.Tensor]:
-        """One step of all networks and of the target networks.
+    def update(self, draw: Draw | TensorDictBase) -> dict[str, Tensor]:
+        """One step of the networks and of the target networks, as far as they are due.
 
         Args:
-            batch: Transitions, batch size ``[B]``; the loss writes their signals.
-            actor_batch: What the actor learns from, if that is another batch.
-            loss_function: Distance of the critic's loss, if not the loss's own.
-            new_step: Whether a new training step begins; false for its further batches, if it has
-                several, which a delay of the actor does not count.
+            draw: The batches of an update; a batch of size ``[B]`` alone is ``Draw(batch)``. The
+                loss writes the signals in ``draw.batch``. If ``draw.new_step`` is false, it is a
+                further batch of the same training step, which a delay of the actor does not count.
 
         Returns:
             Detached values for the log.
+
+        Raises:
+            KeyError: If a batch lacks an entry.
+            ValueError: If a loss is not finite. Nothing of the learner is changed then.
         """
-        if actor_batch is None:
-            actor_batch = batch
-        log = self._descend(batch, actor_batch=actor_batch, loss_function=loss_function)
-        self.targets.step()
-        return log
-
-    def _descend(
-        self,
-        batch: TensorDictBase,
-        *,
-        actor_batch: TensorDictBase | None,
-        loss_function: str | None,
-    ) -> dict[str, torch.Tensor]:
-        """One step of the optimizer; what has no gradient stays as it is.
-
-        Args:
-            batch: What the critic learns from, batch size ``[B]``.
-            actor_batch: What the actor learns from; None: the actor stays as it is.
-            loss_function: Distance of the critic's loss; None: the loss's own.
-
-        Returns:
-            Detached values for the log.
-        """
-        if self._whole is not None:
-            log = self._whole(batch, actor_batch=actor_batch, loss_function=loss_function)
-        else:
-            self.optimizer.zero_grad(set_to_none=True)
-            loss, log = self._losses(batch, actor_batch, loss_function)
-            loss.backward()
-            self.loss.write_action_gradient(batch)
+        if not isinstance(draw, Draw):
+            draw = Draw(draw)
+        updates = self.updates + draw.new_step
+        due = updates % self.policy_delay == 0
+        actor_batch = draw.batch if draw.actor_batch is None else draw.actor_batch
+        log = self._differentiate(draw.batch, actor_batch if due else None, draw.loss_function)
+        refuse_unfinished(log, draw)
         self.optimizer.step()
+        if due:
+            self.targets.step()
+        self.updates = updates
         return {key: value.detach() for key, value in log.items()}
 
-    def _losses(
+    def _differentiate(
         self,
         batch: TensorDictBase,
         actor_batch: TensorDictBase | None,
         loss_function: str | None,
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Sum of the losses, with the action gradient deferred, and values for the log."""
-        raise NotImplementedError
+    ) -> dict[str, Tensor]:
+        """Set the gradients; what has none stays as it is.
+
+        Args:
+            batch: What the critics learn from, batch size ``[B]``.
+            actor_batch: What the actor learns from; None: the actor stays as it is.
+            loss_function: Distance of the critics' loss; None: the loss's own.
+
+        Returns:
+            Losses and other values for the log.
+        """
+        self.optimizer.zero_grad(set_to_none=True)
+        losses, log = self.loss.losses(batch, actor_batch, loss_function=loss_function)
+        sum(losses.values()).backward()
+        self.loss.write_action_gradient(batch)
+        return {**losses, **log}
 
     def end_episode(self) -> None:
         """Keep the target critics as they are now, if the loss averages several of them."""
@@ -210,13 +194,26 @@ class ActorCriticLearner:
             group["lr"] = rate * factor
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, target networks and optimizers; tensors and plain values only."""
-        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict()}
+        """Networks, target networks, optimizer and count; tensors and plain values only."""
+        return {
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore what :meth:`state_dict` gave.
+
+        Args:
+            state_dict: The state of a learner of the same kind, with networks of the same sizes.
+
+        Raises:
+            ValueError: If it is not; nothing is changed then.
+        """
+        check_state(state_dict, self.state_dict(), self.optimizer)
         self.loss.load_state_dict(state_dict["loss"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
+        self.updates = state_dict["updates"]
 
 
 def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
@@ -237,3 +234,13 @@ def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.o
     if name == "radam":
         return torch.optim.RAdam(groups, foreach=True)
     raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
+
+
+def check_rate(name: str, rate: float) -> None:
+    """Refuse a learning rate that is not positive and finite.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if not 0 < rate < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {rate}")

@@ -4,9 +4,9 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from tests.mpfa.losses import GAMMA, make_batch, make_networks
+from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
-from torchrl_mpfa.losses.whole import WholeGradients
+from torchrl_mpfa.learners.compiled import CompiledGradients
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -17,7 +17,8 @@ TRACED = {"backend": "eager"}
 
 
 def make_loss(name, **options):
-    loss = MAKE[name](*make_networks(), gamma=GAMMA, **options)
+    more = {"bounds": BOUNDS} if name == "td3" else {}
+    loss = MAKE[name](*make_networks(), gamma=GAMMA, **more, **options)
     with torch.no_grad():  # Targets of their own, lest a mix-up goes unseen.
         for key, value in loss.named_buffers():
             if key.startswith("target_"):
@@ -48,7 +49,7 @@ def by_losses(name, loss, batch, actor_batch=None, **kwargs):
     [
         {},
         {"reward_scale": 0.1, "saturation_penalty": 2.0, "saturation_limit": 0.1},
-        {"gradient_order": 1.0, "gradient_at": "policy"},
+        {"gradient_order": 1.0},
         {"loss_function": "smooth_l1"},
         {"importance": "none", "signals": ["td_error"]},
         {"signals": []},
@@ -63,7 +64,7 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
     torch.manual_seed(5)  # TD3 draws the noise of its targets.
     gradients, log = by_losses(name, loss, expected, expected)
     torch.manual_seed(5)
-    found = WholeGradients(whole, compile=None)(batch, actor_batch=batch)
+    found = CompiledGradients(whole, compile=None)(batch, actor_batch=batch)
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
@@ -84,7 +85,7 @@ def test_the_actor_may_learn_from_another_batch_and_the_critic_by_another_distan
     torch.manual_seed(5)
     gradients, _ = by_losses(name, loss, expected, other, loss_function="smooth_l1")
     torch.manual_seed(5)
-    WholeGradients(whole, compile=None)(batch, actor_batch=other, loss_function="smooth_l1")
+    CompiledGradients(whole, compile=None)(batch, actor_batch=other, loss_function="smooth_l1")
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
@@ -95,7 +96,7 @@ def test_without_the_actor_only_the_critics_get_gradients():
     loss, whole = make_loss("td3"), make_loss("td3")
     torch.manual_seed(5)
     gradients, _ = by_losses("td3", loss, make_batch())
-    gradients_of = WholeGradients(whole, compile=None)
+    gradients_of = CompiledGradients(whole, compile=None)
     # The actor's gradients of an earlier batch must not move it again.
     gradients_of(make_batch(), actor_batch=make_batch())
     torch.manual_seed(5)
