@@ -18,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torchrl.data import LazyMemmapStorage, RandomSampler
+from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from torchrl_config import main, register, train
@@ -26,13 +27,16 @@ from torchrl_mpfa import (
     MPFASampler,
     Signal,
     SignalDDPGLoss,
+    SignalLoss,
     SignalMemmapStorage,
+    SignalSACLoss,
     SignalSampler,
     SignalTD3Loss,
     SignalTensorStorage,
     make_actor,
     make_critic,
     make_ddpg_loss,
+    make_stochastic_actor,
 )
 from torchrl_mpfa.configs import (
     CONFIGS,
@@ -41,9 +45,11 @@ from torchrl_mpfa.configs import (
     MPFASamplerConfig,
     SignalDDPGLossConfig,
     SignalMemmapStorageConfig,
+    SignalSACLossConfig,
     SignalSamplerConfig,
     SignalTD3LossConfig,
     SignalTensorStorageConfig,
+    StochasticActorConfig,
 )
 from torchrl_mpfa.trainer import PriorityGuard
 
@@ -202,10 +208,8 @@ def test_fusion_adjustments_and_signals_are_configurations_of_their_own() -> Non
         (MPFASamplerConfig, MPFASampler, {"dtype"}),
         (SignalTensorStorageConfig, SignalTensorStorage, set()),
         (SignalMemmapStorageConfig, SignalMemmapStorage, set()),
-        # A trainer of TorchRL does not keep the target critics that would be averaged.
-        (SignalDDPGLossConfig, SignalDDPGLoss, {"target_average"}),
-        (SignalTD3LossConfig, SignalTD3Loss, {"target_average"}),
         (ActorConfig, make_actor, set()),
+        (StochasticActorConfig, make_stochastic_actor, set()),
         (CriticConfig, make_critic, set()),
     ],
 )
@@ -220,12 +224,49 @@ def test_every_argument_is_a_field_with_the_same_default(
         and parameter.kind not in {parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL}
     }
     assert set(arguments) <= {field.name for field in fields(config)}
-    if made in (SignalSampler, SignalTD3Loss):
-        return  # By default PER; and bounds that the trainer may give.
+    if made is SignalSampler:
+        return  # By default PER.
     defaults = OmegaConf.structured(config)
     for name, parameter in arguments.items():
         if isinstance(parameter.default, bool | int | float | str):
             assert defaults[name] == parameter.default, name
+
+
+# What a loss sets itself, what TorchRL has removed, and what belongs to SAC's first version.
+NOT_OF_A_LOSS = {
+    "use_prioritized_weights",
+    "priority_key",
+    "value_network",
+    "delay_value",
+    "skip_done_states",
+}
+
+
+@pytest.mark.parametrize(
+    ("config", "ours", "theirs"),
+    [
+        (SignalDDPGLossConfig, SignalDDPGLoss, DDPGLoss),
+        (SignalTD3LossConfig, SignalTD3Loss, TD3Loss),
+        (SignalSACLossConfig, SignalSACLoss, SACLoss),
+    ],
+)
+def test_every_option_of_a_loss_is_a_field_and_the_other_way_around(
+    config: type, ours: type, theirs: type
+) -> None:
+    defaults: dict[str, object] = {"gamma": 0.99, "loss_function": "l2"}
+    for made in (ours, SignalLoss, theirs):
+        for name, parameter in inspect.signature(made.__init__).parameters.items():  # type: ignore[misc]
+            if name not in {"self", "args", "kwargs", "critic_network"}:
+                defaults.setdefault(name, parameter.default)
+    left_out = NOT_OF_A_LOSS - ({"value_network", "delay_value"} if theirs is DDPGLoss else set())
+    if theirs is SACLoss:
+        left_out |= {"delay_actor"}  # Its targets ask the current policy.
+    names = {field.name for field in fields(config) if not field.name.startswith("_")}
+    assert names == set(defaults) - left_out
+    made = OmegaConf.structured(config)
+    for name in names:
+        if isinstance(defaults[name], bool | int | float | str):
+            assert made[name] == defaults[name], name
 
 
 def test_every_configuration_is_in_a_group_that_torchrl_has() -> None:

@@ -14,7 +14,9 @@ from torchrl_mpfa.configs.learning import (
     PriorityGuardConfig,
     PriorityStepperConfig,
     SignalDDPGLossConfig,
+    SignalSACLossConfig,
     SignalTD3LossConfig,
+    StochasticActorConfig,
 )
 from torchrl_mpfa.configs.replay import (
     MPFASamplerConfig,
@@ -34,9 +36,11 @@ __all__ = [
     "SignalDDPGLossConfig",
     "SignalMemmapStorageConfig",
     "SignalReplayBufferConfig",
+    "SignalSACLossConfig",
     "SignalSamplerConfig",
     "SignalTD3LossConfig",
     "SignalTensorStorageConfig",
+    "StochasticActorConfig",
     "register_configs",
 ]
 
@@ -48,7 +52,9 @@ CONFIGS: dict[tuple[str, str], type] = {
     ("replay_buffer", "signal"): SignalReplayBufferConfig,
     ("loss", "signal_ddpg"): SignalDDPGLossConfig,
     ("loss", "signal_td3"): SignalTD3LossConfig,
+    ("loss", "signal_sac"): SignalSACLossConfig,
     ("network", "signal_actor"): ActorConfig,
+    ("network", "signal_stochastic_actor"): StochasticActorConfig,
     ("network", "signal_critic"): CriticConfig,
     ("hook", "priority_stepper"): PriorityStepperConfig,
     ("hook", "priority_guard"): PriorityGuardConfig,
