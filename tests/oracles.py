@@ -30,19 +30,17 @@ def share(items, test):
     return sum(1 for item in items if test(item)) / len(items)
 
 
-def entropy_of_reward(rewards, strict=False):
+def entropy_of_reward(rewards):
     """Eq. (16)."""
     average = sum(rewards) / len(rewards)
     above = share(rewards, lambda r: r > average)
-    below = share(rewards, lambda r: r < average) if strict else 1 - above
-    return entropy(above, below)
+    return entropy(above, 1 - above)
 
 
-def entropy_of_positive(rewards, strict=False):
+def entropy_of_positive(rewards):
     """Eq. (17)."""
     above = share(rewards, lambda r: r > 0)
-    below = share(rewards, lambda r: r < 0) if strict else 1 - above
-    return entropy(above, below)
+    return entropy(above, 1 - above)
 
 
 def fusion_weights(of_reward, of_td, of_loss):

@@ -13,6 +13,7 @@ from torchrl_mpfa.losses import (
     make_td3_loss,
 )
 from torchrl_mpfa.moving_fusion import Annealed, ScaledFusion, ScheduledFusion
+from torchrl_mpfa.mpfa import MPFASampler
 from torchrl_mpfa.networks import (
     DirectModule,
     make_actor,
@@ -20,7 +21,7 @@ from torchrl_mpfa.networks import (
     make_stochastic_actor,
 )
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.sampler import MPFASampler, SignalSampler
+from torchrl_mpfa.sampler import SignalSampler
 from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 from torchrl_mpfa.selection import Draw, Selection, one_batch
 from torchrl_mpfa.signals import (

@@ -16,6 +16,8 @@ from typing import Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.positive import Level, check_level, is_positive
+
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
 
@@ -83,11 +85,13 @@ class BatchFacts:
         reward: Signed rewards, shape ``[B]``.
         replay_count: How often each was sampled so far, this batch included, shape ``[B]``.
         index: Slots in the storage, shape ``[B]``.
+        mean_reward: Mean reward of the buffer when its probabilities were last counted.
     """
 
     reward: Tensor
     replay_count: Tensor
     index: Tensor
+    mean_reward: float = 0.0
 
 
 @runtime_checkable
@@ -112,7 +116,8 @@ class PositiveBoost:
         boost: Factor :math:`\varphi`.
         bound: See :func:`boost_positive`.
         positive_above: A transition is positive when its reward is above this. With 0 (the paper)
-            every step towards the goal is; a value just under the goal reward leaves only goals.
+            every step towards the goal is; a value just under the goal reward leaves only goals,
+            and ``"mean"``, the mean reward of the buffer, suits rewards of one sign.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -125,17 +130,19 @@ class PositiveBoost:
 
     boost: float = 3.0
     bound: Bound = "floor"
-    positive_above: float = 0.0
+    positive_above: Level = 0.0
 
     def __post_init__(self) -> None:
         _check_positive("boost", self.boost)
+        check_level(self.positive_above)
         if self.bound not in ("floor", "cap", "none"):
             raise ValueError(f"bound must be 'floor', 'cap' or 'none', got {self.bound!r}")
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Boost the positive transitions, shape ``[B]``."""
         raised = boost_positive(priority, boost=self.boost, bound=self.bound)
-        return torch.where(batch.reward > self.positive_above, raised, priority)
+        positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
+        return torch.where(positive, raised, priority)
 
 
 @dataclass(frozen=True)
@@ -148,7 +155,6 @@ class PositiveDecay:
             in the batch, counted from 1, an arbitrary order; ``"rank"``: place when sorted by
             falling priority, so that the highest decays most; ``"count"``: how often the
             transition was replayed.
-        clamp: Stop a decayed priority at the threshold in place of letting it fall below.
         positive_above: As in :class:`PositiveBoost`.
 
     Raises:
@@ -162,11 +168,11 @@ class PositiveDecay:
 
     sharpness: float = 0.01
     position: Position = "batch"
-    clamp: bool = False
-    positive_above: float = 0.0
+    positive_above: Level = 0.0
 
     def __post_init__(self) -> None:
         _check_positive("sharpness", self.sharpness)
+        check_level(self.positive_above)
         if self.position not in ("batch", "rank", "count"):
             raise ValueError(f"position must be 'batch', 'rank' or 'count', got {self.position!r}")
 
@@ -184,10 +190,8 @@ class PositiveDecay:
         """Decay the positive transitions above the threshold, shape ``[B]``."""
         threshold = decay_threshold(priority)
         decayed = priority * self.factors(priority, batch)
-        if self.clamp:
-            decayed = torch.maximum(decayed, threshold)
-        gate = (batch.reward > self.positive_above) & (priority > threshold)
-        return torch.where(gate, decayed, priority)
+        positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
+        return torch.where(positive & (priority > threshold), decayed, priority)
 
 
 @lru_cache(maxsize=64)

@@ -30,17 +30,17 @@ Shapes: ``N`` transitions in the buffer, ``B`` in a batch, ``K`` signals.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.positive import Level, check_level
+
 if TYPE_CHECKING:
     from torchrl_mpfa.signals import SignalTable
-
-Ties = Literal["complement", "strict"]
 
 
 def binary_entropy(first: Tensor, second: Tensor) -> Tensor:
@@ -63,59 +63,64 @@ def binary_entropy(first: Tensor, second: Tensor) -> Tensor:
     return -torch.special.xlogy(shares, shares).sum() / torch.log(shares.new_tensor(2.0)) + 0.0
 
 
-def _split_entropy(reward: Tensor, level: Tensor, ties: Ties) -> Tensor:
-    """Entropy of lying above or below a level, with ties as the reading has them."""
-    if ties not in ("complement", "strict"):
-        raise ValueError(f"ties must be 'complement' or 'strict', got {ties!r}")
+def _split_entropy(reward: Tensor, level: float) -> Tensor:
+    """Entropy of lying above a level; what equals it does not."""
     if reward.numel() == 0:
         raise ValueError(f"reward must hold at least one transition, got shape {[*reward.shape]}")
     above = (reward > level).double().mean()
-    below = (reward < level).double().mean() if ties == "strict" else 1.0 - above
-    return binary_entropy(above, below)
+    return binary_entropy(above, 1.0 - above)
 
 
-def reward_entropy(reward: Tensor, *, ties: Ties = "complement") -> Tensor:
+def reward_entropy(reward: Tensor) -> Tensor:
     r"""Entropy of the immediate reward, H(r) of Eq. (16).
+
+    A reward equal to the average counts as not above it, so that both shares add to one.
 
     Args:
         reward: Signed rewards of the population, shape ``[N]``.
-        ties: What a reward equal to the average counts as. ``"complement"`` (default): not above,
-            so that both shares add to one; ``"strict"``: neither, which is the letter of Eq. (16).
 
     Returns:
         Entropy in bits of being above or below the average reward, shape ``[]``.
 
     Raises:
-        ValueError: If ``reward`` is empty or ``ties`` unknown.
+        ValueError: If ``reward`` is empty.
 
     Examples:
         >>> float(reward_entropy(torch.tensor([0.0, 0.0, 1.0, 1.0])))
         1.0
     """
-    return _split_entropy(reward, reward.double().mean(), ties)
+    return _split_entropy(reward, float(reward.double().mean()))
 
 
-def positive_entropy(reward: Tensor, *, ties: Ties = "complement") -> Tensor:
+def positive_entropy(reward: Tensor, *, positive_above: Level = 0.0) -> Tensor:
     r"""Entropy of positive training, H(TD) = H(loss) of Eq. (17).
 
     Neither the TD error nor the gradient enters: by the paper both entropies are those of the
-    sign of the reward, hence equal.
+    sign of the reward, hence equal. Where all rewards have one sign they are zero.
 
     Args:
         reward: Signed rewards of the population, shape ``[N]``.
-        ties: As for :func:`reward_entropy`, for rewards of exactly zero.
+        positive_above: A transition is positive when its reward is above this: 0 in the paper, or
+            ``"mean"``, the mean of ``reward``.
 
     Returns:
         Entropy in bits of the reward being positive, shape ``[]``.
 
     Raises:
-        ValueError: If ``reward`` is empty or ``ties`` unknown.
+        ValueError: If ``reward`` is empty.
 
     Examples:
         >>> float(positive_entropy(torch.tensor([-1.0, 2.0])))
         1.0
+        >>> pendulum = torch.tensor([-8.0, -6.0, -1.0, -0.1])
+        >>> float(positive_entropy(pendulum))
+        0.0
+        >>> float(positive_entropy(pendulum, positive_above="mean"))
+        1.0
     """
-    return _split_entropy(reward, torch.zeros((), dtype=torch.double, device=reward.device), ties)
+    if positive_above == "mean":
+        return reward_entropy(reward)
+    return _split_entropy(reward, positive_above)
 
 
 def entropy_weights(entropies: Tensor) -> Tensor:
@@ -169,7 +174,8 @@ class Fusion(Protocol):
 
     A user's own fusion is any object with this method; it may keep state. The sampler asks for
     weights when enough of the buffer was rewritten, or, if the fusion has an attribute
-    ``every_batch`` that is true, at every update.
+    ``every_batch`` that is true, at every update. If it has an attribute ``signal_names``, the
+    sampler refuses one that it does not fuse.
     """
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
@@ -191,11 +197,12 @@ class EntropyFusion:
     r"""Weights by information entropy, Eqs. (16)-(20).
 
     Args:
-        reward_signals: Signals weighted by the entropy of the reward (Eq. 16); every other one
-            gets that of positive training (Eq. 17), a user's own too.
+        reward_signals: Signals weighted by the entropy of the reward (Eq. 16), by default
+            ``reward`` where it is fused; every other one gets that of positive training (Eq. 17),
+            a user's own too.
         population: Transitions that the probabilities are counted over: the whole ``"buffer"``
             (default), or the ``"batch"``, which prioritized sampling biases.
-        ties: See :func:`reward_entropy`.
+        positive_above: See :func:`positive_entropy`.
         floor: Smallest weight a signal may get before the weights are normalized again; 0 is the
             paper, whose TD weight vanishes once all rewards are positive.
 
@@ -207,18 +214,24 @@ class EntropyFusion:
         'buffer'
     """
 
-    reward_signals: Sequence[str] = ("reward",)
+    reward_signals: Sequence[str] | None = None
     population: Literal["buffer", "batch"] = "buffer"
-    ties: Ties = "complement"
+    positive_above: Level = 0.0
     floor: float = 0.0
 
     def __post_init__(self) -> None:
+        if isinstance(self.reward_signals, str):
+            raise TypeError(f"reward_signals must be names, got {self.reward_signals!r}")
+        check_level(self.positive_above)
         if self.population not in ("buffer", "batch"):
             raise ValueError(f"population must be 'buffer' or 'batch', got {self.population!r}")
-        if self.ties not in ("complement", "strict"):
-            raise ValueError(f"ties must be 'complement' or 'strict', got {self.ties!r}")
         if not 0.0 <= self.floor < 1.0:
             raise ValueError(f"floor must be in [0, 1), got {self.floor}")
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Signals that must be fused."""
+        return () if self.reward_signals is None else tuple(self.reward_signals)
 
     @property
     def every_batch(self) -> bool:
@@ -228,9 +241,10 @@ class EntropyFusion:
     def entropies(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Entropy of each signal in bits, Eqs. (16)-(17), shape ``[K]``."""
         rewards = table.rewards if self.population == "buffer" else table.rewards[index]
-        of_reward = reward_entropy(rewards, ties=self.ties)
-        of_positive = positive_entropy(rewards, ties=self.ties)
-        return torch.stack([of_reward if n in self.reward_signals else of_positive for n in names])
+        of_reward = reward_entropy(rewards)
+        of_positive = positive_entropy(rewards, positive_above=self.positive_above)
+        by_reward = ("reward",) if self.reward_signals is None else self.reward_signals
+        return torch.stack([of_reward if name in by_reward else of_positive for name in names])
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Weights a, beta, nu of Eqs. (18)-(20), shape ``[K]``."""
@@ -249,6 +263,7 @@ class FixedFusion:
         values: Weight of each signal by name; a signal without one is not counted.
 
     Raises:
+        TypeError: If ``values`` is no mapping.
         ValueError: If a weight is negative or not finite, or all are zero.
 
     Examples:
@@ -259,12 +274,19 @@ class FixedFusion:
     values: dict[str, float] = field(default_factory=lambda: {"td_error": 1.0})
 
     def __post_init__(self) -> None:
+        if not isinstance(self.values, Mapping):
+            raise TypeError(f"values must be a weight for each signal, got {self.values!r}")
         for name, value in self.values.items():
             if not 0.0 <= value < float("inf"):
                 raise ValueError(f"weight of {name!r} must be finite and not negative, got {value}")
         if not any(self.values.values()):
             raise ValueError(f"values must have a positive weight, got {self.values}")
 
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Signals that must be fused."""
+        return tuple(self.values)
+
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """The fixed weights in the order of ``names``, shape ``[K]``."""
-        return torch.tensor([self.values.get(name, 0.0) for name in names])
+        return torch.tensor([self.values.get(name, 0.0) for name in names], dtype=torch.double)

@@ -50,6 +50,11 @@ class ScheduledFusion:
         self._ends = FixedFusion(self.start), FixedFusion(self.end)
         self._progress = 0.0
 
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Signals that must be fused."""
+        return tuple(dict.fromkeys((*self.start, *self.end)))
+
     def anneal(self, progress: float) -> None:
         """Say how much of the training is done, from 0 to 1.
 
@@ -81,6 +86,15 @@ class ScaledFusion:
     """
 
     fusion: Fusion
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.fusion, Fusion):
+            raise TypeError(f"fusion must have a method 'weights', got {self.fusion!r}")
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """As the other fusion."""
+        return tuple(getattr(self.fusion, "signal_names", ()))
 
     @property
     def every_batch(self) -> bool:

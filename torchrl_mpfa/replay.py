@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import seeded_generator
-from torchrl_mpfa.sampler import SignalSampler, signal_table_of
+from torchrl_mpfa.sampler import SignalSampler
 
 _UNRETURNED = 100
 """Batches in a row with signals that were not handed back, after which sampling is refused."""
@@ -55,7 +55,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         self._unreturned = 0
         self._handed_out: TensorDictBase | None = None
         if self._fuses:
-            signal_table_of(self._storage, self._sampler)
+            self._sampler.bind(self._storage)
             self._storage.strict = True
 
     @property

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts
+from torchrl_mpfa.binding import signal_table_of
 from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range
-from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion, fuse
+from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
 from torchrl_mpfa.moving_fusion import Annealed
-from torchrl_mpfa.signals import MPFA_SIGNALS, Signal, SignalTable, as_signals
+from torchrl_mpfa.positive import one_sided
+from torchrl_mpfa.signals import Signal, SignalTable, as_signals
+from torchrl_mpfa.slots import as_slots
+from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.statistics import batch_statistics
-from torchrl_mpfa.tree import TreeSampler
+from torchrl_mpfa.tree import TreeSampler, in_dimensions_of
+from torchrl_mpfa.tree_state import entry
+from torchrl_mpfa.weighing import Weighing, check_weighing, weights_of
 
 _ENTROPY_REFRESH = 1 / 256
 
@@ -40,10 +48,10 @@ class SignalSampler(TreeSampler):
         alpha: Priority exponent :math:`\alpha` of Eq. (8); 0 samples uniformly.
         beta: Importance exponent :math:`\beta` of Eq. (10).
         eps: :math:`\epsilon` of Eqs. (9) and (21), added once, before the adjustments.
-        dtype: Type of the tree, as in TorchRL; only single precision works there.
+        dtype: As in :class:`~torchrl_mpfa.TreeSampler`.
         reduction: As in TorchRL.
-        max_priority_within_buffer: Whether a fresh transition gets the highest priority *in the
-            buffer*; if false, the highest ever seen. Unlike TorchRL's, either costs O(log N).
+        max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
+            transition *in the buffer* was given by an update; if false, the highest ever.
         device: Device of the trees; TorchRL's published wheels have those of the CPU alone.
         signals: The signals to fuse, as objects or names.
         fusion: How they are weighted, see :class:`~torchrl_mpfa.Fusion`.
@@ -51,9 +59,12 @@ class SignalSampler(TreeSampler):
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
             probabilities anew; 0 counts at every update. The default costs a constant time per
             written transition, whatever the capacity.
+        stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
+            priority, as the PER paper does, in place of ``B`` independent ones.
 
     Raises:
-        ValueError: If an argument is out of its range.
+        ValueError: If an argument is out of its range, or the fusion names a signal that is not
+            among the ``signals``.
 
     Examples:
         >>> sampler = SignalSampler(1000, 0.6, 0.4, signals=["td_error"])
@@ -76,12 +87,17 @@ class SignalSampler(TreeSampler):
         fusion: Fusion | None = None,
         adjustments: Sequence[Adjustment] = (),
         entropy_refresh: float = _ENTROPY_REFRESH,
+        stratified: bool = False,
     ) -> None:
         check_range("entropy_refresh", entropy_refresh, low=0)
         self.signals = as_signals(signals)
         self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
         if not isinstance(self.fusion, Fusion):
             raise TypeError(f"fusion must have a method 'weights', got {type(fusion).__name__}")
+        fused = [signal.name for signal in self.signals]
+        for name in getattr(self.fusion, "signal_names", ()):
+            if name not in fused:
+                raise ValueError(unknown("signal of the fusion", name, fused))
         self.adjustments = tuple(adjustments)
         for adjust in self.adjustments:
             if not callable(adjust):
@@ -91,29 +107,37 @@ class SignalSampler(TreeSampler):
         self._names = [s.name for s in self.signals]
         self._columns: slice | list[int] = []
         self._table: SignalTable | None = None
+        self._warned: set[str] = set()
         super().__init__(
-            max_capacity, alpha, beta, eps, dtype, reduction, max_priority_within_buffer, device
+            max_capacity,
+            alpha,
+            beta,
+            eps,
+            dtype,
+            reduction,
+            max_priority_within_buffer,
+            device,
+            stratified=stratified,
         )
 
     def _init(self) -> None:
         super()._init()
-        self._weights: Tensor | None = None
-        self._weighed_at = 0
+        self._weighing: Weighing | None = None
         self._last_batch: tuple[Tensor, Tensor] | None = None
 
     @property
     def weights(self) -> dict[str, float]:
         """The weight of each signal at the last count; empty before the first update."""
-        if self._weights is None:
+        if self._weighing is None:
             return {}
-        return dict(zip(self._names, self._weights.tolist(), strict=True))
+        return dict(zip(self._names, self._weighing.weights.tolist(), strict=True))
 
     def anneal(self, progress: float) -> None:
         """Tell the fusion how much of the training is done, from 0 to 1, if it wants to know."""
         if isinstance(self.fusion, Annealed):
             self.fusion.anneal(progress)
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
         """Draw slots by Eq. (8), and count a replay for each.
 
         Args:
@@ -121,19 +145,58 @@ class SignalSampler(TreeSampler):
             batch_size: ``B``.
 
         Returns:
-            Slots, shape ``[B]``, and ``"priority_weight"`` of Eq. (10) with ``"written_at"``, by
-            which an overwritten slot is known, each of shape ``[B]``.
+            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
+            each; and ``"priority_weight"`` of Eq. (10) with ``"written_at"``, by which an
+            overwritten slot is known, each of shape ``[B]``.
 
         Raises:
             RuntimeError: If the storage is empty.
+            ValueError: If ``batch_size`` is not positive.
         """
-        index, info = super().sample(storage, batch_size)
-        self._last_batch = (index, info["priority_weight"])
+        slots, weight = self._sampled(storage, batch_size)
+        info = {"priority_weight": weight}
+        self._last_batch = (slots, weight)
         table = getattr(storage, "signal_table", None)
         if table is not None:
-            table.count_replay(index)
-            info["written_at"] = table.written_at(index)
-        return index, info
+            table.count_replay(slots)
+            info["written_at"] = table.written_at(slots)
+        else:
+            self._warn_once(
+                f"{type(self).__name__} samples from a {type(storage).__name__}, which keeps no "
+                "signals: nothing can be fused. Use SignalTensorStorage or SignalMemmapStorage, in "
+                "a SignalReplayBuffer"
+            )
+        return in_dimensions_of(storage, slots), info
+
+    def update_priority(
+        self, index: int | Tensor, priority: float | Tensor, *, storage: Storage | None = None
+    ) -> None:
+        """Set priorities directly, as TorchRL's sampler does: neither fused nor adjusted.
+
+        Args:
+            index: As in :meth:`TreeSampler.update_priority`.
+            priority: Priorities before eps and alpha, shape ``[B]``, ``[B, 1]`` or ``[]``.
+            storage: The storage, which places in several dimensions need.
+
+        Raises:
+            IndexError: If a slot is outside the buffer.
+            TypeError: If the index holds anything but integers.
+            RuntimeError: If ``priority`` has not one number a slot.
+            ValueError: If a priority is negative or not finite, or so high that sums overflow.
+        """
+        # TorchRL's buffers hand a first priority to transitions that they find in a storage.
+        if self._table is None and self._highest is not None:
+            self._warn_once(
+                f"{type(self).__name__} was given one number as the priority: it is neither fused "
+                "nor adjusted. TorchRL's own buffers do so in update_tensordict_priority; use "
+                "SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
+            )
+        super().update_priority(index, priority, storage=storage)
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            warnings.warn(text, UserWarning, stacklevel=3)
 
     def update_signals(
         self,
@@ -146,7 +209,8 @@ class SignalSampler(TreeSampler):
         """Store new signals of a batch and set its priorities by Eqs. (21)-(24).
 
         Args:
-            index: Slots, shape ``[B]``. Of a slot that appears twice, the last entry counts.
+            index: Slots, shape ``[B]``, or places in a storage of ``D`` dimensions, shape
+                ``[B, D]``. Of a slot that appears twice, the last entry counts.
             signals: The learned signals by name, each of shape ``[B]`` or ``[B, 1]``.
             storage: The storage with the signal table.
             written_at: The entry of that name in the sampled batch, shape ``[B]``: rows whose
@@ -159,10 +223,10 @@ class SignalSampler(TreeSampler):
             KeyError: If a signal that the sampler fuses is missing.
             IndexError: If a slot is outside the filled part of the buffer.
             ValueError: If a signal has the wrong shape, is negative or not finite.
-            TypeError: If the storage keeps no signals.
+            TypeError: If the storage keeps no signals, or the index holds anything but integers.
         """
-        table = self._bind(storage)
-        slots = torch.as_tensor(index, dtype=torch.long, device="cpu").reshape(-1)
+        table = self.bind(storage)
+        slots = as_slots(index, storage)
         if slots.numel() == 0:
             return 0
         if len(check_index(slots, table.size)) < len(slots):
@@ -191,23 +255,30 @@ class SignalSampler(TreeSampler):
         if slots.numel() == 0:
             return stale
 
-        priority = self._fused(table, rows, slots)
+        weighing = self._weigh(table, slots)
+        priority = self._fused(table, rows, slots, weighing)
+        highest = self._checked(priority)
+        self._weighing = weighing
         table.rows.index_copy_(0, slots, rows)
-        self._write(slots, priority)
+        self._set(slots, priority, highest)
         return stale
 
-    def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor) -> Tensor:
+    def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
         """Priorities of Eqs. (21)-(24), eps included, shape ``[B]``."""
-        rows = rows.to(self.dtype)
-        weights = self._weigh(table, slots)
-        priority = fuse(rows[:, self._columns], weights, eps=self._eps)
+        priority = fuse(rows[:, self._columns], weighing.weights, eps=self._eps)
         facts = BatchFacts(
             reward=rows.select(1, table.reward_column),
             replay_count=rows.select(1, table.count_column),
             index=slots,
+            mean_reward=weighing.mean_reward,
         )
         for adjust in self.adjustments:
             priority = adjust(priority, facts)
+        if priority.shape != slots.shape:
+            raise ValueError(
+                f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
+            )
+        priority = priority.to(torch.double)
         low, high = bounds(priority)
         if not (low >= 0 and high < math.inf):
             raise ValueError(
@@ -215,17 +286,29 @@ class SignalSampler(TreeSampler):
             )
         return priority
 
-    def _bind(self, storage: Storage) -> SignalTable:
-        """The signals of the storage, with the fused ones in the order of their columns."""
-        table = signal_table_of(storage, self)
+    def bind(self, storage: Storage) -> SignalTable:
+        """Take the signals of a storage as those to fuse.
+
+        Args:
+            storage: The storage.
+
+        Returns:
+            Its signals.
+
+        Raises:
+            TypeError: If the storage keeps no signals.
+            ValueError: If its capacity or its signals are not those of the sampler.
+        """
+        table = signal_table_of(storage, self.signals, self._max_capacity)
         if table is not self._table:
-            by_name = self.weights
+            weights, before = self.weights, self._weighing
             self._names = sorted((s.name for s in self.signals), key=table.column.__getitem__)
             places = [table.column[name] for name in self._names]
             # Neighbouring columns are read as a view, which is much faster than by a list.
             neighbours = places == list(range(places[0], places[0] + len(places)))
             self._columns = slice(places[0], places[-1] + 1) if neighbours else places
-            self._set_weights(by_name)
+            if before is not None:
+                self._weighing = replace(before, weights=self._ordered(weights))
             self._table = table
         return table
 
@@ -241,24 +324,19 @@ class SignalSampler(TreeSampler):
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
             check_finite(f"signal {name!r}", value)
 
-    def _set_weights(self, by_name: Mapping[str, float]) -> None:
-        ordered = [by_name[name] for name in self._names] if by_name else None
-        self._weights = None if ordered is None else torch.tensor(ordered, dtype=self.dtype)
-
-    def _weigh(self, table: SignalTable, index: Tensor) -> Tensor:
+    def _weigh(self, table: SignalTable, index: Tensor) -> Weighing:
         """Count the probabilities of Eqs. (16)-(17) anew if enough of the buffer changed."""
-        fresh = table.writes - self._weighed_at
+        last = self._weighing
+        fresh = table.writes - (0 if last is None else last.writes)
         due = not 0 <= fresh <= self.entropy_refresh * table.size or self.entropy_refresh == 0
-        if self._weights is None or due or getattr(self.fusion, "every_batch", False):
-            weights = self.fusion.weights(self._names, table, index)
-            if weights.shape != (len(self._names),):
-                raise ValueError(
-                    f"fusion must give {len(self._names)} weights, got shape {[*weights.shape]}"
-                )
-            check_finite("weights of the fusion", weights)
-            self._weights = weights.to(self.dtype)
-            self._weighed_at = table.writes
-        return self._weights
+        if last is not None and not due and not getattr(self.fusion, "every_batch", False):
+            return last
+        weights = weights_of(self.fusion, self._names, table, index)
+        if last is not None and not due:
+            return replace(last, weights=weights)
+        if (text := one_sided(table.rewards, (self.fusion, *self.adjustments))) is not None:
+            self._warn_once(text)
+        return Weighing(weights, float(table.rewards.mean()), table.writes)
 
     def stats(self, storage: Storage) -> dict[str, float]:
         """What the priorities are made of; see ``docs/metrics.md`` for each entry.
@@ -270,7 +348,7 @@ class SignalSampler(TreeSampler):
             Weights, entropies and shares of the signals, fractions of positive transitions,
             effective sample size and age of the last batch.
         """
-        table = self._bind(storage)
+        table = self.bind(storage)
         return batch_statistics(self._names, self.weights, self.fusion, table, self._last_batch)
 
     def state_dict(self) -> dict[str, Any]:
@@ -279,20 +357,21 @@ class SignalSampler(TreeSampler):
             **super().state_dict(),
             "_signals": sorted(self._names),
             "_weights": self.weights,
-            "_weighed_at": self._weighed_at,
+            "_weighed_at": 0 if self._weighing is None else self._weighing.writes,
+            "_mean_reward": 0.0 if self._weighing is None else self._weighing.mean_reward,
         }
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
         """Refuse a state that does not fit, before anything changes.
 
         Raises:
-            ValueError: If format, capacity or signals differ.
+            ValueError: If an entry is missing, of another sampler, or not what it must be.
         """
         super().check_state(state_dict)
-        if (found := state_dict.get("_signals")) != sorted(self._names):
-            raise ValueError(
-                f"signals of the saved sampler are {found}, of this one {sorted(self._names)}"
-            )
+        names = sorted(self._names)
+        if (found := entry(state_dict, "_signals")) != names:
+            raise ValueError(f"signals of the saved sampler are {found}, of this one {names}")
+        check_weighing(state_dict, names)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -301,92 +380,12 @@ class SignalSampler(TreeSampler):
             ValueError: See :meth:`check_state`.
         """
         super().load_state_dict(state_dict)
-        self._set_weights(state_dict["_weights"])
-        self._weighed_at = state_dict["_weighed_at"]
+        if state_dict["_weights"]:
+            self._weighing = Weighing(
+                self._ordered(state_dict["_weights"]),
+                state_dict["_mean_reward"],
+                state_dict["_weighed_at"],
+            )
 
-
-class MPFASampler(SignalSampler):
-    r"""The paper's replay: entropy-weighted signals, positive transitions boosted and decayed.
-
-    :class:`SignalSampler` with the choices of MPFA-PER: the signals of Eqs. (12)-(14), the weights
-    of Eqs. (16)-(20), and the adjustments of Eqs. (22)-(24).
-
-    Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
-
-    Args:
-        max_capacity: Capacity of the storage ``N``.
-        alpha: Priority exponent :math:`\alpha` of Eq. (8).
-        beta: Importance exponent :math:`\beta` of Eq. (10), to be raised to 1 over the training.
-        eps: :math:`\epsilon` of Eq. (21).
-        dtype: As in :class:`SignalSampler`.
-        reduction: As in :class:`SignalSampler`.
-        max_priority_within_buffer: As in :class:`SignalSampler`.
-        device: As in :class:`SignalSampler`.
-        signals: As in :class:`SignalSampler`.
-        fusion: As in :class:`SignalSampler`.
-        adjustments: As in :class:`SignalSampler`.
-        entropy_refresh: As in :class:`SignalSampler`.
-
-    Raises:
-        ValueError: If an argument is out of its range.
-
-    Examples:
-        >>> sampler = MPFASampler(100_000)
-        >>> [type(adjust).__name__ for adjust in sampler.adjustments]
-        ['PositiveBoost', 'PositiveDecay']
-    """
-
-    def __init__(
-        self,
-        max_capacity: int,
-        alpha: float = 0.6,
-        beta: float = 0.4,
-        eps: float = 0.05,
-        dtype: torch.dtype = torch.float,
-        reduction: str = "max",
-        max_priority_within_buffer: bool = True,
-        device: torch.device | str | None = "cpu",
-        *,
-        signals: Sequence[Signal | str] = MPFA_SIGNALS,
-        fusion: Fusion | None = None,
-        adjustments: Sequence[Adjustment] | None = None,
-        entropy_refresh: float = _ENTROPY_REFRESH,
-    ) -> None:
-        super().__init__(
-            max_capacity,
-            alpha,
-            beta,
-            eps,
-            dtype,
-            reduction,
-            max_priority_within_buffer,
-            device,
-            signals=signals,
-            fusion=EntropyFusion() if fusion is None else fusion,
-            adjustments=(PositiveBoost(), PositiveDecay()) if adjustments is None else adjustments,
-            entropy_refresh=entropy_refresh,
-        )
-
-
-def signal_table_of(storage: Storage, sampler: SignalSampler) -> SignalTable:
-    """The signals of a storage, after a check that they fit the sampler.
-
-    Raises:
-        TypeError: If the storage keeps no signals.
-        ValueError: If its capacity or its signals are not those of the sampler.
-    """
-    table = getattr(storage, "signal_table", None)
-    if not isinstance(table, SignalTable):
-        raise TypeError(
-            f"storage must keep signals (SignalTensorStorage, SignalMemmapStorage), got "
-            f"{type(storage).__name__}"
-        )
-    if table.capacity != sampler.max_size:
-        raise ValueError(
-            f"max_capacity of the sampler is {sampler.max_size}, max_size of the storage "
-            f"{table.capacity}"
-        )
-    absent = [signal.name for signal in sampler.signals if signal.name not in table.column]
-    if absent:
-        raise ValueError(f"signals {absent} of the sampler are not in the storage: {table.names}")
-    return table
+    def _ordered(self, weights: Mapping[str, float]) -> Tensor:
+        return torch.tensor([weights[name] for name in self._names], dtype=torch.double)

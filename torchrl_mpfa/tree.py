@@ -2,41 +2,45 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.data import Storage
-from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import check_finite, check_index, check_range, seeded_generator
+from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range, seeded_generator
 from torchrl_mpfa.priorities import importance_weights
-from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.slots import as_slots, last_of_each
+from torchrl_mpfa.tree_state import SavedTrees
 
-_FORMAT = 1
+_SERIAL = 8192
+"""Rows up to which writing by index goes in their order."""
 
 
-class TreeSampler(PrioritizedSampler):
+class TreeSampler(SavedTrees):
     r"""Proportional sampling from segment trees, Eqs. (8) and (10).
 
-    The same draws and weights as :class:`~torchrl.data.replay_buffers.PrioritizedSampler`, with
-    its sharp edges taken off: the highest priority in the buffer costs O(log N) in place of
-    O(N); draws come from a generator that ``torch.manual_seed`` reaches and that is saved;
-    a negative or infinite priority is refused where it enters; a saved state holds tensors and
-    numbers only, and one that does not fit is refused before anything changes.
+    The draws and weights of :class:`~torchrl.data.replay_buffers.PrioritizedSampler`, with
+    its sharp edges taken off: draws are in double precision, as single precision is not enough for
+    a million slots; the highest priority in the buffer costs O(log N) in place of O(N); draws come
+    from a generator that ``torch.manual_seed`` reaches and that is saved; a priority that is
+    negative or not finite is refused where it enters; a saved state holds tensors and numbers
+    only, and one that does not fit is refused before anything changes.
 
     Args:
         max_capacity: Capacity of the storage ``N``.
         alpha: Priority exponent :math:`\alpha` of Eq. (8); 0 samples uniformly.
         beta: Importance exponent :math:`\beta` of Eq. (10).
         eps: :math:`\epsilon` of Eq. (9).
-        dtype: Type of the tree, as in TorchRL; only single precision works there.
+        dtype: Type of the importance weights, single or double precision. Unlike TorchRL's, the
+            trees are in double precision whatever it is.
         reduction: As in TorchRL.
-        max_priority_within_buffer: Whether a fresh transition gets the highest priority *in the
-            buffer*; if false, the highest ever seen.
+        max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
+            transition *in the buffer* was given by an update; if false, the highest ever.
         device: Device of the trees; TorchRL's published wheels have those of the CPU alone.
+        stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
+            priority, as the PER paper does, in place of ``B`` independent ones.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -59,19 +63,33 @@ class TreeSampler(PrioritizedSampler):
         reduction: str = "max",
         max_priority_within_buffer: bool = False,
         device: torch.device | str | None = "cpu",
+        *,
+        stratified: bool = False,
     ) -> None:
         check_range("max_capacity", max_capacity, low=1)
         for name, value in (("alpha", alpha), ("beta", beta), ("eps", eps)):
             check_range(name, value, low=0)
+        if dtype not in (torch.float, torch.double):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+        self.stratified = stratified
+        self._weight_dtype = dtype
         super().__init__(
             max_capacity, alpha, beta, eps, dtype, reduction, max_priority_within_buffer, device
         )
 
     def _init(self) -> None:
-        super()._init()
+        # TorchRL chooses its trees by the dtype, of which only the single one works there.
+        self.dtype = torch.double
+        try:
+            super()._init()
+        finally:
+            self.dtype = self._weight_dtype
         # TorchRL finds the highest priority in the buffer by reading every leaf. A minimum tree
-        # over the negated priorities has it at its root.
+        # over the negated priorities has it at its root. It leaves out fresh transitions: they
+        # would hand on the highest priority that they were given, and one outlier would stay.
         self._max_tree = type(self._min_tree)(self._max_capacity)
+        # Priorities with eps, before alpha; NaN where nothing was written.
+        self._priorities = torch.full((self._max_capacity,), torch.nan, dtype=torch.double)
         self._highest: float | None = None
         self._highest_slot: int | None = None
 
@@ -83,9 +101,8 @@ class TreeSampler(PrioritizedSampler):
             return None, None
         if not self._max_priority_within_buffer:
             return max(highest - self._eps, 0.0), self._highest_slot
-        leaves = -self._max_tree[torch.arange(self._max_capacity)]
-        slot = int((leaves == highest).long().argmax()) if bool((leaves == highest).any()) else None
-        return max(highest - self._eps, 0.0), slot
+        leaves = torch.as_tensor(self._max_tree[torch.arange(self._max_capacity)]).reshape(-1)
+        return max(highest - self._eps, 0.0), int(leaves.argmin())
 
     @_max_priority.setter
     def _max_priority(self, value: tuple[float | None, int | None] | None) -> None:
@@ -94,9 +111,8 @@ class TreeSampler(PrioritizedSampler):
         self._highest_slot = slot
 
     def _highest_priority(self) -> float | None:
-        """Highest priority, eps included; None if nothing was written."""
-        # With alpha = 0 all leaves are alike, and TorchRL keeps the highest ever seen.
-        if self._max_priority_within_buffer and self._alpha > 0:
+        """Highest priority, eps included; None if no update was made."""
+        if self._max_priority_within_buffer:
             highest = -self._max_tree.query(0, self._max_capacity)
             return None if highest < 0 else float(highest)
         return self._highest
@@ -107,7 +123,24 @@ class TreeSampler(PrioritizedSampler):
         highest = self._highest_priority()
         return 1.0 if highest is None else max(highest - self._eps, 0.0)
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+    def priorities(self, index: Tensor | None = None) -> Tensor:
+        """Priorities with eps, before alpha, in double precision; NaN where nothing was written.
+
+        Args:
+            index: Slots, shape ``[B]``; by default all of them.
+
+        Returns:
+            Priorities, shape ``[B]``.
+
+        Examples:
+            >>> sampler = TreeSampler(3, 1.0, 0.4, eps=0.5)
+            >>> sampler.update_priority([0, 2], torch.tensor([1.0, 2.0]))
+            >>> sampler.priorities().tolist()
+            [1.5, nan, 2.5]
+        """
+        return self._priorities.clone() if index is None else self._priorities[index]
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
         """Draw slots by Eq. (8), with the weights of Eq. (10).
 
         Args:
@@ -115,20 +148,29 @@ class TreeSampler(PrioritizedSampler):
             batch_size: ``B``.
 
         Returns:
-            Slots, shape ``[B]``, and ``{"priority_weight": ...}``, shape ``[B]``.
+            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
+            each; and ``{"priority_weight": ...}``, shape ``[B]``.
 
         Raises:
             RuntimeError: If the storage is empty.
+            ValueError: If ``batch_size`` is not positive.
         """
+        slots, weight = self._sampled(storage, batch_size)
+        return in_dimensions_of(storage, slots), {"priority_weight": weight}
+
+    def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
+        """Slots along the flattened storage and their weights, each of shape ``[B]``."""
         if self._rng is None:
             # TorchRL would fall back on NumPy's global generator, which torch.manual_seed
             # does not reach.
             self._rng = seeded_generator()
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
         size = len(storage)
         if size == 0:
             raise RuntimeError("cannot sample from an empty buffer: len(storage) is 0")
-        index, weight = self._draw(size, batch_size)
-        return index, {"priority_weight": weight}
+        slots, weight = self._draw(size, batch_size)
+        return slots, weight.to(self.dtype)
 
     def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Slots and their weights, each of shape ``[B]``, out of the first ``size`` slots."""
@@ -143,21 +185,42 @@ class TreeSampler(PrioritizedSampler):
         leaf = torch.as_tensor(self._sum_tree[index]).reshape(-1)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
 
+    def _uniform(self, size: int, batch_size: int) -> Tensor:
+        """Slots drawn uniformly, shape ``[B]``."""
+        if self.stratified:
+            return self._mass(batch_size).mul_(size).long().clamp_max_(size - 1)
+        return torch.randint(size, (batch_size,), generator=self._rng)
+
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
         """Slots drawn in proportion to the leaves of a tree of sums, shape ``[B]``."""
-        mass = torch.rand(batch_size, generator=self._rng) * tree.query(0, size)
+        mass = self._mass(batch_size).mul_(tree.query(0, size))
         index = torch.as_tensor(tree.scan_lower_bound(mass)).reshape(-1)
         # Rounding can carry the last bit of mass past the last slot.
         return index.clamp_max_(size - 1)
 
+    def _mass(self, batch_size: int) -> Tensor:
+        """Shares of the total priority to look up, in [0, 1), shape ``[B]``."""
+        mass = torch.rand(batch_size, generator=self._rng, dtype=torch.double)
+        if not self.stratified:
+            return mass
+        # In random order: a batch sorted by slot would tell its place in it by its age.
+        return mass.add_(torch.randperm(batch_size, generator=self._rng)).div_(batch_size)
+
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
-        """Give fresh transitions the highest priority."""
+        """Give fresh transitions the highest priority.
+
+        Raises:
+            IndexError: If a slot is outside the buffer.
+            TypeError: If the index holds anything but integers.
+        """
+        slots = check_index(as_slots(index, storage), self._max_capacity)
+        if len(slots) == 0:
+            return
         highest = self._highest_priority()
         priority = 1.0 + self._eps if highest is None else highest
-        slots = torch.as_tensor(index, dtype=torch.long).reshape(-1)
-        slots = check_index(slots, self._max_capacity)
-        if len(slots):
-            self._write(slots, torch.full(slots.shape, priority))
+        if self._highest is None:
+            self._highest, self._highest_slot = priority, int(slots[0])
+        self._write(slots, torch.full(slots.shape, priority, dtype=torch.double), learned=False)
 
     def add(self, index: Tensor | int) -> None:
         """Nothing to do: the tree of highest priorities forgets an overwritten slot by itself."""
@@ -172,117 +235,89 @@ class TreeSampler(PrioritizedSampler):
         """Set priorities directly, as TorchRL's sampler does: neither fused nor adjusted.
 
         Args:
-            index: Slots, shape ``[B]``; -1 is skipped.
+            index: Slots, shape ``[B]``, or places in a storage of ``D`` dimensions, shape
+                ``[B, D]``; -1 is skipped.
             priority: Priorities before eps and alpha, shape ``[B]``, ``[B, 1]`` or ``[]``.
-            storage: Not used.
+            storage: The storage, which places in several dimensions need.
 
         Raises:
             IndexError: If a slot is outside the buffer.
+            TypeError: If the index holds anything but integers.
             RuntimeError: If ``priority`` has not one number a slot.
-            ValueError: If a priority is negative or not finite.
+            ValueError: If a priority is negative or not finite, or so high that sums overflow.
         """
-        slots = torch.as_tensor(index, dtype=torch.long, device="cpu")
-        if slots.ndim > 1:
-            raise RuntimeError(f"index must have one dimension, got shape {[*slots.shape]}")
-        slots = slots.reshape(-1)
+        slots = as_slots(index, storage)
         value = torch.as_tensor(priority, device="cpu").detach()
         if value.numel() not in (1, slots.numel()):
             raise RuntimeError(
                 "priority should be a number or an iterable of the same length as index. Got "
                 f"priority of shape {value.shape} and index {slots.shape}."
             )
-        value = value.to(self.dtype).reshape(-1).expand(slots.shape)
-        check_finite("priority", value)
+        value = value.to(torch.double).reshape(-1).expand(slots.shape)
         kept = check_index(slots, self._max_capacity)
         if len(kept) == 0:
             return
-        self._write(kept, (value if len(kept) == len(slots) else value[slots >= 0]) + self._eps)
+        value = value if len(kept) == len(slots) else value[slots >= 0]
+        inherited = self._inherited(kept, value)
+        value = value + self._eps
+        highest = self._checked(value)
+        if bool(inherited.any()):
+            self._write(kept[inherited], value[inherited], learned=False)
+            kept, value = kept[~inherited], value[~inherited]
+        if len(kept):
+            self._set(kept, value, highest)
 
-    def _write(self, index: Tensor, priority: Tensor) -> None:
-        """Write priorities, eps included, to the trees."""
-        leaf = self._leaf(priority)
-        self._sum_tree[index] = leaf
-        self._min_tree[index] = leaf
-        self._max_tree[index] = -priority
-        highest = -self._max_tree.query(0, self._max_capacity)
+    def _inherited(self, slots: Tensor, value: Tensor) -> Tensor:
+        """Which rows only get the highest priority that fresh ones have anyway, shape ``[B]``.
+
+        TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
+        transitions that they find in a storage, and for batches without a priority.
+        """
+        fresh = torch.as_tensor(self._max_tree[slots]).reshape(-1) > 0
+        return fresh & (value.float() == torch.tensor(self.default_priority).float())
+
+    def _checked(self, priority: Tensor) -> float:
+        """The highest of priorities, eps included, which are refused if they poison a tree."""
+        low, high = bounds(priority)
+        if not (low >= 0 and high < math.inf):
+            check_finite("priority", priority - self._eps)
+            check_finite("priority", priority)
+        if not high**self._alpha * self._max_capacity < math.inf:
+            raise ValueError(f"priority must not be so high that sums overflow, got {high}")
+        return high
+
+    def _set(self, slots: Tensor, priority: Tensor, highest: float) -> None:
+        """Write priorities that an update gave, eps included, of which this is the highest."""
+        self._write(slots, priority, learned=True)
         if self._highest is None or highest > self._highest:
-            self._highest, self._highest_slot = highest, int(index[priority.argmax()])
+            self._highest, self._highest_slot = highest, int(slots[priority.argmax()])
+
+    def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
+        """Write priorities, eps included, to the trees."""
+        if len(slots) > _SERIAL and (last := last_of_each(slots)) is not None:
+            slots, priority = slots[last], priority[last]
+        self._priorities.index_copy_(0, slots, priority)
+        self._max_tree[slots] = -priority if learned else torch.full_like(priority, math.inf)
+        self._write_leaves(slots, self._leaf(priority))
+
+    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
+        """Write what slots are drawn in proportion to, shape ``[B]``."""
+        self._sum_tree[slots] = leaf
+        self._min_tree[slots] = leaf
 
     def _leaf(self, priority: Tensor) -> Tensor:
         """What slots are drawn in proportion to, priorities to the power of alpha, ``[B]``."""
         return priority.pow(self._alpha)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that the next batches depend on; tensors and plain values only."""
-        slots = torch.arange(self._max_capacity)
-        return {
-            "_schema_version": self._STATE_SCHEMA_VERSION,
-            "_format": _FORMAT,
-            "_max_capacity": self._max_capacity,
-            "_alpha": float(self._alpha),
-            "_beta": float(self._beta),
-            "_eps": float(self._eps),
-            "_max_priority": self._max_priority,
-            "_highest": self._highest,
-            "_highest_slot": self._highest_slot,
-            "_sum_tree": torch.as_tensor(self._sum_tree[slots]).clone(),
-            "_min_tree": torch.as_tensor(self._min_tree[slots]).clone(),
-            "_max_tree": torch.as_tensor(self._max_tree[slots]).clone(),
-        }
+    def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
+        """Follow a new alpha; unlike TorchRL's, exact, and from 0 as well."""
+        slots = self._priorities.isfinite().nonzero().squeeze(1)
+        if len(slots):
+            self._write_leaves(slots, self._leaf(self._priorities[slots]))
 
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
 
-        Raises:
-            ValueError: If format or capacity differ.
-        """
-        if (found := state_dict.get("_format")) != _FORMAT:
-            raise ValueError(f"format of the saved sampler is {found}, this version has {_FORMAT}")
-        if (found := state_dict["_max_capacity"]) != self._max_capacity:
-            raise ValueError(
-                f"max_capacity of the saved sampler is {found}, of this one {self._max_capacity}"
-            )
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
-        self.check_state(state_dict)
-        self._init()
-        self._alpha = state_dict["_alpha"]
-        self._beta = state_dict["_beta"]
-        self._eps = state_dict["_eps"]
-        self._highest = state_dict["_highest"]
-        self._highest_slot = state_dict["_highest_slot"]
-        # Leaves that were never written hold what the tree takes for nothing; only the others
-        # are written back, and inner nodes follow from the leaves alone.
-        written = (state_dict["_max_tree"] <= 0).nonzero().squeeze(1)
-        if len(written):
-            for name in ("_sum_tree", "_min_tree", "_max_tree"):
-                getattr(self, name)[written] = state_dict[name][written]
-
-    def dumps(self, path: str | Path) -> None:
-        """Save in a folder: everything in one file, and beside it what a person can read."""
-        path = Path(path).absolute()
-        path.mkdir(exist_ok=True)
-        state = self.state_dict()
-        save_atomically(state, path / "sampler.pt")
-        plain = {key: value for key, value in state.items() if not isinstance(value, Tensor)}
-        text = json.dumps(plain, indent=2)
-        (path / "sampler_metadata.json").write_text(text, encoding="utf-8")
-
-    def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read a saved sampler and refuse it as :meth:`check_state` does."""
-        state: dict[str, Any] = load_safely(Path(path) / "sampler.pt")
-        self.check_state(state)
-        return state
-
-    def loads(self, path: str | Path) -> None:
-        """Restore from a folder.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
-        self.load_state_dict(self.check_dump(path))
+def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
+    """Slots as TorchRL's sampler gives them: a tuple of places for several dimensions."""
+    if getattr(storage, "ndim", 1) == 1:
+        return slots
+    return torch.unravel_index(slots, storage.shape)

@@ -22,7 +22,7 @@ def priorities_of(name):
     buffer = make_buffer(sampler, 8, 4, filled=0, signals=signals_of(method))
     buffer.extend(TensorDict({"next": {"reward": torch.tensor(REWARDS).unsqueeze(1)}}, [8]))
     set_signals(buffer, td_error=torch.tensor(ERRORS), action_gradient=torch.tensor(SLOPES))
-    return (-torch.as_tensor(sampler._max_tree[torch.arange(8)])).tolist(), sampler
+    return sampler.priorities(torch.arange(8)).tolist(), sampler
 
 
 def entropies():

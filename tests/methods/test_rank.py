@@ -54,7 +54,7 @@ def test_between_two_sortings_a_priority_gets_the_rank_that_it_would_have_had():
         torch.tensor([9]), {"td_error": torch.tensor([8.5])}, storage=buffer._storage
     )
     leaves = torch.as_tensor(sampler._sum_tree[torch.arange(10)])
-    expected = torch.arange(1.0, 11.0).pow(-ALPHA)
+    expected = torch.arange(1.0, 11.0).double().pow(-ALPHA)
     expected[9] = 3.0**-ALPHA
     torch.testing.assert_close(leaves, expected)
 
@@ -69,7 +69,7 @@ def test_all_are_sorted_when_enough_priorities_are_new():
             torch.tensor([slot]), {"td_error": torch.tensor([0.1])}, storage=buffer._storage
         )
         ranks.append(torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values)
-    whole = torch.arange(10.0, 0.0, -1.0).pow(-ALPHA)
+    whole = torch.arange(10.0, 0.0, -1.0).double().pow(-ALPHA)
     torch.testing.assert_close(ranks[0], whole)
     assert not torch.allclose(ranks[4], whole)
     torch.testing.assert_close(ranks[6], whole)

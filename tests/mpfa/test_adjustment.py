@@ -99,12 +99,29 @@ def test_positions_by_count_decay_by_how_often_a_transition_was_replayed():
     assert found.tolist() == pytest.approx(expected)
 
 
-def test_with_clamp_nothing_falls_below_the_threshold():
-    priority, rewards = torch.tensor([4.0, 2.0]), facts([1.0, 1.0])
-    free = PositiveDecay(sharpness=0.01)(priority, rewards)
-    held = PositiveDecay(sharpness=0.01, clamp=True)(priority, rewards)
-    assert float(free[0]) < 3.0
-    assert held.tolist() == [3.0, 2.0]
+def test_what_decays_may_fall_below_the_threshold():
+    decayed = PositiveDecay(sharpness=0.01)(torch.tensor([4.0, 2.0]), facts([1.0, 1.0]))
+    assert float(decayed[0]) < 3.0
+
+
+@pytest.mark.parametrize("adjust", [PositiveBoost, PositiveDecay])
+def test_positive_may_mean_above_the_mean_reward_of_the_buffer(adjust):
+    """Rewards of one sign: those of -1 are positive where the mean is -2, those of -3 are not."""
+    batch = BatchFacts(
+        torch.tensor([-1.0, -3.0, -5.0]), torch.ones(3), torch.arange(3), mean_reward=-2.0
+    )
+    priority = torch.tensor([3.0, 3.0, 0.0])
+    assert adjust()(priority, batch).tolist() == [3.0, 3.0, 0.0]
+    found = adjust(positive_above="mean")(priority, batch)
+    assert found[0] != 3.0
+    assert found[1:].tolist() == [3.0, 0.0]
+
+
+@pytest.mark.parametrize("level", ["median", None, math.nan, True])
+@pytest.mark.parametrize("adjust", [PositiveBoost, PositiveDecay])
+def test_a_level_that_is_none_is_refused(adjust, level):
+    with pytest.raises(ValueError, match="positive_above must be a finite number or 'mean', got"):
+        adjust(positive_above=level)
 
 
 def test_decay_asks_for_more_than_positive_above():

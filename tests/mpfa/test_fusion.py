@@ -51,33 +51,38 @@ def test_positive_entropy_of_a_hand_example():
     assert float(positive_entropy(rewards)) == pytest.approx(0.8112781)
 
 
-@pytest.mark.parametrize("ties", ["complement", "strict"])
 @pytest.mark.parametrize("seed", range(5))
-def test_both_entropies_equal_the_oracle(ties, seed):
+def test_both_entropies_equal_the_oracle(seed):
     # Rounded, so that zeros and ties happen.
     rewards = (torch.randn(200, generator=seeded(seed)) * 2).round()
-    expected = oracles.entropy_of_reward(rewards.tolist(), ties == "strict")
-    assert float(reward_entropy(rewards, ties=ties)) == pytest.approx(expected)
-    expected = oracles.entropy_of_positive(rewards.tolist(), ties == "strict")
-    assert float(positive_entropy(rewards, ties=ties)) == pytest.approx(expected)
+    expected = oracles.entropy_of_reward(rewards.tolist())
+    assert float(reward_entropy(rewards)) == pytest.approx(expected)
+    expected = oracles.entropy_of_positive(rewards.tolist())
+    assert float(positive_entropy(rewards)) == pytest.approx(expected)
 
 
-def test_ties_count_as_not_greater_by_default_and_not_at_all_when_strict():
+def test_ties_count_as_not_greater():
     rewards = torch.tensor([1.0, 0.0, 0.0, -1.0])
     assert float(positive_entropy(rewards)) == pytest.approx(0.8112781)
-    # A quarter above, a quarter below, and half nowhere: -2 (1/4 log2 1/4).
-    assert float(positive_entropy(rewards, ties="strict")) == pytest.approx(1.0)
-    same = torch.zeros(4)
-    assert float(reward_entropy(same)) == 0.0
-    assert float(reward_entropy(same, ties="strict")) == 0.0
+    assert float(reward_entropy(torch.zeros(4))) == 0.0
+
+
+def test_positive_may_mean_above_a_level_or_above_the_mean():
+    """Pendulum: all rewards are negative, so that none is positive by the letter."""
+    rewards = torch.tensor([-8.0, -6.0, -1.0, -0.5])
+    assert float(positive_entropy(rewards)) == 0.0
+    assert float(positive_entropy(rewards, positive_above=-7.0)) == pytest.approx(0.8112781)
+    assert float(positive_entropy(rewards, positive_above="mean")) == 1.0
+    table, index = make_table(rewards.tolist()), torch.arange(4)
+    assert EntropyFusion().weights(NAMES, table, index).tolist() == [0.0, 0.0, 1.0]
+    cured = EntropyFusion(positive_above="mean").weights(NAMES, table, index)
+    assert cured.tolist() == pytest.approx([1 / 3] * 3)
 
 
 @pytest.mark.parametrize("entropy", [reward_entropy, positive_entropy])
-def test_entropies_refuse_an_empty_population_and_unknown_ties(entropy):
+def test_entropies_refuse_an_empty_population(entropy):
     with pytest.raises(ValueError, match="reward must hold at least one transition"):
         entropy(torch.empty(0))
-    with pytest.raises(ValueError, match="ties must be 'complement' or 'strict', got 'none'"):
-        entropy(torch.ones(2), ties="none")
 
 
 def test_reward_entropy_does_not_change_with_scale_and_offset():
@@ -146,20 +151,19 @@ def test_when_every_reward_is_positive_only_the_reward_has_weight_unless_there_i
 
 
 def test_a_signal_of_ones_own_gets_the_entropy_of_positive_training_unless_told_otherwise():
-    table, index = make_table([4.0, 1.0, 1.0, -2.0]), torch.arange(4)
-    of_reward = oracles.entropy_of_reward([4.0, 1.0, 1.0, -2.0])
+    table, index = make_table([4.0, 1.0, 1.0, 1.0, -2.0]), torch.arange(5)
+    of_reward = oracles.entropy_of_reward([4.0, 1.0, 1.0, 1.0, -2.0])
     names = ["novelty", "reward"]
-    found = EntropyFusion(ties="strict").entropies(names, table, index)
-    assert found[0] == pytest.approx(oracles.entropy_of_positive([4.0, 1.0, 1.0, -2.0]))
-    named = EntropyFusion(reward_signals=["novelty"], ties="strict")
-    strict = oracles.entropy_of_reward([4.0, 1.0, 1.0, -2.0], strict=True)
-    assert named.entropies(names, table, index)[0] == pytest.approx(strict)
-    assert strict != of_reward
+    found = EntropyFusion().entropies(names, table, index)
+    assert found[0] == pytest.approx(oracles.entropy_of_positive([4.0, 1.0, 1.0, 1.0, -2.0]))
+    assert found[1] == pytest.approx(of_reward)
+    named = EntropyFusion(reward_signals=["novelty"])
+    assert named.entropies(names, table, index).tolist() == found.flip(0).tolist()
 
 
 @pytest.mark.parametrize(
     ("argument", "value"),
-    [("population", "world"), ("ties", "both"), ("floor", -0.1), ("floor", 1.0)],
+    [("population", "world"), ("positive_above", "both"), ("floor", -0.1), ("floor", 1.0)],
 )
 def test_entropy_fusion_refuses_what_is_out_of_range(argument, value):
     with pytest.raises(ValueError, match=rf"{argument} must be .*got '?{value}"):

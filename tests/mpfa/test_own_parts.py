@@ -75,7 +75,7 @@ def update(buffer, index, td_error, novelty):
 
 
 def priorities(buffer):
-    return (-torch.as_tensor(buffer.sampler._max_tree[torch.arange(len(buffer))])).tolist()
+    return buffer.sampler.priorities(torch.arange(len(buffer))).tolist()
 
 
 def test_own_signals_go_from_the_batch_to_the_priority():

@@ -13,7 +13,8 @@ from torchrl.trainers.algorithms.configs import (
 )
 from torchrl.trainers.algorithms.configs.data import SamplerConfig
 
-from torchrl_mpfa.sampler import MPFASampler, SignalSampler
+from torchrl_mpfa.mpfa import MPFASampler
+from torchrl_mpfa.sampler import SignalSampler
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.storage import SignalMemmapStorage, SignalTensorStorage
 
@@ -47,6 +48,7 @@ class SignalSamplerConfig(SamplerConfig):
     fusion: Any = None
     adjustments: list[Any] | None = field(default_factory=list)
     entropy_refresh: float = 1 / 256
+    stratified: bool = False
     _target_: str = "torchrl_mpfa.configs.replay._make_signal_sampler"
     _convert_: str = "all"
 
@@ -65,6 +67,7 @@ class MPFASamplerConfig(SignalSamplerConfig):
     max_priority_within_buffer: bool = True
     signals: list[Any] = field(default_factory=_mpfa_signals)
     adjustments: list[Any] | None = None
+    positive_above: Any = 0.0
     _target_: str = "torchrl_mpfa.configs.replay._make_mpfa_sampler"
 
 

@@ -28,7 +28,7 @@ from torchrl_mpfa.methods.rank import RankSampler
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.sampler import SignalSampler
-from torchrl_mpfa.selection import Draw, Selection, one_batch
+from torchrl_mpfa.selection import Selection, one_batch
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.storage import SignalTensorStorage

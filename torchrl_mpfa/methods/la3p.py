@@ -17,8 +17,10 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.sampler import SignalSampler
 from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.tree_state import refuse
 
 Part = Literal["uniform", "prioritized", "inverse"]
+_LARGEST = torch.finfo(torch.double).max
 
 
 class LA3PSampler(SignalSampler):
@@ -41,6 +43,8 @@ class LA3PSampler(SignalSampler):
         (128, 128)
     """
 
+    KIND = "la3p"
+
     def __init__(self, *args: Any, uniform_fraction: float = 0.5, **kwargs: Any) -> None:
         if not 0.0 < uniform_fraction < 1.0:
             raise ValueError(f"uniform_fraction must be in (0, 1), got {uniform_fraction}")
@@ -52,9 +56,17 @@ class LA3PSampler(SignalSampler):
         super()._init()
         self._inverse_tree = type(self._sum_tree)(self._max_capacity)
 
-    def _write(self, index: Tensor, priority: Tensor) -> None:
-        super()._write(index, priority)
-        self._inverse_tree[index] = 1.0 / self._leaf(priority)
+    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
+        super()._write_leaves(slots, leaf)
+        self._inverse_tree[slots] = 1.0 / leaf
+
+    def _checked(self, priority: Tensor) -> float:
+        highest = super()._checked(priority)
+        # Not so low that the inverse overflows, which a priority of zero would be.
+        lowest = priority.min().item()
+        if not lowest**self._alpha * _LARGEST > self._max_capacity:
+            raise ValueError(f"priority must not be so low that its inverse overflows: {lowest}")
+        return highest
 
     def sizes(self, batch_size: int) -> tuple[int, int]:
         """Size of the uniform part of a batch, and of the other two.
@@ -84,7 +96,7 @@ class LA3PSampler(SignalSampler):
         if self._part is not None:
             count = self.sizes(batch_size)[self._part != "uniform"]
         if self._part == "uniform":
-            index = torch.randint(size, (count,), generator=self._rng)
+            index = self._uniform(size, count)
         else:
             tree = self._inverse_tree if self._part == "inverse" else self._sum_tree
             index = self._proportional(tree, size, count)
@@ -97,9 +109,20 @@ class LA3PSampler(SignalSampler):
             ValueError: See :meth:`check_state`.
         """
         super().load_state_dict(state_dict)
-        written = (state_dict["_max_tree"] <= 0).nonzero().squeeze(1)
-        if len(written):
-            self._inverse_tree[written] = 1.0 / state_dict["_sum_tree"][written]
+        slots = self._priorities.isfinite().nonzero().squeeze(1)
+        if len(slots):
+            self._inverse_tree[slots] = 1.0 / state_dict["_sum_tree"][slots]
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            ValueError: If an entry is missing, of another sampler, or not what it must be.
+        """
+        super().check_state(state_dict)
+        shares = state_dict["_sum_tree"][~state_dict["_priorities"].isnan()]
+        if not bool((shares > 0).all()):
+            refuse("_sum_tree", "positive where something was written", 0.0)
 
 
 def split_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:

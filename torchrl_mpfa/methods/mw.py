@@ -16,6 +16,8 @@ from torch import Tensor
 
 from torchrl_mpfa.sampler import SignalSampler
 from torchrl_mpfa.signals import SignalTable
+from torchrl_mpfa.tree_state import check_tensor
+from torchrl_mpfa.weighing import Weighing
 
 _NO_LEAF = float("inf")
 
@@ -40,6 +42,8 @@ class CappedSampler(SignalSampler):
         1024
     """
 
+    KIND = "capped"
+
     def __init__(self, *args: Any, replay_cap: int = 1024, **kwargs: Any) -> None:
         if isinstance(replay_cap, bool) or not isinstance(replay_cap, int) or replay_cap < 1:
             raise ValueError(f"replay_cap must be a positive integer, got {replay_cap!r}")
@@ -50,35 +54,42 @@ class CappedSampler(SignalSampler):
         super()._init()
         self._spent = torch.zeros(self._max_capacity, dtype=torch.bool)
 
-    def mark_update(self, index: int | Tensor, *, storage: Any = None) -> None:
-        """Give fresh transitions the highest priority, and a count that starts anew."""
-        slots = torch.as_tensor(index, dtype=torch.long).reshape(-1)
-        self._spent[slots[slots >= 0]] = False
-        super().mark_update(index, storage=storage)
+    def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
+        if not learned:
+            self._spent[slots] = False  # The count of a fresh transition starts anew.
+        super()._write(slots, priority, learned=learned)
 
-    def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor) -> Tensor:
-        priority = super()._fused(table, rows, slots)
+    def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
+        priority = super()._fused(table, rows, slots, weighing)
         self._spent[slots] = rows.select(1, table.count_column) >= self.replay_cap
         return priority
 
-    def _write(self, index: Tensor, priority: Tensor) -> None:
-        super()._write(index, priority)
-        spent = index[self._spent[index]]
+    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
+        super()._write_leaves(slots, leaf)
+        spent = slots[self._spent[slots]]
         if len(spent):
-            self._sum_tree[spent] = torch.zeros(len(spent))
+            self._sum_tree[spent] = torch.zeros(len(spent), dtype=torch.double)
             # The lowest share of those that can be drawn is what weights are relative to.
-            self._min_tree[spent] = torch.full((len(spent),), _NO_LEAF)
+            self._min_tree[spent] = torch.full((len(spent),), _NO_LEAF, dtype=torch.double)
 
     def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         left = size - int(self._spent[:size].sum())
         if left >= batch_size:
             return super()._draw(size, batch_size)
-        index = torch.randint(size, (batch_size,), generator=self._rng)
-        return index, torch.ones(batch_size)
+        return self._uniform(size, batch_size), torch.ones(batch_size)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
         return {**super().state_dict(), "_spent": self._spent.clone()}
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            ValueError: If an entry is missing, of another sampler, or not what it must be.
+        """
+        super().check_state(state_dict)
+        check_tensor(state_dict, "_spent", torch.bool, self._max_capacity)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -87,4 +98,4 @@ class CappedSampler(SignalSampler):
             ValueError: See :meth:`check_state`.
         """
         super().load_state_dict(state_dict)
-        self._spent = state_dict["_spent"].clone()
+        self._spent.copy_(state_dict["_spent"])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.tree_state import check_count, check_tensor, refuse
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
@@ -53,6 +54,8 @@ class RankSampler(SignalSampler):
         0.25
     """
 
+    KIND = "rank"
+
     def __init__(self, *args: Any, rank_refresh: float = 0.25, **kwargs: Any) -> None:
         check_range("rank_refresh", rank_refresh, low=0)
         self.rank_refresh = rank_refresh
@@ -61,34 +64,46 @@ class RankSampler(SignalSampler):
     def _init(self) -> None:
         super()._init()
         # Priorities at the last sorting, negated, so that they rise with the rank.
-        self._order = torch.empty(0)
+        self._order = torch.empty(0, dtype=torch.double)
         self._written = 0
 
     def _leaf(self, priority: Tensor) -> Tensor:
         rank = torch.searchsorted(self._order, -priority) + 1
-        return rank_share(rank.to(self.dtype), alpha=self._alpha)
+        return rank_share(rank.to(torch.double), alpha=self._alpha)
 
-    def _write(self, index: Tensor, priority: Tensor) -> None:
-        super()._write(index, priority)
-        self._written += len(index)
+    def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
+        super()._write(slots, priority, learned=learned)
+        self._written += len(slots)
         if self._written > self.rank_refresh * len(self._order):
             self._sort()
 
     def _sort(self) -> None:
         """Give every written slot its true rank."""
-        negated = torch.as_tensor(self._max_tree[torch.arange(self._max_capacity)]).reshape(-1)
-        slots = (negated <= 0).nonzero().squeeze(1)
-        self._order, places = negated[slots].sort(stable=True)
-        ranks = torch.arange(1, len(slots) + 1, dtype=self.dtype)
-        leaf = rank_share(ranks, alpha=self._alpha)
-        ordered = slots[places]
-        self._sum_tree[ordered] = leaf
-        self._min_tree[ordered] = leaf
+        slots = self._priorities.isfinite().nonzero().squeeze(1)
+        self._order, places = self._priorities[slots].neg().sort(stable=True)
+        ranks = torch.arange(1, len(slots) + 1, dtype=torch.double)
+        self._write_leaves(slots[places], rank_share(ranks, alpha=self._alpha))
         self._written = 0
+
+    def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
+        if len(self._order):
+            self._sort()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
         return {**super().state_dict(), "_order": self._order.clone(), "_written": self._written}
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            ValueError: If an entry is missing, of another sampler, or not what it must be.
+        """
+        super().check_state(state_dict)
+        order = check_tensor(state_dict, "_order", torch.double, None)
+        if len(order) > self._max_capacity or not bool((order.diff() >= 0).all()):
+            refuse("_order", f"at most {self._max_capacity} rising numbers", f"{len(order)} others")
+        check_count(state_dict, "_written")
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

@@ -1,0 +1,40 @@
+"""What ties a sampler to a storage: the signals of its slots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl.data import Storage
+
+from torchrl_mpfa.signals import Signal, SignalTable
+
+
+def signal_table_of(storage: Storage, signals: Sequence[Signal], capacity: int) -> SignalTable:
+    """The signals of a storage, after a check that they fit a sampler.
+
+    Args:
+        storage: The storage.
+        signals: What the sampler fuses.
+        capacity: The sampler's capacity ``N``.
+
+    Returns:
+        The signals.
+
+    Raises:
+        TypeError: If the storage keeps no signals.
+        ValueError: If its capacity or its signals are not those of the sampler.
+    """
+    table = getattr(storage, "signal_table", None)
+    if not isinstance(table, SignalTable):
+        raise TypeError(
+            f"storage must keep signals (SignalTensorStorage, SignalMemmapStorage), got "
+            f"{type(storage).__name__}"
+        )
+    if table.capacity != capacity:
+        raise ValueError(
+            f"max_capacity of the sampler is {capacity}, max_size of the storage {table.capacity}"
+        )
+    absent = [signal.name for signal in signals if signal.name not in table.column]
+    if absent:
+        raise ValueError(f"signals {absent} of the sampler are not in the storage: {table.names}")
+    return table

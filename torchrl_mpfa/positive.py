@@ -1,0 +1,70 @@
+"""Positive transitions: those whose reward is above a level, 0 in the paper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Literal
+
+from torch import Tensor
+
+Level = float | Literal["mean"]
+"""A reward, or ``"mean"``: the mean reward of the buffer."""
+_ENOUGH = 1000
+"""Rewards from which on it is worth a warning that all are on one side."""
+
+
+def check_level(positive_above: Level) -> None:
+    """Refuse what is neither a finite number nor ``"mean"``."""
+    number = isinstance(positive_above, int | float) and not isinstance(positive_above, bool)
+    if positive_above != "mean" and not (number and math.isfinite(positive_above)):
+        raise ValueError(
+            f"positive_above must be a finite number or 'mean', got {positive_above!r}"
+        )
+
+
+def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor:
+    """Whether transitions are positive, :math:`r_i > 0` in the paper (Eqs. 17, 22-24).
+
+    Args:
+        reward: Signed rewards, shape ``[B]``.
+        positive_above: The level. Where all rewards have one sign, 0 tells nothing apart;
+            ``"mean"`` does.
+        mean: Mean reward of the buffer.
+
+    Returns:
+        Truth values, shape ``[B]``.
+
+    Examples:
+        >>> import torch
+        >>> is_positive(torch.tensor([-3.0, -1.0]), "mean", mean=-2.0).tolist()
+        [False, True]
+    """
+    return reward > (mean if positive_above == "mean" else positive_above)
+
+
+def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
+    """What to say where all rewards of a buffer are on one side of a level that parts ask for.
+
+    Args:
+        rewards: Signed rewards of the buffer, shape ``[N]``.
+        parts: Fusion and adjustments; those that tell positive transitions from others have an
+            attribute ``positive_above``.
+
+    Returns:
+        The sentence; None where both sides are there, or too few rewards to tell.
+    """
+    if len(rewards) < _ENOUGH:
+        return None
+    # A fusion may stand around another one.
+    found = (getattr(getattr(part, "fusion", part), "positive_above", "mean") for part in parts)
+    for level in {level for level in found if level != "mean"}:
+        above = int((rewards > float(level)).sum())
+        if above in (0, len(rewards)):
+            return (
+                f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
+                f"above {level}: by Eq. (17) TD error and gradient get no weight beside the "
+                "reward, and boost and decay tell no transitions apart. Set "
+                "positive_above='mean', or to a level between the rewards"
+            )
+    return None
