@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import seeded_generator
+from torchrl_mpfa.checks import check_finite, seeded_generator
+from torchrl_mpfa.dumps import new_dump, open_dump
+from torchrl_mpfa.replay_state import check_batch_size, check_generator_state, check_writer_state
 from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.signal_storage import SignalStorageMixin
+from torchrl_mpfa.tree import TreeSampler
 
+_MISSING = (
+    "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "
+    "SignalSACLoss write td_error and action_gradient; with another loss, or a signal of your own, "
+    "write batch[{key!r}] = ..., one number a transition"
+)
 _UNRETURNED = 100
 """Batches in a row with signals that were not handed back, after which sampling is refused."""
 
@@ -50,55 +61,105 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
     """
 
     def __init__(self, *, generator: torch.Generator | None = None, **kwargs: Any) -> None:
-        super().__init__(generator=generator or seeded_generator(), **kwargs)
         self.stale_updates = 0
         self._unreturned = 0
         self._handed_out: TensorDictBase | None = None
+        super().__init__(generator=generator or seeded_generator(), **kwargs)
+
+    def _init(self) -> None:
+        super()._init()
         if self._fuses:
             self._sampler.bind(self._storage)
+            self._storage.needs_signals = True
+        if self._checks:
             self._storage.strict = True
+        if self._prefetch_cap and isinstance(self._sampler, PrioritizedSampler):
+            raise ValueError(
+                f"prefetch must be 0 with a prioritized sampler, got {self._prefetch_cap}: batches "
+                "that are drawn ahead know nothing of the update before them, and one seed would "
+                "not always give the same batches"
+            )
 
     @property
     def _fuses(self) -> bool:
         return isinstance(self._sampler, SignalSampler)
 
+    @property
+    def _checks(self) -> bool:
+        return isinstance(self._storage, SignalStorageMixin) and not self._is_consuming()
+
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write transitions, and return their slots.
 
         Args:
-            tensordicts: Transitions, batch size ``[B]``.
+            tensordicts: Transitions, batch size ``[B]``, or ``[B, T]`` from ``B`` environments. In
+                a storage of one dimension each of the latter is a row of its own, environment by
+                environment.
             update_priority: As in TorchRL.
 
         Returns:
-            Slots, shape ``[B]``.
+            Slots, shape ``[B]``; ``[B * T, 2]`` for a storage of two dimensions.
 
         Raises:
-            KeyError: If the transitions lack a reward or signal; nothing is changed.
-            ValueError: If a reward or signal is not finite or out of shape; nothing is changed.
+            KeyError: If an entry is missing or unknown; nothing is changed.
+            ValueError: If an entry has another shape or dtype than in the storage, or a number is
+                not finite; nothing is changed.
         """
-        if not self._fuses:
+        if not self._checks or not isinstance(tensordicts, TensorDictBase):
             return super().extend(tensordicts, update_priority=update_priority)
-        writer, table = self._writer, self._storage.signal_table
-        with self._replay_lock:
-            place = {key: getattr(writer, key, None) for key in ("_cursor", "_write_count")}
-            writes = table.writes
-            try:
-                return super().extend(tensordicts, update_priority=update_priority)
-            except BaseException:
-                # TorchRL's writer moves on before the storage can refuse, and would leave slots
-                # that were never written among the filled ones.
-                if table.writes == writes and place["_cursor"] is not None:
-                    for key, value in place.items():
-                        setattr(writer, key, value)
-                raise
+        data = self._transform.inv(tensordicts)
+        if data is None or data.shape.numel() == 0:
+            shape = (0,) if self._storage.ndim == 1 else (0, self._storage.ndim)
+            return torch.zeros(shape, dtype=torch.long)
+        priority = data.get(self.priority_key, None)
+        # The writer adds the slots to it, and the caller's is left as it is.
+        data = data.exclude(self.priority_key) if priority is not None else data.copy()
+        if type(data) is not TensorDict:
+            data = data.contiguous()
+        if self._storage.ndim == 1 and data.ndim > 1:
+            data = data.reshape(-1)
+        if priority is not None:
+            check_finite(f"{self.priority_key!r} of the transitions", priority)
+        with self._replay_lock, self._write_lock:
+            index = self._write(data)
+        if priority is not None and update_priority is not False:
+            self.update_priority(index, priority.reshape(-1, *priority.shape[data.ndim :]))
+        return index
 
-    def add(self, data: TensorDictBase) -> int | None:
+    def _write(self, data: TensorDictBase) -> Tensor:
+        if self.dim_extend > 0:
+            data = self._transpose(data)
+        self._storage.admit(data)
+        writer = self._writer
+        # Only the first write, which allocates the storage, can still fail.
+        place = [] if self._storage.initialized else _place(writer)
+        try:
+            with torch.no_grad():
+                index: Tensor = writer.extend(data)
+        except BaseException:
+            for key, value in place:
+                setattr(writer, key, value)
+            raise
+        self._sampler.extend(index)
+        return index
+
+    def add(self, data: TensorDictBase) -> Any:
         """Write one transition, and return its slot."""
-        if not self._fuses:
+        if not self._checks:
             return super().add(data)
         # TorchRL's add would ask the new transition for learned signals, which it cannot have.
         index = self.extend(data.unsqueeze(0))
-        return int(index[0]) if len(index) else None
+        return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
+
+    def empty(self, empty_write_count: bool = True) -> None:
+        """Forget all transitions, and the batches that were prefetched from them.
+
+        Args:
+            empty_write_count: As in TorchRL.
+        """
+        with self._futures_lock:
+            self._clear_prefetch_queue_locked()
+            super().empty(empty_write_count)
 
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
         data, info = super()._sample(batch_size)
@@ -107,7 +168,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         if self._fuses:
             with data.unlock_():
                 for key, value in info.items():
-                    data.set(key, value)
+                    data.set(key, torch.stack(value, -1) if isinstance(value, tuple) else value)
         return data, info
 
     def sample(
@@ -129,7 +190,10 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         Raises:
             RuntimeError: If a loss wrote signals in the last hundred batches and none of them came
                 back to :meth:`update_tensordict_priority`.
+            ValueError: If ``batch_size`` is not a positive integer.
         """
+        if batch_size is not None and not (isinstance(batch_size, Integral) and batch_size > 0):
+            raise ValueError(f"batch_size must be a positive integer, got {batch_size!r}")
         if return_info or include_info is not None or not self._fuses:
             return super().sample(batch_size, return_info, include_info)
         self._check_returned()
@@ -169,15 +233,12 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         index = data.get("index", None)
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
-        index = index.reshape(-1)
         signals: dict[str, Tensor] = {}
         for signal in self._sampler.signals:
             if signal.known_at == "update":
                 value = data.get(signal.key, None)
                 if value is None:
-                    raise KeyError(
-                        f"signal {signal.name!r} is missing: the batch has no {signal.key!r}"
-                    )
+                    raise KeyError(_MISSING.format(name=signal.name, key=signal.key))
                 signals[signal.name] = value
         with self._replay_lock, self._write_lock:
             stale = self._sampler.update_signals(
@@ -195,26 +256,70 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_handed_out": None}
 
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            KeyError: If the state of a part or an entry of it is missing.
+            ValueError: If a part cannot be restored from its state.
+        """
+        for key in ("_storage", "_sampler", "_writer", "_transforms", "_batch_size", "_rng"):
+            if key not in state_dict:
+                raise KeyError(f"{key!r} is missing in the saved buffer")
+        for part, key in ((self._sampler, "_sampler"), (self._storage, "_storage")):
+            if isinstance(part, TreeSampler | SignalStorageMixin):
+                part.check_state(state_dict[key])
+        size = self._storage._max_size_along_dim0 if self._storage.ndim == 1 else None
+        check_writer_state(state_dict["_writer"], None if size is None else size())
+        check_batch_size(state_dict["_batch_size"])
+        check_generator_state(state_dict["_rng"])
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore storage, signals, priorities, writer and generator.
 
         Raises:
-            KeyError: If the state has no signals; nothing is changed.
-            ValueError: If format, capacity or signals differ; nothing is changed.
+            KeyError: See :meth:`check_state`.
+            ValueError: See :meth:`check_state`.
         """
-        if self._fuses:
-            self._sampler.check_state(state_dict["_sampler"])
-            self._storage.check_state(state_dict["_storage"])
+        if self._checks:
+            self.check_state(state_dict)
         super().load_state_dict(state_dict)
 
-    def loads(self, path: str | Path) -> None:
-        """Restore from a folder that :meth:`dumps` wrote.
+    def dumps(self, path: str | Path) -> None:
+        """Save in a folder, whole or not at all, with a checksum of each file.
+
+        The queue of a buffer that prefetches is not saved.
 
         Raises:
-            KeyError: If it has no signals; nothing is changed.
-            ValueError: If format, capacity or signals differ; nothing is changed.
+            ValueError: If the data hold anything but tensors and plain values.
         """
-        if self._fuses:
-            self._sampler.check_dump(Path(path) / "sampler")
-            self._storage.check_dump(Path(path) / "storage")
-        super().loads(path)
+        with new_dump(path) as folder:
+            super().dumps(folder)
+
+    def loads(self, path: str | Path) -> None:
+        """Restore from a folder that :meth:`dumps` wrote, without executing anything in it.
+
+        Raises:
+            FileNotFoundError: If there is no such folder.
+            KeyError: If an entry is missing; nothing is changed.
+            ValueError: If a file is damaged, missing, or one that could execute something, or
+                anything does not fit this buffer; nothing is changed.
+        """
+        folder = open_dump(path)
+        for part, name in ((self._sampler, "sampler"), (self._storage, "storage")):
+            if isinstance(part, TreeSampler | SignalStorageMixin):
+                part.check_dump(folder / name)
+        super().loads(folder)
+
+    def _dump_prefetch_state(self, path: Path, prefetch_state: dict[str, Any]) -> None:
+        """Nothing: TorchRL would pickle it, and what is pickled can execute anything."""
+
+    def _load_prefetch_state(self, path: Path) -> None:
+        """Nothing: TorchRL would unpickle it."""
+
+
+def _place(writer: Any) -> list[tuple[str, int]]:
+    """Where a writer is, as far as TorchRL's writers in a ring keep it."""
+    return [
+        (key, getattr(writer, key)) for key in ("_cursor", "_write_count") if hasattr(writer, key)
+    ]

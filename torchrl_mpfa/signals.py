@@ -7,7 +7,9 @@ the loss (the TD error, the gradient). A user's own signal is one more :class:`S
 
 from __future__ import annotations
 
+import fcntl
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from tensordict import is_tensor_collection
+from numpy.typing import NDArray
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -103,7 +105,13 @@ class SignalTable:
         capacity: Number of slots ``N``.
         signals: The signals to keep.
         reward_key: Where the signed reward of a transition is read.
-        file: Memory-map the table to this file in place of keeping it in memory.
+        file: Memory-map the table to this file in place of keeping it in memory. No other table
+            may be mapped to it as long as this one lives.
+        existsok: Whether the file may be there already, and is overwritten.
+
+    Raises:
+        FileExistsError: If the file is there and ``existsok`` is false, or another table, of this
+            process or another, is mapped to it.
     """
 
     def __init__(
@@ -113,6 +121,7 @@ class SignalTable:
         *,
         reward_key: NestedKey = ("next", "reward"),
         file: Path | None = None,
+        existsok: bool = False,
     ) -> None:
         made = as_signals(signals)
         self.capacity = capacity
@@ -128,9 +137,7 @@ class SignalTable:
         if file is None:
             self.rows = torch.empty(capacity, width, dtype=torch.double)
         else:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            mapped = np.memmap(file, dtype=np.float64, mode="w+", shape=(capacity, width))
-            self.rows = torch.from_numpy(mapped)
+            self.rows = torch.from_numpy(_map(file, (capacity, width), existsok=existsok))
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
         self.writes = 0
@@ -146,6 +153,10 @@ class SignalTable:
         """Signed rewards of the filled slots, shape ``[size]``."""
         return self.rows[: self.size, self.reward_column]
 
+    def blank(self, count: int) -> Tensor:
+        """Rows of transitions of which nothing is known, not yet written."""
+        return self._blank.expand(count, -1).clone()
+
     def read(self, data: Any, count: int) -> Tensor:
         """Rows for new transitions, checked and not yet written.
 
@@ -160,9 +171,7 @@ class SignalTable:
             ValueError: If a reward or a signal is not finite, a signal is negative, or either
                 has not one number a transition.
         """
-        rows = self._blank.expand(count, -1).clone()
-        if not is_tensor_collection(data):
-            return rows
+        rows = self.blank(count)
         reward = _column(data, self.reward_key, "reward", count)
         if reward is not None:
             rows[:, self.reward_column] = reward
@@ -220,13 +229,42 @@ class SignalTable:
         """Refuse a state that does not belong to this table, before anything changes.
 
         Raises:
-            ValueError: If the capacity or the signals differ.
+            KeyError: If an entry is missing.
+            ValueError: If capacity or signals differ, or a value cannot be.
         """
+        for word in ("capacity", "names", "size", "writes", "rows"):
+            if word not in state:
+                raise KeyError(f"{word!r} is missing in the saved signals")
         for word, mine in (("capacity", self.capacity), ("names", self.names)):
             if state[word] != mine:
                 raise ValueError(
                     f"{word} of the saved signals is {state[word]}, of this storage {mine}"
                 )
+        size, writes, rows = state["size"], state["writes"], state["rows"]
+        if type(size) is not int or not 0 <= size <= self.capacity:
+            raise ValueError(
+                f"size of the saved signals must be in [0, {self.capacity}], got {size}"
+            )
+        if type(writes) is not int or writes < 0:
+            raise ValueError(f"writes of the saved signals must not be negative, got {writes}")
+        shape = (size, self.rows.shape[1])
+        if not isinstance(rows, Tensor) or rows.shape != shape or rows.dtype is not torch.double:
+            raise ValueError(f"rows of the saved signals must be double of shape {[*shape]}")
+        self._check_rows(rows, writes)
+
+    def _check_rows(self, rows: Tensor, writes: int) -> None:
+        signals = rows[:, : self.reward_column]
+        counts, times = rows[:, self.count_column], rows[:, self.time_column]
+        # Of what is not known yet there is NaN.
+        if not (signals.isnan() | ((signals >= 0) & (signals < math.inf))).all():
+            raise ValueError("the saved signals must be finite and not negative")
+        if rows[:, self.reward_column].isinf().any():
+            raise ValueError("the saved rewards must be finite")
+        if not ((counts >= 0) & (counts < math.inf) & (times >= 0) & (times < writes)).all():
+            raise ValueError(
+                f"replay counts of the saved signals must be finite and not negative, times of "
+                f"writing in [0, {writes})"
+            )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -238,6 +276,26 @@ class SignalTable:
         self.clear()
         self.size, self.writes = state["size"], state["writes"]
         self.rows[: self.size] = state["rows"]
+
+
+def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.float64]:
+    """Numbers in a file that is locked for as long as they are in use."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # Opened without emptying it: it may be another's.
+    with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as opened:
+        try:
+            # The mapping holds on to the lock after the file is closed.
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise FileExistsError(
+                f"{file} is in use by a living storage: give each a scratch_dir of its own"
+            ) from None
+        if file.stat().st_size and not existsok:
+            raise FileExistsError(
+                f"{file} is there from an earlier storage: pass existsok=True to overwrite it"
+            )
+        opened.truncate(0)
+        return np.memmap(opened, dtype=np.float64, mode="w+", shape=shape)
 
 
 def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:

@@ -30,7 +30,9 @@ def test_a_missing_signal_is_named(buffer, name):
     batch = write_signals(buffer.sample())
     del batch["signals", name]
     before = snapshot(buffer)
-    with pytest.raises(KeyError, match=f"signal '{name}' is missing: .*'signals', '{name}'"):
+    with pytest.raises(
+        KeyError, match=f"signal '{name}' is missing: .*'signals', '{name}'.*SignalDDPGLoss.*batch"
+    ):
         buffer.update_tensordict_priority(batch)
     assert same(before, snapshot(buffer))
 
@@ -100,7 +102,11 @@ def test_transitions_without_a_reward_are_refused_and_leave_no_hole(way, start):
         buffer.extend(make_transitions(3))
     before, filled = snapshot(buffer), len(buffer)
     lacking = make_transitions(2).exclude(("next", "reward"))
-    with pytest.raises(KeyError, match=r"the transitions lack 'reward': .* \('next', 'reward'\)"):
+    message = {
+        "empty": r"the transitions lack 'reward': no finite entry at \('next', 'reward'\)",
+        "half full": r"entry \('next', 'reward'\) is missing in the transitions",
+    }
+    with pytest.raises(KeyError, match=message[start]):
         if way == "extend":
             buffer.extend(lacking)
         else:
@@ -114,35 +120,11 @@ def test_transitions_without_a_reward_are_refused_and_leave_no_hole(way, start):
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
 def test_transitions_with_a_reward_that_is_not_finite_are_refused(buffer, wrong):
     before = snapshot(buffer)
-    with pytest.raises(ValueError, match=f"reward at .* must be finite, got {wrong}"):
+    with pytest.raises(
+        ValueError, match=rf"\('next', 'reward'\) must be finite, got {wrong} in row 1"
+    ):
         buffer.extend(make_transitions(3, rewards=[0.0, wrong, 1.0]))
     assert same(before, snapshot(buffer))
-
-
-def test_transitions_that_were_not_flattened_are_refused(buffer):
-    before = snapshot(buffer)
-    rows = make_transitions(6).reshape(3, 2)
-    with pytest.raises(ValueError, match=r"reward .* one number a transition, got shape \[3, 2, 1"):
-        buffer.extend(rows)
-    assert same(before, snapshot(buffer))
-
-
-def test_transitions_of_another_form_than_those_before_are_refused_and_leave_no_hole(buffer):
-    # TorchRL's storage counts rows before it finds that they do not fit.
-    wide = make_transitions(2).set("observation", torch.zeros(2, 7))
-    with pytest.raises(RuntimeError):
-        buffer.extend(wide)
-    assert len(buffer) == buffer.storage.signal_table.size == 10
-    assert buffer.extend(make_transitions(2, first=10)).tolist() == [10, 11]
-    assert buffer[:]["observation"].squeeze(1).tolist() == list(range(12))
-
-
-def test_a_priority_of_ones_own_that_is_refused_leaves_the_transitions_written(buffer):
-    data = make_transitions(2).set("td_error", torch.tensor([1.0, -1.0]))
-    with pytest.raises(RuntimeError, match="Failed to update priority of extended data"):
-        buffer.extend(data)
-    assert len(buffer) == 12
-    assert buffer.extend(make_transitions(1)).tolist() == [12]
 
 
 def test_capacities_of_sampler_and_storage_must_agree():

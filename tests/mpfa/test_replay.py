@@ -194,19 +194,23 @@ def test_without_a_generator_the_global_seed_rules():
     assert drawn[0].equal(drawn[1])
 
 
-def test_prefetching_gives_batches_that_can_be_updated():
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(32), sampler=MPFASampler(32), batch_size=8, prefetch=2
-    )
-    buffer.extend(make_transitions(32))
-    for seed in range(20):
-        batch = buffer.sample()
-        assert batch["observation"].squeeze(1).equal(batch["index"].float())
-        buffer.update_tensordict_priority(write_signals(batch, seed=seed))
-        # The next slot of the ring is overwritten by a transition of the same number.
-        buffer.add(make_transitions(1, seed=seed, first=seed)[0])
-    assert buffer.sampler.weights
-    assert torch.isfinite(leaves(buffer)).all()
+def test_prefetching_is_refused_with_priorities_for_the_reason_that_is_given():
+    for sampler in (MPFASampler(32), TreeSampler(32, 0.6, 0.4), PrioritizedSampler(32, 0.6, 0.4)):
+        with pytest.raises(
+            ValueError, match="prefetch must be 0 with a prioritized sampler, got 2"
+        ):
+            SignalReplayBuffer(
+                storage=SignalTensorStorage(32), sampler=sampler, batch_size=8, prefetch=2
+            )
+
+
+def test_emptying_forgets_what_was_prefetched():
+    buffer = SignalReplayBuffer(storage=SignalTensorStorage(50), batch_size=8, prefetch=2)
+    buffer.extend(make_transitions(50))
+    buffer.sample()
+    buffer.empty()
+    buffer.extend(make_transitions(50, first=1000))
+    assert min(float(buffer.sample()["observation"].min()) for _ in range(4)) >= 1000
 
 
 def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():

@@ -1,6 +1,7 @@
 """Save, kill and load: what comes after is equal to the last bit, generator included."""
 
 import os
+import pickle
 import shutil
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from torchrl_mpfa import (
     load_safely,
     save_atomically,
 )
+from torchrl_mpfa.dumps import seal_dump
 
 ROUNDS = 100
 
@@ -148,6 +150,12 @@ def drop_table(state):
     del state["_storage"]["_signals"]
 
 
+def seal_again(folder):
+    """Make the checksums of a dump those of what is in it now, as an attacker could."""
+    seal_dump(folder / "dump-1/storage", folder / "dump-1/storage")
+    seal_dump(folder, folder / "dump-1")
+
+
 SPOILS = [
     (spoil_capacity, ValueError, "max_capacity of the saved sampler is 25, of this one 24"),
     (spoil_signals, ValueError, r"signals of the saved sampler are \['novelty', 'td_error'\]"),
@@ -172,12 +180,13 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(
     spoil(state)
     if way == "folder":
         first.dumps(tmp_path / "buffer")
-        save_atomically(state["_sampler"], tmp_path / "buffer/sampler/sampler.pt")
+        folder = tmp_path / "buffer/dump-1"
+        save_atomically(state["_sampler"], folder / "sampler/sampler.pt")
         signals = {key: state["_storage"].get(key) for key in ("_signals", "_signals_format")}
-        file = tmp_path / "buffer/storage/signals.pt"
-        save_atomically(signals, file)
+        save_atomically(signals, folder / "storage/signals.pt")
         if spoil is drop_table:
-            file.unlink()
+            (folder / "storage/signals.pt").unlink()
+        seal_again(tmp_path / "buffer")
     before = snapshot(second)
     with pytest.raises(error, match=message):
         if way == "state":
@@ -208,19 +217,16 @@ class Trap:
 
 
 @pytest.mark.parametrize("file", ["sampler/sampler.pt", "storage/signals.pt"])
-@pytest.mark.parametrize("harm", ["truncated", "malicious"])
-def test_a_harmed_folder_is_refused_and_nothing_changes(file, harm, tmp_path):
+def test_a_folder_with_code_in_it_is_refused_and_nothing_changes(file, tmp_path):
     first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
     first.extend(make_transitions(24))
     second.extend(make_transitions(9, seed=3))
     first.dumps(tmp_path / "buffer")
-    path, trap = tmp_path / "buffer" / file, tmp_path / "trap"
-    if harm == "truncated":
-        path.write_bytes(path.read_bytes()[:300])
-    else:
-        save_atomically({"_format": 1, "x": Trap(str(trap))}, path)
+    path, trap = tmp_path / "buffer/dump-1" / file, tmp_path / "trap"
+    save_atomically({"_format": 1, "x": Trap(str(trap))}, path)
+    seal_again(tmp_path / "buffer")
     before = snapshot(second)
-    with pytest.raises(Exception, match=f"{path.name} is cut short|{path.name} holds more than"):
+    with pytest.raises(pickle.UnpicklingError, match=f"{path.name} holds more than tensors"):
         second.loads(tmp_path / "buffer")
     assert not trap.exists()
     assert same(before, snapshot(second))
@@ -231,7 +237,7 @@ def test_what_is_saved_of_the_sampler_can_be_read_by_a_person(tmp_path):
     buffer.extend(make_transitions(24))
     train_rounds(buffer, 2)
     buffer.dumps(tmp_path / "buffer")
-    text = Path(tmp_path / "buffer/sampler/sampler_metadata.json").read_text()
+    text = Path(tmp_path / "buffer/dump-1/sampler/sampler_metadata.json").read_text()
     assert '"_alpha": 0.6' in text
     assert '"td_error"' in text
 

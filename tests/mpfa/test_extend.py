@@ -1,0 +1,251 @@
+"""Transitions that do not fit are refused before anything of them is written."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict, lazy_stack
+from torchrl.data import TensorDictMaxValueWriter
+from torchrl.data.replay_buffers.samplers import RandomSampler
+
+from tests.mpfa.transitions import make_buffer, same, seeded, snapshot, train_rounds
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    TreeSampler,
+)
+
+CAPACITY = 8
+
+
+def make_full_transitions(count, value=1.0):
+    """Transitions with every entry of navigation, all of one number."""
+    end = torch.zeros(count, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": torch.full((count, 3), value),
+            "action": torch.full((count, 2), value),
+            "next": {
+                "observation": torch.full((count, 3), value + 1),
+                "reward": torch.full((count, 1), value),
+                "done": end,
+                "terminated": end.clone(),
+            },
+        },
+        [count],
+    )
+
+
+def changed(key, value):
+    def change(data):
+        data[key] = value
+
+    return change
+
+
+def removed(key):
+    def change(data):
+        del data[key]
+
+    return change
+
+
+NAN = torch.tensor([[1.0], [torch.nan]])
+BAD = {
+    "reward in double": (
+        changed(("next", "reward"), torch.ones(2, 1, dtype=torch.double)),
+        r"\('next', 'reward'\) must be torch.float32 as in the storage, got torch.float64",
+    ),
+    "reward without its dimension": (
+        changed(("next", "reward"), torch.ones(2)),
+        r"\('next', 'reward'\) must have the shape \[1\] in each transition, got \[\]",
+    ),
+    "wide action": (
+        changed("action", torch.ones(2, 3)),
+        r"'action' must have the shape \[2\] in each transition, got \[3\]",
+    ),
+    "narrow observation": (
+        changed("observation", torch.ones(2, 1)),
+        r"'observation' must have the shape \[3\] in each transition, got \[1\]",
+    ),
+    "integer done": (
+        changed(("next", "done"), torch.zeros(2, 1, dtype=torch.long)),
+        r"\('next', 'done'\) must be torch.bool as in the storage, got torch.int64",
+    ),
+    "no next observation": (
+        removed(("next", "observation")),
+        r"\('next', 'observation'\) is missing in the transitions",
+    ),
+    "nothing next": (removed("next"), r"'next' is missing in the transitions"),
+    "no action": (removed("action"), r"'action' is missing in the transitions"),
+    "unknown entry": (changed("loc", torch.ones(2, 2)), r"'loc' is not in the storage"),
+    "entries in place of a tensor": (
+        changed("action", TensorDict({"a": torch.ones(2, 2)}, [2])),
+        r"'action' must be a tensor, got TensorDict",
+    ),
+    "a tensor in place of entries": (
+        changed("next", torch.ones(2, 1)),
+        r"'next' must hold entries",
+    ),
+    "NaN reward": (
+        changed(("next", "reward"), NAN),
+        r"\('next', 'reward'\) must be finite, got nan in row 1",
+    ),
+    "NaN action": (
+        changed("action", NAN.expand(2, 2)),
+        r"'action' must be finite, got nan in row 1",
+    ),
+    "infinite next observation": (
+        changed(("next", "observation"), torch.tensor([[1.0, 1, 1], [1, -torch.inf, 1]])),
+        r"\('next', 'observation'\) must be finite, got -inf in row 1",
+    ),
+    "negative priority": (
+        changed("td_error", torch.tensor([1.0, -1.0])),
+        r"'td_error' of the transitions must be finite and not negative, got -1.0",
+    ),
+}
+
+
+@pytest.fixture(params=["memory", "memmap", "uniform"])
+def buffer(request, tmp_path):
+    """A full ring in the middle of its training."""
+    if request.param == "uniform":
+        buffer = SignalReplayBuffer(
+            storage=SignalTensorStorage(CAPACITY),
+            sampler=RandomSampler(),
+            batch_size=4,
+            generator=seeded(),
+        )
+        buffer.extend(make_full_transitions(CAPACITY))
+        return buffer
+    kind = SignalTensorStorage if request.param == "memory" else SignalMemmapStorage
+    kwargs = {} if request.param == "memory" else {"scratch_dir": tmp_path}
+    buffer = make_buffer(CAPACITY, storage=kind(CAPACITY, **kwargs))
+    buffer.extend(make_full_transitions(CAPACITY + 3))
+    train_rounds(buffer, 3)
+    return buffer
+
+
+@pytest.mark.parametrize("name", BAD)
+@pytest.mark.parametrize("way", ["extend", "add", "lazy stack"])
+def test_what_does_not_fit_is_refused_by_name_and_nothing_has_changed(buffer, name, way):
+    change, message = BAD[name]
+    data = make_full_transitions(2, 9.0)
+    change(data)
+    before = snapshot(buffer)
+    with pytest.raises((KeyError, ValueError), match=message.replace("row 1", "row [01]")):
+        if way == "add":
+            buffer.add(data[1])
+        elif way == "extend":
+            buffer.extend(data)
+        else:
+            buffer.extend(lazy_stack(list(data.unbind(0))))
+    assert same(before, snapshot(buffer))
+    # What comes next is what would have come without it.
+    twin = deepcopy(buffer)
+    assert (
+        twin.extend(make_full_transitions(1)).tolist()
+        == buffer.extend(make_full_transitions(1)).tolist()
+    )
+    assert same(twin.sample(), buffer.sample())
+
+
+def test_what_is_written_is_what_torchrl_would_have_written(buffer):
+    index = buffer.extend(make_full_transitions(2, 9.0))
+    found = buffer[index].exclude("index")
+    assert same(found.to_dict(), make_full_transitions(2, 9.0).to_dict())
+    assert len(buffer) == CAPACITY
+    assert buffer[:]["index"].tolist() == list(range(CAPACITY))
+
+
+@pytest.mark.parametrize("count", [1, CAPACITY - 1, CAPACITY, CAPACITY + 1, 3 * CAPACITY + 2])
+def test_of_more_transitions_than_slots_the_last_stay(count):
+    buffer = make_buffer(CAPACITY)
+    data = make_full_transitions(count)
+    data["observation"] = torch.arange(count).float().unsqueeze(1).expand(count, 3).contiguous()
+    data["next", "reward"] = torch.arange(count).float().unsqueeze(1)
+    buffer.extend(make_full_transitions(3))
+    index = buffer.extend(data)
+    last = dict(zip(index.tolist(), range(count), strict=True))
+    for slot, number in last.items():
+        assert buffer[slot]["observation"].tolist() == [number] * 3
+        assert buffer.storage.signal_table.rewards[slot] == number
+
+
+@pytest.mark.parametrize("kind", [TreeSampler, MPFASampler])
+def test_a_refused_extend_is_not_remembered_by_a_writer_that_keeps_the_best(kind):
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(4),
+        sampler=kind(4, 0.6, 0.4),
+        writer=TensorDictMaxValueWriter(rank_key=("next", "reward")),
+        batch_size=4,
+    )
+    for value in (1.0, 2.0, 3.0, 4.0):
+        buffer.extend(make_full_transitions(1, value))
+    bad = make_full_transitions(2, 100.0)
+    bad["observation"][0] = torch.nan
+    with pytest.raises(ValueError, match="'observation' must be finite, got nan in row 0"):
+        buffer.extend(bad)
+    for value in (50.0, 51.0, 52.0):
+        buffer.extend(make_full_transitions(1, value))
+    assert sorted(buffer[:]["observation"][:, 0].tolist()) == [4, 50, 51, 52]
+
+
+def test_an_empty_batch_is_written_as_nothing(buffer):
+    before = snapshot(buffer)
+    assert buffer.extend(make_full_transitions(0)).tolist() == []
+    assert same(before, snapshot(buffer))
+
+
+def test_the_first_transitions_are_checked_too():
+    buffer = make_buffer(CAPACITY)
+    data = make_full_transitions(2)
+    data["action"][1, 0] = torch.inf
+    with pytest.raises(ValueError, match="'action' must be finite, got inf in row 1"):
+        buffer.extend(data)
+    assert len(buffer) == 0
+    assert buffer.extend(make_full_transitions(2)).tolist() == [0, 1]
+
+
+def test_large_numbers_whose_sum_overflows_are_no_mistake():
+    buffer = make_buffer(CAPACITY)
+    for _ in range(2):
+        data = make_full_transitions(2)
+        data["observation"] = torch.full((2, 3), 3e38)
+        buffer.extend(data)
+    assert len(buffer) == 4
+
+
+def test_an_entry_may_be_allowed_to_hold_infinities():
+    storage = SignalTensorStorage(CAPACITY, allow_nonfinite=["ranges", ("next", "ranges")])
+    buffer = make_buffer(CAPACITY, storage=storage)
+    for _ in range(2):
+        data = make_full_transitions(2)
+        data["ranges"] = torch.full((2, 5), torch.inf)
+        data["next", "ranges"] = torch.full((2, 5), torch.nan)
+        buffer.extend(data)
+    assert buffer[:]["ranges"].isinf().all()
+    buffer.load_state_dict(buffer.state_dict())
+
+
+def test_the_transitions_themselves_are_not_changed(buffer):
+    data = make_full_transitions(2)
+    buffer.extend(data)
+    assert "index" not in set(data.keys())
+
+
+def test_transitions_with_gradients_are_stored_without():
+    buffer = make_buffer(CAPACITY)
+    for _ in range(2):
+        data = make_full_transitions(2)
+        data["action"] = data["action"].requires_grad_()
+        buffer.extend(data)
+    assert not buffer.sample()["action"].requires_grad
+
+
+@pytest.mark.parametrize("size", [-1, 0, 2.5, [3], "4"])
+def test_a_batch_size_that_is_none_is_refused_by_name(size, buffer):
+    with pytest.raises(ValueError, match=r"batch_size must be a positive integer, got "):
+        buffer.sample(size)

@@ -1,0 +1,133 @@
+"""Folders of files that are whole or absent, whose damage is noticed, and that execute nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from torchrl_mpfa.saving import write_text_atomically
+
+MANIFEST = "manifest.json"
+_FORMAT = 1
+_CHUNK = 1 << 20
+_EXECUTABLE = {".pkl", ".pickle"}
+"""Endings of the files that TorchRL and TensorDict would unpickle, which can execute anything."""
+
+
+@contextmanager
+def new_dump(path: str | Path) -> Iterator[Path]:
+    """A new folder inside ``path`` that counts once it is whole, and then replaces the one before.
+
+    Which folder counts stands in ``path/manifest.json``, which is replaced in one step: a crash at
+    any moment leaves the old dump or the new one. What a killed dump left is removed by the next.
+
+    Args:
+        path: The folder of the dump; made if it is not there.
+
+    Yields:
+        The folder to write in.
+    """
+    path = Path(path).absolute()
+    path.mkdir(exist_ok=True)
+    numbers = [int(found.name[5:]) for found in _versions(path)]
+    folder = path / f"dump-{max(numbers, default=0) + 1}"
+    folder.mkdir()
+    try:
+        yield folder
+        seal_dump(path, folder)
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
+    for old in _versions(path):
+        if old != folder:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def seal_dump(path: Path, folder: Path) -> None:
+    """Write size and checksum of every file in ``folder`` to ``path/manifest.json``.
+
+    Raises:
+        ValueError: If a file could execute something when it is read.
+    """
+    files = {name: _measure(folder / name) for name in _files(folder)}
+    for name in files:
+        _refuse_executable(folder / name)
+    manifest = {"format": _FORMAT, "folder": os.path.relpath(folder, path), "files": files}
+    write_text_atomically(json.dumps(manifest, indent=1) + "\n", path / MANIFEST)
+
+
+def open_dump(path: str | Path) -> Path:
+    """Compare every file of a dump with its checksum.
+
+    Args:
+        path: What :func:`new_dump` or :func:`seal_dump` was given.
+
+    Returns:
+        The folder in which the files lie.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        ValueError: If it is no whole dump, a file is missing, unknown or damaged, or a file could
+            execute something when it is read.
+    """
+    path = Path(path).absolute()
+    if not path.is_dir():
+        raise FileNotFoundError(f"no such folder: {path}")
+    if not (path / MANIFEST).exists():
+        raise ValueError(f"{path} is no whole dump of this package: it has no {MANIFEST}")
+    try:
+        manifest: dict[str, Any] = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        name, files, found = manifest["folder"], dict(manifest["files"]), manifest["format"]
+        if not (name == "." or re.fullmatch(r"dump-\d+", name)):
+            raise ValueError(f"it names the folder {name!r}")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path / MANIFEST} is damaged: {error}") from error
+    if found != _FORMAT:
+        raise ValueError(f"format of {path / MANIFEST} is {found}, this version reads {_FORMAT}")
+    folder = path / name
+    present = _files(folder)
+    for file in present:
+        _refuse_executable(folder / file)
+    for file in sorted({*present} ^ {*files}):
+        word = "missing" if file in files else "not part of the dump"
+        raise ValueError(f"{folder / file} is {word}")
+    for file in present:
+        if _measure(folder / file) != files[file]:
+            raise ValueError(f"{folder / file} is damaged: its size or checksum is wrong")
+    return folder
+
+
+def _versions(path: Path) -> list[Path]:
+    return [found for found in path.glob("dump-*") if re.fullmatch(r"dump-\d+", found.name)]
+
+
+def _files(folder: Path) -> list[str]:
+    """Names of all files under a folder, but for its own manifest."""
+    found = [file for file in folder.rglob("*") if not file.is_dir() and file != folder / MANIFEST]
+    return sorted(file.relative_to(folder).as_posix() for file in found)
+
+
+def _refuse_executable(file: Path) -> None:
+    if file.suffix in _EXECUTABLE:
+        raise ValueError(
+            f"{file} could execute anything when it is read: dumps hold tensors and plain values "
+            "only"
+        )
+
+
+def _measure(file: Path) -> list[int]:
+    """Size in bytes and CRC-32 of a file, which is on the disk afterwards."""
+    size, checksum = 0, 0
+    with file.open("rb") as opened:
+        os.fsync(opened.fileno())
+        while chunk := opened.read(_CHUNK):
+            size += len(chunk)
+            checksum = zlib.crc32(chunk, checksum)
+    return [size, checksum]

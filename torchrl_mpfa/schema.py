@@ -1,0 +1,176 @@
+"""What a storage holds, entry by entry, and the check of transitions before they are written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Union
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+INDEX_KEY = "index"
+"""Where TorchRL's writers put the slot of a transition; in-place writes come without it."""
+
+Pairs = list[tuple[Tensor, Tensor]]
+_Path = tuple[str, ...]
+_Tree = dict[str, Union["_Entry", "_Tree"]]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    stored: Tensor
+    row: torch.Size
+    """Shape of one transition's."""
+    dtype: torch.dtype
+    finite: bool
+    """Whether NaN and infinities are refused."""
+
+
+class Schema:
+    """Keys, shapes and dtypes of the transitions in a storage.
+
+    Args:
+        stored: All slots.
+        ndim: How many dimensions of the storage count slots.
+        allow_nonfinite: Entries that may hold NaN and infinities.
+    """
+
+    def __init__(
+        self, stored: TensorDictBase, ndim: int, allow_nonfinite: Sequence[NestedKey] = ()
+    ) -> None:
+        self._tree = _describe(stored, ndim, {as_path(key) for key in allow_nonfinite}, ())
+        index = self._tree.get(INDEX_KEY)
+        self.index = index.stored if isinstance(index, _Entry) else None
+        self.only_tensors = _count(self._tree) == len(stored.keys(True, True))
+        self._first = next(((k, e) for k, e in self._tree.items() if type(e) is _Entry), None)
+
+    def describes(self, stored: TensorDictBase) -> bool:
+        """Whether the tensors of a storage are still those that were described."""
+        return self._first is not None and stored.get(self._first[0]) is self._first[1].stored
+
+    def check(self, data: TensorDictBase, lead: int, *, whole: bool) -> Pairs:
+        """Refuse transitions of another form than those in the storage.
+
+        Args:
+            data: The transitions.
+            lead: How many dimensions of ``data`` count transitions.
+            whole: Whether an entry that is missing, unknown or not finite is refused, too.
+
+        Returns:
+            Each entry of the storage with what is to be written to it.
+
+        Raises:
+            KeyError: If an entry is missing or unknown.
+            ValueError: If shape or dtype of an entry differ, or a number is not finite.
+        """
+        pairs: Pairs = []
+        _match(self._tree, data, lead, whole, (), pairs)
+        return pairs
+
+
+def check_finite_entries(
+    data: TensorDictBase, lead: int, allow_nonfinite: Sequence[NestedKey] = ()
+) -> None:
+    """Refuse a number in the transitions that is not finite, naming its entry and row.
+
+    Args:
+        data: The transitions.
+        lead: How many dimensions of ``data`` count transitions.
+        allow_nonfinite: Entries that may hold NaN and infinities.
+
+    Raises:
+        ValueError: If a floating-point entry holds NaN or an infinity.
+    """
+    allowed = {as_path(key) for key in allow_nonfinite}
+    for key, value in data.items(include_nested=True, leaves_only=True):
+        path = as_path(key)
+        if isinstance(value, Tensor) and value.is_floating_point() and path not in allowed:
+            _check_finite(value, lead, path)
+
+
+def as_path(key: NestedKey) -> _Path:
+    """A key of a tensordict as a tuple."""
+    return (key,) if isinstance(key, str) else tuple(key)
+
+
+def _describe(stored: TensorDictBase, ndim: int, allowed: set[_Path], path: _Path) -> _Tree:
+    tree: _Tree = {}
+    for key, value in stored.items():
+        if isinstance(value, TensorDictBase):
+            tree[key] = _describe(value, ndim, allowed, (*path, key))
+        elif isinstance(value, Tensor):
+            finite = value.is_floating_point() and (*path, key) not in allowed
+            tree[key] = _Entry(value, value.shape[ndim:], value.dtype, finite)
+    return tree
+
+
+def _count(tree: _Tree) -> int:
+    return sum(1 if isinstance(entry, _Entry) else _count(entry) for entry in tree.values())
+
+
+def _match(
+    tree: _Tree, data: TensorDictBase, lead: int, whole: bool, path: _Path, pairs: Pairs
+) -> None:
+    known = 0
+    for key, value in data.items():
+        expected = tree.get(key)
+        if type(expected) is _Entry:
+            _check_form(expected, value, lead, path, key)
+            if whole and expected.finite:
+                _check_finite(value, lead, (*path, key))
+            pairs.append((expected.stored, value))
+        elif isinstance(expected, dict):
+            if not isinstance(value, TensorDictBase):
+                raise ValueError(f"entry {_name(path, key)} must hold entries, got {_kind(value)}")
+            _match(expected, value, lead, whole, (*path, key), pairs)
+        elif whole and isinstance(value, Tensor | TensorDictBase) and key != INDEX_KEY:
+            raise KeyError(
+                f"entry {_name(path, key)} is not in the storage, whose first transitions did not "
+                "have it: leave it out, or write it from the start"
+            )
+        known += expected is not None
+    if whole and known != len(tree):
+        for key in tree:
+            if key != INDEX_KEY and data.get(key, None) is None:
+                raise KeyError(f"entry {_name(path, key)} is missing in the transitions")
+
+
+def _check_form(expected: _Entry, value: object, lead: int, path: _Path, key: str) -> None:
+    if not isinstance(value, Tensor):
+        raise ValueError(f"entry {_name(path, key)} must be a tensor, got {_kind(value)}")
+    if value.dtype is not expected.dtype:
+        raise ValueError(
+            f"entry {_name(path, key)} must be {expected.dtype} as in the storage, got "
+            f"{value.dtype}"
+        )
+    if value.shape[lead:] != expected.row:
+        raise ValueError(
+            f"entry {_name(path, key)} must have the shape {[*expected.row]} in each transition, "
+            f"got {[*value.shape[lead:]]}"
+        )
+
+
+def _check_finite(value: Tensor, lead: int, path: _Path) -> None:
+    # A sum is finite only if all of its terms are, and costs a third of asking each of them.
+    if math.isfinite(value.sum().item()):
+        return
+    bad = (~value.isfinite()).nonzero()
+    if len(bad) == 0:
+        return
+    place, row = bad[0].tolist(), bad[0][:lead].tolist()
+    raise ValueError(
+        f"entry {_name(path[:-1], path[-1])} must be finite, got {value[tuple(place)].item()} in "
+        f"row {row[0] if len(row) == 1 else row}"
+    )
+
+
+def _kind(value: object) -> str:
+    return type(value).__name__
+
+
+def _name(path: _Path, key: str) -> str:
+    return repr((*path, key) if path else key)

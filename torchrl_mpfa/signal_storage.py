@@ -1,0 +1,289 @@
+"""What makes a TorchRL storage keep signals: the check and the write of transitions, and files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_mpfa.dumps import open_dump, seal_dump
+from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
+from torchrl_mpfa.signals import SignalTable
+from torchrl_mpfa.storage_state import check_data_state, check_length, read_length
+
+_FORMAT = 1
+_FILE = "signals.pt"
+
+
+@dataclass(frozen=True)
+class _Admitted:
+    """Transitions that were checked, and what is to be written of them."""
+
+    data: Any
+    rows: Tensor | None
+    """Their rows of the signal table; None if they have no entries that could be read."""
+    pairs: Pairs | None
+    """Entries of the storage with what goes there; None if TorchRL has to find them."""
+
+
+class SignalStorageMixin:
+    """Adds a :class:`~torchrl_mpfa.SignalTable` to a TorchRL storage.
+
+    Every write of a slot resets its signals, whichever writer makes it, so that a transition
+    never has those of the one that was there before; nothing of them shows in sampled batches.
+    What does not fit is refused before anything of it is written.
+    """
+
+    signal_table: SignalTable
+    ndim: int
+    max_size: int
+    #: Set by :class:`~torchrl_mpfa.SignalReplayBuffer`: every entry must be there and finite.
+    strict = False
+    #: Set by a buffer whose sampler fuses: a write without reward or signal is refused.
+    needs_signals = False
+    _allow_nonfinite: Sequence[NestedKey] = ()
+    _admitted: _Admitted | None = None
+    _schema: Schema | None = None
+    _all_slots: Tensor | None = None
+
+    def admit(self, data: Any) -> None:
+        """Check transitions that are about to be written; nothing is changed.
+
+        Args:
+            data: Transitions, batch size ``[B]``, or ``[T, B]`` for a storage of two dimensions.
+
+        Raises:
+            KeyError: If an entry is missing or unknown, or a reward or signal that the sampler
+                needs is missing.
+            ValueError: If shape or dtype of an entry are not those in the storage, or a number is
+                not finite.
+        """
+        self._admitted = self._check(data)
+
+    def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
+        """Write transitions and reset the signals of their slots.
+
+        Raises:
+            KeyError: See :meth:`admit`.
+            ValueError: See :meth:`admit`.
+        """
+        admitted, self._admitted = self._admitted, None
+        if admitted is None or admitted.data is not data:
+            admitted = self._check(_as_batch(data))
+        size = len(self)  # type: ignore[arg-type]
+        try:
+            if not (set_cursor and self._write(cursor, admitted.data, admitted.pairs)):
+                super().set(cursor, data, set_cursor=set_cursor)  # type: ignore[misc]
+                self._schema = None
+        except BaseException:
+            # TorchRL counts the rows before it writes them.
+            self._len = size
+            raise
+        table, slots = self.signal_table, self._slots(cursor)
+        table.write(slots, table.blank(len(slots)) if admitted.rows is None else admitted.rows)
+        table.size = len(self)  # type: ignore[arg-type]
+
+    def _check(self, data: Any) -> _Admitted:
+        if not is_tensor_collection(data):
+            return _Admitted(data, None, None)
+        lead = min(self.ndim, data.ndim)
+        pairs = None
+        if isinstance(data, TensorDictBase):
+            self._check_shape(data)
+            schema = self._known_schema()
+            if schema is not None:
+                pairs = schema.check(data, lead, whole=self.strict)
+            elif self.strict:
+                check_finite_entries(data, lead, self._allow_nonfinite)
+        rows = self.signal_table.read(data, data.shape[:lead].numel())
+        if self.needs_signals and (name := self.signal_table.missing(rows)) is not None:
+            keys = {s.name: s.key for s in self.signal_table.written}
+            key = keys.get(name, self.signal_table.reward_key)
+            raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
+        return _Admitted(data, rows, pairs)
+
+    def _check_shape(self, data: TensorDictBase) -> None:
+        """Refuse rows of another width than those of a storage of several dimensions."""
+        if self.ndim == 1 or data.ndim < self.ndim:
+            return
+        across = data.shape[1 : self.ndim]
+        if self.initialized:  # type: ignore[attr-defined]
+            expected = self._total_shape[1:]  # type: ignore[attr-defined]
+            if across != expected:
+                raise ValueError(
+                    f"transitions must come {[*expected]} at a time, as the first ones did, got "
+                    f"{[*across]}"
+                )
+        elif self.max_size % across.numel():
+            raise ValueError(
+                f"max_size must be a multiple of the {across.numel()} transitions that come at a "
+                f"time, got {self.max_size}"
+            )
+
+    def _known_schema(self) -> Schema | None:
+        """Schema of the stored tensordict; None if there is none yet."""
+        stored = getattr(self, "_storage", None)
+        if type(stored) is not TensorDict:
+            return None
+        if self._schema is None or not self._schema.describes(stored):
+            self._schema = Schema(stored, self.ndim, self._allow_nonfinite)
+        return self._schema
+
+    def _write(self, cursor: Any, data: Any, pairs: Pairs | None) -> bool:
+        """Write what was checked, entry by entry; False if TorchRL's own way is needed."""
+        if not (
+            self.strict
+            and pairs
+            and self.ndim == 1
+            and isinstance(cursor, Tensor)
+            and cursor.ndim == 1
+            and cursor.dtype is torch.long
+            and len(cursor) <= self.max_size
+            and self._schema is not None
+            and self._schema.only_tensors
+        ):
+            return False
+        index, place = data.get(INDEX_KEY, None), self._schema.index
+        if (index is None) != (place is None):
+            return False
+        if place is not None and pairs[-1][0] is not place:
+            # The writer has put it there after the check.
+            pairs = [*pairs, (place, index)]
+        device = cursor.device
+        if any(value.device != device or stored.device != device for stored, value in pairs):
+            return False
+        self._set_last_cursor(cursor)  # type: ignore[attr-defined]
+        with torch.no_grad():
+            for stored, value in pairs:
+                stored.index_copy_(0, cursor, value)
+        self._len = min(len(self) + len(cursor), self.max_size)  # type: ignore[arg-type]
+        self._bump_mutation_revision()  # type: ignore[attr-defined]
+        return True
+
+    def _slots(self, cursor: Any) -> Tensor:
+        """Numbers of the slots that a writer's cursor names, shape ``[B]``."""
+        if self.ndim == 1:
+            return _as_index(cursor, self.max_size)
+        if self._all_slots is None:
+            self._all_slots = torch.arange(self.max_size).reshape(self._total_shape)  # type: ignore[attr-defined]
+        if isinstance(cursor, Tensor):
+            cursor = cursor.cpu()
+        return self._all_slots[cursor].reshape(-1)
+
+    def _empty(self) -> None:
+        super()._empty()  # type: ignore[misc]
+        self.signal_table.clear()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The data, and the signals under ``"_signals"``."""
+        state: dict[str, Any] = super().state_dict()  # type: ignore[misc]
+        return {**state, "_signals": self.signal_table.state_dict(), "_signals_format": _FORMAT}
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            KeyError: If the state lacks an entry.
+            ValueError: If format, capacity, signals, or the form of the data differ, or the data
+                are not finite.
+        """
+        self._check_signals(state_dict)
+        for key in ("_storage", "_len", "initialized"):
+            if key not in state_dict:
+                raise KeyError(f"{key!r} is missing in the saved storage")
+        length = check_length(state_dict["_len"], self.max_size, state_dict["_signals"]["size"])
+        self._check_data(state_dict["_storage"], length)
+
+    def _check_signals(self, state: dict[str, Any]) -> None:
+        if "_signals" not in state:
+            raise KeyError("the saved storage has no signals: '_signals' is missing")
+        _check_format(state.get("_signals_format"))
+        self.signal_table.check_state(state["_signals"])
+
+    def _check_data(self, data: Any, length: int) -> None:
+        check_data_state(
+            data,
+            getattr(self, "_storage", None),
+            length=length,
+            ndim=self.ndim,
+            max_size=self.max_size,
+            allow_nonfinite=self._allow_nonfinite if self.strict else None,
+        )
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore data and signals.
+
+        Raises:
+            KeyError: See :meth:`check_state`.
+            ValueError: See :meth:`check_state`.
+        """
+        self.check_state(state_dict)
+        super().load_state_dict(state_dict)  # type: ignore[misc]
+        self._schema = None
+        self.signal_table.load_state_dict(state_dict["_signals"])
+
+    def dumps(self, path: str | Path) -> None:
+        """Save data and signals in a folder, with a checksum of each of its files."""
+        path = Path(path)
+        super().dumps(path)  # type: ignore[misc]
+        state = {"_signals": self.signal_table.state_dict(), "_signals_format": _FORMAT}
+        save_atomically(state, path / _FILE)
+        seal_dump(path, path)
+
+    def check_dump(self, path: str | Path) -> dict[str, Any]:
+        """Read the saved signals, and refuse the folder as :meth:`check_state` does a state."""
+        path = open_dump(path)
+        if not (path / _FILE).exists():
+            raise KeyError(f"the saved storage has no signals: {path / _FILE} is missing")
+        state: dict[str, Any] = load_safely(path / _FILE)
+        self._check_signals(state)
+        length = read_length(path, self.max_size, state["_signals"]["size"])
+        if (path / "meta.json").exists():
+            self._check_data(TensorDict.load_memmap(path), length)
+        return state
+
+    def loads(self, path: str | Path) -> None:
+        """Restore data and signals from a folder.
+
+        Raises:
+            KeyError: See :meth:`check_state`.
+            ValueError: See :meth:`check_state`; or if a file is damaged, missing, or one that
+                could execute something.
+        """
+        state = self.check_dump(path)
+        super().loads(path)  # type: ignore[misc]
+        self._schema = None
+        self.signal_table.load_state_dict(state["_signals"])
+
+    def __getstate__(self) -> Any:
+        # What is worked out from the data is worked out anew from its copy.
+        state: Any = super().__getstate__()
+        return {**state, "_schema": None, "_admitted": None}
+
+
+def _check_format(found: Any) -> None:
+    if found != _FORMAT:
+        raise ValueError(f"format of the saved signals is {found}, this version reads {_FORMAT}")
+
+
+def _as_index(cursor: Any, capacity: int) -> Tensor:
+    """The slots that a writer's cursor names, shape ``[B]``."""
+    if isinstance(cursor, slice):
+        return torch.arange(*cursor.indices(capacity))
+    if isinstance(cursor, Tensor) and cursor.dtype is torch.bool:
+        return cursor.nonzero().squeeze(1).cpu()
+    return torch.as_tensor(cursor, dtype=torch.long, device="cpu").reshape(-1)
+
+
+def _as_batch(data: Any) -> Any:
+    """A list of transitions as one batch; anything else as it is."""
+    if isinstance(data, list) and data and is_tensor_collection(data[0]):
+        return torch.stack(data)
+    return data
