@@ -233,6 +233,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         index = data.get("index", None)
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
+        if self._storage.ndim == 1:
+            index = index.reshape(-1)
         signals: dict[str, Tensor] = {}
         for signal in self._sampler.signals:
             if signal.known_at == "update":

@@ -57,7 +57,9 @@ def train_rounds(buffer, rounds, *, seed=0):
     drawn = []
     for _ in range(rounds):
         batch = buffer.sample()
-        drawn.append(torch.cat((batch["index"].double(), batch["priority_weight"].double())))
+        drawn.append(
+            torch.cat((batch["index"].double().flatten(), batch["priority_weight"].double()))
+        )
         buffer.update_tensordict_priority(write_signals(batch, generator=generator))
     return torch.stack(drawn)
 

@@ -1,0 +1,168 @@
+"""Several environments: batches of trajectories, storages of two dimensions, collectors."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import PrioritizedSliceSampler
+from torchrl.envs import SerialEnv
+from torchrl.testing.mocking_classes import CountingEnv
+
+from tests.mpfa.transitions import same, seeded, snapshot, train_rounds, write_signals
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+)
+
+ENVS, STEPS, CAPACITY = 3, 4, 24
+
+
+def make_trajectories(first=0, steps=STEPS):
+    """Transitions ``[ENVS, steps]`` whose reward is 100 times the environment, plus the step."""
+    step = torch.arange(first, first + steps, dtype=torch.float32)
+    number = 100 * torch.arange(ENVS).unsqueeze(1) + step
+    return TensorDict(
+        {"observation": number.unsqueeze(-1), "next": {"reward": number.unsqueeze(-1)}},
+        [ENVS, steps],
+    )
+
+
+def make_deep_buffer(kind=SignalTensorStorage, *, ndim=2, seed=0, **kwargs):
+    return SignalReplayBuffer(
+        storage=kind(CAPACITY, ndim=ndim, **kwargs),
+        sampler=MPFASampler(CAPACITY),
+        batch_size=8,
+        generator=seeded(seed),
+    )
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_a_ring_of_two_dimensions_keeps_signals_and_data_together(kind):
+    ours = make_deep_buffer(kind)
+    stock = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(CAPACITY, ndim=2),
+        batch_size=8,
+    )
+    for first in range(0, 40, STEPS):
+        found = ours.extend(make_trajectories(first))
+        assert found.equal(stock.extend(make_trajectories(first)))
+        assert len(ours) == len(stock)
+        assert ours.storage[:]["observation"].equal(stock.storage[:]["observation"])
+        rewards = ours.storage[:]["next", "reward"].flatten()
+        torch.testing.assert_close(ours.storage.signal_table.rewards.float(), rewards)
+
+
+def test_batches_carry_places_and_updates_find_them():
+    buffer = make_deep_buffer()
+    buffer.extend(make_trajectories())
+    batch = write_signals(buffer.sample())
+    assert batch["index"].shape == (8, 2)
+    place = batch["index"]
+    stored = buffer.storage[:]["observation"][place[:, 0], place[:, 1]]
+    assert batch["observation"].equal(stored)
+    buffer.update_tensordict_priority(batch)
+    table = buffer.storage.signal_table
+    slots = place[:, 0] * ENVS + place[:, 1]
+    known = table.rows[:, table.column["td_error"]].isfinite().nonzero().squeeze(1)
+    assert known.tolist() == slots.unique().tolist()
+    leaves = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(ENVS * STEPS)])
+    fresh = leaves[[slot for slot in range(ENVS * STEPS) if slot not in slots.tolist()]]
+    assert fresh.unique().numel() == 1
+    assert not torch.isin(leaves[slots], fresh).all()
+
+
+def test_priorities_by_hand_take_places_too():
+    buffer = make_deep_buffer()
+    buffer.extend(make_trajectories())
+    for index in (torch.tensor([[1, 2], [3, 0]]), (torch.tensor([1, 3]), torch.tensor([2, 0]))):
+        buffer.update_priority(index, torch.tensor([7.0, 9.0]))
+        slots = torch.tensor([1 * ENVS + 2, 3 * ENVS])
+        found = torch.as_tensor(buffer.sampler._sum_tree[slots])
+        assert found.tolist() == pytest.approx([7.05**0.6, 9.05**0.6])
+
+
+def test_rows_that_were_overwritten_are_known_in_two_dimensions():
+    buffer = make_deep_buffer()
+    buffer.extend(make_trajectories(steps=8))
+    batch = write_signals(buffer.sample())
+    buffer.extend(make_trajectories(8, steps=2))
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == int((batch["index"][:, 0] < 2).sum()) > 0
+
+
+def test_training_goes_on_bit_for_bit_in_two_dimensions(tmp_path):
+    first, second, third = make_deep_buffer(), make_deep_buffer(seed=3), make_deep_buffer(seed=4)
+    first.extend(make_trajectories(steps=6))
+    train_rounds(first, 4)
+    second.load_state_dict(first.state_dict())
+    first.dumps(tmp_path / "buffer")
+    third.loads(tmp_path / "buffer")
+    drawn = []
+    for buffer in (first, second, third):
+        buffer.extend(make_trajectories(9, steps=3))
+        drawn.append(buffer.sample())
+    assert same(snapshot(first), snapshot(second))
+    assert same(drawn[0].to_dict(), drawn[1].to_dict())
+    assert same(drawn[0].to_dict(), drawn[2].to_dict())
+
+
+def test_another_number_of_environments_is_refused_and_nothing_changes():
+    buffer = make_deep_buffer()
+    with pytest.raises(ValueError, match=r"max_size must be a multiple of the 5 transitions .* 24"):
+        buffer.extend(TensorDict({"next": {"reward": torch.ones(5, 2, 1)}}, [5, 2]))
+    assert len(buffer) == 0
+    buffer.extend(make_trajectories())
+    before = snapshot(buffer)
+    with pytest.raises(ValueError, match=r"transitions must come \[3\] at a time, .* got \[2\]"):
+        buffer.extend(make_trajectories()[:2])
+    assert same(before, snapshot(buffer))
+
+
+@pytest.mark.parametrize("shape", [(ENVS, STEPS), (1, ENVS, STEPS)])
+def test_in_one_dimension_every_step_of_every_environment_is_a_row(shape):
+    buffer = make_deep_buffer(ndim=1)
+    index = buffer.extend(make_trajectories().reshape(shape))
+    assert index.tolist() == list(range(ENVS * STEPS))
+    assert buffer[:]["observation"].flatten().equal(make_trajectories()["observation"].flatten())
+    buffer.update_tensordict_priority(write_signals(buffer.sample()))
+
+
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_a_collector_of_several_environments_fills_the_buffer(ndim):
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(60, ndim=ndim), sampler=MPFASampler(60), batch_size=8
+    )
+    env = SerialEnv(ENVS, lambda: CountingEnv(max_steps=5))
+    collector = Collector(
+        env, env.rand_action, frames_per_batch=30, total_frames=120, replay_buffer=buffer
+    )
+    for _ in collector:
+        batch = write_signals(buffer.sample())
+        assert batch.batch_size == (8,)
+        assert batch["next", "observation"].shape == (8, 1)
+        buffer.update_tensordict_priority(batch)
+    collector.shutdown()
+    assert len(buffer) == 60
+    assert buffer.sampler.weights
+
+
+# TorchRL's own sampler numbers slots of two dimensions in a way that NumPy is about to drop.
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+@pytest.mark.parametrize("ndim", [1, 2])
+def test_torchrls_slices_are_drawn_from_our_storage(ndim):
+    sampler = PrioritizedSliceSampler(
+        CAPACITY, alpha=0.6, beta=0.4, slice_len=2, end_key=("next", "done"), strict_length=False
+    )
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(CAPACITY, ndim=ndim), sampler=sampler, batch_size=8
+    )
+    data = make_trajectories()
+    data["next", "done"] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
+    data["next", "done"][:, -1] = True
+    index = buffer.extend(data)
+    buffer.update_priority(index, torch.rand(ENVS * STEPS))
+    steps = buffer.sample()["observation"].reshape(-1, 2)
+    assert steps[:, 1].equal(steps[:, 0] + 1)
