@@ -1,0 +1,187 @@
+"""Targets of several steps and by other estimators: those of TorchRL's own losses."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs.transforms import MultiStepTransform
+from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss, ValueEstimators
+from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
+
+from tests.mpfa import sac_networks
+from tests.mpfa.losses import BOUNDS, make_batch, make_networks
+from torchrl_mpfa import DDPGLearner, SignalDDPGLoss, SignalSACLoss, SignalTD3Loss, TD3Learner
+from torchrl_mpfa.learners.compiled import CompiledGradients
+
+# TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
+
+GAMMA, STEPS = 0.5, 3
+KINDS = {
+    "ddpg": (SignalDDPGLoss, DDPGLoss, {"delay_actor": True, "loss_function": "l2"}),
+    "td3": (SignalTD3Loss, TD3Loss, {"bounds": BOUNDS, "loss_function": "l2"}),
+    "sac": (SignalSACLoss, SACLoss, {"loss_function": "l2", "alpha_init": 0.3}),
+}
+
+
+def make_pair(name, estimator=ValueEstimators.TD0, **options):
+    """Our loss and TorchRL's with the same networks, whose targets differ from them."""
+    ours, theirs, common = KINDS[name]
+    networks = (sac_networks.make_networks if name == "sac" else make_networks)()
+    pair = theirs(*deepcopy(networks), **common), ours(*networks, **common, importance="torchrl")
+    for loss in pair:
+        loss.make_value_estimator(estimator, **{"gamma": GAMMA, **options})
+    with torch.no_grad():
+        for key, value in pair[1].named_buffers():
+            if key.startswith("target_"):
+                value.mul_(0.7)
+    pair[0].load_state_dict(pair[1].state_dict())
+    return pair
+
+
+def of_several_steps(count=14, **options):
+    """What a buffer holds after TorchRL's transform: ends in the middle, and a time limit."""
+    transform = MultiStepTransform(n_steps=STEPS, gamma=GAMMA, **options)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(count), transform=transform, batch_size=1
+    )
+    trajectory = make_batch(count)
+    ends = trajectory["next"]
+    for key, row in (("terminated", 5), ("truncated", 9)):
+        ends[key] = torch.zeros(count, 1, dtype=torch.bool)
+        ends[key][row] = True
+    ends["done"] = ends["terminated"] | ends["truncated"]
+    buffer.extend(trajectory)
+    return buffer[:]
+
+
+def targets_of(loss, batch):
+    """Targets, or where TorchRL does not tell them what shows them: the critics' loss."""
+    torch.manual_seed(3)  # TD3 and SAC ask random actions.
+    losses = loss(batch)
+    return losses["target_value"] if "target_value" in losses.keys() else losses["loss_qvalue"]  # noqa: SIM118
+
+
+@pytest.mark.parametrize("column", [False, True], ids=["[B]", "[B, 1]"])
+@pytest.mark.parametrize("options", [{}, {"done_keys": ["done"]}], ids=str)
+@pytest.mark.parametrize("name", KINDS)
+def test_targets_of_several_steps_are_those_of_torchrls_loss(name, options, column):
+    batch = of_several_steps(**options)
+    assert set(batch["steps_to_next_obs"].flatten().tolist()) == {1, 2, 3}
+    assert bool(batch["next", "terminated"].any())
+    if column:
+        batch["steps_to_next_obs"] = batch["steps_to_next_obs"].unsqueeze(-1)
+    theirs, ours = make_pair(name)
+    expected = targets_of(theirs, batch.clone())
+    torch.testing.assert_close(targets_of(ours, batch.clone()), expected)
+    one_step = targets_of(ours, batch.exclude("steps_to_next_obs"))
+    assert not torch.allclose(one_step, expected)
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
+    batch = of_several_steps(done_keys=["done"])
+    _, loss = make_pair(name)
+    networks = loss._networks()
+    critics = networks.target_critics if name == "td3" else [networks.target_critic]
+    torch.manual_seed(3)
+    compute = loss.value_loss if name == "td3" else loss.loss_value
+    found = compute(batch)[1]["target_value"]
+    torch.manual_seed(3)
+    noise = loss.target_noise(batch["action"]) if name == "td3" else torch.zeros(len(batch), 2)
+    for row in range(len(batch)):
+        after = batch["next"][row]
+        action = networks.target_actor.module(after["observation"])[1] + noise[row]
+        action = action.clamp(-1.0, 1.0)
+        value = min(float(q.module(after["observation"], action)) for q in critics)
+        expected = float(after["reward"])
+        if not bool(after["terminated"]):
+            expected += GAMMA ** int(batch["steps_to_next_obs"][row]) * value
+        assert float(found[row]) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("column", [False, True], ids=["[B]", "[B, 1]"])
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_a_compiled_update_has_the_targets_of_several_steps_too(name, column):
+    batch = of_several_steps()
+    if column:
+        batch["steps_to_next_obs"] = batch["steps_to_next_obs"].unsqueeze(-1)
+    _, loss = make_pair(name)
+    loss.importance = "critic"
+    expected = targets_of(loss, batch.clone())
+    torch.manual_seed(3)
+    log = CompiledGradients(loss, compile=None)(batch, actor_batch=None)
+    torch.testing.assert_close(log["target_value"], expected)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "options"),
+    [
+        (ValueEstimators.TDLambda, {"lmbda": 0.7}),
+        (ValueEstimators.TD1, {}),
+        (ValueEstimators.TD0, {"average_rewards": True}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", KINDS)
+def test_other_value_estimators_are_honored_as_by_torchrl(name, estimator, options):
+    theirs, ours = make_pair(name, estimator, **options)
+    batch = make_batch(12).reshape(2, 6)
+    expected = targets_of(theirs, batch.clone())
+    found = targets_of(ours, batch.clone())
+    torch.testing.assert_close(found, expected)
+    ours.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    assert not torch.allclose(targets_of(ours, batch.clone()), expected)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_estimator_may_be_given_as_it_is(name):
+    _, by_name = make_pair(name, ValueEstimators.TDLambda, lmbda=0.7)
+    _, given = make_pair(name)
+    made = TDLambdaEstimator(gamma=GAMMA, lmbda=0.7, value_network=None)
+    given.make_value_estimator(made)
+    batch = make_batch(12).reshape(2, 6)
+    found, expected = (targets_of(loss, batch.clone()) for loss in (given, by_name))
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_an_estimator_that_makes_no_targets_for_a_critic_of_actions_is_refused(name):
+    _, loss = make_pair(name)
+    kept = loss.value_estimator
+    with pytest.raises(ValueError, match=r"value_type .*GAE"):
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=GAMMA, lmbda=0.9)
+    with pytest.raises(ValueError, match=r"value_type must make one of TD0Estimator.*, got GAE"):
+        loss.make_value_estimator(GAE(gamma=GAMMA, lmbda=0.9, value_network=None))
+    assert loss.value_estimator is kept
+    assert loss.value_type is ValueEstimators.TD0
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("ddpg", DDPGLearner), ("td3", TD3Learner)], ids=["ddpg", "td3"]
+)
+def test_what_a_compiled_update_cannot_estimate_is_refused_by_name(name, kind):
+    _, loss = make_pair(name, ValueEstimators.TDLambda, lmbda=0.7)
+    loss.importance = "critic"
+    with pytest.raises(ValueError, match=r"compile needs the value estimator TD0.*TDLambdaEst"):
+        kind(loss, compile=True)
+    loss.make_value_estimator(TD0Estimator(gamma=GAMMA, value_network=None, average_rewards=True))
+    with pytest.raises(ValueError, match="without average_rewards"):
+        kind(loss, compile=True)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    learner = kind(loss, compile={"backend": "eager"})
+    loss.make_value_estimator(ValueEstimators.TDLambda, gamma=GAMMA, lmbda=0.7)
+    with pytest.raises(ValueError, match="compile needs the value estimator TD0"):
+        learner.update(make_batch())
+
+
+def test_a_discount_that_is_set_later_reaches_the_compiled_update():
+    _, loss = make_pair("ddpg")
+    loss.importance = "critic"
+    gradients, batch = CompiledGradients(loss, compile=None), make_batch()
+    for gamma in (0.5, 0.0):
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        log = gradients(batch, actor_batch=None)
+        torch.testing.assert_close(log["target_value"], loss(batch.clone())["target_value"])
+    torch.testing.assert_close(log["target_value"], batch["next", "reward"].squeeze(1))
