@@ -1,5 +1,6 @@
 """The gradient signal of Eq. (14) and the options of SignalDDPGLoss."""
 
+import inspect
 import math
 import pickle
 from copy import deepcopy
@@ -11,7 +12,19 @@ from torch import nn
 from torchrl.objectives import ValueEstimators
 
 from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
-from torchrl_mpfa import SignalDDPGLoss, make_ddpg_loss
+from torchrl_mpfa import (
+    SignalDDPGLoss,
+    SignalLoss,
+    SignalSACLoss,
+    SignalTD3Loss,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_td3_loss,
+)
+from torchrl_mpfa.losses.functional import pal_distance
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -257,3 +270,57 @@ def test_a_copied_or_converted_loss_uses_its_own_parameters(way):
 def test_arguments_out_of_range_are_refused(argument, value):
     with pytest.raises(ValueError, match=argument):
         make_loss(**{argument: value})
+
+
+@pytest.mark.parametrize("kind", ["ddpg", "td3", "sac"])
+def test_networks_in_the_wrong_order_are_refused_by_name_and_stay_as_they_are(kind):
+    make, maker, more = {
+        "ddpg": (make_ddpg_loss, make_actor, {}),
+        "td3": (make_td3_loss, make_actor, {"bounds": (-1.0, 1.0)}),
+        "sac": (make_sac_loss, make_stochastic_actor, {}),
+    }[kind]
+    actor, critic = maker(5, 2, width=8), make_critic(5, 2, width=8)
+    name = "value_network" if kind == "ddpg" else "qvalue_network"
+    if kind == "sac":
+        with pytest.raises(TypeError, match="actor_network must be a Probabilistic"):
+            make(critic, actor)
+    else:
+        words = f"actor_network and {name} are in the wrong order: actor_network reads 'action'"
+        with pytest.raises(ValueError, match=words):
+            make(critic, actor, **more)
+    with pytest.raises(TypeError, match=f"{name} must be a TensorDictModule, got Linear"):
+        make(actor, nn.Linear(5, 1), **more)
+    blind = TensorDictModule(nn.Linear(5, 1), ["observation"], ["state_action_value"])
+    with pytest.raises(ValueError, match=f"{name} must read what actor_network writes"):
+        make(actor, blind, **more)
+    make(actor, critic, **more)
+
+
+@pytest.mark.parametrize("gamma", [-0.1, 1.1, math.nan])
+def test_a_discount_outside_of_zero_to_one_is_refused(gamma):
+    networks = make_networks()
+    for make, more in ((make_ddpg_loss, {}), (make_td3_loss, {"bounds": (-1.0, 1.0)})):
+        with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got"):
+            make(*networks, gamma=gamma, **more)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.7])
+def test_the_exponent_of_pal_reaches_the_loss(alpha):
+    loss, batch = make_loss(loss_function="pal", pal_alpha=alpha), make_batch()
+    batch["next", "reward"] *= 5.0
+    found = loss(batch)
+    error = found["target_value"] - found["pred_value"]
+    assert float(error.abs().max()) > 1
+    torch.testing.assert_close(found["loss_value"], pal_distance(error, alpha=alpha).mean())
+
+
+@pytest.mark.parametrize("kind", [SignalDDPGLoss, SignalTD3Loss, SignalSACLoss])
+def test_each_loss_says_where_its_options_are_and_takes_each_of_them(kind):
+    options = set(inspect.signature(SignalLoss.__init__).parameters)
+    options -= {"self", "actor_network", "critic_network", "kwargs"}
+    assert len(options) == 8
+    assert "Options: see :class:`~torchrl_mpfa.losses.SignalLoss`" in kind.__doc__
+    for name in options:
+        assert f"``{name}``" in kind.__doc__
+        assert f"        {name}: " in SignalLoss.__doc__
+        assert name not in inspect.signature(kind.__init__).parameters

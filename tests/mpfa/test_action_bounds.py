@@ -1,0 +1,243 @@
+"""Bounds of actions: from a spec to the networks and to the losses."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+from torchrl.objectives import SACLoss, TD3Loss, ValueEstimators
+
+from tests.mpfa.losses import GAMMA, make_batch, parameter_gradients
+from torchrl_mpfa import (
+    SACLearner,
+    SignalTD3Loss,
+    TD3Learner,
+    make_actor,
+    make_critic,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_td3_loss,
+)
+from torchrl_mpfa.learners.compiled import CompiledGradients
+from torchrl_mpfa.networks import ActionScale, action_bounds
+
+# TorchRL warns at every loss whose target networks nothing moves.
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
+
+LOW, HIGH = [-2.0, 0.0], [2.0, 10.0]
+SPEC = Bounded(low=torch.tensor(LOW), high=torch.tensor(HIGH), shape=(2,))
+MAKERS = [make_actor, make_stochastic_actor]
+
+
+def make(maker, spec=SPEC, **kwargs):
+    torch.manual_seed(0)
+    return maker(5, 2, action_spec=spec, width=16, final_init=0.5, **kwargs)
+
+
+def networks(maker):
+    return make(maker), make_critic(5, 2, width=16, final_init=0.5)
+
+
+def batch_of(count=6):
+    batch = make_batch(count)
+    batch["action"] = SPEC.rand((count,))
+    return batch
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_actions_reach_every_bound_and_none_beyond(maker):
+    policy = make(maker)
+    observed = {"observation": torch.randn(500, 5)}
+    with torch.no_grad():
+        policy.layers()[-3].weight.mul_(20.0)
+        found = policy.outputs(observed)
+        called = policy(TensorDict(observed, [500]))
+    expected = torch.tensor([0.0, 5.0]) + torch.tensor([2.0, 5.0]) * found["preactivation"].tanh()
+    torch.testing.assert_close(found["action"], expected)
+    torch.testing.assert_close(called["action"], expected)
+    torch.testing.assert_close(found["action"].amin(0), torch.tensor(LOW), atol=0.1, rtol=0)
+    torch.testing.assert_close(found["action"].amax(0), torch.tensor(HIGH), atol=0.1, rtol=0)
+    assert SPEC.is_in(found["action"][0])
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_layers_lead_from_the_observation_to_the_greedy_action(maker):
+    for spec in (SPEC, None):
+        policy = make(maker, spec, layers=3)
+        at = observed = torch.randn(4, 5)
+        for layer in policy.layers():
+            at = layer(at)
+        torch.testing.assert_close(at, policy.outputs({"observation": observed})["action"])
+        kinds = [type(layer) for layer in policy.layers()]
+        assert kinds[:3] == [nn.Linear, nn.LayerNorm, nn.ReLU]
+        assert kinds[-1] is (nn.Tanh if spec is None else ActionScale)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_a_spec_of_minus_one_to_one_needs_no_last_layer(maker):
+    plain = make(maker, None)
+    bounded = make(maker, Bounded(low=-1.0, high=1.0, shape=(2,)))
+    assert plain.state_dict().keys() == bounded.state_dict().keys()
+    assert len(plain.layers()) == len(bounded.layers())
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_the_bounds_are_saved_with_the_policy(maker):
+    first = make(maker)
+    second = make(maker, Bounded(low=-9.0, high=9.0, shape=(2,)))
+    second.load_state_dict(first.state_dict())
+    observed = {"observation": torch.randn(4, 5)}
+    torch.testing.assert_close(
+        second.outputs(observed)["action"], first.outputs(observed)["action"]
+    )
+
+
+def test_random_actions_have_the_density_of_torchrls_distribution():
+    policy = make(make_stochastic_actor)
+    inputs = {"observation": torch.randn(50, 5)}
+    torch.manual_seed(1)
+    action, log_density, means = policy.sample(inputs)
+    found = policy.module[0].outputs(inputs)
+    theirs = TanhNormal(means, found["scale"], low=torch.tensor(LOW), high=torch.tensor(HIGH))
+    torch.manual_seed(1)
+    expected = theirs.rsample_and_log_prob()
+    torch.testing.assert_close(action, expected[0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(log_density, expected[1], rtol=1e-4, atol=1e-4)
+    with set_exploration_type(ExplorationType.RANDOM):
+        drawn = policy(TensorDict(inputs, [50]))["action"]
+    assert bool(((drawn >= torch.tensor(LOW)) & (drawn <= torch.tensor(HIGH))).all())
+
+
+def test_the_density_integrates_to_one():
+    policy = make_stochastic_actor(1, 1, action_spec=Bounded(low=0.0, high=10.0, shape=(1,)))
+    scale = policy.action_scale
+    # Of a standard normal, at the actions of a grid: sum the density of equal steps of action.
+    action = torch.linspace(0.01, 9.99, 2001, dtype=torch.double)
+    before = torch.atanh((action - 5.0) / 5.0)
+    normal = torch.distributions.Normal(0.0, 1.0).log_prob(before)
+    jacobian = torch.log1p(-before.tanh().square()) + scale.half_width.double().log()
+    total = float((normal - jacobian).exp().sum() * (action[1] - action[0]))
+    assert total == pytest.approx(1.0, abs=1e-2)
+    torch.manual_seed(0)
+    drawn, log_density, loc = policy.sample({"observation": torch.zeros(1000, 1)})
+    deviation = policy.module[0].outputs({"observation": torch.zeros(1000, 1)})["scale"]
+    at = torch.atanh((drawn - 5.0) / 5.0)
+    expected = torch.distributions.Normal(loc, deviation).log_prob(at)
+    expected = (expected - torch.log1p(-at.tanh().square()) - math.log(5.0)).sum(-1)
+    inside = at.squeeze(-1).abs() < 2
+    torch.testing.assert_close(log_density[inside], expected[inside], rtol=1e-3, atol=1e-3)
+
+
+def test_td3_equals_torchrls_within_these_bounds():
+    pair = []
+    for kind, more in ((TD3Loss, {}), (SignalTD3Loss, {"importance": "torchrl"})):
+        loss = kind(
+            *networks(make_actor), action_spec=SPEC, policy_noise=2.0, noise_clip=3.0, **more
+        )
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+        pair.append(loss)
+    pair[0].load_state_dict(pair[1].state_dict())
+    found = []
+    for loss in pair:
+        torch.manual_seed(1)
+        losses = loss(batch_of_seed())
+        (losses["loss_actor"] + losses["loss_qvalue"]).backward()
+        found.append((losses, parameter_gradients(loss)))
+    for key in ("loss_actor", "loss_qvalue", "target_value"):
+        torch.testing.assert_close(found[1][0][key], found[0][0][key], msg=key)
+    for name, gradient in found[1][1].items():
+        torch.testing.assert_close(gradient, found[0][1][name], msg=name)
+
+
+def batch_of_seed():
+    torch.manual_seed(9)
+    batch = batch_of()
+    torch.manual_seed(1)
+    return batch
+
+
+def test_sac_equals_torchrls_within_these_bounds():
+    ours = make_sac_loss(*networks(make_stochastic_actor), gamma=GAMMA, importance="torchrl")
+    theirs = SACLoss(*networks(make_stochastic_actor), loss_function="l2")
+    theirs.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    theirs.load_state_dict(ours.state_dict())
+    found = [loss(batch_of_seed()) for loss in (ours, theirs)]
+    for key in ("loss_actor", "loss_qvalue", "loss_alpha", "entropy"):
+        torch.testing.assert_close(found[0][key], found[1][key], rtol=1e-4, atol=1e-4, msg=key)
+
+
+def test_the_compiled_update_keeps_to_the_bounds_too():
+    expected, batch = batch_of_seed(), batch_of_seed()
+    losses = [
+        make_td3_loss(*networks(make_actor), gamma=GAMMA, action_spec=SPEC, policy_noise=3.0)
+        for _ in range(2)
+    ]
+    losses[1].load_state_dict(losses[0].state_dict())
+    torch.manual_seed(4)
+    log = losses[0].value_loss(expected)[1]
+    torch.manual_seed(4)
+    found = CompiledGradients(losses[1], compile=None)(batch, actor_batch=batch)
+    torch.testing.assert_close(found["target_value"], log["target_value"])
+    torch.testing.assert_close(batch["signals"].to_dict(), expected["signals"].to_dict())
+
+
+def test_learners_train_within_bounds_and_move_no_bound():
+    for learner in (
+        TD3Learner(
+            make_td3_loss(*networks(make_actor), action_spec=SPEC), compile={"backend": "eager"}
+        ),
+        SACLearner(make_sac_loss(*networks(make_stochastic_actor))),
+    ):
+        for _ in range(4):
+            learner.update(batch_of())
+        *_, scale = learner.policy.layers()
+        assert scale.center.tolist() == [0.0, 5.0]
+        assert scale.half_width.tolist() == [2.0, 5.0]
+
+
+def test_a_spec_may_be_that_of_a_batch_of_environments_or_have_a_key():
+    batched = SPEC.expand(3, 2)
+    for spec in (SPEC, batched, Composite(action=SPEC), Composite(action=batched, shape=(3,))):
+        low, high = action_bounds(spec, 2)
+        assert (low.tolist(), high.tolist()) == (LOW, HIGH)
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        (Unbounded((2,)), "action_spec must be Bounded, got Unbounded"),
+        (Categorical(3), "action_spec must be Bounded, got Categorical"),
+        (Bounded(low=0, high=3, shape=(2,), dtype=torch.int64), "real numbers, got torch.int64"),
+        (Bounded(low=-1.0, high=1.0, shape=(3,)), "must have action_size = 2 entries"),
+        (Bounded(low=-1.0, high=math.inf, shape=(2,)), "finite bounds, low < high"),
+        (Bounded(low=1.0, high=1.0, shape=(2,)), "finite bounds, low < high"),
+        (Composite(a=SPEC, b=SPEC), "action_spec must have one entry, got 2"),
+        (
+            Bounded(low=torch.tensor([LOW, [0.0, 0.0]]), high=torch.tensor([HIGH, HIGH])),
+            "the same bounds for all environments",
+        ),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("maker", MAKERS)
+def test_a_spec_that_bounds_no_action_of_this_size_is_refused(maker, spec, words):
+    with pytest.raises(ValueError, match=words):
+        make(maker, spec)
+
+
+def test_td3_assumes_no_bounds():
+    actor, critic = networks(make_actor)
+    with pytest.raises(ValueError, match="one of action_spec and bounds must be given"):
+        make_td3_loss(actor, critic)
+    with pytest.raises(ValueError, match="one of action_spec and bounds must be given"):
+        make_td3_loss(actor, critic, bounds=(-1.0, 1.0), action_spec=SPEC)
+    with pytest.raises(ValueError, match=r"bounds must be finite, low < high, got \(1.0, -1.0\)"):
+        make_td3_loss(actor, critic, bounds=(1.0, -1.0))
+    with pytest.raises(ValueError, match="action_spec must be Bounded, got Unbounded"):
+        make_td3_loss(actor, critic, action_spec=Unbounded((2,)))
+    loss = make_td3_loss(actor, critic, bounds=(torch.tensor(LOW), torch.tensor(HIGH)))
+    assert loss.max_action.tolist() == HIGH

@@ -1,0 +1,207 @@
+"""What learners refuse, and that nothing of them has changed by then."""
+
+import re
+from copy import deepcopy
+
+import pytest
+import torch
+
+from tests.mpfa import sac_networks
+from tests.mpfa.losses import BOUNDS, make_batch, make_networks
+from tests.mpfa.transitions import same
+from torchrl_mpfa import (
+    DDPGLearner,
+    Draw,
+    SACLearner,
+    TD3Learner,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_td3_loss,
+)
+
+TRACED = {"compile": {"backend": "eager"}}
+
+
+def make_learner(name, seed=0, **options):
+    """A learner after some updates, so that its optimizer has a state."""
+    if name == "sac":
+        learner = SACLearner(make_sac_loss(*sac_networks.make_networks(seed)), **options)
+    elif name == "td3":
+        loss = make_td3_loss(*make_networks(seed), bounds=BOUNDS)
+        learner = TD3Learner(loss, **options)
+    else:
+        learner = DDPGLearner(make_ddpg_loss(*make_networks(seed)), **options)
+    for step in range(3):
+        learner.update(make_batch(seed=step))
+    return learner
+
+
+ALL = [("ddpg", {}), ("td3", {}), ("sac", {}), ("ddpg", TRACED), ("td3", TRACED)]
+IDS = ["ddpg", "td3", "sac", "ddpg traced", "td3 traced"]
+
+
+def spoiled(entry, value=float("nan")):
+    batch = make_batch()
+    batch[entry][4] = value
+    return batch
+
+
+def snapshot(learner):
+    return deepcopy(learner.state_dict())
+
+
+@pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
+def test_a_batch_with_a_number_that_is_none_changes_nothing_and_is_named(name, options):
+    learner = make_learner(name, **options)
+    before = snapshot(learner)
+    for entry in ("observation", "action", ("next", "reward"), ("next", "observation")):
+        words = re.escape(f"batch must be finite, got nan in {entry!r}, row 4")
+        with pytest.raises(ValueError, match=words):
+            learner.update(spoiled(entry))
+        assert same(snapshot(learner), before)
+
+
+def test_after_a_refused_batch_the_next_one_gives_what_it_would_have_given():
+    learner, other = make_learner("ddpg"), make_learner("ddpg")
+    with pytest.raises(ValueError, match="batch must be finite"):
+        learner.update(spoiled("observation"))
+    for each in (learner, other):
+        each.update(make_batch(seed=7))
+    assert same(snapshot(learner), snapshot(other))
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3", "sac"])
+def test_an_actors_batch_of_its_own_is_named_as_well(name):
+    learner = make_learner(name)
+    before = snapshot(learner)
+    draw = Draw(make_batch(), actor_batch=spoiled("observation", float("inf")))
+    with pytest.raises(ValueError, match="actor_batch must be finite, got inf in 'observation'"):
+        learner.update(draw)
+    assert same(snapshot(learner), before)
+
+
+@pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
+def test_a_batch_without_an_entry_changes_nothing(name, options):
+    learner = make_learner(name, **options)
+    before = snapshot(learner)
+    for entry in ("action", ("next", "reward"), ("next", "terminated")):
+        with pytest.raises((KeyError, AttributeError, TypeError)):
+            learner.update(make_batch().exclude(entry))
+        assert same(snapshot(learner), before)
+
+
+def test_rewards_that_overflow_the_loss_are_told_from_rewards_that_are_none():
+    learner = make_learner("ddpg")
+    before = snapshot(learner)
+    with pytest.raises(ValueError, match="loss_value must be finite, got inf of a finite batch"):
+        learner.update(spoiled(("next", "reward"), 1e30))
+    assert same(snapshot(learner), before)
+
+
+def altered(state, path, value):
+    """A copy of a state in which one entry has another value, or is missing."""
+    state = deepcopy(state)
+    at = state
+    for key in path[:-1]:
+        at = at[key]
+    if value is None:
+        del at[path[-1]]
+    else:
+        at[path[-1]] = value
+    return state
+
+
+def weight_of(state, start="target_"):
+    """Name of the first matrix among the entries of the loss."""
+    entries = state["loss"].items()
+    return next(n for n, v in entries if n.startswith(start) and getattr(v, "ndim", 0) >= 2)
+
+
+@pytest.mark.parametrize("name", ["ddpg", "sac"])
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        (["optimizer"], None, "state_dict lacks 'optimizer'"),
+        (["loss"], None, "state_dict lacks 'loss'"),
+        (["updates"], None, "state_dict lacks 'updates'"),
+        (["updates"], "3", r"state_dict\['updates'\] must be a count, got '3'"),
+        (["updates"], -1, r"state_dict\['updates'\] must be a count, got -1"),
+        (["optimizer"], [], r"state_dict\['optimizer'\] must be a mapping, got list"),
+        (["optimizer", "state"], None, r"state_dict\['optimizer'\] lacks 'state'"),
+        (["optimizer", "state", 0, "exp_avg"], None, r"\['state'\]\[0\] lacks 'exp_avg'"),
+        (
+            ["optimizer", "state", 0, "exp_avg"],
+            torch.zeros(1),
+            r"\['state'\]\[0\]\['exp_avg'\] must have shape \(.*\), got \(1,\)",
+        ),
+        (["optimizer", "state", 99], {}, r"\['state'\] must be of \d+ parameters"),
+        (["optimizer", "param_groups"], [], r"\['param_groups'\] must have \d groups, got \[\]"),
+        (["optimizer", "param_groups", 0, "lr"], None, r"\['param_groups'\]\[0\] lacks 'lr'"),
+        (["optimizer", "param_groups", 0, "params"], [0], r"\[0\]\['params'\] must be \[0, 1"),
+        (["loss", "other"], torch.zeros(1), r"state_dict\['loss'\] has 'other'"),
+        (["loss", "WEIGHT"], None, r"state_dict\['loss'\] lacks 'target_"),
+        (["loss", "WEIGHT"], torch.zeros(3), r"'\] must have shape \(.*\), got \(3,\)"),
+        (["loss", "WEIGHT"], "text", r"'\] must be a tensor, got str"),
+        (["loss", "WEIGHT"], torch.nan, r"'\] must be finite, got nan"),
+    ],
+    ids=str,
+)
+def test_a_foreign_state_changes_nothing_and_is_named(name, path, value, words):
+    learner, other = make_learner(name), make_learner(name, seed=1)
+    state = other.state_dict()
+    if path[-1] == "WEIGHT":
+        key = weight_of(state)
+        path = [*path[:-1], key]
+        if value is torch.nan:
+            value = torch.full_like(state["loss"][key], torch.nan)
+    before = snapshot(learner)
+    with pytest.raises(ValueError, match=words):
+        learner.load_state_dict(altered(state, path, value))
+    assert same(snapshot(learner), before)
+    learner.load_state_dict(state)
+    assert same(snapshot(learner), snapshot(other))
+
+
+def test_the_state_of_another_kind_or_size_is_refused():
+    learner = make_learner("ddpg")
+    before = snapshot(learner)
+    for other in ("td3", "sac"):
+        with pytest.raises(ValueError, match=r"state_dict\['loss'\] (lacks|has) "):
+            learner.load_state_dict(make_learner(other).state_dict())
+    wide = DDPGLearner(make_ddpg_loss(*make_networks(width=32)))
+    with pytest.raises(ValueError, match="must have shape"):
+        learner.load_state_dict(wide.state_dict())
+    for wrong in (None, 3, "state"):
+        with pytest.raises(ValueError, match="state_dict must be a mapping"):
+            learner.load_state_dict(wrong)
+    assert same(snapshot(learner), before)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(DDPGLearner, "td3"), (TD3Learner, "sac"), (SACLearner, "ddpg")]
+)
+def test_a_loss_of_another_learner_is_refused_by_both_names(kind, name):
+    loss = make_learner(name).loss
+    expected = kind.loss_type.__name__
+    words = f"loss of a {kind.__name__} must be a {expected}, got {type(loss).__name__}"
+    with pytest.raises(TypeError, match=words):
+        kind(loss)
+
+
+def test_sac_has_no_compile():
+    with pytest.raises(TypeError, match="compile"):
+        SACLearner(make_learner("sac").loss, compile=True)
+
+
+@pytest.mark.parametrize("name", ["actor_lr", "critic_lr", "critic_weight_decay", "tau"])
+def test_rates_that_are_no_numbers_are_refused(name):
+    for value in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"{name} must .*got {value}"):
+            make_learner("td3", **{name: value})
+
+
+@pytest.mark.parametrize("name", ["ddpg", "td3", "sac"])
+def test_the_defaults_are_those_of_table_1_and_a_light_decay(name):
+    groups = make_learner(name).optimizer.param_groups
+    assert [group["lr"] for group in groups[:2]] == [1e-4, 1e-4]
+    assert [group["weight_decay"] for group in groups[:2]] == [0.0, 1e-4]
