@@ -14,6 +14,7 @@ from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.slots import as_slots, last_of_each
 from torchrl_mpfa.tree_state import SavedTrees
 
+_LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _SERIAL = 8192
 """Rows up to which writing by index goes in their order."""
 
@@ -282,7 +283,7 @@ class TreeSampler(SavedTrees):
         if not (low >= 0 and high < math.inf):
             check_finite("priority", priority - self._eps)
             check_finite("priority", priority)
-        if not high**self._alpha * self._max_capacity < math.inf:
+        if high > 0 and self._alpha * math.log(high) + math.log(self._max_capacity) > _LOG_LARGEST:
             raise ValueError(f"priority must not be so high that sums overflow, got {high}")
         return high
 

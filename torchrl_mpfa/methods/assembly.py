@@ -26,6 +26,7 @@ from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler
 from torchrl_mpfa.moving_fusion import ScaledFusion
+from torchrl_mpfa.positive import check_level
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.sampler import SignalSampler
 from torchrl_mpfa.selection import Selection, one_batch
@@ -35,7 +36,10 @@ from torchrl_mpfa.storage import SignalTensorStorage
 
 _SIGNALS = {signal.name: signal for signal in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)}
 _FUSIONS: dict[str, Callable[[Method], Fusion]] = {
-    "entropy": lambda method: EntropyFusion(population=method.population),  # type: ignore[arg-type]
+    "entropy": lambda method: EntropyFusion(
+        population=method.population,  # type: ignore[arg-type]
+        positive_above=method.positive_above,
+    ),
     "fixed": lambda method: _equal(method),
     "scaled": lambda method: ScaledFusion(_equal(method)),
     "value_schedule": lambda method: value_schedule(),
@@ -192,7 +196,8 @@ def make_sampler(method: Method) -> SignalSampler | RandomSampler:
         method.alpha,
         method.beta,
         method.eps,
-        max_priority_within_buffer=True,
+        max_priority_within_buffer=method.max_priority_within_buffer,
+        stratified=method.stratified,
         signals=signals_of(method),
         fusion=_FUSIONS[method.fusion](method),
         adjustments=make_adjustments(method),
@@ -204,12 +209,17 @@ def make_adjustments(method: Method) -> list[Adjustment]:
     """What the method does to fused priorities, in this order."""
     made: list[Adjustment] = []
     if method.boost:
-        boost = PositiveBoost(boost=method.boost_factor, bound=method.boost_bound)  # type: ignore[arg-type]
+        boost = PositiveBoost(
+            boost=method.boost_factor,
+            bound=method.boost_bound,  # type: ignore[arg-type]
+            positive_above=method.positive_above,
+        )
         made.append(boost)
     if method.decay:
         decay = PositiveDecay(
             sharpness=method.decay_sharpness,
             position=method.decay_position,  # type: ignore[arg-type]
+            positive_above=method.positive_above,
         )
         made.append(decay)
     if method.priority_floor > 0:
@@ -250,6 +260,7 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
     for name, words in _WORDS.items():
         if getattr(made, name) not in words:
             raise ValueError(unknown(name, getattr(made, name), words))
+    check_level(made.positive_above)
     for name in ("capacity", "batch_size", "candidates", "target_average"):
         value = getattr(made, name)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:

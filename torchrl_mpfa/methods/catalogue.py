@@ -60,8 +60,15 @@ class Method:
     """sigma of Eq. 23."""
     decay_position: str = "batch"
     """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
+    positive_above: Any = 0.0
+    """A transition is positive, in Eqs. 17 and 22-24, when its reward is above this: a number, or
+    ``mean``, the mean reward of the buffer, for rewards of one sign."""
     population: str = "buffer"
     """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
+    max_priority_within_buffer: bool = True
+    """Whether a fresh transition gets the highest priority in the buffer, or the highest ever."""
+    stratified: bool = False
+    """Whether a batch takes one transition from each of equal parts of the total priority."""
     importance: str = "critic"
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     loss_function: str = "l2"
@@ -84,6 +91,7 @@ _LAP: dict[str, Any] = {
     "eps": 0.0,
     "alpha": 0.4,
     "priority_floor": 1.0,
+    "max_priority_within_buffer": False,
     "importance": "none",
     "loss_function": "smooth_l1",
 }

@@ -7,6 +7,7 @@ is wrong learns little: it gets transitions in proportion to the *inverse* of th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -20,7 +21,8 @@ from torchrl_mpfa.selection import Draw
 from torchrl_mpfa.tree_state import refuse
 
 Part = Literal["uniform", "prioritized", "inverse"]
-_LARGEST = torch.finfo(torch.double).max
+_LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
+_TINY = torch.finfo(torch.double).tiny
 
 
 class LA3PSampler(SignalSampler):
@@ -64,7 +66,8 @@ class LA3PSampler(SignalSampler):
         highest = super()._checked(priority)
         # Not so low that the inverse overflows, which a priority of zero would be.
         lowest = priority.min().item()
-        if not lowest**self._alpha * _LARGEST > self._max_capacity:
+        least = (math.log(self._max_capacity) - _LOG_LARGEST) / max(self._alpha, _TINY)
+        if not (lowest > 0 and math.log(lowest) > least):
             raise ValueError(f"priority must not be so low that its inverse overflows: {lowest}")
         return highest
 

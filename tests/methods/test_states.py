@@ -1,0 +1,134 @@
+"""Saved samplers: what does not fit is refused by name, before anything changes."""
+
+import pytest
+import torch
+
+from tests.methods.replays import make_transitions, seeded
+from tests.mpfa.transitions import same
+from torchrl_mpfa.methods import make_replay
+
+METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer"]
+
+
+def make_trained(name, *, seed=0, capacity=12):
+    replay = make_replay(
+        name, capacity=capacity, batch_size=4, generator=seeded(seed), replay_cap=2
+    )
+    replay.buffer.extend(make_transitions(9, seed=seed))
+    for _ in range(4):
+        for draw in replay.select(replay.buffer):
+            for signal in replay.signals:
+                draw.batch["signals", signal] = torch.rand(len(draw.batch), generator=seeded(seed))
+            if replay.signals:
+                replay.buffer.update_tensordict_priority(draw.batch)
+    return replay
+
+
+def batches(replay):
+    return torch.cat([d.batch["index"] for _ in range(5) for d in replay.select(replay.buffer)])
+
+
+@pytest.mark.parametrize("way", ["state", "folder"])
+@pytest.mark.parametrize("name", METHODS)
+def test_a_sampler_goes_on_as_if_nothing_had_happened(name, way, tmp_path):
+    first, second = make_trained(name), make_trained(name, seed=3)
+    if way == "state":
+        second.buffer.load_state_dict(first.buffer.state_dict())
+    else:
+        first.buffer.dumps(tmp_path)
+        second.buffer.loads(tmp_path)
+    assert same(first.buffer.sampler.state_dict(), second.buffer.sampler.state_dict())
+    assert batches(first).equal(batches(second))
+
+
+NOTHING = object()
+
+
+def spoiled(state, name, value):
+    made = dict(state)
+    if value is NOTHING:
+        del made[name]
+    else:
+        made[name] = value(state[name]) if callable(value) else value
+    return made
+
+
+def with_nan(tensor):
+    tensor = tensor.clone()
+    tensor[0] = torch.nan
+    return tensor
+
+
+COMMON = [
+    *[
+        (name, NOTHING, f"'{name}' is missing in the saved sampler")
+        for name in (
+            *("_alpha", "_beta", "_eps", "_max_capacity", "_highest", "_highest_slot", "_kind"),
+            *("_priorities", "_learned", "_sum_tree", "_min_tree", "_signals", "_weights"),
+            *("_weighed_at", "_mean_reward"),
+        )
+    ],
+    ("_alpha", "0.6", "'_alpha' of the saved sampler must be a finite number.*got '0.6'"),
+    ("_beta", torch.tensor(1.0), "'_beta' of the saved sampler must be a finite number"),
+    ("_eps", -1.0, "'_eps' of the saved sampler must be"),
+    ("_highest", float("nan"), "'_highest' of the saved sampler must be a finite number"),
+    ("_highest_slot", 12, "'_highest_slot' of the saved sampler must be"),
+    ("_max_capacity", 10**18, "max_capacity of the saved sampler is 1000000000000000000"),
+    ("_sum_tree", with_nan, "'_sum_tree' of the saved sampler must be finite and not negative"),
+    ("_min_tree", with_nan, "'_min_tree' of the saved sampler must be not negative, got nan"),
+    ("_sum_tree", lambda t: t[:3], r"'_sum_tree' .* must be torch.float64 of shape \[12\], got"),
+    ("_sum_tree", lambda t: t.float(), "'_sum_tree' .*got 'torch.float32 of shape"),
+    ("_sum_tree", [1.0], "'_sum_tree' of the saved sampler must be a tensor"),
+    (
+        "_sum_tree",
+        lambda t: t * 0 + 1e308,
+        "'_sum_tree' of the saved sampler must be of finite sum",
+    ),
+    ("_priorities", lambda t: -t, "'_priorities' of the saved sampler must be finite and not neg"),
+    ("_learned", lambda t: ~(t & False), "'_learned' of the saved sampler must be false where"),
+    ("_weights", {"x": 1.0}, "'_weights' of the saved sampler must be empty, or one number"),
+    ("_weighed_at", -1, "'_weighed_at' of the saved sampler must be an integer of at least 0"),
+    ("_mean_reward", float("inf"), "'_mean_reward' of the saved sampler must be a finite number"),
+]
+OWN = [
+    ("rank_per", "_order", NOTHING, "'_order' is missing"),
+    ("rank_per", "_order", lambda t: t.flip(0), "'_order' of the saved sampler must be"),
+    ("rank_per", "_written", "3", "'_written' of the saved sampler must be an integer"),
+    ("mw", "_spent", NOTHING, "'_spent' is missing"),
+    ("mw", "_spent", lambda t: t.float(), "'_spent' of the saved sampler must be torch.bool"),
+    ("la3p", "_sum_tree", lambda t: t * 0, "'_sum_tree' of the saved sampler must be positive"),
+    ("cer", "_newest", NOTHING, "'_newest' is missing"),
+    ("cer", "_newest", ["0"], "'_newest' of the saved sampler must be None, or a place"),
+    ("cer", "_newest", -3, "'_newest' of the saved sampler must be None, or a place"),
+]
+CASES = [(name, *case) for name in METHODS[:4] for case in COMMON] + OWN
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return {name: (make_trained(name), make_trained(name, seed=3)) for name in METHODS}
+
+
+@pytest.mark.parametrize(("method", "name", "value", "message"), CASES)
+def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(
+    trained, method, name, value, message
+):
+    first, second = (replay.buffer.sampler for replay in trained[method])
+    before = second.state_dict()
+    with pytest.raises(ValueError, match=message):
+        second.load_state_dict(spoiled(first.state_dict(), name, value))
+    assert same(before, second.state_dict())
+
+
+@pytest.mark.parametrize("method", METHODS[:4])
+def test_a_state_of_another_sampler_is_refused(trained, method):
+    for other in METHODS[:4]:
+        if other == method:
+            continue
+        first, second = trained[other][0].buffer.sampler, trained[method][1].buffer.sampler
+        before = second.state_dict()
+        with pytest.raises(ValueError, match="the saved sampler is '|signals of the saved sampler"):
+            second.load_state_dict(first.state_dict())
+        assert same(before, second.state_dict())
+    with pytest.raises(ValueError, match="the saved sampler must be a mapping, got list"):
+        second.load_state_dict([1])

@@ -1,0 +1,93 @@
+"""Rewards of one sign: Eq. (17) degenerates, one warning says so, and one argument cures it."""
+
+import warnings
+
+import pytest
+import torch
+
+from tests.mpfa.transitions import make_buffer, make_transitions, seeded, train_rounds
+from torchrl_mpfa import EntropyFusion, MPFASampler, PositiveBoost, PositiveDecay, ScaledFusion
+from torchrl_mpfa.methods import make_replay
+
+
+def pendulum(count=1200, *, seed=0):
+    """Rewards of Pendulum: a cost, hence negative."""
+    return make_transitions(count, rewards=-torch.rand(count, generator=seeded(seed)) * 16)
+
+
+def test_one_warning_names_the_cure():
+    buffer = make_buffer(2000, 32, entropy_refresh=0)
+    buffer.extend(pendulum())
+    with pytest.warns(
+        UserWarning, match=r"none of the 1200 rewards .*positive_above='mean'"
+    ) as seen:
+        train_rounds(buffer, 5)
+    assert len(seen) == 1
+    assert buffer.sampler.weights == {"td_error": 0.0, "action_gradient": 0.0, "reward": 1.0}
+
+
+def test_rewards_that_are_all_positive_are_told_of_too():
+    buffer = make_buffer(2000, 32)
+    buffer.extend(make_transitions(1000, rewards=torch.rand(1000) + 0.1))
+    with pytest.warns(UserWarning, match="all of the 1000 rewards in the buffer are above 0.0"):
+        train_rounds(buffer, 1)
+
+
+@pytest.mark.parametrize("level", ["mean", -8.0])
+def test_the_cure_gives_every_signal_its_weight_and_a_part_of_the_rows_their_boost(level):
+    buffer = make_buffer(2000, 64, positive_above=level, entropy_refresh=0)
+    buffer.extend(pendulum())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train_rounds(buffer, 3)
+    assert min(buffer.sampler.weights.values()) > 0.3
+    plain = make_buffer(2000, 64, positive_above=level, adjustments=[], entropy_refresh=0)
+    plain.extend(pendulum())
+    train_rounds(plain, 3)
+    batch = buffer.sample()
+    rewards = batch["next", "reward"].squeeze(1)
+    assert ((rewards > -8.0).float().mean() - 0.5).abs() < 0.3
+
+
+def test_one_argument_reaches_entropy_boost_and_decay():
+    sampler = MPFASampler(8, positive_above="mean")
+    assert sampler.fusion == EntropyFusion(positive_above="mean")
+    assert sampler.adjustments == (
+        PositiveBoost(positive_above="mean"),
+        PositiveDecay(positive_above="mean"),
+    )
+    sampler = make_replay("mpfa_per", capacity=8, positive_above=-2).buffer.sampler
+    found = {part.positive_above for part in (sampler.fusion, *sampler.adjustments)}
+    assert found == {-2}
+    with pytest.raises(
+        ValueError, match="positive_above must be given to a fusion and adjustments"
+    ):
+        MPFASampler(8, positive_above=1.0, fusion=EntropyFusion(), adjustments=[])
+    with pytest.raises(ValueError, match="positive_above must be a finite number or 'mean', got"):
+        MPFASampler(8, positive_above="meen")
+
+
+def test_the_mean_is_that_of_the_buffer_and_saved():
+    first, second = (make_buffer(64, 8, positive_above="mean") for _ in range(2))
+    first.extend(make_transitions(64, rewards=torch.arange(-64.0, 0.0)))
+    train_rounds(first, 1)
+    assert first.sampler.state_dict()["_mean_reward"] == -32.5
+    second.load_state_dict(first.state_dict())
+    assert second.sampler.state_dict()["_mean_reward"] == -32.5
+    assert train_rounds(first, 3).equal(train_rounds(second, 3))
+
+
+@pytest.mark.parametrize("rewards", [torch.rand(999), torch.rand(1500) - 0.5])
+def test_few_rewards_or_rewards_of_both_signs_are_no_reason_for_a_warning(rewards):
+    buffer = make_buffer(2000, 32, entropy_refresh=0)
+    buffer.extend(make_transitions(len(rewards), rewards=rewards))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train_rounds(buffer, 2)
+
+
+def test_a_fusion_around_the_entropies_is_looked_into():
+    buffer = make_buffer(2000, 32, fusion=ScaledFusion(EntropyFusion()), adjustments=[])
+    buffer.extend(pendulum())
+    with pytest.warns(UserWarning, match="none of the 1200 rewards"):
+        train_rounds(buffer, 1)

@@ -1,0 +1,103 @@
+"""Draws in double precision, and stratified ones: frequencies within the noise of chi-square."""
+
+import math
+
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage
+from torchrl.data.replay_buffers import PrioritizedSampler
+
+from tests.mpfa.transitions import seeded
+from torchrl_mpfa import TreeSampler
+
+
+def filled(sampler, count, *, spread=3.0):
+    """A storage of so many slots with random priorities, and their probabilities."""
+    storage = LazyTensorStorage(count)
+    storage.set(torch.arange(count), torch.zeros(count))
+    priority = (torch.randn(count, generator=seeded(0), dtype=torch.double) * spread).exp() + 1e-3
+    sampler.mark_update(torch.arange(count), storage=storage)
+    sampler.update_priority(torch.arange(count), priority.float())
+    sampler._rng = seeded(1)
+    return storage, priority / priority.sum()
+
+
+def score(index, probability):
+    """Standard score of chi-square over the slots that are expected five times or more."""
+    count, draws = torch.bincount(index, minlength=len(probability)), len(index)
+    expected = probability * draws
+    often = expected >= 5
+    # All others together are one more cell.
+    found = torch.cat((count[often], count[~often].sum().reshape(1)))
+    wanted = torch.cat((expected[often], expected[~often].sum().reshape(1)))
+    found, wanted = found[wanted > 0], wanted[wanted > 0]
+    degrees = len(wanted) - 1
+    square = float(((found - wanted).square() / wanted).sum())
+    return (square - degrees) / math.sqrt(2 * degrees)
+
+
+def drawn(sampler, storage, draws):
+    return torch.cat([sampler.sample(storage, draws // 10)[0] for _ in range(10)])
+
+
+def test_single_slots_have_their_frequencies_among_a_hundred_thousand():
+    sampler = TreeSampler(100_000, 1.0, 0.4, 0.0)
+    storage, probability = filled(sampler, 100_000, spread=0.3)
+    assert abs(score(drawn(sampler, storage, 2_000_000), probability)) < 4
+
+
+def test_single_slots_have_their_frequencies_among_a_million():
+    sampler = TreeSampler(1_000_000, 1.0, 0.4, 0.0)
+    storage, probability = filled(sampler, 1_000_000, spread=0.3)
+    assert abs(score(drawn(sampler, storage, 6_000_000), probability)) < 4
+
+
+@pytest.mark.slow
+def test_in_single_precision_they_have_not():
+    """A mass of 24 bits names each of a million slots by some seventeen values."""
+    sampler = PrioritizedSampler(1_000_000, 1.0, 0.4, 0.0)
+    storage, probability = filled(sampler, 1_000_000, spread=0.3)
+    assert score(drawn(sampler, storage, 20_000_000), probability) > 7
+
+
+@pytest.mark.slow
+def test_single_slots_have_their_frequencies_in_a_hundred_million_draws():
+    sampler = TreeSampler(1_000_000, 1.0, 0.4, 0.0)
+    storage, probability = filled(sampler, 1_000_000, spread=0.3)
+    index = torch.cat([drawn(sampler, storage, 10_000_000) for _ in range(10)])
+    assert abs(score(index, probability)) < 4
+
+
+def test_stratified_batches_take_one_slot_from_each_part_of_the_priority():
+    sampler = TreeSampler(50, 1.0, 0.4, 0.0, stratified=True)
+    storage, probability = filled(sampler, 50, spread=1.0)
+    edges = probability.cumsum(0)
+    for _ in range(20):
+        index, _ = sampler.sample(storage, 64)
+        count = torch.bincount(index, minlength=50)
+        # A slot that has a share of the priority is drawn so often, give or take one.
+        whole = (64 * edges).floor() - (64 * (edges - probability)).ceil()
+        assert (count >= whole.clamp_min(0)).all()
+        assert ((count - 64 * probability).abs() < 2).all()
+
+
+def test_stratified_batches_have_the_same_frequencies_and_come_in_no_order():
+    sampler = TreeSampler(200, 1.0, 0.4, 0.0, stratified=True)
+    storage, probability = filled(sampler, 200, spread=0.5)
+    batches = torch.stack([sampler.sample(storage, 64)[0] for _ in range(3000)])
+    found = torch.bincount(batches.flatten(), minlength=200) / batches.numel()
+    # Less than the noise of independent draws.
+    sigma = (probability * (1 - probability) / batches.numel()).sqrt()
+    assert ((found - probability).abs() < 4 * sigma).all()
+    # No place of a batch holds other slots than another one does.
+    means = batches.double().mean(0)
+    assert ((means - means.mean()).abs() < 5 * batches.double().std() / math.sqrt(3000)).all()
+
+
+def test_the_type_of_the_weights_is_the_one_asked_for():
+    for dtype in (torch.float, torch.double):
+        sampler = TreeSampler(10, 0.6, 0.4, dtype=dtype)
+        storage, _ = filled(sampler, 10)
+        assert sampler.sample(storage, 4)[1]["priority_weight"].dtype is dtype
+    with pytest.raises(ValueError, match=r"dtype must be torch.float32 or .*, got torch.int64"):
+        TreeSampler(10, 0.6, 0.4, dtype=torch.long)
