@@ -86,8 +86,7 @@ class PathPlanner:
         *self._centers, radii = np.array(circles).reshape(-1, 3).T
         self._squares = radii * radii
         nodes = np.concatenate([np.empty((0, 2)), *corners])
-        free = [world.clearance(x, y) >= self.radius - _TOUCH for x, y in nodes]
-        self._nodes = nodes[np.array(free, dtype=np.bool_)]
+        self._nodes = nodes[world.clearances(nodes) >= self.radius - _TOUCH]
         self._neighbors: dict[int, list[tuple[int, float]]] = {}
 
     def is_straight(self, start: Point, goal: Point) -> bool:
@@ -148,10 +147,12 @@ class PathPlanner:
             groups[first] = first
             frontier = [first]
             while frontier:
-                for neighbor, _ in self._neighbors_of(frontier.pop()):
-                    if groups[neighbor] < 0:
-                        groups[neighbor] = first
-                        frontier.append(neighbor)
+                x, y = self._nodes[frontier.pop()]
+                # Only what is in no group yet is looked for, which soon is little.
+                left = np.flatnonzero(groups < 0)
+                found = left[self._visible((x, y), self._nodes[left])]
+                groups[found] = first
+                frontier += found.tolist()
         return groups
 
     def length(self, start: Point, goal: Point) -> float:

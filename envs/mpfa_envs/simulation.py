@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import math
+import platform
 import tempfile
+import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pybullet
+
+try:
+    import pybullet
+except ImportError as error:
+    raise ImportError(
+        "physics='wheels' needs PyBullet, which has wheels for Python 3.11 and earlier only, and "
+        f"this is Python {platform.python_version()}: use physics='kinematic', which needs no "
+        "PyBullet, or Python 3.11 and pip install 'torchrl-mpfa[envs]'"
+    ) from error
+
+from mpfa_envs.checks import check_count, check_positive
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,15 +61,13 @@ class Simulation:
     """
 
     def __init__(self, *, time_step: float, substeps: int = 1) -> None:
-        if not (math.isfinite(time_step) and time_step > 0):
-            raise ValueError(f"time_step must be positive, got {time_step}")
-        if substeps < 1:
-            raise ValueError(f"substeps must be positive, got {substeps}")
-        self.time_step = time_step
-        self.substeps = substeps
+        self.time_step = check_positive("time_step", time_step)
+        self.substeps = check_count("substeps", substeps)
         self.bodies: dict[str, int] = {}
         """Names of the bodies and the engine's numbers for them."""
         self._client: int = pybullet.connect(pybullet.DIRECT)
+        # A server takes 34 MB: one whose owner was dropped without close() must go as well.
+        self._release = weakref.finalize(self, _disconnect, self._client)
         self._wheels: list[int] = []
         self._rest_height = 0.0
         self._configure()
@@ -303,6 +313,11 @@ class Simulation:
 
     def close(self) -> None:
         """Shut the server down; a second call does nothing."""
-        if self.is_connected:
-            pybullet.disconnect(physicsClientId=self._client)
+        self._release()
         self._client = -1
+
+
+def _disconnect(client: int) -> None:
+    """Shut a server down, if it lives."""
+    if pybullet.isConnected(physicsClientId=client):
+        pybullet.disconnect(physicsClientId=client)

@@ -6,7 +6,7 @@ import math
 import os
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import yaml
@@ -26,8 +26,12 @@ _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
 _KEYS: Final = ("name", "size", *_SHAPES)
 _REGION_CLEARANCE: Final = 0.5
 """A region must hold a point this far from every obstacle: what the TurtleBot2 asks for [m]."""
-_GRID: Final = 0.05
-"""Spacing of the points that are tried in a region [m]."""
+_FINEST: Final = 0.01
+"""Room that a square of this diagonal may hold is not looked for [m]."""
+_MOST_CELLS: Final = 100_000
+"""A region in which more squares are undecided is too large and too narrow to be looked through."""
+_LARGEST_FILE: Final = 1_000_000
+"""Longest text that is read [characters]."""
 
 
 class WorldFileError(ValueError):
@@ -44,7 +48,8 @@ def load_world(path: str | os.PathLike[str]) -> World:
         The world; without a name in the file it is called as the file.
 
     Raises:
-        WorldFileError: If the file cannot be read, is not YAML, or does not describe a world.
+        WorldFileError: If the file cannot be read, is too large, is not YAML, or does not describe
+            a world.
 
     Examples:
         >>> from mpfa_envs import EXAMPLE_WORLD, load_world
@@ -57,6 +62,8 @@ def load_world(path: str | os.PathLike[str]) -> World:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise WorldFileError(f"{path}: cannot be read: {error}") from error
+    if len(text) > _LARGEST_FILE:
+        raise WorldFileError(f"{path}: has {len(text)} characters, more than {_LARGEST_FILE}")
     try:
         # Nodes instead of objects: they carry line numbers, and no tag can run anything.
         root = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -64,6 +71,8 @@ def load_world(path: str | os.PathLike[str]) -> World:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
+    except RecursionError:
+        raise WorldFileError(f"{path}: is nested too deeply") from None
     return _Reader(path).world(root)
 
 
@@ -90,10 +99,11 @@ class _Reader:
         if "size" not in entries:
             raise self.error(root, "size is missing; it is a list [width, depth] in meters")
         size = self.size(entries["size"])
-        room = World(name=name, size=size)
+        room = self.built(entries["size"], name=name, size=size)
         boxes = self.shapes(entries, "boxes", room)
         cylinders = self.shapes(entries, "cylinders", room)
-        world = World(
+        world = self.built(
+            root,
             name=name,
             size=size,
             boxes=tuple(box for box, _ in boxes if isinstance(box, Box)),
@@ -109,6 +119,13 @@ class _Reader:
             start_regions=starts,
             goal_regions=goals,
         )
+
+    def built(self, node: yaml.Node | None, **parts: Any) -> World:
+        """Build a world, with the line of a node if that is refused."""
+        try:
+            return World(**parts)
+        except ValueError as error:
+            raise self.error(node, str(error)) from error
 
     def mapping(
         self, node: yaml.Node | None, what: str, keys: tuple[str, ...]
@@ -184,25 +201,38 @@ class _Reader:
         for region, node in self.shapes(entries, key, world):
             if not isinstance(region, Box):
                 continue
-            if not _has_room(world, region):
+            found = _has_room(world, region)
+            if not found:
+                what = "is too large to find a" if found is None else "has no"
                 raise self.error(
                     node,
-                    f"an entry of {key} has no point {_REGION_CLEARANCE} m from every obstacle "
+                    f"an entry of {key} {what} point {_REGION_CLEARANCE} m from every obstacle "
                     f"and wall, got {region}",
                 )
             regions.append(region)
         return tuple(regions)
 
 
-def _has_room(world: World, region: Box) -> bool:
-    """Tell whether a point of a grid over the region is clear."""
-    columns = max(2, math.ceil((region.x_max - region.x_min) / _GRID) + 1)
-    rows = max(2, math.ceil((region.y_max - region.y_min) / _GRID) + 1)
-    return any(
-        world.clearance(x, y) >= _REGION_CLEARANCE
-        for x in np.linspace(region.x_min, region.x_max, columns).tolist()
-        for y in np.linspace(region.y_min, region.y_max, rows).tolist()
-    )
+def _has_room(world: World, region: Box) -> bool | None:
+    """Tell whether a region has a point that is clear; None if it is too large to tell.
+
+    The region is cut in four again and again. Within a rectangle the clearance differs from that of
+    its middle by half its diagonal at most, so that most rectangles are decided at once.
+    """
+    half = np.array([region.x_max - region.x_min, region.y_max - region.y_min]) / 2
+    middles = np.array([[region.x_min, region.y_min]]) + half
+    corners = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    while len(middles) <= _MOST_CELLS:
+        clearances = world.clearances(middles)
+        if (clearances >= _REGION_CLEARANCE).any():
+            return True
+        reach = float(np.hypot(*half))
+        undecided = middles[clearances + reach >= _REGION_CLEARANCE]
+        if reach < _FINEST / 2 or not len(undecided):
+            return False
+        half = half / 2
+        middles = (undecided[:, None] + corners * half).reshape(-1, 2)
+    return None
 
 
 def save_world(world: World, path: str | os.PathLike[str]) -> None:

@@ -5,12 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+LARGEST_SIDE: Final = 1000.0
+"""No room is wider or deeper than this [m]."""
+MOST_OBSTACLES: Final = 200
+"""No room has more obstacles: first paths among 200 take seconds, among 2,000 they take hours."""
+_CHUNK: Final = 2_000_000
+"""Distances between points and obstacles that are computed at once."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +86,15 @@ class World:
 
     Args:
         name: What messages and pictures call it.
-        size: Inner width and depth (x, y) [m]; the walls stand around it.
+        size: Inner width and depth (x, y) [m], at most 1,000 each; the walls stand around it.
         boxes: Obstacles with straight sides.
-        cylinders: Round obstacles.
+        cylinders: Round obstacles; with the boxes at most 200.
         start_regions: Where an episode may start; empty: anywhere in the room.
         goal_regions: Where a goal may lie; empty: anywhere in the room.
 
     Raises:
-        ValueError: If the size is not positive or something does not lie in the room.
+        ValueError: If the size is out of its range, there are too many obstacles, or something does
+            not lie in the room.
 
     Examples:
         >>> from mpfa_envs import Box, World
@@ -105,6 +113,13 @@ class World:
     def __post_init__(self) -> None:
         if len(self.size) != 2 or not all(math.isfinite(side) and side > 0 for side in self.size):
             raise ValueError(f"size must be two positive lengths, got {self.size}")
+        if max(self.size) > LARGEST_SIDE:
+            raise ValueError(f"size must be at most {LARGEST_SIDE:g} m, got {self.size}")
+        obstacles = len(self.boxes) + len(self.cylinders)
+        if obstacles > MOST_OBSTACLES:
+            raise ValueError(
+                f"boxes and cylinders must be at most {MOST_OBSTACLES} in all, got {obstacles}"
+            )
         for field in ("boxes", "start_regions", "goal_regions"):
             for box in getattr(self, field):
                 if not self.holds(box):
@@ -186,4 +201,32 @@ class World:
         if self.cylinders:
             centers, radii = self._cylinder_arrays
             nearest = min(nearest, float((np.hypot(*(centers - ((x,), (y,)))) - radii).min()))
+        return nearest
+
+    def clearances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Measure the distance from many points to the nearest obstacle or wall.
+
+        Args:
+            points: Positions, shape ``[N, 2]`` [m].
+
+        Returns:
+            Distances, shape ``[N]`` [m], negative in an obstacle and behind a wall.
+        """
+        x, y = points[:, 0], points[:, 1]
+        nearest = np.minimum(self.size[0] / 2 - np.abs(x), self.size[1] / 2 - np.abs(y))
+        edges = np.array(self._edges).reshape(-1, 4).T
+        (center_x, center_y), radii = self._cylinder_arrays
+        rows = max(1, _CHUNK // max(1, len(self._edges) + len(radii)))
+        for first in range(0, len(points), rows):
+            part = slice(first, first + rows)
+            px, py = x[part, None], y[part, None]
+            # How far outside of each box; negative inside.
+            across = np.maximum(edges[0] - px, px - edges[2])
+            up = np.maximum(edges[1] - py, py - edges[3])
+            outside = np.hypot(np.maximum(across, 0.0), np.maximum(up, 0.0))
+            to_boxes = outside + np.minimum(np.maximum(across, up), 0.0)
+            to_circles = np.hypot(center_x - px, center_y - py) - radii
+            for gaps in (to_boxes, to_circles):
+                if gaps.size:
+                    nearest[part] = np.minimum(nearest[part], gaps.min(axis=1))
         return nearest

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,12 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
             5,
             "an entry of goal has no point 0.5 m from every obstacle",
         ),
+        ("size: [1e308, 1e308]\n", 1, r"size must be at most 1000 m, got \(1e\+308, 1e\+308\)"),
+        (
+            "size: [500, 500]\nboxes:\n" + "  - {x_min: 0, x_max: 1, y_min: 0, y_max: 1}\n" * 201,
+            1,
+            "boxes and cylinders must be at most 200 in all, got 201",
+        ),
         ("size: [4, 4\nboxes: 1\n", 2, "is not YAML"),
         ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),
     ],
@@ -91,6 +98,58 @@ def test_a_bad_file_is_refused_with_its_line(
     path.write_text(text)
     with pytest.raises(WorldFileError, match=f"bad.yaml:{line}: .*{message}"):
         load_world(path)
+
+
+@pytest.mark.parametrize("open_, close", [("[", "]"), ("{a: ", "}"), ("- ", "")])
+def test_a_file_that_is_nested_deeply_is_refused(open_: str, close: str, tmp_path: Path) -> None:
+    path = tmp_path / "deep.yaml"
+    path.write_text("size: " + open_ * 2000 + close * 2000)
+    with pytest.raises(WorldFileError, match=r"deep.yaml.*(nested too deeply|is not YAML)"):
+        load_world(path)
+
+
+def test_a_file_that_is_too_long_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "long.yaml"
+    path.write_text("#" * 1_000_001)
+    with pytest.raises(WorldFileError, match=r"long.yaml: has 1000001 characters, more than"):
+        load_world(path)
+
+
+FENCES = "\n".join(
+    f"  - {{x_min: {x}, x_max: {x + 0.5}, y_min: -499, y_max: 499}}" for x in range(-100, 100)
+)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "message"),
+    [
+        ("  - {x_min: -400, x_max: 400, y_min: -400, y_max: 400}", "has no point 0.5 m"),
+        # Passages that are a little too narrow, 200 of them, each of 1 km.
+        (FENCES, "is too large to find a point 0.5 m|has no point 0.5 m"),
+    ],
+)
+def test_a_large_region_without_room_is_refused_soon(
+    boxes: str, message: str, tmp_path: Path
+) -> None:
+    region = "start:\n  - {x_min: -99, x_max: 99, y_min: -400, y_max: 400}\n"
+    path = tmp_path / "large.yaml"
+    path.write_text(f"size: [1000, 1000]\nboxes:\n{boxes}\n{region}")
+    start = time.process_time()
+    with pytest.raises(WorldFileError, match=message):
+        load_world(path)
+    assert time.process_time() - start < 10.0
+
+
+def test_a_region_with_a_little_room_somewhere_is_taken(tmp_path: Path) -> None:
+    text = """size: [200, 200]
+boxes:
+  - {x_min: -100, x_max: 63.1, y_min: -100, y_max: 100}
+  - {x_min: 64.2, x_max: 100, y_min: -100, y_max: 100}
+start:
+  - {x_min: -90, x_max: 90, y_min: -90, y_max: 90}
+"""
+    (tmp_path / "slit.yaml").write_text(text)
+    assert len(load_world(tmp_path / "slit.yaml").start_regions) == 1
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

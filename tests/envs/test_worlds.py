@@ -139,3 +139,19 @@ def test_a_world_without_a_task_is_an_error_and_not_an_endless_search(
     env = NavigationEnv(world=world, physics="kinematic")
     with pytest.raises(ValueError, match=message):
         env.reset(seed=0)
+
+
+def test_clearances_of_many_points_are_those_of_each() -> None:
+    world = World(
+        name="both",
+        size=(10.0, 6.0),
+        boxes=(Box(-4.0, -2.0, -1.0, 2.0), Box(-2.0, -1.0, 0.0, 1.0)),
+        cylinders=(Cylinder(2.0, 0.0, 1.0),),
+    )
+    points = np.random.default_rng(0).uniform(-6.0, 6.0, (500, 2))
+    found = world.clearances(points)
+    expected = [world.clearance(x, y) for x, y in points.tolist()]
+    # In a box the one says 0, the other how deep.
+    np.testing.assert_allclose(np.where(np.array(expected) == 0.0, 0.0, found), expected)
+    assert world.clearances(np.array([[-3.0, 0.5]])) == pytest.approx(-1.0)
+    assert world.clearances(np.empty((0, 2))).shape == (0,)

@@ -1,0 +1,75 @@
+"""Checks of arguments, with errors that name the argument and the value."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def check_number(name: str, value: Any) -> float:
+    """A finite number.
+
+    Raises:
+        ValueError: If it is none.
+
+    Examples:
+        >>> check_number("goal_reward", 10)
+        10.0
+    """
+    if isinstance(value, (bool, str, bytes)):
+        raise ValueError(f"{name} must be a finite number, got {value!r}")
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be a finite number, got {value!r}")
+    return number
+
+
+def check_positive(name: str, value: Any) -> float:
+    """A finite number above zero.
+
+    Raises:
+        ValueError: If it is none.
+
+    Examples:
+        >>> check_positive("time_step", "0.1")
+        Traceback (most recent call last):
+        ...
+        ValueError: time_step must be a finite number, got '0.1'
+    """
+    number = check_number(name, value)
+    if number <= 0.0:
+        raise ValueError(f"{name} must be positive, got {value!r}")
+    return number
+
+
+def check_share(name: str, value: Any) -> float:
+    """A number in [0, 1].
+
+    Raises:
+        ValueError: If it is none.
+    """
+    number = check_number(name, value)
+    if not 0.0 <= number <= 1.0:
+        raise ValueError(f"{name} must be in [0, 1], got {value!r}")
+    return number
+
+
+def check_count(name: str, value: Any, *, least: int = 1) -> int:
+    """An integer of at least ``least``.
+
+    Raises:
+        ValueError: If it is none.
+
+    Examples:
+        >>> check_count("seed", -1, least=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: seed must be an integer of at least 0, got -1
+    """
+    if isinstance(value, bool) or not hasattr(value, "__index__") or value.__index__() < least:
+        what = "a positive integer" if least == 1 else f"an integer of at least {least}"
+        raise ValueError(f"{name} must be {what}, got {value!r}")
+    return int(value)

@@ -1,0 +1,37 @@
+"""A simulation that nobody holds any more is gone, whether or not anyone closed it."""
+
+from __future__ import annotations
+
+import gc
+
+import pybullet
+
+from mpfa_envs import NavigationEnv
+
+
+def servers() -> int:
+    return sum(bool(pybullet.isConnected(client)) for client in range(1000))
+
+
+def test_sixty_environments_that_are_dropped_leave_no_server() -> None:
+    gc.collect()
+    before = servers()
+    for seed in range(60):
+        env = NavigationEnv(world="A")
+        env.reset(seed=seed)
+        del env
+    gc.collect()
+    assert servers() == before
+
+
+def test_a_closed_server_is_not_closed_again_when_its_number_is_another_ones() -> None:
+    first = NavigationEnv(world="A")
+    number = first._drive.simulation.client
+    first.close()
+    second = NavigationEnv(world="A")
+    assert second._drive.simulation.client == number
+    del first
+    gc.collect()
+    second.reset(seed=0)
+    second.step([0.0, 0.0])
+    second.close()
