@@ -70,7 +70,8 @@ def make_trainer(
     """
     torch.manual_seed(seed)
     env = make_env(world=world, seed=seed)
-    actor, critic = (make(24, 2, width=sizes.width) for make in (make_actor, make_critic))
+    actor = make_actor(24, 2, action_spec=env.action_spec, width=sizes.width)
+    critic = make_critic(24, 2, width=sizes.width)
     # The trainer copies the loss's actor over the collector's policy: both have the noise, which
     # the loss leaves out when it calls the actor.
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)

@@ -51,7 +51,7 @@ from torchrl_mpfa.configs import (
     SignalTensorStorageConfig,
     StochasticActorConfig,
 )
-from torchrl_mpfa.trainer import PriorityGuard
+from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*Trainer is an experimental"),
@@ -277,35 +277,56 @@ def test_every_configuration_is_in_a_group_that_torchrl_has() -> None:
         assert others - {own for at, own in CONFIGS if at == group}, group
 
 
-def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
+def parts_of(algorithm: str) -> list[str]:
+    """Groups and values of a trainer of TorchRL with the loss of the same algorithm."""
     choices = {
         **{"sampler": "mpfa", "storage": "signal_tensor", "replay_buffer": "signal"},
-        **{"loss": "signal_td3", "trainer": "td3", "collector": "sync", "optimizer": "adam"},
+        **{"loss": f"signal_{algorithm}", "trainer": algorithm},
+        **{"collector": "sync", "optimizer": "adam"},
         **{"env": "navigation", "target_net_updater": "soft"},
         **{"network@actor": "signal_actor", "network@critic": "signal_critic"},
     }
+    if algorithm == "sac":
+        choices["network@actor"] = "signal_stochastic_actor"
     values = {
         **{"replay_buffer.storage": "${storage}", "replay_buffer.sampler": "${sampler}"},
         **{"storage.max_size": 100, "replay_buffer.batch_size": 4},
         **{f"{net}.observation_size": 24 for net in ("actor", "critic")},
         **{f"{net}.action_size": 2 for net in ("actor", "critic")},
-        **{"env._partial_": "true", "loss._partial_": "true", "collector._partial_": "true"},
+        **{"env._partial_": "true"},
         **{"collector.create_env_fn": "${env}", "collector.frames_per_batch": 20},
         **{"collector.total_frames": 60, "trainer.total_frames": 60},
         **{"collector.auto_register_policy_transforms": "true"},
         **{f"trainer.{part}": f"${{{part}}}" for part in ("collector", "optimizer")},
         **{"trainer.replay_buffer": "${replay_buffer}", "trainer.loss_module": "${loss}"},
-        **{"trainer.actor_network": "${actor}", "trainer.qvalue_network": "${critic}"},
         **{"trainer.target_net_updater": "${target_net_updater}", "trainer.logger": "null"},
         **{"trainer.save_trainer_file": "null", "trainer.progress_bar": "false"},
         **{"trainer.optim_steps_per_batch": 3},
     }
     overrides = [f"+{group}={name}" for group, name in choices.items()]
-    config = compose(overrides=overrides + [f"{key}={value}" for key, value in values.items()])
-    trainer = instantiate(config.trainer)
+    return overrides + [f"{key}={value}" for key, value in values.items()]
+
+
+def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
+    more = ["loss._partial_=true", "collector._partial_=true"]
+    more += ["trainer.actor_network=${actor}", "trainer.qvalue_network=${critic}"]
+    trainer = instantiate(compose(overrides=parts_of("td3") + more).trainer)
     PriorityGuard().register(trainer)
     trainer.train()
     assert type(trainer.loss_module) is SignalTD3Loss
+    assert_learned(trainer, "td_error", "action_gradient")
+
+
+def test_sac_in_torchrls_sac_trainer_updates_priorities() -> None:
+    more = ["collector.policy=${actor}", "loss.actor_network=${actor}"]
+    more += ["loss.qvalue_network=${critic}", "loss.reward_scale=0.1", "loss.alpha_init=0.2"]
+    more += ["trainer.log_rewards=false"]
+    trainer = instantiate(compose(overrides=parts_of("sac") + more).trainer)
+    PriorityStepper().register(trainer)
+    PriorityGuard().register(trainer)
+    trainer.train()
+    assert type(trainer.loss_module) is SignalSACLoss
+    assert float(trainer.loss_module.alpha_init) == pytest.approx(0.2)
     assert_learned(trainer, "td_error", "action_gradient")
 
 
