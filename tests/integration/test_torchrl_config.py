@@ -272,6 +272,8 @@ def test_every_option_of_a_loss_is_a_field_and_the_other_way_around(
 def test_every_configuration_is_in_a_group_that_torchrl_has() -> None:
     repo = ConfigStore.instance().repo
     for group, name in CONFIGS:
+        if group == "replay":
+            continue  # Whole methods with their selection, which TorchRL has no place for.
         others = {file.removesuffix(".yaml") for file in repo[group]}
         assert name in others
         assert others - {own for at, own in CONFIGS if at == group}, group

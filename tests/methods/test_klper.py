@@ -17,18 +17,23 @@ def seeded(seed):
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
-@pytest.mark.parametrize("variance", [0.01, 0.5])
-def test_the_divergence_is_that_of_two_gaussians(size, variance):
+def test_deviations_wider_than_the_noise_have_the_divergence_of_two_gaussians(size):
     deviation = torch.randn(3, 64, size, generator=seeded(size)).double() * 0.3 + 0.1
-    found = gaussian_divergence(deviation, variance=variance)
+    found = gaussian_divergence(deviation, variance=0.01)
     for batch, value in zip(deviation, found, strict=True):
         mean = batch.mean(0)
-        covariance = (batch - mean).T @ (batch - mean) / len(batch) + 1e-6 * torch.eye(size)
-        reference = MultivariateNormal(
-            torch.zeros(size).double(), variance * torch.eye(size).double()
-        )
+        covariance = (batch - mean).T @ (batch - mean) / len(batch)
+        reference = MultivariateNormal(torch.zeros(size).double(), 0.01 * torch.eye(size).double())
         expected = kl_divergence(MultivariateNormal(mean, covariance), reference)
         torch.testing.assert_close(value, expected)
+
+
+def test_deviations_narrower_than_the_noise_are_no_further_from_the_policy():
+    deviation = torch.randn(64, 2, generator=seeded(1)).double() * 0.3
+    mean = deviation.mean(0)
+    found = gaussian_divergence(deviation, variance=0.5)
+    torch.testing.assert_close(found, 0.5 * mean.square().sum() / 0.5)
+    assert gaussian_divergence(deviation - mean, variance=0.5) < 1e-12
 
 
 def test_the_divergence_of_one_number_by_hand():
@@ -39,6 +44,39 @@ def test_the_divergence_of_one_number_by_hand():
 
 def test_equal_deviations_have_a_finite_divergence():
     assert gaussian_divergence(torch.full((8, 2), 0.5), variance=0.04).isfinite()
+
+
+def mixed_batches(sigma, *, spread, generator, count=256):
+    """Three batches, each half the policy's and half uniformly random, and their shares of it.
+
+    Each transition of the policy's has the noise of an episode of its own, as the scripts have it,
+    and is clipped to the range of actions.
+    """
+    policy = torch.tanh(torch.randn(3, count, 2, generator=generator) * spread)
+    own = torch.rand(3, count, 1, generator=generator) < 0.5
+    noise = torch.randn(3, count, 2, generator=generator) * sigma
+    noise = noise * torch.rand(3, count, 1, generator=generator)
+    uniform = torch.rand(3, count, 2, generator=generator) * 2 - 1
+    action = torch.where(own, (policy + noise).clamp(-1, 1), uniform)
+    return action - policy, own.squeeze(-1)
+
+
+@pytest.mark.parametrize("spread", [0.003, 0.5, 1.5])
+@pytest.mark.parametrize("sigma", [0.2, 0.6, 0.8, 1.0])
+def test_uniformly_random_actions_do_not_score_better_than_the_policys(sigma, spread):
+    generator, better, share = seeded(3), 0, 0.0
+    for _ in range(150):
+        deviation, own = mixed_batches(sigma, spread=spread, generator=generator)
+        # The noise of the episode that acts, anything between none and all of it.
+        variance = max((sigma * float(torch.rand((), generator=generator))) ** 2, 1e-3)
+        flat, mask = deviation.reshape(-1, 2), own.reshape(-1)
+        both = torch.stack((flat[mask][:256], flat[~mask][:256]))
+        mine, others = gaussian_divergence(both, variance=variance)
+        better += bool(mine < others)
+        chosen = int(gaussian_divergence(deviation, variance=variance).argmin())
+        share += float(own[chosen].double().mean()) - float(own.double().mean())
+    assert better > 0.7 * 150
+    assert share > 0
 
 
 def drawn(policy, shifts, *, count=64, sigma=0.2):
@@ -68,8 +106,8 @@ def test_the_present_noise_is_asked_for_at_each_batch():
     asked = iter([0.2, 0.7])
     select = LowestDivergence(policy, batches=2, sigma=lambda: next(asked))
     wide = drawn(policy, [0.0, 0.0], sigma=0.7)
-    narrow = drawn(policy, [0.0, 0.0], sigma=0.2)
-    both = torch.cat([narrow[:64], wide[64:]])
+    shifted = drawn(policy, [0.4, 0.4], sigma=0.1)
+    both = torch.cat([shifted[:64], wide[64:]])
     assert select(both)["number"][0] == 0
     assert select(both)["number"][0] == 64
 

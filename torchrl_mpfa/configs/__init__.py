@@ -2,8 +2,11 @@
 
 TorchRL composes trainers out of groups of configurations (``torchrl.trainers.algorithms.configs``).
 :func:`register_configs` adds those of this package to them: ``sampler=mpfa``,
-``storage=signal_tensor``, ``replay_buffer=signal``, ``loss=signal_ddpg``. Hydra is needed here and
-nowhere else in the package, which does not import this module by itself.
+``storage=signal_tensor``, ``replay_buffer=signal``, ``loss=signal_ddpg``. A whole method is one
+entry: ``replay_buffer=signal_mpfa_per`` is its buffer, and ``replay=la3p``, in a group of this
+package, is what :func:`~torchrl_mpfa.methods.make_replay` makes, with the selection that LA3P and
+KLPER need. Hydra is needed here and nowhere else in the package, which does not import this module
+by itself.
 """
 
 from torchrl.trainers.algorithms.configs import ConfigStore
@@ -18,6 +21,7 @@ from torchrl_mpfa.configs.learning import (
     SignalTD3LossConfig,
     StochasticActorConfig,
 )
+from torchrl_mpfa.configs.methods import METHOD_CONFIGS
 from torchrl_mpfa.configs.replay import (
     MPFASamplerConfig,
     SignalMemmapStorageConfig,
@@ -58,8 +62,9 @@ CONFIGS: dict[tuple[str, str], type] = {
     ("network", "signal_critic"): CriticConfig,
     ("hook", "priority_stepper"): PriorityStepperConfig,
     ("hook", "priority_guard"): PriorityGuardConfig,
+    **METHOD_CONFIGS,
 }
-"""The configurations by TorchRL's group and by name."""
+"""The configurations by group, TorchRL's or ``replay``, and by name."""
 
 
 def register_configs() -> None:

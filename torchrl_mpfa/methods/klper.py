@@ -5,7 +5,8 @@ batch prioritized experience replay", https://arxiv.org/abs/2111.01865. **A reco
 abstract says that batches are prioritized, not transitions, and that the most on-policy one is
 used. The measure here, the Kullback-Leibler divergence of a Gaussian fitted to the deviations of
 the stored actions from the policy's, is that of a later method of the same group; the number of
-batches and the direction of the divergence are our reading.
+batches, the direction of the divergence, and that actions nearer to the policy than its noise are
+no further from it, are our reading.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
-_JITTER = 1e-6
 _LEAST_VARIANCE = 1e-3
 
 
@@ -28,12 +28,17 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
     r"""How far actions are from the policy's, against noise of a known variance.
 
     A Gaussian with mean :math:`m` and covariance :math:`C` is fitted to the deviations of each
-    batch, and its divergence from :math:`N(0, v I)` is
+    batch. With the eigenvalues :math:`\lambda_i` of :math:`C`, but none below :math:`v`, the
+    divergence from :math:`N(0, v I)` is
 
     .. math::
 
-        \tfrac12 \left( \frac{\operatorname{tr} C}{v} + \frac{m^\top m}{v} - d + d \ln v
-        - \ln\det C \right)
+        \tfrac12 \left( \sum_i \Big( \frac{\lambda_i}{v} - 1 - \ln \frac{\lambda_i}{v} \Big)
+        + \frac{m^\top m}{v} \right)
+
+    Without that bound, deviations *smaller* than the noise would count as far from the policy: of
+    past episodes with less noise, of actions that were clipped to their range. Uniformly random
+    actions, which are as wide as a noise of :math:`1/\sqrt3`, would then score better.
 
     Args:
         deviation: Stored actions less those of the policy, shape ``[..., B, A]``.
@@ -53,16 +58,12 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
     """
     if not 0.0 < variance < math.inf:
         raise ValueError(f"variance must be positive and finite, got {variance}")
-    deviation = deviation.double()  # The logarithm of a small determinant.
-    size = deviation.shape[-1]
+    deviation = deviation.double()
     mean = deviation.mean(-2)
     centered = deviation - mean.unsqueeze(-2)
     covariance = centered.mT @ centered / deviation.shape[-2]
-    # Batches whose actions all deviate by the same would have no determinant.
-    covariance = covariance + _JITTER * torch.eye(size, dtype=torch.double, device=mean.device)
-    trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-    spread = (trace + mean.square().sum(-1)) / variance
-    return 0.5 * (spread - size + size * math.log(variance) - torch.logdet(covariance))
+    wider = (torch.linalg.eigvalsh(covariance) / variance).clamp_min(1.0)
+    return 0.5 * ((wider - 1.0 - wider.log()).sum(-1) + mean.square().sum(-1) / variance)
 
 
 class LowestDivergence:
@@ -76,8 +77,8 @@ class LowestDivergence:
     Args:
         policy: The current policy; reads what its ``in_keys`` name, writes the action.
         batches: Number of batches ``K`` to choose from.
-        sigma: Standard deviation of the exploration noise, or a function that tells the present
-            one, in units of the action.
+        sigma: Standard deviation of the exploration noise in units of the action, or a function
+            that tells that of the episode that acts.
         action_key: Key of the action.
 
     Raises:

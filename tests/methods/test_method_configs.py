@@ -1,0 +1,58 @@
+"""Every method out of Hydra's groups, with every setting of the catalogue as a field."""
+
+from dataclasses import fields
+
+import pytest
+from hydra import compose, initialize
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from torchrl_mpfa import SignalReplayBuffer, make_actor
+from torchrl_mpfa.configs import CONFIGS, register_configs
+from torchrl_mpfa.methods import METHODS, Method, Replay
+
+SMALL = ["capacity=32", "batch_size=4"]
+CHOOSY = {"la3p", "klper"}
+
+
+@pytest.fixture
+def composed():
+    register_configs()
+    with initialize(version_base=None, config_path=None):
+        yield lambda *overrides: compose(overrides=list(overrides))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_is_made_by_its_name(composed, name):
+    config = composed(f"+replay={name}", *(f"replay.{each}" for each in SMALL)).replay
+    more = {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if name == "klper" else {}
+    replay = instantiate(config, **more)
+    assert isinstance(replay, Replay)
+    expected = {**vars(METHODS[name]), "capacity": 32, "batch_size": 4}
+    assert vars(replay.method) == expected
+
+
+@pytest.mark.parametrize("name", sorted(set(METHODS) - CHOOSY))
+def test_a_method_of_one_batch_is_a_buffer_in_torchrls_group(composed, name):
+    overrides = [f"replay_buffer.{each}" for each in (*SMALL, "alpha=0.3", "positive_above=mean")]
+    buffer = instantiate(composed(f"+replay_buffer=signal_{name}", *overrides).replay_buffer)
+    assert isinstance(buffer, SignalReplayBuffer)
+    assert buffer.batch_size == 4
+    if hasattr(buffer.sampler, "alpha"):
+        assert buffer.sampler.alpha == 0.3
+
+
+def test_methods_that_choose_their_batches_are_no_buffer_alone(composed):
+    assert not any(("replay_buffer", f"signal_{name}") in CONFIGS for name in CHOOSY)
+    overrides = ["+replay_buffer=signal_lap", "replay_buffer.selection=split"]
+    with pytest.raises(Exception, match="method 'lap' chooses the batches of a step itself"):
+        instantiate(composed(*overrides).replay_buffer)
+    with pytest.raises(Exception, match="method 'klper' needs policy and sigma"):
+        instantiate(composed("+replay=klper").replay)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_setting_is_a_field_with_the_default_of_the_method(name):
+    config = OmegaConf.structured(CONFIGS["replay", name])
+    for setting in fields(Method):
+        assert config[setting.name] == getattr(METHODS[name], setting.name)
