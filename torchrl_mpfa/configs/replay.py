@@ -83,6 +83,7 @@ class SignalTensorStorageConfig(LazyTensorStorageConfig):
 
     signals: list[Any] = field(default_factory=_mpfa_signals)
     reward_key: Any = ("next", "reward")
+    allow_nonfinite: list[Any] = field(default_factory=list)
     _target_: str = "torchrl_mpfa.configs.replay._make_tensor_storage"
     _convert_: str = "all"
 
@@ -99,6 +100,7 @@ class SignalMemmapStorageConfig(LazyMemmapStorageConfig):
 
     signals: list[Any] = field(default_factory=_mpfa_signals)
     reward_key: Any = ("next", "reward")
+    allow_nonfinite: list[Any] = field(default_factory=list)
     _target_: str = "torchrl_mpfa.configs.replay._make_memmap_storage"
     _convert_: str = "all"
 
@@ -132,15 +134,25 @@ def _make_mpfa_sampler(*, signals: Sequence[Any], **kwargs: Any) -> MPFASampler:
 
 
 def _make_tensor_storage(
-    *, signals: Sequence[Any], reward_key: Any, **kwargs: Any
+    *, signals: Sequence[Any], reward_key: Any, allow_nonfinite: Sequence[Any], **kwargs: Any
 ) -> SignalTensorStorage:
-    return SignalTensorStorage(signals=_signals(signals), reward_key=_key(reward_key), **kwargs)
+    return SignalTensorStorage(
+        signals=_signals(signals),
+        reward_key=_key(reward_key),
+        allow_nonfinite=[_key(key) for key in allow_nonfinite],
+        **kwargs,
+    )
 
 
 def _make_memmap_storage(
-    *, signals: Sequence[Any], reward_key: Any, **kwargs: Any
+    *, signals: Sequence[Any], reward_key: Any, allow_nonfinite: Sequence[Any], **kwargs: Any
 ) -> SignalMemmapStorage:
-    return SignalMemmapStorage(signals=_signals(signals), reward_key=_key(reward_key), **kwargs)
+    return SignalMemmapStorage(
+        signals=_signals(signals),
+        reward_key=_key(reward_key),
+        allow_nonfinite=[_key(key) for key in allow_nonfinite],
+        **kwargs,
+    )
 
 
 def _key(key: Any) -> Any:

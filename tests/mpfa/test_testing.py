@@ -1,0 +1,196 @@
+"""The checks for parts of one's own: all of ours pass, and broken ones are caught."""
+
+import pytest
+import torch
+
+from torchrl_mpfa import (
+    EntropyFusion,
+    FixedFusion,
+    MPFASampler,
+    PositiveBoost,
+    PositiveDecay,
+    ScaledFusion,
+    ScheduledFusion,
+    SignalSampler,
+)
+from torchrl_mpfa.methods import (
+    RELATIVE_ERROR,
+    RELATIVE_VALUE,
+    CappedSampler,
+    LA3PSampler,
+    PriorityFloor,
+    RankSampler,
+    ReplayPenalty,
+    value_schedule,
+)
+from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
+
+
+@pytest.mark.parametrize(
+    "adjustment",
+    [
+        PositiveBoost(),
+        PositiveBoost(bound="cap", positive_above="mean"),
+        PositiveDecay(),
+        PositiveDecay(position="rank"),
+        PositiveDecay(position="count", positive_above=1.0),
+        PriorityFloor(1.0),
+        ReplayPenalty(),
+    ],
+)
+def test_our_adjustments_pass(adjustment):
+    check_adjustment(adjustment)
+
+
+@pytest.mark.parametrize(
+    ("fusion", "signals"),
+    [
+        (EntropyFusion(), ["reward", "td_error", "action_gradient"]),
+        (EntropyFusion(population="batch", floor=0.1), ["reward", "novelty"]),
+        (EntropyFusion(positive_above="mean"), ["td_error", "action_gradient"]),
+        (FixedFusion({"td_error": 1.0}), ["reward", "td_error"]),
+        (ScaledFusion(FixedFusion({"reward": 1.0, "td_error": 1.0})), ["reward", "td_error"]),
+        (ScheduledFusion({"reward": 1.0}, {"td_error": 1.0}), ["reward", "td_error"]),
+        (value_schedule(), [RELATIVE_VALUE, RELATIVE_ERROR]),
+    ],
+)
+def test_our_fusions_pass(fusion, signals):
+    check_fusion(fusion, signals)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: MPFASampler(40),
+        lambda: MPFASampler(40, stratified=True, max_priority_within_buffer=False),
+        lambda: SignalSampler(40, 0.6, 0.4, 0.05, dtype=torch.double),
+        lambda: SignalSampler(40, 0.0, 0.4),
+        lambda: RankSampler(40, 0.7, 0.5, 0.05),
+        lambda: CappedSampler(40, 0.6, 0.4, 0.05, replay_cap=1000),
+        lambda: LA3PSampler(40, 0.4, 0.0, 0.01),
+    ],
+    ids=["mpfa", "stratified", "double", "uniform", "rank", "capped", "la3p"],
+)
+def test_our_samplers_pass(make):
+    check_sampler(make)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (lambda priority, batch: priority[:1], r"must have shape \[2\], got shape \[1\]"),
+        (lambda priority, batch: 3.0, r"must have shape \[1\], got float"),
+        (lambda priority, batch: -priority, "must be finite and not negative, got -"),
+        (lambda priority, batch: priority / 0.0, "must be finite and not negative, got inf"),
+        (lambda priority, batch: priority.mul_(2.0), "must not change what it is given"),
+        (lambda priority, batch: priority * torch.rand(()), "the same for the same batch"),
+    ],
+)
+def test_broken_adjustments_are_caught(broken, message):
+    with pytest.raises(AssertionError, match=message):
+        check_adjustment(broken)
+
+
+class Broken:
+    def __init__(self, weigh):
+        self.weights = weigh
+
+
+def scribble(names, table, index):
+    table.rows[:10] = 1.0
+    return torch.ones(len(names))
+
+
+@pytest.mark.parametrize(
+    ("weigh", "message"),
+    [
+        (lambda names, table, index: torch.ones(1), "one weight for each of"),
+        (lambda names, table, index: [1.0] * len(names), "one weight for each of .*got list"),
+        (
+            lambda names, table, index: torch.zeros(len(names)),
+            "one of the weights must be positive",
+        ),
+        (lambda names, table, index: -torch.ones(len(names)), "weights must be finite and not neg"),
+        (lambda names, table, index: table.rewards.mean().log().expand(3), "got nan|got -inf"),
+        (lambda names, table, index: torch.arange(1.0, 4.0), "must follow the order of names"),
+        (scribble, "must not change the signals of the buffer"),
+    ],
+)
+def test_broken_fusions_are_caught(weigh, message):
+    with pytest.raises(AssertionError, match=message):
+        check_fusion(Broken(weigh))
+    with pytest.raises(AssertionError, match="must have a method 'weights'"):
+        check_fusion(object())
+
+
+class DrawsSlotZero(SignalSampler):
+    def _draw(self, size, batch_size):
+        index, weight = super()._draw(size, batch_size)
+        return torch.where(torch.rand(batch_size, generator=self._rng) < 0.1, 0, index), weight
+
+
+class GivesNegativeWeights(SignalSampler):
+    def _draw(self, size, batch_size):
+        index, weight = super()._draw(size, batch_size)
+        return index, -weight
+
+
+class DrawsTooFew(SignalSampler):
+    def _draw(self, size, batch_size):
+        index, weight = super()._draw(size, batch_size)
+        return index[1:], weight[1:]
+
+
+class KeepsACountToItself(SignalSampler):
+    """Draws depend on a count that is not saved."""
+
+    drawn = 0
+
+    def _draw(self, size, batch_size):
+        self.drawn += 1
+        index, weight = super()._draw(size, batch_size)
+        return (index + self.drawn) % size, weight
+
+
+class ForgetsAlpha(SignalSampler):
+    def load_state_dict(self, state_dict):
+        super().load_state_dict(state_dict)
+        self._alpha = 0.123
+
+
+class TakesEverything(SignalSampler):
+    def _checked(self, priority):
+        return 1.0
+
+
+class ChangesFirst(SignalSampler):
+    def update_priority(self, index, priority, *, storage=None):
+        self._beta += 0.1
+        super().update_priority(index, priority, storage=storage)
+
+
+class LoadsAnything(SignalSampler):
+    def check_state(self, state_dict):
+        pass
+
+    def load_state_dict(self, state_dict):
+        if len(state_dict) == len(self.state_dict()):
+            super().load_state_dict(state_dict)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (DrawsSlotZero, "slot 0 must be drawn with probability"),
+        (GivesNegativeWeights, r"priority_weight must be in \(0, 1\]"),
+        (DrawsTooFew, "a batch must have 16 integer slots"),
+        (KeepsACountToItself, "must draw as the one that saved it"),
+        (ForgetsAlpha, "must have that state"),
+        (TakesEverything, "a priority of nan must be refused"),
+        (ChangesFirst, "was refused, but changed the sampler"),
+        (LoadsAnything, "a state without .* must be refused"),
+    ],
+)
+def test_broken_samplers_are_caught(broken, message):
+    with pytest.raises(AssertionError, match=message):
+        check_sampler(lambda: broken(40, 0.6, 0.4, 0.05))
