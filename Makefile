@@ -45,10 +45,10 @@ demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minu
 	@echo "== training on map A, $(EPISODES) episodes; Ctrl-C stops after the current one"
 	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: A, episodes: $(EPISODES)}]' $(ARGS)
 	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
-	$(BIN)/python examples/evaluate.py runs/demo --world A --episodes $(EPISODES)
+	$(BIN)/python examples/evaluate.py runs/demo --worlds A --episodes $(EPISODES)
 
 train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='method=per seed=1'
-	$(BIN)/python examples/train.py curriculum=paper learner.lr_power=1 learner.compile=$(COMPILE) $(ARGS)
+	$(BIN)/python examples/train.py curriculum=paper learner.compile=$(COMPILE) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
 	$(PYTEST) $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import torch
 
-from assembly import make_curiosity, make_learner
 from benchmarks.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
 from benchmarks.timing import MICROSECONDS, Call, Entry, entry, take_turns
-from methods import ALIASES, METHODS, Method
-from replay_assembly import make_buffer, make_selection
-from settings import Learner
+from navigation.assembly import make_curiosity, make_learner
+from navigation.settings import LearnerSettings
+from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 
 BASELINE = "ddpg"
 _FILL = 10_000
@@ -29,16 +28,16 @@ def make_step(method: Method) -> Call:
     """
     torch.manual_seed(0)
     sizes = OBSERVATION_SIZE, ACTION_SIZE
-    learner = make_learner(Learner(), method, *sizes)
+    learner = make_learner(LearnerSettings(), method, *sizes)
     curiosity = make_curiosity(method, *sizes)
-    buffer = make_buffer(method, seed=0)
+    replay = make_replay(method, policy=learner.policy, sigma=_SIGMA)
+    buffer = replay.buffer
     buffer.extend(make_transitions(_FILL))
-    select = make_selection(method, learner.policy, lambda: _SIGMA)
     transition = make_transitions(1)
 
     def step() -> None:
         buffer.extend(transition)
-        for draw in select(buffer):
+        for draw in replay.select(buffer):
             if curiosity is not None:
                 curiosity(draw.batch)
             learner.update(draw)

@@ -85,16 +85,13 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
                 "[{world: A, episodes: 100}]",
-                "python examples/evaluate.py runs/demo --world A --episodes 100",
+                "python examples/evaluate.py runs/demo --worlds A --episodes 100",
             ],
         ),
-        (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--world A --episodes 2"]),
+        (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--worlds A --episodes 2"]),
         (
             ["train", "COMPILE=false", "ARGS=method=per seed=1"],
-            [
-                "python examples/train.py curriculum=paper learner.lr_power=1 "
-                "learner.compile=false method=per seed=1"
-            ],
+            ["python examples/train.py curriculum=paper learner.compile=false method=per seed=1"],
         ),
         (["test"], ["python -m pytest"]),
         (["test", "SLOW=1"], ["python -m pytest -m 'slow or not slow'"]),

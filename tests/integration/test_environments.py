@@ -1,32 +1,31 @@
-"""Where a run learns and where it is judged."""
+"""Where a run learns and where its policy is judged."""
 
 from __future__ import annotations
 
 import pytest
 
-from environments import make_evaluation_env, make_training_env
-from settings import Environment
+from mpfa_envs import NavigationEnv
+from navigation.environments import env_arguments, make_training_env
+from navigation.settings import EnvironmentSettings
 
 
 @pytest.mark.parametrize(("robot", "radius"), [("turtlebot2", 0.18), ("burger", 0.105)])
-def test_a_robot_learns_with_a_margin_and_is_judged_by_contact(robot: str, radius: float) -> None:
-    settings = Environment(robot=robot, physics="kinematic", margin=0.1, progress_scale=3.0)
-    training, judging = make_training_env("C", settings), make_evaluation_env("C", settings)
-    learning = training.envs[0]
-    assert learning.collision_distance == pytest.approx(radius + 0.1)
-    assert judging.collision_distance == pytest.approx(radius)
+def test_a_robot_learns_with_a_clearance(robot: str, radius: float) -> None:
+    settings = EnvironmentSettings(
+        robot=robot, physics="kinematic", clearance=0.1, progress_scale=3.0
+    )
+    training = make_training_env("C", settings)
+    assert training.envs[0].collision_distance == pytest.approx(radius + 0.1)
+    assert env_arguments(settings)["closeness_distance"] == pytest.approx(radius + 0.1)
     training.close()
-    judging.close()
-
-
-def test_an_unknown_robot_is_named() -> None:
-    with pytest.raises(ValueError, match=r"robot must be .*got 'burgr'"):
-        make_training_env("C", Environment(robot="burgr"))
 
 
 def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
-    settings = Environment(physics="kinematic", margin=0.1, max_steps=40, action_repeat=3)
-    training, judging = make_training_env("D", settings), make_evaluation_env("D", settings)
+    settings = EnvironmentSettings(
+        physics="kinematic", clearance=0.1, max_steps=40, action_repeat=3
+    )
+    training = make_training_env("D", settings)
+    judging = NavigationEnv(world="D", collision_distance="contact", **env_arguments(settings))
     training.set_seed(1)
     seen = training.reset()["observation"].numpy()
     task = training.envs[0].task

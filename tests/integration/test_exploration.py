@@ -6,8 +6,8 @@ import pytest
 import torch
 from torchrl.data import Bounded
 
-from exploration import NoisyPolicy, RandomPolicy, make_explorer
-from settings import Exploration
+from navigation.exploration import NoisyPolicy, RandomPolicy, make_explorer
+from navigation.settings import ExplorationSettings
 from torchrl_mpfa import make_actor, make_stochastic_actor
 
 SPEC = Bounded(low=-1.0, high=1.0, shape=(2,))
@@ -21,7 +21,7 @@ def deviations(explorer: NoisyPolicy, count: int = 400) -> torch.Tensor:
 
 
 def test_noise_falls_from_its_first_to_its_last_size() -> None:
-    settings = Exploration(sigma=0.3, sigma_end=0.1, annealing_steps=100)
+    settings = ExplorationSettings(sigma=0.3, sigma_end=0.1, annealing_steps=100)
     explorer = NoisyPolicy(make_actor(5, 2), settings, SPEC)
     assert explorer.sigma == pytest.approx(0.3)
     deviations(explorer, 100)
@@ -30,26 +30,27 @@ def test_noise_falls_from_its_first_to_its_last_size() -> None:
 
 
 def test_every_episode_has_its_own_share_of_the_noise_if_that_is_varied() -> None:
-    settings = Exploration(sigma=0.2, sigma_end=0.2, varied=True)
+    settings = ExplorationSettings(sigma=0.2, sigma_end=0.2, varied=True)
     explorer = NoisyPolicy(make_actor(5, 2), settings, SPEC)
     shares = []
     for _ in range(30):
         explorer.begin_episode()
         spread = deviations(explorer, 100).std().item()
         assert spread == pytest.approx(0.2 * explorer.share, rel=0.25, abs=1e-3)
+        assert explorer.sigma == pytest.approx(0.2 * explorer.share)
         shares.append(explorer.share)
     assert min(shares) < 0.15
     assert max(shares) > 0.85
 
 
 def test_without_varying_the_noise_is_the_same_in_all_episodes() -> None:
-    explorer = NoisyPolicy(make_actor(5, 2), Exploration(varied=False), SPEC)
+    explorer = NoisyPolicy(make_actor(5, 2), ExplorationSettings(varied=False), SPEC)
     explorer.begin_episode()
     assert explorer.share == 1.0
 
 
 def test_a_policy_that_is_random_by_itself_gets_no_noise() -> None:
-    explorer = make_explorer(make_stochastic_actor(5, 2), Exploration(), SPEC)
+    explorer = make_explorer(make_stochastic_actor(5, 2), ExplorationSettings(), SPEC)
     assert isinstance(explorer, RandomPolicy)
     with torch.no_grad():
         actions = torch.stack([explorer.act(OBSERVATION) for _ in range(50)])
@@ -58,4 +59,4 @@ def test_a_policy_that_is_random_by_itself_gets_no_noise() -> None:
 
 
 def test_a_deterministic_policy_gets_noise() -> None:
-    assert isinstance(make_explorer(make_actor(5, 2), Exploration(), SPEC), NoisyPolicy)
+    assert isinstance(make_explorer(make_actor(5, 2), ExplorationSettings(), SPEC), NoisyPolicy)

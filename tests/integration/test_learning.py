@@ -8,22 +8,28 @@ from pathlib import Path
 import pytest
 import torch
 
-from evaluation import greedy, run_episodes
-from mpfa_envs import NavigationEnv, evaluation_pairs
-from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
-from training import TrainingRun
+from mpfa_envs import evaluate
+from navigation.evaluating import exported_policy
+from navigation.settings import (
+    GROUPS,
+    CurriculumSettings,
+    EnvironmentSettings,
+    Stage,
+    TrainSettings,
+)
+from navigation.training import TrainingRun
 
 pytestmark = pytest.mark.slow
 # Neither the tasks of training nor those that the documentation reports.
-TASKS = evaluation_pairs("A", 40, 4711)
+SEED = 4711
 
 
 def settings_of(method: str, learner: str, episodes: int) -> TrainSettings:
     settings = TrainSettings(
         method=replace(GROUPS["method"][method]),
         learner=GROUPS["learner"][learner](),
-        curriculum=Curriculum("A", [Stage("A", episodes)]),
-        environment=Environment(physics="kinematic"),
+        curriculum=CurriculumSettings("A", [Stage("A", episodes)]),
+        environment=EnvironmentSettings(physics="kinematic"),
         seed=5,
     )
     settings.tracking.mode = "off"
@@ -31,9 +37,8 @@ def settings_of(method: str, learner: str, episodes: int) -> TrainSettings:
 
 
 def greedy_success(run: TrainingRun) -> float:
-    env = NavigationEnv(world="A", physics="kinematic", collision_distance="contact")
-    results, _ = run_episodes(env, greedy(run.learner.policy), TASKS, progress=False)
-    env.close()
+    policy = exported_policy(run.learner.policy, run.settings)
+    results = evaluate(policy, "A", episodes=40, seed=SEED)
     return sum(result.success for result in results) / len(results)
 
 

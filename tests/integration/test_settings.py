@@ -1,47 +1,79 @@
-"""Settings: Hydra composes them, typed, and a slip of the pen gets a suggestion."""
+"""Settings: Hydra composes them, typed, and each mistake is one sentence."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
-from hydra import compose, initialize
 from hydra.core.global_hydra import GlobalHydra
 
-from overrides import check_overrides
-from settings import GROUPS, Stage, register
-from train import as_settings
+from navigation.checks import RULES, check_settings, settings_by_name
+from navigation.command_line import composed, parse_overrides
+from navigation.settings import GROUPS, Stage, TrainSettings, register
 
 
 @pytest.fixture(autouse=True)
 def hydra_at_work() -> Iterator[None]:
     GlobalHydra.instance().clear()
     register()
-    with initialize(version_base="1.3", config_path=None):
-        yield
+    yield
+
+
+def one(*arguments: str) -> TrainSettings:
+    (settings,) = composed(arguments)
+    return settings
 
 
 def test_the_defaults_are_table_1_of_the_paper() -> None:
-    settings = as_settings(compose("train"))
+    settings = one()
     assert (settings.learner.actor_lr, settings.learner.critic_lr) == (1e-4, 1e-4)
     assert (settings.learner.gamma, settings.learner.tau) == (0.99, 0.01)
     assert (settings.method.capacity, settings.method.batch_size) == (100_000, 256)
 
 
 def test_the_paper_curriculum_has_a_thousand_episodes() -> None:
-    stages = as_settings(compose("train", ["curriculum=paper"])).curriculum.stages
+    stages = one("curriculum=paper").curriculum.stages
     assert stages == [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)]
     assert sum(stage.episodes for stage in stages) == 1000
 
 
 @pytest.mark.parametrize(("group", "choice"), [(g, c) for g, cs in GROUPS.items() for c in cs])
 def test_every_choice_of_every_group_composes(group: str, choice: str) -> None:
-    as_settings(compose("train", [f"{group}={choice}"]))
+    one(f"{group}={choice}")
 
 
 def test_an_override_reaches_the_typed_settings() -> None:
-    settings = as_settings(compose("train", ["method=per", "method.alpha=0.7", "seed=5"]))
+    settings = one("method=per", "method.alpha=0.7", "seed=5")
     assert (settings.method.name, settings.method.alpha, settings.seed) == ("per", 0.7, 5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ([], "A"),
+        (["curriculum=paper"], "paper"),
+        (["curriculum.stages=[{world: D, episodes: 5}]"], "D5"),
+        (["curriculum=paper", "curriculum.stages=[{world: A, episodes: 2}]"], "A2"),
+        (["curriculum.stages=[{world: A, episodes: 3},{world: B, episodes: 4}]"], "A3+B4"),
+        (["curriculum.name=mine", "curriculum.stages=[{world: D, episodes: 5}]"], "mine"),
+    ],
+)
+def test_a_run_is_called_after_the_stages_that_it_has(arguments: list[str], name: str) -> None:
+    settings = one(*arguments)
+    assert settings.curriculum.name == name
+    assert settings.run_dir == f"runs/{name}-mpfa_per-ddpg-0"
+
+
+def test_two_long_curricula_have_two_short_names() -> None:
+    texts = [
+        "curriculum.stages=["
+        + ",".join(f"{{world: random-{n}, episodes: {last}}}" for n in range(20))
+        + "]"
+        for last in (1, 2)
+    ]
+    first, second = (one(text).curriculum.name or "" for text in texts)
+    assert first != second
+    assert len(first) < 60
 
 
 @pytest.mark.parametrize(
@@ -57,11 +89,70 @@ def test_an_override_reaches_the_typed_settings() -> None:
 def test_an_unknown_setting_is_an_error_that_suggests_the_nearest(
     argument: str, message: str
 ) -> None:
-    with pytest.raises(SystemExit, match=message):
-        check_overrides([argument])
+    with pytest.raises(ValueError, match=message):
+        parse_overrides([argument])
 
 
 def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
-    check_overrides(
-        ["-m", "seed=0,1,2", "method=mpfa_per,per", "hydra.verbose=true", "--cfg", "job"]
-    )
+    arguments = ["-m", "seed=0,1,2", "method=mpfa_per,per", "hydra.verbose=true", "--cfg", "job"]
+    found = [(s.seed, s.method.name) for s in composed(arguments)]
+    assert found == [(seed, method) for seed in (0, 1, 2) for method in ("mpfa_per", "per")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("learner.gamma=2", r"learner.gamma must be in \[0, 1\], got 2.0"),
+        ("learner.saturation_penalty=nan", "learner.saturation_penalty must be .*got nan"),
+        ("learner.width=0", "learner.width must be at least 1, got 0"),
+        ("learner.tau=0", r"learner.tau must be in \(0, 1\], got 0.0"),
+        ("seed=abc", "seed: Value 'abc'"),
+        ("seed=-1", "seed must be at least 0, got -1"),
+        ("threads=0", "threads must be at least 1"),
+        ("device=warp", "device must be one that PyTorch knows, got 'warp'"),
+        ("checkpoint_every=0", "checkpoint_every must be at least 1, got 0"),
+        ("tracking.log_every=0", "tracking.log_every must be at least 1, got 0"),
+        ("tracking.mode=of", "tracking.mode must be one of offline, online, off, got 'of'"),
+        ("evaluation.episodes=0", "evaluation.episodes must be at least 1, got 0"),
+        ("evaluation.world=X", "evaluation.world: world must be .*got 'X'"),
+        ("curriculum.stages=[]", "curriculum.stages must name at least one world"),
+        ("curriculum.name=a/b", "curriculum.name must be letters"),
+        (
+            "curriculum.stages=[{world: A, episodes: -3}]",
+            r"curriculum.stages\[0\].episodes must be at least 1, got -3",
+        ),
+        (
+            "curriculum.stages=[{world: A, episodes: 2},{world: Q, episodes: 2}]",
+            r"curriculum.stages\[1\].world: world must be .*got 'Q'",
+        ),
+        ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
+        ("method.fusion=entropi", "method.fusion must be one of entropy"),
+        ("method.alpha=inf", "method.alpha must be finite and not negative, got inf"),
+        ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
+        ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
+        ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
+        ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
+        ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
+        ("seed=0,-1", "seed must be at least 0, got -1"),
+        ("learner.gamma=[", ".+"),
+    ],
+)
+def test_a_value_that_cannot_be_is_one_sentence_with_its_name(arguments: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        list(composed(arguments.split(" ") if "{" not in arguments else [arguments]))
+    assert "\n" not in str(caught.value)
+
+
+def test_every_number_and_every_word_among_the_settings_has_a_rule() -> None:
+    looked_up = {"run_dir", "resume", "device", "environment.robot", "evaluation.world"}
+    free = {"tracking.project", "method.signals", "curriculum.stages"}
+    for name, value in settings_by_name(TrainSettings()):
+        if not isinstance(value, bool) and name not in looked_up | free:
+            assert name in RULES, name
+    names = {name for name, _ in settings_by_name(TrainSettings())}
+    assert set(RULES) <= names
+
+
+@pytest.mark.parametrize(("group", "choice"), [(g, c) for g, cs in GROUPS.items() for c in cs])
+def test_every_choice_passes_the_checks(group: str, choice: str) -> None:
+    check_settings(one(f"{group}={choice}"))

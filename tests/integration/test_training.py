@@ -1,30 +1,28 @@
-"""The training script: resuming, stopping, refusing; every part of it on tiny runs."""
+"""The training run: resuming, records, policies; every part of it on tiny runs."""
 
 from __future__ import annotations
 
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 from torchrl.data import RandomSampler
 
-from methods import ALIASES
-from process import prepare_process
-from records import draw_learning_curve, load_policy
-from settings import GROUPS, Stage, TrainSettings
+from mpfa_envs import load_policy
+from navigation.checkpoints import read_checkpoint
+from navigation.figures import plot_learning_curve
+from navigation.files import CHECKPOINT
+from navigation.records import EpisodeRecord, as_table
+from navigation.settings import GROUPS, Stage, TrainSettings
+from navigation.training import TrainingRun, prepare_process
 from tests.integration.tiny_runs import rows, tiny, train
 from torchrl_mpfa import SignalSampler, save_atomically
-from training import CHECKPOINT, TrainingRun, read_checkpoint
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
+from torchrl_mpfa.methods import ALIASES
 
 
 def test_training_treats_denormal_numbers_as_zero() -> None:
@@ -43,16 +41,16 @@ def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -
     settings.evaluation.every, settings.evaluation.episodes = 50, 2
     evaluated, plain = train(tmp_path / "evaluated", settings), train(tmp_path / "plain", tiny())
     assert rows(evaluated) == rows(plain)
-    steps = [record.total_steps for record in evaluated.progress]
+    steps = [record.total_steps for record in evaluated.evaluations]
     # At the first end of an episode after each multiple of fifty.
     ends = [0, *(record.total_steps for record in evaluated.records)]
     assert steps == [end for before, end in pairwise(ends) if end // 50 > before // 50]
-    for record in evaluated.progress:
+    for record in evaluated.evaluations:
         assert record.success + record.collision + record.timeout == pytest.approx(1.0)
         assert record.world == "validation"
-    lines = (tmp_path / "evaluated" / "progress.csv").read_text().splitlines()
+    lines = (tmp_path / "evaluated" / "evaluations.csv").read_text().splitlines()
     assert len(lines) == 1 + len(steps)
-    assert not (tmp_path / "plain" / "progress.csv").exists()
+    assert not (tmp_path / "plain" / "evaluations.csv").exists()
 
 
 @pytest.mark.parametrize(
@@ -71,12 +69,11 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
 ) -> None:
     whole = train(tmp_path / "whole", tiny(method, learner=learner))
     part = TrainingRun(tiny(method, learner=learner), tmp_path)
-    part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 3))
+    part.train(on_episode=lambda record: record.episode == 3 and part.stop.ask())
     part.close()
     assert part.episode == 4
 
-    resumed = TrainingRun(tiny(method, learner=learner), tmp_path)
-    resumed.load(read_checkpoint(tmp_path))
+    resumed = TrainingRun(tiny(method, learner=learner), tmp_path, read_checkpoint(tmp_path))
     assert resumed.train()
     resumed.close()
 
@@ -149,21 +146,19 @@ def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
     assert run.buffer[:]["next", "reward"].abs().max() < 1e3
 
 
-def test_a_curriculum_that_does_not_carry_starts_anew_on_each_map(tmp_path: Path) -> None:
+def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Path) -> None:
     settings = tiny()
     settings.curriculum.carry = False
     run = train(tmp_path, settings)
-    of_second_map = sum(record.steps for record in run.records[3:])
-    assert len(run.buffer) == min(of_second_map, settings.method.capacity)
-    assert run.buffer.write_count == of_second_map
+    of_second_world = sum(record.steps for record in run.records[3:])
+    assert len(run.buffer) == min(of_second_world, settings.method.capacity)
+    assert run.buffer.write_count == of_second_world
 
     part = TrainingRun(settings, tmp_path / "part")
-    (tmp_path / "part").mkdir()
-    # Stopped between the maps.
-    part.train(on_episode=lambda record: setattr(part, "_stop", record.episode == 2))
+    # Stopped between the worlds.
+    part.train(on_episode=lambda record: record.episode == 2 and part.stop.ask())
     part.close()
-    resumed = TrainingRun(settings, tmp_path / "part")
-    resumed.load(read_checkpoint(tmp_path / "part"))
+    resumed = TrainingRun(settings, tmp_path / "part", read_checkpoint(tmp_path / "part"))
     assert resumed.train()
     resumed.close()
     assert rows(resumed) == rows(run)
@@ -180,24 +175,21 @@ def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
 @pytest.mark.parametrize("learner", sorted(GROUPS["learner"]))
 def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str) -> None:
     run = train(tmp_path, tiny(learner=learner))
-    policy, state = load_policy(tmp_path)
+    policy = load_policy(tmp_path)
     observation = torch.rand(5, 24)
     trained = run.learner.policy.outputs({"observation": observation})["action"]
-    assert torch.equal(policy.outputs({"observation": observation})["action"], trained)
-    assert state["trained"]["episodes"] == 6
+    np.testing.assert_allclose(policy(observation.numpy()), trained.detach().numpy(), atol=1e-5)
+    assert policy.card["episodes"] == 6
+    assert policy.card["steps"] == run.step
+    assert policy.env_arguments["closeness_distance"] == pytest.approx(0.25)
 
 
-def test_a_policy_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    save_atomically({"format": 99}, tmp_path / "policy.pt")
-    with pytest.raises(ValueError, match=r"no policy of format 3"):
-        load_policy(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"train\.py writes policy\.pt"):
-        load_policy(tmp_path / "elsewhere")
-
-
-def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
-    save_atomically({"format": 99}, tmp_path / CHECKPOINT)
-    with pytest.raises(ValueError, match=r"format 99, this version reads 3"):
+def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    save_atomically({"format": 3}, tmp_path / CHECKPOINT)
+    with pytest.raises(ValueError, match=r"format 3, this version reads 4"):
+        read_checkpoint(tmp_path)
+    (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match=CHECKPOINT):
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match="resume"):
         read_checkpoint(tmp_path / "elsewhere")
@@ -205,55 +197,50 @@ def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_the_learning_curve_is_drawn(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
-    draw_learning_curve(run.records, tmp_path / "curve.png")
+    plot_learning_curve(as_table(run.records, EpisodeRecord), tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def script(folder: Path, *overrides: str) -> list[str]:
-    stages = "curriculum.stages=[{world: A, episodes: 10000}]"
-    sizes = ["method.capacity=100", "method.batch_size=16", "learner.width=16"]
-    return [
-        sys.executable,
-        str(EXAMPLES / "train.py"),
-        *(f"run_dir={folder}", stages, "environment.physics=kinematic", "environment.max_steps=20"),
-        *sizes,
-        *("tracking=off", "checkpoint_every=1", *overrides),
-    ]
+def test_an_episode_that_fails_leaves_a_checkpoint_of_the_one_before(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", tiny())
+    failing = TrainingRun(tiny(), tmp_path)
+    update = failing.learner.update
+
+    def fail(draw: object) -> dict[str, torch.Tensor]:
+        if failing.episode == 4 and failing.driver.info()["path_length"] > 0.2:
+            # What a broken step would have done to the networks must not be saved.
+            for weight in failing.learner.loss.parameters():
+                weight.data.fill_(math.nan)
+            raise RuntimeError("the fifth episode fails")
+        return update(draw)
+
+    failing.learner.update = fail  # type: ignore[assignment, method-assign]
+    with pytest.raises(RuntimeError, match="fifth episode"):
+        failing.train()
+    failing.close()
+    state = read_checkpoint(tmp_path)
+    assert state["episode"] == 4
+    assert len(pd.read_csv(tmp_path / "episodes.csv")) == 4
+    resumed = TrainingRun(tiny(), tmp_path, state)
+    assert resumed.train()
+    resumed.close()
+    assert rows(resumed) == rows(whole)
 
 
-def start(command: list[str]) -> subprocess.Popen[str]:
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def test_rates_fall_linearly_in_long_runs_and_with_the_cube_in_short_ones(tmp_path: Path) -> None:
+    def rate_at_half(episodes: int) -> float:
+        run = TrainingRun(tiny(episodes=[Stage("A", episodes)]), tmp_path)
+        run.episode = episodes // 2
+        run._anneal()
+        run.close()
+        return float(run.learner.optimizer.param_groups[0]["lr"])
+
+    assert rate_at_half(100) == pytest.approx(1e-4 / 8)
+    assert rate_at_half(1000) == pytest.approx(1e-4 / 2)
 
 
-def wait_for(file: Path, process: subprocess.Popen[str], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not file.exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end, f"{file} did not appear"
-        time.sleep(0.05)
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-def test_a_killed_run_goes_on_and_ctrl_c_says_how(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    killed = start(script(folder, "overlap=true"))
-    wait_for(folder / CHECKPOINT, killed)
-    killed.send_signal(signal.SIGKILL)
-    # Returns when nobody holds the other end anymore: a second process must have ended, too.
-    killed.communicate(timeout=60)
-    episode = read_checkpoint(folder)["episode"]
-    assert episode >= 1
-
-    refused = subprocess.run(script(folder), capture_output=True, text=True, timeout=120)
-    assert refused.returncode != 0
-    assert f"go on with it by resume={folder}" in refused.stderr
-
-    (folder / "policy.pt").unlink(missing_ok=True)
-    command = [*script(tmp_path / "other"), f"resume={folder}"]
-    resumed = start(command)
-    wait_for(folder / "policy.pt", resumed)
-    resumed.send_signal(signal.SIGINT)
-    out, err = resumed.communicate(timeout=120)
-    assert resumed.returncode == 130, err
-    assert f"go on with: train.py resume={folder}" in out
-    assert read_checkpoint(folder)["episode"] > episode
+def test_klper_is_told_the_noise_of_the_episode_that_acts(tmp_path: Path) -> None:
+    run = TrainingRun(tiny("klper"), tmp_path)
+    run.explorer.share = 0.25  # type: ignore[attr-defined]
+    assert run.explorer.sigma == pytest.approx(0.25 * run.settings.exploration.sigma)
+    run.close()

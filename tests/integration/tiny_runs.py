@@ -5,11 +5,27 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from settings import GROUPS, Curriculum, Environment, Stage, TrainSettings
-from training import TrainingRun
+from navigation.settings import (
+    GROUPS,
+    CurriculumSettings,
+    EnvironmentSettings,
+    Stage,
+    TrainSettings,
+)
+from navigation.training import TrainingRun
 
-# Two maps, so that a change of map lies between the checkpoints too.
+# Two worlds, so that a change of world lies between the checkpoints too.
 STAGES = [Stage("A", 3), Stage("B", 3)]
+OVERRIDES = [
+    "learner.width=8",
+    "method.batch_size=8",
+    "method.capacity=200",
+    "environment.physics=kinematic",
+    "environment.max_steps=20",
+    "evaluation.every=0",
+    "tracking=off",
+]
+"""The same on the command line."""
 
 
 def tiny(
@@ -18,8 +34,8 @@ def tiny(
     settings = TrainSettings(
         method=replace(GROUPS["method"][method]),
         learner=GROUPS["learner"][learner](),
-        curriculum=Curriculum("tiny", episodes or STAGES),
-        environment=Environment(physics="kinematic", max_steps=25),
+        curriculum=CurriculumSettings("tiny", list(episodes or STAGES)),
+        environment=EnvironmentSettings(physics="kinematic", max_steps=25),
         checkpoint_every=1000,
         seed=3,
     )

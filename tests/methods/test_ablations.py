@@ -4,10 +4,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from methods import METHODS
-from replay_assembly import make_sampler, signals_of
 from tests import oracles
 from tests.methods.replays import make_buffer, set_signals
+from torchrl_mpfa.methods import METHODS
+from torchrl_mpfa.methods.assembly import make_sampler, signals_of
 
 REWARDS = [3.0, -1.0, 0.5, 0.5, -2.0, 0.1, 9.0, -0.2]
 ERRORS = [0.2, 1.5, 0.1, 2.0, 0.7, 0.05, 3.0, 1.0]

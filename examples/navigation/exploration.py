@@ -12,9 +12,9 @@ from torchrl.envs import set_exploration_type
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import AdditiveGaussianModule
 
-from settings import Exploration
+from navigation.settings import ExplorationSettings
 from torchrl_mpfa import DirectModule
-from torchrl_mpfa.stochastic import StochasticActor
+from torchrl_mpfa.networks import StochasticActor
 
 
 class Explorer(Protocol):
@@ -25,7 +25,7 @@ class Explorer(Protocol):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the actions around the policy's."""
+        """Standard deviation of the actions around the policy's, in the present episode."""
         ...
 
     def begin_episode(self) -> None:
@@ -48,7 +48,7 @@ class Explorer(Protocol):
 class NoisyPolicy:
     """Gaussian noise on the action, clipped to its range, falling linearly.
 
-    With ``varied`` each episode has a share of it that is drawn uniformly from [0, 1]: what the
+    With ``varied`` each episode has a share of it that is sampled uniformly from [0, 1]: what the
     policy does without noise, circling included, is then in the data as well.
 
     Args:
@@ -58,7 +58,7 @@ class NoisyPolicy:
     """
 
     def __init__(
-        self, policy: DirectModule, settings: Exploration, action_spec: TensorSpec
+        self, policy: DirectModule, settings: ExplorationSettings, action_spec: TensorSpec
     ) -> None:
         self.policy = policy
         self.varied = settings.varied
@@ -72,11 +72,11 @@ class NoisyPolicy:
 
     @property
     def sigma(self) -> float:
-        """Present standard deviation of the noise, of an episode that has all of it."""
-        return float(self.noise.sigma)
+        """Present standard deviation of the noise: the episode's share of it."""
+        return self.share * float(self.noise.sigma)
 
     def begin_episode(self) -> None:
-        """Draw the share of the noise that the episode has."""
+        """Sample the share of the noise that the episode has."""
         if self.varied:
             self.share = float(torch.rand(()))
 
@@ -107,7 +107,7 @@ class RandomPolicy:
             spread of the actions.
     """
 
-    def __init__(self, policy: StochasticActor, settings: Exploration) -> None:
+    def __init__(self, policy: StochasticActor, settings: ExplorationSettings) -> None:
         self.policy = policy
         self.sigma = settings.sigma_end
 
@@ -115,7 +115,7 @@ class RandomPolicy:
         """Nothing changes."""
 
     def act(self, observation: Tensor) -> Tensor:
-        """An action that the policy draws."""
+        """An action sampled from the policy."""
         with set_exploration_type(ExplorationType.RANDOM):
             found = self.policy.outputs({"observation": observation})
         action: Tensor = found["action"]
@@ -130,7 +130,7 @@ class RandomPolicy:
 
 
 def make_explorer(
-    policy: DirectModule | StochasticActor, settings: Exploration, action_spec: TensorSpec
+    policy: DirectModule | StochasticActor, settings: ExplorationSettings, action_spec: TensorSpec
 ) -> Explorer:
     """Noise for a policy without any, none for one that is random.
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import draw_sampling
-from draw_sampling import KINDS, count_draws, main
-from methods import ALIASES, METHODS
+import plot_sampling
+from plot_sampling import KINDS, count_samples, main
+from torchrl_mpfa.methods import ALIASES, METHODS
 
 DOCS = Path(__file__).parents[2] / "docs" / "methods"
 NAMES = sorted(set(METHODS) - set(ALIASES))
@@ -17,12 +17,12 @@ NAMES = sorted(set(METHODS) - set(ALIASES))
 
 @pytest.fixture(autouse=True)
 def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(draw_sampling, "COUNT", 400)
-    monkeypatch.setattr(draw_sampling, "ROUNDS", 60)
+    monkeypatch.setattr(plot_sampling, "COUNT", 400)
+    monkeypatch.setattr(plot_sampling, "ROUNDS", 60)
 
 
 def means_by_kind(name: str, who: str = "critic") -> dict[str, float]:
-    transitions, found = count_draws(METHODS[name])
+    transitions, found = count_samples(METHODS[name])
     return {
         kind: float(found[who][transitions.kind == number].mean())
         for number, kind in enumerate(KINDS)
@@ -30,7 +30,7 @@ def means_by_kind(name: str, who: str = "critic") -> dict[str, float]:
 
 
 def test_uniform_replay_favors_nothing() -> None:
-    transitions, found = count_draws(METHODS["ddpg"])
+    transitions, found = count_samples(METHODS["ddpg"])
     assert list(found) == ["critic"]
     assert found["critic"].mean() == pytest.approx(1.0)
     error = transitions.signals["td_error"].numpy()
@@ -39,7 +39,7 @@ def test_uniform_replay_favors_nothing() -> None:
 
 
 def test_per_favors_large_errors_and_mpfa_per_goals_as_well() -> None:
-    transitions, found = count_draws(METHODS["per"])
+    transitions, found = count_samples(METHODS["per"])
     error = transitions.signals["td_error"].numpy()
     high = error > np.median(error)
     assert found["critic"][high].mean() > 1.3 * found["critic"][~high].mean()
@@ -49,14 +49,14 @@ def test_per_favors_large_errors_and_mpfa_per_goals_as_well() -> None:
 
 
 def test_la3p_gives_the_actor_small_errors_and_the_critic_large_ones() -> None:
-    transitions, found = count_draws(METHODS["la3p"])
+    transitions, found = count_samples(METHODS["la3p"])
     error = transitions.signals["td_error"].numpy()
     large = error > np.quantile(error, 0.95)
     assert found["critic"][large].mean() > 1.1 > 0.97 > found["actor"][large].mean()
 
 
 def test_combined_replay_has_the_newest_in_every_batch() -> None:
-    _, found = count_draws(METHODS["cer"])
+    _, found = count_samples(METHODS["cer"])
     assert found["critic"].argmax() == len(found["critic"]) - 1
 
 

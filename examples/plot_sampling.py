@@ -1,12 +1,12 @@
-"""Draw what each method trains on: how often it samples which transitions of one common buffer.
+"""Plot what each method trains on: how often it samples which transitions of one common buffer.
 
-    python examples/draw_sampling.py                       all methods, to docs/methods/images
-    python examples/draw_sampling.py per mpfa_per --output runs/figures
+    python examples/plot_sampling.py                       all methods, to docs/methods/images
+    python examples/plot_sampling.py per mpfa_per --output runs/figures
 
 The buffer is made up: a quarter of a navigation run, with few goals and collisions, TD errors and
 gradients of a wide spread, and actions that are the further from the policy the older they are.
 Its signals stay as they are, while batches are sampled and priorities updated until these have
-settled; then every draw counts.
+settled; then every sample counts.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from methods import ALIASES, METHODS, Method
-from replay_assembly import learned_signals, make_buffer, make_selection
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
+from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 
 COUNT = 2_000
 BATCH_SIZE = 128
@@ -93,37 +92,43 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
     return Transitions(data, signals, kind)
 
 
-def count_draws(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str, Array]]:
+def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str, Array]]:
     """Sample with a method and count.
 
     Args:
         method: The method.
-        seed: Seed of the draws.
+        seed: Seed of the sampling.
 
     Returns:
-        The transitions, and how often each was drawn relative to uniform sampling, for the critic
+        The transitions, and how often each was sampled relative to uniform sampling, for the critic
         and, if that has batches of its own, for the actor; each of shape ``[N]``.
     """
     torch.manual_seed(0)
     policy = make_actor(OBSERVATION_SIZE, ACTION_SIZE, width=16, final_init=0.5)
     transitions = make_transitions(policy, count=COUNT)
-    method = replace(method, capacity=COUNT, batch_size=BATCH_SIZE, replay_cap=REPLAY_CAP)
-    buffer = make_buffer(method, seed=seed)
+    replay = make_replay(
+        method,
+        capacity=COUNT,
+        batch_size=BATCH_SIZE,
+        generator=torch.Generator().manual_seed(seed),
+        policy=policy,
+        sigma=SIGMA,
+        replay_cap=REPLAY_CAP,
+    )
+    buffer = replay.buffer
     buffer.extend(transitions.data)
     if isinstance(buffer.sampler, SignalSampler):
         buffer.sampler.anneal(1.0)
-    select = make_selection(method, policy, lambda: SIGMA)
-    names = learned_signals(method)
     counts = {"critic": torch.zeros(COUNT), "actor": torch.zeros(COUNT)}
     own = False
     for number in range(2 * ROUNDS):
-        for draw in select(buffer):
+        for draw in replay.select(buffer):
             actor_batch = draw.batch if draw.actor_batch is None else draw.actor_batch
             own = own or draw.actor_batch is not None
             if number >= ROUNDS:
                 for who, batch in (("critic", draw.batch), ("actor", actor_batch)):
                     counts[who] += torch.bincount(batch["index"], minlength=COUNT)
-            _update(buffer, draw.batch, transitions, names)
+            _update(buffer, draw.batch, transitions, replay.signals)
     found = {who: (each / each.mean()).double().numpy() for who, each in counts.items()}
     return transitions, found if own else {"critic": found["critic"]}
 
@@ -142,8 +147,8 @@ def _update(
     buffer.update_tensordict_priority(batch)
 
 
-def draw(name: str, path: Path) -> None:
-    """Draw the figure of a method.
+def plot(name: str, path: Path) -> None:
+    """Plot the figure of a method.
 
     Args:
         name: The method.
@@ -154,7 +159,7 @@ def draw(name: str, path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    transitions, found = count_draws(METHODS[name])
+    transitions, found = count_samples(METHODS[name])
     figure, axes = pyplot.subplots(1, 3, figsize=(10, 2.8), layout="constrained")
     error = transitions.signals["td_error"].numpy()
     for number, (kind, color) in enumerate(zip(KINDS, COLORS, strict=True)):
@@ -190,7 +195,7 @@ def draw(name: str, path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the figures that are asked for.
+    """Plot the figures that are asked for.
 
     Args:
         arguments: The command line.
@@ -212,7 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     for name in tqdm(names, unit="figure"):
-        draw(name, options.output / f"{name}.png")
+        plot(name, options.output / f"{name}.png")
     return 0
 
 

@@ -1,26 +1,32 @@
 """Settings of a training run: typed, in one place, each with its default and its reason.
 
 Hydra builds its command line from these: ``train.py method=per learner.width=128 seed=3``. The
-methods are in ``methods.py``.
+settings of a method are those of :class:`torchrl_mpfa.methods.Method`; what values are allowed is
+in ``checks.py``.
 """
 
 from __future__ import annotations
 
+import hashlib
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
 
-from methods import METHODS, Method
+from torchrl_mpfa.methods import METHODS, Method
 
 
 @dataclass
-class Learner:
+class LearnerSettings:
     """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
 
     name: str = "ddpg"
     algorithm: str = "ddpg"
-    """``ddpg``, ``td3`` or ``sac``."""
+    """``ddpg``, ``td3`` or ``sac``; ``learner=td3`` chooses it with what goes with it."""
     update_every: int = 1
     """Actions for each update, which the paper does not give."""
     actor_lr: float = 1e-4
@@ -30,9 +36,9 @@ class Learner:
     lr_end_factor: float = 0.0
     """Learning rates fall with the episodes from Table 1's to this fraction; 1: constant. At a
     constant rate DDPG forgets and relearns, and the last policy is a matter of luck."""
-    lr_power: float = 3.0
+    lr_power: float | None = None
     """Shape of the fall: 1 is linear, right for a thousand episodes; 3 has halved the rates after a
-    fifth of them, right for a hundred."""
+    fifth of them, right for a hundred. Null: 1 from 500 episodes on, 3 below."""
     gamma: float = 0.99
     """Table 1."""
     tau: float = 0.01
@@ -71,7 +77,7 @@ class Learner:
 
 
 @dataclass
-class TD3(Learner):
+class TD3Settings(LearnerSettings):
     """TD3 with networks and rates of the DDPG learner: two critics, smoothed target, delay."""
 
     name: str = "td3"
@@ -79,7 +85,7 @@ class TD3(Learner):
 
 
 @dataclass
-class SAC(Learner):
+class SACSettings(LearnerSettings):
     """SAC with networks and rates of the DDPG learner, and a policy that is random by itself."""
 
     name: str = "sac"
@@ -87,7 +93,7 @@ class SAC(Learner):
 
 
 @dataclass
-class PlainLearner(Learner):
+class PlainSettings(LearnerSettings):
     """DDPG without the recipe, as the paper's code most likely had it."""
 
     name: str = "plain"
@@ -103,7 +109,7 @@ class PlainLearner(Learner):
 
 
 @dataclass
-class Exploration:
+class ExplorationSettings:
     """Uniform actions at first, then Gaussian noise on the policy's."""
 
     random_steps: int = 1_000
@@ -121,32 +127,62 @@ class Exploration:
 
 @dataclass
 class Stage:
-    """Episodes on one map."""
+    """Episodes in one world."""
 
     world: str = "A"
-    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, or the path of a world file."""
+    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, ``random-SEED``, or the path of a world
+    file."""
     episodes: int = 100
 
 
 @dataclass
-class Curriculum:
-    """Maps one after the other."""
+class CurriculumSettings:
+    """Worlds one after the other."""
 
-    name: str = "A"
+    name: str | None = None
+    """Part of the run's folder and of its group in wandb; null: named after the stages."""
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", 100)])
     carry: bool = True
-    """Whether networks and buffer carry on from map to map, or start anew."""
+    """Whether networks and buffer carry on from world to world, or start anew."""
 
 
-def _single(world: str, episodes: int) -> Curriculum:
-    return Curriculum(name=world, stages=[Stage(world, episodes)])
+CURRICULA = {
+    "A": [Stage("A", 100)],
+    "B": [Stage("B", 200)],
+    "C": [Stage("C", 300)],
+    "D": [Stage("D", 400)],
+    "paper": [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)],
+}
+"""The paper's episodes on each of its maps, and all of them one after the other."""
+_LONGEST_NAME = 60
 
 
-PAPER_STAGES = [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)]
+def curriculum_name(stages: Sequence[Stage]) -> str:
+    """What a curriculum is called unless the user names it: after what is really run.
+
+    Args:
+        stages: The stages.
+
+    Returns:
+        The name of one of :data:`CURRICULA`, or worlds and episodes.
+
+    Examples:
+        >>> curriculum_name([Stage("A", 100)]), curriculum_name([Stage("A", 5), Stage("B", 7)])
+        ('A', 'A5+B7')
+    """
+    for name, known in CURRICULA.items():
+        if list(stages) == known:
+            return name
+    parts = [re.sub(r"[^\w.-]", "_", Path(s.world).stem) + str(s.episodes) for s in stages]
+    whole = "+".join(parts)
+    if len(whole) <= _LONGEST_NAME:
+        return whole
+    digest = hashlib.sha256(repr(list(stages)).encode()).hexdigest()[:8]
+    return f"{parts[0][:20]}+{len(parts) - 1}-more-{digest}"
 
 
 @dataclass
-class Environment:
+class EnvironmentSettings:
     """The navigation task."""
 
     robot: str = "turtlebot2"
@@ -161,9 +197,9 @@ class Environment:
     progress_scale: float = 5.0
     """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
     far away, and a critic that is a little too smooth would rather circle than arrive."""
-    margin: float = 0.07
-    """Clearance of the robot's rim that training counts as a collision [m]. With 0.17 m, 0.35 m
-    from its center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
+    clearance: float = 0.07
+    """Clearance below which training counts a collision [m]. With 0.17 m, 0.35 m from the robot's
+    center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
     detour_chance: float = 0.8
     """Chance that start and goal of an episode must have something between them. As they come, up
     to a half of the goals can be driven at blindly."""
@@ -172,19 +208,19 @@ class Environment:
 
 
 @dataclass
-class Evaluation:
+class EvaluationSettings:
     """Greedy episodes during training, which show how fast it learns and change nothing in it."""
 
     every: int = 0
     """Steps between two evaluations; 0: none."""
     world: str = "validation"
-    """Never the test map, by which nothing may be chosen."""
+    """Never the test world, by which nothing may be chosen."""
     episodes: int = 20
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
 
 
 @dataclass
-class Tracking:
+class TrackingSettings:
     """Where the run is logged."""
 
     mode: str = "offline"
@@ -205,6 +241,7 @@ class TrainSettings:
             {"learner": "ddpg"},
             {"curriculum": "A"},
             {"tracking": "offline"},
+            {"override hydra/job_logging": "none"},
         ]
     )
     hydra: Any = field(
@@ -214,56 +251,87 @@ class TrainSettings:
                 "dir": "runs/sweep-${now:%Y-%m-%d_%H-%M-%S}",
                 "subdir": "${hydra.job.override_dirname}",
             },
-            "job_logging": {"root": {"level": "WARNING"}},
+            # The run writes its settings itself, once it knows that the folder is its own.
+            "output_subdir": None,
         }
     )
-    run_dir: str = "runs/${curriculum.name}-${method.name}-${learner.name}-${seed}"
+    run_dir: str = (
+        "runs/${curriculum_name:${curriculum.name},${curriculum.stages}}"
+        "-${method.name}-${learner.name}-${seed}"
+    )
     """Folder of checkpoints, logs and pictures."""
     seed: int = 0
     device: str = "cpu"
     """Where the networks are; the buffer stays in main memory."""
     threads: int = 1
     """Threads of PyTorch; with networks this small a second one gains nothing."""
-    overlap: bool = False
-    """Drive in a second process while the networks learn, with a policy that is one update older.
-    Where a second core is free, a run takes a fifth less time; see ``docs/results.md``."""
     overwrite: bool = False
-    """Whether to start anew in a folder that holds a run."""
+    """Whether to start anew in a folder that holds a run; its files are moved to ``previous/``."""
     resume: str | None = None
-    """Folder of a run to go on with; its own settings are used."""
+    """Folder of a run to go on with, with its own settings. More episodes, tracking, threads and
+    how often to evaluate and to save may be changed; anything else is refused."""
     checkpoint_every: int = 25
     """Episodes between two checkpoints."""
     method: Method = field(default_factory=Method)
-    learner: Learner = field(default_factory=Learner)
-    curriculum: Curriculum = field(default_factory=Curriculum)
-    tracking: Tracking = field(default_factory=Tracking)
-    exploration: Exploration = field(default_factory=Exploration)
-    environment: Environment = field(default_factory=Environment)
-    evaluation: Evaluation = field(default_factory=Evaluation)
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
+    curriculum: CurriculumSettings = field(default_factory=CurriculumSettings)
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    exploration: ExplorationSettings = field(default_factory=ExplorationSettings)
+    environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
 
 
 GROUPS: dict[str, dict[str, Any]] = {
     "method": METHODS,
-    "learner": {"ddpg": Learner, "td3": TD3, "sac": SAC, "plain": PlainLearner},
-    "curriculum": {
-        "A": _single("A", 100),
-        "B": _single("B", 200),
-        "C": _single("C", 300),
-        "D": _single("D", 400),
-        "paper": Curriculum(name="paper", stages=PAPER_STAGES),
+    "learner": {
+        "ddpg": LearnerSettings,
+        "td3": TD3Settings,
+        "sac": SACSettings,
+        "plain": PlainSettings,
     },
+    "curriculum": {name: CurriculumSettings(stages=stages) for name, stages in CURRICULA.items()},
     "tracking": {
-        "offline": Tracking,
-        "online": Tracking(mode="online"),
-        "off": Tracking(mode="off"),
+        "offline": TrackingSettings,
+        "online": TrackingSettings(mode="online"),
+        "off": TrackingSettings(mode="off"),
     },
 }
 
 
 def register() -> None:
     """Make the settings known to Hydra."""
+    OmegaConf.register_new_resolver("curriculum_name", _resolve_name, replace=True)
     store = ConfigStore.instance()
     store.store(name="train", node=TrainSettings)
     for group, choices in GROUPS.items():
         for name, node in choices.items():
             store.store(group=group, name=name, node=node)
+
+
+def _resolve_name(name: str | None, stages: Sequence[Any]) -> str:
+    return name or curriculum_name([Stage(stage.world, stage.episodes) for stage in stages])
+
+
+def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
+    """Typed settings from what Hydra composed or a checkpoint holds.
+
+    Args:
+        config: The values; those that it lacks are the defaults.
+
+    Returns:
+        The settings, with the curriculum named.
+
+    Raises:
+        omegaconf.errors.OmegaConfBaseException: If a value is of another type, or unknown.
+    """
+    values = OmegaConf.create(config) if isinstance(config, dict) else config.copy()
+    OmegaConf.set_struct(values, False)
+    for name in ("defaults", "hydra"):
+        values.pop(name, None)
+    merged = OmegaConf.merge(OmegaConf.structured(TrainSettings), values)
+    merged.pop("hydra", None)
+    settings = OmegaConf.to_object(merged)
+    assert isinstance(settings, TrainSettings)
+    curriculum = settings.curriculum
+    curriculum.name = curriculum.name or curriculum_name(curriculum.stages)
+    return settings

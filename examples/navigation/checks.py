@@ -1,0 +1,174 @@
+"""What values settings may have; each mistake is one sentence, before anything has started."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import torch
+
+from mpfa_envs.maps import resolve_world
+from mpfa_envs.robot import resolve_robot
+from navigation.settings import TrainSettings
+
+Rule = tuple[Callable[[Any], bool], str]
+
+
+def at_least(least: float) -> Rule:
+    """Finite, and not below a bound."""
+    return lambda value: least <= value < math.inf, f"at least {least:g}"
+
+
+def choice(*names: str) -> Rule:
+    """One of some words."""
+    return lambda value: value in names, f"one of {', '.join(names)}"
+
+
+POSITIVE: Rule = (lambda value: 0.0 < value < math.inf, "positive and finite")
+NOT_NEGATIVE: Rule = (lambda value: 0.0 <= value < math.inf, "finite and not negative")
+SHARE: Rule = (lambda value: 0.0 <= value <= 1.0, "in [0, 1]")
+OPEN_SHARE: Rule = (lambda value: 0.0 < value <= 1.0, "in (0, 1]")
+NAME: Rule = (
+    lambda value: re.fullmatch(r"[\w.+-]+", value) is not None,
+    "letters, digits and any of . _ + -, as it names a folder",
+)
+
+RULES: dict[str, Rule] = {
+    "seed": at_least(0),
+    "threads": at_least(1),
+    "checkpoint_every": at_least(1),
+    "method.name": NAME,
+    "method.selection": choice("prioritized", "uniform", "newest", "rank", "capped", "split"),
+    "method.fusion": choice("entropy", "fixed", "scaled", "value_schedule"),
+    "method.population": choice("buffer", "batch"),
+    "method.boost_bound": choice("floor", "cap", "none"),
+    "method.decay_position": choice("batch", "rank", "count"),
+    "method.importance": choice("critic", "torchrl", "none"),
+    "method.loss_function": choice("l2", "smooth_l1", "pal"),
+    "method.optimizer": choice("adam", "radam"),
+    "method.capacity": at_least(1),
+    "method.batch_size": at_least(1),
+    "method.candidates": at_least(1),
+    "method.replay_cap": at_least(1),
+    "method.target_average": at_least(1),
+    "method.alpha": NOT_NEGATIVE,
+    "method.beta": SHARE,
+    "method.beta_end": SHARE,
+    "method.eps": NOT_NEGATIVE,
+    "method.priority_floor": NOT_NEGATIVE,
+    "method.replay_penalty": NOT_NEGATIVE,
+    "method.boost_factor": POSITIVE,
+    "method.decay_sharpness": NOT_NEGATIVE,
+    "method.curiosity_scale": POSITIVE,
+    "learner.name": NAME,
+    "learner.algorithm": choice("ddpg", "td3", "sac"),
+    "learner.update_every": at_least(1),
+    "learner.actor_lr": POSITIVE,
+    "learner.critic_lr": POSITIVE,
+    "learner.lr_end_factor": SHARE,
+    "learner.lr_power": POSITIVE,
+    "learner.gamma": SHARE,
+    "learner.tau": OPEN_SHARE,
+    "learner.width": at_least(1),
+    "learner.layers": at_least(1),
+    "learner.final_init": POSITIVE,
+    "learner.critic_weight_decay": NOT_NEGATIVE,
+    "learner.reward_scale": POSITIVE,
+    "learner.saturation_penalty": NOT_NEGATIVE,
+    "learner.saturation_limit": NOT_NEGATIVE,
+    "learner.policy_delay": at_least(1),
+    "learner.policy_noise": NOT_NEGATIVE,
+    "learner.noise_clip": NOT_NEGATIVE,
+    "learner.alpha_init": POSITIVE,
+    "learner.alpha_lr": POSITIVE,
+    "curriculum.name": NAME,
+    "exploration.random_steps": at_least(0),
+    "exploration.sigma": NOT_NEGATIVE,
+    "exploration.sigma_end": NOT_NEGATIVE,
+    "exploration.annealing_steps": at_least(1),
+    "environment.physics": choice("wheels", "kinematic"),
+    "environment.max_steps": at_least(1),
+    "environment.action_repeat": at_least(1),
+    "environment.progress_scale": NOT_NEGATIVE,
+    "environment.clearance": NOT_NEGATIVE,
+    "environment.detour_chance": SHARE,
+    "evaluation.every": at_least(0),
+    "evaluation.episodes": at_least(1),
+    "tracking.mode": choice("offline", "online", "off"),
+    "tracking.log_every": at_least(1),
+}
+"""By dotted name; a setting that is null is not looked at."""
+
+
+def settings_by_name(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every setting with its dotted name.
+
+    Args:
+        settings: The settings.
+        prefix: What is before their names.
+
+    Yields:
+        Name and value; the settings of a group are single ones, stages are one value.
+    """
+    for entry in fields(settings):
+        if not prefix and entry.name in ("hydra", "defaults"):
+            continue
+        value, name = getattr(settings, entry.name), prefix + entry.name
+        if is_dataclass(value):
+            yield from settings_by_name(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def check_settings(settings: TrainSettings) -> None:
+    """Refuse a value that cannot be.
+
+    Args:
+        settings: The settings.
+
+    Raises:
+        ValueError: With the setting's name and its value.
+    """
+    if not settings.curriculum.stages:
+        raise ValueError("curriculum.stages must name at least one world, got []")
+    for name, value in settings_by_name(settings):
+        if name in RULES and value is not None:
+            allowed, wanted = RULES[name]
+            if not allowed(value):
+                raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    for number, stage in enumerate(settings.curriculum.stages):
+        where = f"curriculum.stages[{number}]"
+        if stage.episodes < 1:
+            raise ValueError(f"{where}.episodes must be at least 1, got {stage.episodes}")
+        _resolve(f"{where}.world", resolve_world, stage.world)
+    _resolve("evaluation.world", resolve_world, settings.evaluation.world)
+    _resolve("environment.robot", resolve_robot, settings.environment.robot)
+    method = settings.method
+    if method.capacity < method.batch_size * method.candidates:
+        raise ValueError(
+            f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "
+            f"got {method.capacity}: it would never learn"
+        )
+    if settings.learner.compile and settings.learner.algorithm == "sac":
+        raise ValueError("learner.compile must be false with SAC, got True")
+    _check_device(settings.device)
+
+
+def _resolve(name: str, resolve: Callable[[str], Any], value: str) -> None:
+    """Have the error of something that is looked up name the setting."""
+    try:
+        resolve(value)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
+
+
+def _check_device(device: str) -> None:
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ValueError(f"device must be one that PyTorch knows, got {device!r}") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={device}: PyTorch finds no GPU on this machine")

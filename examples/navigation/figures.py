@@ -1,0 +1,128 @@
+"""Pictures of how runs learn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from PIL import Image
+
+Runs = Mapping[str, Mapping[str, pd.DataFrame]]
+"""Tables by the name of their arm, then of their run."""
+_GIF_FRAMES = 120
+
+
+def plot_learning_curve(episodes: pd.DataFrame, path: Path, *, window: int = 20) -> None:
+    """Plot success and average reward over the episodes of a run, and where its world changes.
+
+    Args:
+        episodes: A row for each training episode.
+        path: The PNG file.
+        window: Episodes of the running mean.
+    """
+    figure, axes = _pyplot().subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
+    number = np.arange(1, len(episodes) + 1)
+    worlds = episodes["world"].to_numpy()
+    labels = {"success": "success rate", "average_reward": "average reward per step"}
+    for axis, (name, label) in zip(axes, labels.items(), strict=True):
+        axis.plot(number, episodes[name].astype(float), ".", color="0.75", markersize=3)
+        axis.plot(number, running_mean(episodes[name], window), color="tab:blue")
+        axis.set_ylabel(label)
+        for change in np.flatnonzero(worlds[1:] != worlds[:-1]):
+            axis.axvline(change + 1.5, color="0.5", linestyle=":")
+    axes[0].set_title(f"mean of {window} episodes; dots are single ones")
+    axes[1].set_xlabel("episode")
+    _finish(figure, axes, path)
+
+
+def plot_training(runs: Runs, path: Path, *, window: int = 20) -> None:
+    """Plot success and average reward of the training episodes, over episodes and over steps.
+
+    Args:
+        runs: Tables with a row for each training episode.
+        path: The PNG file.
+        window: Episodes of the running mean.
+    """
+    figure, axes = _pyplot().subplots(2, 2, figsize=(10, 6), sharey="row", layout="constrained")
+    labels = {"success": "success rate", "average_reward": "average reward per step"}
+    for place, (arm, tables) in enumerate(runs.items()):
+        for number, table in enumerate(tables.values()):
+            for line, name in enumerate(labels):
+                values = running_mean(table[name], window)
+                for column, x in enumerate((np.arange(1, len(table) + 1), table["total_steps"])):
+                    label = arm if number == 0 else None
+                    axes[line, column].plot(
+                        x, values, color=f"C{place}", alpha=0.6, lw=1, label=label
+                    )
+    for line, title in enumerate(labels.values()):
+        axes[line, 0].set_ylabel(f"{title}, mean of {window}")
+    axes[1, 0].set_xlabel("episode")
+    axes[1, 1].set_xlabel("step")
+    axes[0, 1].legend()
+    _finish(figure, axes.flat, path)
+
+
+def plot_evaluations(runs: Runs, path: Path) -> None:
+    """Plot greedy success in the validation world over the steps, a line for each run.
+
+    Args:
+        runs: Tables with a row for each evaluation.
+        path: The PNG file.
+    """
+    figure, axis = _pyplot().subplots(figsize=(7, 4), layout="constrained")
+    for place, (arm, tables) in enumerate(runs.items()):
+        for number, table in enumerate(tables.values()):
+            axis.plot(
+                table["total_steps"],
+                table["success"],
+                color=f"C{place}",
+                alpha=0.7,
+                marker=".",
+                label=arm if number == 0 else None,
+            )
+    axis.set(xlabel="step", ylabel="greedy success in the validation world", ylim=(-0.02, 1.02))
+    axis.legend()
+    _finish(figure, [axis], path)
+
+
+def write_animation(frames: Sequence[NDArray[np.uint8]], path: Path) -> None:
+    """Write an animation of at most some hundred frames, twice as fast as real.
+
+    Args:
+        frames: Pictures, each of shape ``[height, width, 3]``.
+        path: The GIF file.
+    """
+    step = -(-len(frames) // _GIF_FRAMES)
+    chosen = [Image.fromarray(frame) for frame in [*frames[:-1:step], frames[-1]]]
+    # One palette of the whole episode and no dithering: what stands still is stored once.
+    palette = chosen[0].quantize(64)
+    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chosen]
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=50 * step, loop=0, optimize=True
+    )
+
+
+def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:
+    """Mean of the last ``window`` values, of fewer at the start."""
+    return values.astype(float).rolling(window, min_periods=1).mean().to_numpy()
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def _finish(figure: Any, axes: Iterable[Any], path: Path) -> None:
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    _pyplot().close(figure)

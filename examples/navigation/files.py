@@ -1,0 +1,74 @@
+"""The folder of a run: what lies in it, and who may write there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+CHECKPOINT = "checkpoint.pt"
+POLICY = "policy.npz"
+SETTINGS = "settings.json"
+EPISODES = "episodes.csv"
+EVALUATIONS = "evaluations.csv"
+CURVE = "learning_curve.png"
+STATUS = "status.json"
+PREVIOUS = "previous"
+"""Where the files of a run go that is started anew."""
+_LOCK = ".lock"
+# The checkpoint first: once it is gone, nothing can go on with the old run.
+_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, EPISODES, EVALUATIONS, CURVE, STATUS)
+
+
+class FolderInUse(RuntimeError):
+    """Another process works in the folder."""
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Hold a folder, so that no other run or study writes in it.
+
+    The system lets go of the lock when the process ends, however that ends. What a killed process
+    had half written is removed.
+
+    Args:
+        folder: The folder; made if there is none.
+
+    Raises:
+        FolderInUse: If another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    held = FileLock(folder / _LOCK, timeout=0)
+    try:
+        held.acquire()
+    except Timeout:
+        raise FolderInUse(
+            f"another process is at work in {folder}: wait for it, or end it"
+        ) from None
+    try:
+        for pattern in (".*.tmp", f".{POLICY}.*"):
+            for half_written in folder.glob(pattern):
+                half_written.unlink(missing_ok=True)
+        yield
+    finally:
+        held.release()
+
+
+def set_aside(folder: Path) -> None:
+    """Move the files of an earlier run to ``previous/``, in place of those that lie there.
+
+    Args:
+        folder: The folder of the run, which the caller holds.
+    """
+    if not any((folder / name).exists() for name in _OF_A_RUN):
+        return
+    previous = folder / PREVIOUS
+    previous.mkdir(exist_ok=True)
+    for name in _OF_A_RUN:
+        (previous / name).unlink(missing_ok=True)
+    for name in _OF_A_RUN:
+        if (folder / name).exists():
+            os.replace(folder / name, previous / name)

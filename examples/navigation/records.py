@@ -1,0 +1,76 @@
+"""What a run leaves behind in rows: one for each training episode, one for each evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from torchrl_mpfa.saving import write_text_atomically
+
+
+@dataclass
+class EpisodeRecord:
+    """One training episode."""
+
+    episode: int
+    world: str
+    steps: int
+    total_steps: int
+    reward: float
+    """Total reward."""
+    average_reward: float
+    """Total reward over steps, the paper's curve."""
+    seconds: float
+    """Wall-clock time [s]."""
+    success: bool
+    collision: bool
+    timeout: bool
+    path_length: float
+    """Distance driven [m]."""
+    shortest_path: float
+    """Shortest path of the task [m]."""
+
+
+@dataclass
+class EvaluationRecord:
+    """One evaluation during training."""
+
+    total_steps: int
+    episode: int
+    """Training episodes finished."""
+    world: str
+    """Where it was evaluated."""
+    success: float
+    collision: float
+    timeout: float
+    spl: float
+    seconds: float
+    """Wall-clock time that it took [s]."""
+
+
+def as_table(rows: Sequence[Any], kind: type[Any]) -> pd.DataFrame:
+    """Rows of one kind as a table.
+
+    Args:
+        rows: Instances of ``kind``, a dataclass.
+        kind: Names the columns, of a table without rows as well.
+
+    Returns:
+        A table with a column for each field.
+    """
+    columns = [entry.name for entry in fields(kind)]
+    return pd.DataFrame([asdict(row) for row in rows], columns=columns)
+
+
+def write_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV, in one step."""
+    write_text_atomically(table.to_csv(index=False), path)
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a table; one without rows if there is no such file."""
+    return pd.read_csv(path) if path.exists() else pd.DataFrame()

@@ -1,0 +1,120 @@
+"""A run from its start to its end: who may write in its folder, and what its exit status says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.types import Override
+
+from navigation import files
+from navigation.checkpoints import read_checkpoint
+from navigation.checks import check_settings
+from navigation.figures import plot_learning_curve
+from navigation.records import EpisodeRecord, as_table
+from navigation.resuming import changed, check_lawful
+from navigation.settings import TrainSettings, as_settings
+from navigation.training import TrainingRun, prepare_process
+from torchrl_mpfa.saving import write_text_atomically
+
+
+class Refused(Exception):
+    """A run that is not begun, and why in one sentence."""
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Turn errors of what comes before the first step into :class:`Refused`."""
+    try:
+        yield
+    except (ValueError, OSError, files.FolderInUse) as error:
+        raise Refused(" ".join(str(error).split())) from error
+
+
+def start(settings: TrainSettings, folder: Path) -> int:
+    """Train anew.
+
+    Args:
+        settings: The settings, checked.
+        folder: Of the run.
+
+    Returns:
+        Exit status: 0, or 128 and the number of the signal that stopped the run.
+
+    Raises:
+        Refused: If the folder holds a run and ``overwrite`` is false, if another run is at work in
+            it, or if the parts refuse a setting.
+    """
+    with ExitStack() as held:
+        with refusing():
+            held.enter_context(files.lock(folder))
+            if (folder / files.CHECKPOINT).exists() and not settings.overwrite:
+                raise ValueError(
+                    f"{folder} holds a run: go on with it by resume={folder}, or start anew by "
+                    "overwrite=true"
+                )
+            files.set_aside(folder)
+            training = _prepared(settings, folder, None)
+        return _train(training)
+
+
+def resume(folder: Path, overrides: list[Override]) -> int:
+    """Go on with a run where its checkpoint was written.
+
+    Args:
+        folder: Of the run.
+        overrides: Settings that shall be others from now on.
+
+    Returns:
+        As :func:`start`.
+
+    Raises:
+        Refused: If there is no checkpoint, if it cannot be read, if a setting may not change, or if
+            another run is at work in the folder.
+    """
+    with ExitStack() as held:
+        with refusing():
+            if not folder.is_dir():
+                raise FileNotFoundError(f"resume: there is no folder {folder}")
+            held.enter_context(files.lock(folder))
+            state = read_checkpoint(folder)
+            settings = changed(state["settings"], overrides)
+            check_settings(settings)
+            check_lawful(as_settings(state["settings"]), settings, folder)
+            training = _prepared(settings, folder, state)
+        return _train(training)
+
+
+def _prepared(settings: TrainSettings, folder: Path, state: dict[str, Any] | None) -> TrainingRun:
+    prepare_process(settings)
+    training = TrainingRun(settings, folder, state)
+    write_settings(settings, folder / files.SETTINGS)
+    return training
+
+
+def _train(training: TrainingRun) -> int:
+    folder = training.folder
+    try:
+        finished = training.train()
+    except KeyboardInterrupt:
+        finished = False
+    finally:
+        training.close()
+    curve = folder / files.CURVE
+    if training.records:
+        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
+    if finished:
+        print(f"policy: {folder / files.POLICY}   curve: {curve}")
+        return 0
+    print(f"stopped after episode {training.episode}; go on with: train.py resume={folder}")
+    return training.stop.exit_status
+
+
+def write_settings(settings: TrainSettings, path: Path) -> None:
+    """Keep the settings of a run where people and studies can read them."""
+    values = {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}
+    write_text_atomically(json.dumps(values, indent=2) + "\n", path)

@@ -1,0 +1,88 @@
+"""How a run ends early: Ctrl-C, a scheduler, a closed terminal, or a parent that is gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import FrameType
+
+from tqdm import tqdm
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_LIFELINE = "NAVIGATION_LIFELINE"
+
+
+class Stop:
+    """Whether a program was asked to stop, and by which signal.
+
+    The first signal lets it end in good order; at the second it stops at once.
+
+    Args:
+        answer: What it says to the first one.
+    """
+
+    def __init__(self, answer: str = "stopping after this episode") -> None:
+        self.answer = answer
+        self.signal: int | None = None
+
+    def __bool__(self) -> bool:
+        return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """As shells have it: 128 and the number of the signal."""
+        return 128 + (self.signal or 0)
+
+    def ask(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
+        """Ask to stop; a handler of signals.
+
+        Raises:
+            KeyboardInterrupt: If that was asked for before.
+        """
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+        name = signal.Signals(number).name
+        tqdm.write(f"{name}: {self.answer}; once more to stop at once")
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Have the signals ask to stop."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, self.ask) for number in SIGNALS}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def end_with_parent() -> None:
+    """End by SIGTERM when the process that gave :func:`lifeline` is gone, however it ended."""
+    number = os.environ.pop(_LIFELINE, None)
+    if number is None:
+        return
+
+    def wait(descriptor: int = int(number)) -> None:
+        os.read(descriptor, 1)  # Nothing is ever written: it returns once the other end is closed.
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, daemon=True, name="lifeline").start()
+
+
+def lifeline(descriptor: int) -> Mapping[str, str]:
+    """The environment of a child that calls :func:`end_with_parent`.
+
+    Args:
+        descriptor: The end of a pipe to read from, handed on to the child; this process keeps the
+            other one open.
+
+    Returns:
+        Environment variables.
+    """
+    return {**os.environ, _LIFELINE: str(descriptor)}
