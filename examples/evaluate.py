@@ -1,41 +1,36 @@
-"""Evaluate a trained policy on fixed start and goal pairs of a map.
+"""Evaluate a trained policy between fixed starts and goals in one or several worlds.
 
-    python examples/evaluate.py runs/demo --world A --episodes 100
-    python examples/evaluate.py examples/policies/td3-mpfa_per.pt    one that comes with the project
+    python examples/evaluate.py runs/demo --worlds A --episodes 100
+    python examples/evaluate.py runs/demo --worlds test random:100-109 --episodes 40
+    python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
 
-Writes to the folder of the run, of another file to runs/evaluation-NAME, or to --output:
-evaluation.json (the estimates), evaluation.csv (a row an episode), trajectories.png (the map with
-every path) and episode.gif (one episode from above).
+Prints a row for each world and their total. Writes to the folder ``evaluation-WORLDS`` in that of
+the run, for another file to runs/evaluation-NAME, or to --output: summary.csv (the rows with their
+intervals), episodes.csv (a row an episode), settings.json (what was asked for, and the policy's
+card), and for each world trajectories-WORLD.png (every way) and episode-WORLD.gif (one from above).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, fields
 from pathlib import Path
 
-import torch
-from numpy.typing import NDArray
+import pandas as pd
 from PIL import Image
 
-from environments import make_evaluation_env
-from evaluation import (
-    EpisodeResult,
-    Interval,
-    greedy,
-    run_episode,
-    run_episodes,
-    summarize,
-)
-from mpfa_envs import NavigationEnv, Task, evaluation_pairs, render_trajectories
-from records import load_policy, write_rows, write_text_atomically
-from settings import Environment
+from mpfa_envs import EpisodeResult, Policy, load_policy, render_trajectories
+from navigation import files
+from navigation.evaluating import Drives, drive, film, summary_row
+from navigation.figures import write_animation
+from navigation.records import as_table, write_table
+from navigation.stopping import end_with_parent
+from navigation.worlds import parse_worlds, world_name, worlds_label
+from torchrl_mpfa.saving import write_text_atomically
 
-_UNITS = {"time_s": "s", "path_length": "m", "min_clearance": "m"}
-_GIF_FRAMES = 120
+_COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
+_SECONDS = {"time_s": "{:.1f}", "min_clearance": "{:.3f}"}
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -43,118 +38,104 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("policy", type=Path, help="policy.pt, or the folder of a run")
-    parser.add_argument("--world", default="test", help="map or world file (default: test)")
-    parser.add_argument("--episodes", type=int, default=200, help="number of pairs (default: 200)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
-    parser.add_argument("--output", type=Path, help="folder (default: that of the run)")
-    parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
-    parser.add_argument("--no-gif", action="store_true", help="write no animation")
-    return parser.parse_args(arguments)
-
-
-def output_folder(policy: Path) -> Path:
-    """Where results go unless the command line says: to the run that the policy is of."""
-    if policy.is_dir():
-        return policy
-    return (
-        policy.parent if policy.name == "policy.pt" else Path("runs") / f"evaluation-{policy.stem}"
+    parser.add_argument("policy", type=Path, help="policy.npz, or the folder of a run")
+    parser.add_argument(
+        "--worlds",
+        nargs="+",
+        default=["test"],
+        help="names, world files, and spans of random worlds such as random:100-109",
     )
+    parser.add_argument("--episodes", type=int, default=200, help="in each world (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
+    parser.add_argument("--output", type=Path, help="folder (default: in that of the run)")
+    parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
+    parser.add_argument("--no-pictures", action="store_true", help="write tables alone")
+    options = parser.parse_args(arguments)
+    for name, least in (("episodes", 1), ("seed", 0)):
+        if getattr(options, name) < least:
+            parser.error(f"--{name} must be at least {least}, got {getattr(options, name)}")
+    try:
+        options.names = parse_worlds(options.worlds)
+        options.loaded = load_policy(options.policy)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    return options
 
 
-def print_table(summary: dict[str, Interval]) -> None:
-    """Print the estimates with their intervals."""
-    print(f"{'':14}{'mean':>9}   95 % interval")
-    for name, interval in summary.items():
-        unit = f" [{_UNITS[name]}]" if name in _UNITS else ""
-        print(f"{name + unit:14}{interval.value:9.3f}   [{interval.low:.3f}, {interval.high:.3f}]")
+def output_folder(policy: Path, words: Sequence[str]) -> Path:
+    """Where results go unless the command line says: each choice of worlds has its own folder."""
+    name = f"evaluation-{worlds_label(words)}"
+    if policy.is_dir():
+        return policy / name
+    if policy.name == files.POLICY:
+        return policy.parent / name
+    return Path("runs") / f"evaluation-{policy.stem}" / name
+
+
+def printed(summary: pd.DataFrame) -> str:
+    """The table on the screen: estimates, and the interval of success."""
+    table = summary[["world", "episodes"]].copy()
+    for name, form in {**_COLUMNS, **_SECONDS}.items():
+        table[name] = summary[name].map(form.format)
+    ends = zip(summary["success_low"], summary["success_high"], strict=True)
+    table.insert(3, "95 %", [f"[{low:.1%}, {high:.1%}]" for low, high in ends])
+    return table.to_string(index=False)
 
 
 def write_pictures(
-    env: NavigationEnv,
-    results: list[EpisodeResult],
-    trajectories: list[NDArray],  # type: ignore[type-arg]
-    tasks: list[Task],
-    title: str,
-    folder: Path,
+    policy: Policy, world: str, drives: Drives, options: argparse.Namespace, folder: Path
 ) -> None:
-    """Draw every path into one picture of the map."""
-    outcomes = [
-        "success" if r.success else "collision" if r.collision else "timeout" for r in results
-    ]
+    """Every way in one picture, and one episode as an animation."""
+    results, name = drives.results, world_name(world)
+    ends = ["success" if r.success else "collision" if r.collision else "timeout" for r in results]
     picture = render_trajectories(
-        env.world,
-        trajectories,
-        [task.goal for task in tasks],
-        outcomes,  # type: ignore[arg-type]
-        title=title,
+        world,
+        drives.trails,
+        drives.goals,
+        ends,  # type: ignore[arg-type]
+        title=f"world {name}",
         size=640,
     )
-    Image.fromarray(picture).save(folder / "trajectories.png")
+    Image.fromarray(picture).save(folder / f"trajectories-{name}.png")
+    # The success with the longest way shows most; any episode if there is none.
+    shown = max([r for r in results if r.success] or results, key=lambda r: r.path_length)
+    frames = film(policy, world, episode=shown.episode, seed=options.seed, physics=options.physics)
+    write_animation(frames, folder / f"episode-{name}.gif")
 
 
-def write_animation(frames: list[NDArray], path: Path) -> None:  # type: ignore[type-arg]
-    """Write an animation of at most some hundred frames, twice as fast as real."""
-    step = -(-len(frames) // _GIF_FRAMES)
-    chosen = [Image.fromarray(frame) for frame in [*frames[:-1:step], frames[-1]]]
-    # One palette and no dithering: what stands still is equal in all frames and stored once.
-    palette = chosen[0].quantize(64)
-    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chosen]
-    pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=50 * step, loop=0, optimize=True
-    )
+def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
+    """Evaluate, print, write.
 
+    Args:
+        arguments: The command line.
 
-def main(arguments: Sequence[str] | None = None) -> dict[str, Interval]:
-    """Evaluate, print, write."""
+    Returns:
+        A row for each world, and the total.
+    """
+    end_with_parent()
     options = parse(arguments)
-    torch.set_num_threads(1)  # One observation at a time: a second thread only costs.
-    policy, state = load_policy(options.policy)
-    folder = options.output or output_folder(options.policy)
-    folder.mkdir(parents=True, exist_ok=True)
-    settings = Environment(**state["environment"])
-    settings.physics = options.physics or settings.physics
-    env = make_evaluation_env(options.world, settings, render_mode="rgb_array")
-    tasks = evaluation_pairs(options.world, options.episodes, options.seed, robot=settings.robot)
-    act = greedy(policy)
-    results, trajectories = run_episodes(env, act, tasks)
-    summary = summarize(results)
-    print(f"\n{options.policy} on map {options.world}, {len(tasks)} fixed pairs")
-    print_table(summary)
-
-    document = {
-        **{name: _plain(interval.value) for name, interval in summary.items()},
-        "episodes": len(results),
-        "intervals": {name: [_plain(i.low), _plain(i.high)] for name, i in summary.items()},
-        "world": str(options.world),
-        "seed": options.seed,
-        "physics": settings.physics,
-        "trained": state["trained"],
-    }
-    write_text_atomically(json.dumps(document, indent=2) + "\n", folder / "evaluation.json")
-    names = [entry.name for entry in fields(EpisodeResult)]
-    write_rows([asdict(result) for result in results], names, folder / "evaluation.csv")
-    write_pictures(env, results, trajectories, tasks, f"map {options.world}", folder)
-    written = ["evaluation.json", "evaluation.csv", "trajectories.png"]
-    if not options.no_gif:
-        frames: list[NDArray] = []  # type: ignore[type-arg]
-        run_episode(env, act, tasks[_longest(results)], 0, frames=frames)
-        write_animation(frames, folder / "episode.gif")
-        written.append("episode.gif")
-    env.close()
-    print("written: " + ", ".join(str(folder / name) for name in written))
+    policy: Policy = options.loaded
+    folder = options.output or output_folder(options.policy, options.worlds)
+    asked = {"episodes": options.episodes, "seed": options.seed, "physics": options.physics}
+    results: list[EpisodeResult] = []
+    rows = []
+    with files.lock(folder):
+        for world in options.names:
+            drives = drive(policy, world, progress=not options.no_pictures, **asked)
+            results += drives.results
+            rows.append({"world": world_name(world), **summary_row(drives.results)})
+            if not options.no_pictures:
+                write_pictures(policy, world, drives, options, folder)
+        if len(rows) > 1:
+            rows.append({"world": "total", **summary_row(results)})
+        summary = pd.DataFrame(rows)
+        write_table(summary, folder / "summary.csv")
+        write_table(as_table(results, EpisodeResult), folder / files.EPISODES)
+        document = {"words": options.worlds, **asked, "card": policy.card}
+        write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
+    print(f"\n{options.policy}, {options.episodes} pairs in each world\n{printed(summary)}")
+    print(f"written: {folder}")
     return summary
-
-
-def _plain(value: float) -> float | None:
-    """A mean over no episode is null: JSON has no NaN."""
-    return None if math.isnan(value) else value
-
-
-def _longest(results: list[EpisodeResult]) -> int:
-    """The success with the longest way, which shows most; any episode if there is none."""
-    reached = [r for r in results if r.success] or results
-    return max(reached, key=lambda r: r.path_length).episode
 
 
 if __name__ == "__main__":

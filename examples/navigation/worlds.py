@@ -1,0 +1,71 @@
+"""The worlds that a command line names."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from mpfa_envs.maps import resolve_world
+
+_LONGEST = 60
+
+
+def parse_worlds(words: Sequence[str]) -> list[str]:
+    """The worlds that some words stand for.
+
+    Args:
+        words: Names of worlds, paths of world files, and spans of random worlds.
+
+    Returns:
+        Names and paths, each of which there is.
+
+    Raises:
+        ValueError: If there is no such world, or one is named twice.
+
+    Examples:
+        >>> parse_worlds(["test", "random:7-9"])
+        ['test', 'random-7', 'random-8', 'random-9']
+    """
+    worlds: list[str] = []
+    for word in words:
+        span = re.fullmatch(r"random:(\d{1,9})-(\d{1,9})", word)
+        if span is None:
+            worlds.append(word)
+        else:
+            first, last = int(span[1]), int(span[2])
+            if last < first:
+                raise ValueError(f"{word} ends before it begins")
+            worlds += [f"random-{number}" for number in range(first, last + 1)]
+    for number, world in enumerate(worlds):
+        if world in worlds[:number]:
+            raise ValueError(f"world {world!r} is named twice")
+        resolve_world(world)
+    return worlds
+
+
+def world_name(world: str) -> str:
+    """A world as part of a file's name: that of a world file without folder and ending."""
+    return re.sub(r"[^\w.-]", "_", Path(world).stem if Path(world).suffix else world)
+
+
+def worlds_label(words: Sequence[str]) -> str:
+    """A name for the results in some worlds.
+
+    Args:
+        words: As given to :func:`parse_worlds`.
+
+    Returns:
+        Part of a file's name; other worlds have another one.
+
+    Examples:
+        >>> worlds_label(["test", "random:100-109"])
+        'test+random-100-109'
+    """
+    label = "+".join(world_name(word.replace(":", "-")) for word in words)
+    if len(label) <= _LONGEST and not any(Path(word).suffix for word in words):
+        return label
+    # Two world files may have one name, in two folders.
+    digest = hashlib.sha256("\n".join(words).encode()).hexdigest()[:8]
+    return f"{label[:_LONGEST]}-{digest}"
