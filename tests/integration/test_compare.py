@@ -2,93 +2,182 @@
 
 from __future__ import annotations
 
-import csv
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+import torch
 
 import compare
+import evaluate
+from navigation import files
+from navigation.command_line import composed
+from navigation.records import read_table
+from navigation.running import Refused, resume, start
+from navigation.studies import with_defaults
+from tests.integration.tiny_runs import OVERRIDES
 
-EXAMPLES = Path(compare.__file__).parent
-TINY = [
-    "learner.width=8",
-    "method.batch_size=8",
-    "method.capacity=200",
-    "environment.physics=kinematic",
-    "environment.max_steps=20",
-    "evaluation.every=0",
-    "curriculum.stages=[{world: A, episodes: 2}]",
-]
+EPISODES = "curriculum.stages=[{{world: A, episodes: {}}}]"
 
 
 def study(
-    folder: Path, *more: str, methods: tuple[str, ...] = ("mpfa_per", "uniform")
+    folder: Path, *more: str, methods: tuple[str, ...] = ("mpfa_per", "uniform"), length: int = 2
 ) -> list[str]:
     return [
         *("--folder", str(folder), "--methods", *methods, "--seeds", "0"),
-        *("--world", "B", "--episodes", "3", *more, "--", *TINY),
+        *("--worlds", "B", "random:7-8", "--episodes", "2", *more),
+        *("--", *OVERRIDES, EPISODES.format(length)),
     ]
 
 
-def rows(folder: Path) -> list[dict[str, str]]:
-    with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+class InThisProcess:
+    """Does what a child process would, without the seconds that one takes to start."""
+
+    def __init__(self, command: Sequence[str], log: Path) -> None:
+        arguments = list(command[2:])
+        if command[1].endswith("evaluate.py"):
+            evaluate.main(arguments)
+            self.status = 0
+            return
+        try:
+            if arguments[0].startswith("resume="):
+                self.status = resume(Path(arguments[0].removeprefix("resume=")), [])
+            else:
+                (settings,) = composed(arguments)
+                self.status = start(settings, Path(settings.run_dir))
+        except Refused as error:
+            log.write_text(str(error))
+            self.status = 2
+
+    def ended(self) -> int:
+        return self.status
 
 
-def test_a_study_keeps_every_episode_and_a_second_call_does_nothing(tmp_path: Path) -> None:
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(compare, "Child", InThisProcess)
+    monkeypatch.setattr(compare, "_PAUSE", 0.0)
+    yield
+    torch.set_flush_denormal(False)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_study_keeps_every_episode_and_refuses_other_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert compare.main(study(tmp_path)) == 0
-    found = rows(tmp_path)
-    assert [(row["method"], row["episode"]) for row in found] == [
-        (method, str(number)) for method in ("mpfa_per", "uniform") for number in range(3)
-    ]
-    for row in found:
-        ends = [row[name] == "True" for name in ("success", "collision", "timeout")]
-        assert sum(ends) == 1
-    before = (tmp_path / "ddpg-mpfa_per-0" / "checkpoint.pt").stat().st_mtime_ns
+    found = read_table(tmp_path / files.EPISODES)
+    worlds = ["B", "B", "random-7", "random-7", "random-8", "random-8"]
+    assert list(found["world"]) == worlds * 2
+    assert list(found["method"]) == ["mpfa_per"] * 6 + ["uniform"] * 6
+    assert (found["success"] ^ found["collision"] ^ found["timeout"]).all()
+    kept = json.loads((tmp_path / files.SETTINGS).read_text())
+    assert kept["runs"]["ddpg-uniform-0"]["method"]["name"] == "uniform"
+    assert kept["worlds"] == ["B", "random:7-8"]
+
+    # Again: nothing happens.
+    checkpoint = tmp_path / "ddpg-mpfa_per-0" / files.CHECKPOINT
+    before = checkpoint.stat().st_mtime_ns
     assert compare.main(study(tmp_path)) == 0
-    assert (tmp_path / "ddpg-mpfa_per-0" / "checkpoint.pt").stat().st_mtime_ns == before
-    assert rows(tmp_path) == found
+    assert checkpoint.stat().st_mtime_ns == before
+    assert "2 runs, 2 of them done" in capsys.readouterr().out
+
+    # Other settings: refused by name, nothing touched.
+    other = [*study(tmp_path, methods=("mpfa_per",)), "method.alpha=0.9"]
+    assert compare.main(other) == 2
+    message = capsys.readouterr().err
+    assert "ddpg-mpfa_per-0 was trained with method.alpha=0.6, asked for is 0.9" in message
+    assert checkpoint.stat().st_mtime_ns == before
+
+    # Trained anew only if asked to; other pairs are driven without training.
+    assert compare.main([*study(tmp_path, "--anew", methods=("mpfa_per",)), other[-1]]) == 0
+    assert json.loads((checkpoint.parent / files.SETTINGS).read_text())["method"]["alpha"] == 0.9
+    before = checkpoint.stat().st_mtime_ns
+    more = [*study(tmp_path, methods=("mpfa_per",)), other[-1]]
+    more[more.index("--episodes") + 1] = "3"
+    assert compare.main(more) == 0
+    assert len(read_table(tmp_path / files.EPISODES)) == 9
+    assert checkpoint.stat().st_mtime_ns == before
 
 
-def test_a_killed_study_goes_on_to_the_same_rows(tmp_path: Path) -> None:
-    arguments = study(tmp_path / "killed", methods=("mpfa_per",))
-    arguments[-1] = "curriculum.stages=[{world: A, episodes: 30}]"
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def trainings(process: subprocess.Popen[bytes]) -> list[int]:
+    """Children of a process that run ``train.py``."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [n for n in map(int, children) if b"train.py" in Path(f"/proc/{n}/cmdline").read_bytes()]
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
+def test_a_killed_study_leaves_no_training_behind_and_goes_on_to_the_same_rows(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    arguments = [*study(tmp_path / "killed", methods=("mpfa_per",), length=40)]
     arguments.append("checkpoint_every=1")
     process = subprocess.Popen(
-        [sys.executable, str(EXAMPLES / "compare.py"), *arguments],
+        [sys.executable, compare.__file__ or "", *arguments],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,
     )
-    checkpoint = tmp_path / "killed" / "ddpg-mpfa_per-0" / "checkpoint.pt"
+    checkpoint = tmp_path / "killed" / "ddpg-mpfa_per-0" / files.CHECKPOINT
     deadline = time.monotonic() + 120
     while not checkpoint.exists():
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
+    (child,) = trainings(process)
+    process.send_signal(signal.SIGKILL)
     process.wait()
-    assert not (tmp_path / "killed" / "episodes.csv").exists()
+    while alive(child):
+        assert time.monotonic() < deadline, "a training outlived the study"
+        time.sleep(0.05)
+    assert not (tmp_path / "killed" / files.EPISODES).exists()
+
+    request.getfixturevalue("in_this_process")
     assert compare.main(arguments) == 0
     arguments[1] = str(tmp_path / "whole")
     assert compare.main(arguments) == 0
-    assert rows(tmp_path / "killed") == rows(tmp_path / "whole")
+    killed, whole = (read_table(tmp_path / name / files.EPISODES) for name in ("killed", "whole"))
+    assert killed.equals(whole)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_run_that_fails_is_named_and_the_others_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = study(tmp_path, "--jobs", "1")
     # A file where the run wants its checkpoint, which is no checkpoint.
     (tmp_path / "ddpg-mpfa_per-0").mkdir()
-    (tmp_path / "ddpg-mpfa_per-0" / "checkpoint.pt").write_bytes(b"no checkpoint")
-    assert compare.main(arguments) == 1
+    (tmp_path / "ddpg-mpfa_per-0" / files.CHECKPOINT).write_bytes(b"no checkpoint")
+    assert compare.main(study(tmp_path, "--jobs", "1")) == 1
     assert "ddpg-mpfa_per-0: failed, see" in capsys.readouterr().out
-    assert {row["method"] for row in rows(tmp_path)} == {"uniform"}
+    assert set(read_table(tmp_path / files.EPISODES)["method"]) == {"uniform"}
+
+
+def test_two_studies_do_not_work_in_one_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with files.lock(tmp_path):
+        assert compare.main(study(tmp_path)) == 2
+    assert f"another process is at work in {tmp_path}" in capsys.readouterr().err
+
+
+def test_defaults_of_a_study_give_way_to_its_command_line() -> None:
+    assert with_defaults(["curriculum=A"]) == [
+        "tracking=off",
+        "evaluation.every=5000",
+        "curriculum=A",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -97,6 +186,10 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
         (["--methods", "pre"], "unknown method 'pre'"),
         (["--learners", "ddgp"], "unknown learner 'ddgp'"),
         (["--jobs", "0"], "--jobs must be at least 1, got 0"),
+        (["--seeds", "0", "0"], "--seeds has 0 twice"),
+        (["--methods", "per", "per"], "--methods has per twice"),
+        (["--worlds", "test", "test"], "world 'test' is named twice"),
+        (["--worlds", "tset"], "did you mean"),
     ],
 )
 def test_a_wrong_command_line_is_refused(
@@ -105,3 +198,11 @@ def test_a_wrong_command_line_is_refused(
     with pytest.raises(SystemExit):
         compare.main(arguments)
     assert message in capsys.readouterr().err
+
+
+def test_a_setting_that_cannot_be_is_refused_before_anything_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare.main([*study(tmp_path), "learner.gamma=2"]) == 2
+    assert "compare.py: learner.gamma must be in [0, 1]" in capsys.readouterr().err
+    assert not (tmp_path / "ddpg-mpfa_per-0").exists()

@@ -1,0 +1,155 @@
+"""Studies: the runs of several methods, learners and seeds, their settings, and their rows."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from navigation import files
+from navigation.checks import settings_by_name
+from navigation.command_line import composed
+from navigation.records import read_table, write_table
+from navigation.resuming import LAWFUL, OF_THE_CALL
+from navigation.settings import TrainSettings, as_settings
+from navigation.worlds import worlds_label
+from torchrl_mpfa.saving import write_text_atomically
+
+SCRIPTS = Path(__file__).resolve().parents[1]
+DEFAULTS = ("curriculum=paper", "tracking=off", "evaluation.every=5000")
+"""What a study has unless its command line says otherwise."""
+
+
+def with_defaults(overrides: Sequence[str]) -> list[str]:
+    """The settings of a study, but where the command line has others."""
+    given = {override.partition("=")[0] for override in overrides}
+    return [*(d for d in DEFAULTS if d.partition("=")[0] not in given), *overrides]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What every policy of a study is asked to do."""
+
+    words: tuple[str, ...]
+    """Worlds, as on the command line."""
+    episodes: int
+    """Pairs of start and goal in each of them."""
+
+    @property
+    def folder(self) -> str:
+        """Folder of the results, in that of a run."""
+        return f"evaluation-{worlds_label(self.words)}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a study."""
+
+    learner: str
+    method: str
+    seed: int
+    folder: Path
+    """Of the study."""
+
+    @property
+    def name(self) -> str:
+        """Name of the run, and of its folder."""
+        return f"{self.learner}-{self.method}-{self.seed}"
+
+    @property
+    def path(self) -> Path:
+        """Folder of the run."""
+        return self.folder / self.name
+
+    def overrides(self, overrides: Sequence[str]) -> list[str]:
+        """Its settings on the command line of ``train.py``."""
+        own = [f"learner={self.learner}", f"method={self.method}", f"seed={self.seed}"]
+        return [*own, f"run_dir={self.path}", *with_defaults(overrides)]
+
+    def asked(self, overrides: Sequence[str]) -> TrainSettings:
+        """Its settings.
+
+        Raises:
+            ValueError: If they cannot be, or are those of several runs.
+        """
+        first, *others = composed(self.overrides(overrides))
+        if others:
+            raise ValueError("a study takes one value for each setting, not a sweep")
+        return first
+
+    def trains(self, overrides: Sequence[str], *, anew: bool = False) -> list[str]:
+        """The command that trains it, or goes on where a checkpoint lies."""
+        script = [sys.executable, str(SCRIPTS / "train.py")]
+        if (self.path / files.CHECKPOINT).exists() and not anew:
+            return [*script, f"resume={self.path}"]
+        return [*script, *self.overrides(overrides), "overwrite=true"]
+
+    def evaluates(self, wanted: Evaluation) -> list[str]:
+        """The command that evaluates its policy."""
+        return [
+            *(sys.executable, str(SCRIPTS / "evaluate.py"), str(self.path)),
+            *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
+        ]
+
+    def status(self) -> Mapping[str, Any]:
+        """How far it says that it is; nothing before its first episode."""
+        return _read_json(self.path / files.STATUS)
+
+    def is_trained(self) -> bool:
+        """Whether it came to its end."""
+        return bool(self.status().get("finished"))
+
+    def is_evaluated(self, wanted: Evaluation) -> bool:
+        """Whether its last policy was evaluated as it is asked for."""
+        found = _read_json(self.path / wanted.folder / files.SETTINGS)
+        return (
+            self.is_trained()
+            and found.get("episodes") == wanted.episodes
+            and found.get("words") == list(wanted.words)
+            and found.get("card", {}).get("steps") == self.status().get("steps")
+        )
+
+    def differences(self, asked: TrainSettings) -> list[str]:
+        """Where the settings that it was trained with are others than those asked for."""
+        found = _read_json(self.path / files.SETTINGS)
+        if not found:
+            return []
+        had, wanted = (dict(settings_by_name(each)) for each in (as_settings(found), asked))
+        free = {*LAWFUL, *OF_THE_CALL, "device"}
+        return [
+            f"{name}={had[name]}, asked for is {value}"
+            for name, value in wanted.items()
+            if name not in free and had[name] != value
+        ]
+
+
+def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
+    """Write the rows of all evaluated runs in one file, and their settings in another.
+
+    Args:
+        jobs: The runs.
+        wanted: What they were asked to do.
+        folder: Of the study.
+    """
+    tables, settings = [], {}
+    for job in jobs:
+        if job.is_evaluated(wanted):
+            table = read_table(job.path / wanted.folder / files.EPISODES)
+            table.insert(0, "learner", job.learner)
+            table.insert(1, "method", job.method)
+            table.insert(2, "seed", job.seed)
+            tables.append(table)
+            settings[job.name] = _read_json(job.path / files.SETTINGS)
+    if tables:
+        write_table(pd.concat(tables), folder / files.EPISODES)
+    document = {"worlds": wanted.words, "episodes": wanted.episodes, "runs": settings}
+    write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
+
+
+def _read_json(path: Path) -> Mapping[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
