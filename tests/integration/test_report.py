@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-import csv
+import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy import stats
 
 import report
-from aggregates import interquartile_mean, probability_of_improvement, stratified_bootstrap
+from navigation.intervals import (
+    bootstrap_runs,
+    bootstrap_runs_and_pairs,
+    interquartile_mean,
+    least_p,
+    mean,
+    permutation_p,
+    probability_of_improvement,
+    runs_needed,
+    t_interval,
+)
+from navigation.records import write_table
 
-
-def write(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+LINE = "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |"
 
 
 @pytest.fixture
@@ -31,20 +37,21 @@ def study(tmp_path: Path) -> Path:
                 good = failures is not None and (seed, episode) not in failures
                 evaluation.append(
                     {
-                        **{"learner": "ddpg", "method": method, "seed": seed, "episode": episode},
-                        **{"success": good, "collision": not good, "timeout": False},
-                        **{"time_s": 20.0 + seed, "spl": 0.8 * good},
+                        **{"learner": "ddpg", "method": method, "seed": seed, "world": "test"},
+                        **{"episode": episode, "success": good, "collision": not good},
+                        **{"timeout": False, "time_s": 20.0 + seed, "spl": 0.8 * good},
                     }
                 )
             folder = tmp_path / f"ddpg-{method}-{seed}"
+            folder.mkdir()
             training = [
                 {"total_steps": 10 * (n + 1), "success": n > 1, "average_reward": 0.1 * n}
                 for n in range(5)
             ]
-            write(folder / "episodes.csv", training)
-            progress = [{"total_steps": 5000, "success": 0.5}, {"total_steps": 9000, "success": 1}]
-            write(folder / "progress.csv", progress)
-    write(tmp_path / "episodes.csv", evaluation)
+            write_table(pd.DataFrame(training), folder / "episodes.csv")
+            found = [{"total_steps": 5000, "success": 0.5}, {"total_steps": 9000, "success": 1}]
+            write_table(pd.DataFrame(found), folder / "evaluations.csv")
+    write_table(pd.DataFrame(evaluation), tmp_path / "episodes.csv")
     return tmp_path
 
 
@@ -53,14 +60,39 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
     text = (study / "tables.md").read_text(encoding="utf-8")
     assert text.strip() == capsys.readouterr().out.strip()
     # Seven of eight pairs, of which four took 20 s and three 21 s.
-    assert "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |" in text
+    assert LINE in text
     assert "| ddpg | per | 0.0% | 0.0%, 0.0% | 100.0% | 0.0% | 0.000 |  |" in text
     assert "| paper | MPFA-PER | 90.5% |" in text
     # From zero to 0.5 in 5,000 steps, then to 1 in 4,000: (1250 + 3000) / 9000.
     assert "| ddpg | mpfa_per | 9,000; 9,000 | 0.472 | 0.472, 0.472 |" in text
-    assert "| ddpg/mpfa_per > ddpg/per | 0.938 [" in text
-    for name in ("training.png", "progress.png"):
+    # Two runs against two: six ways to deal them out, two of which differ as much.
+    assert "| ddpg/mpfa_per − ddpg/per | +0.875, p = 0.333 | +0.700, p = 0.333 | 0.333 |" in text
+    assert "Success of ddpg varies from run to run by 12.50 points" in text
+    for name in ("training.png", "evaluations.png"):
         assert (study / name).stat().st_size > 5000
+
+
+def test_random_worlds_have_tables_of_their_own_without_the_paper(study: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    rooms = rows.assign(world=["random-5", "random-3"] * (len(rows) // 2))
+    write_table(pd.concat([rows, rooms]), study / "episodes.csv")
+    report.main([str(study)])
+    test, random = (study / "tables.md").read_text(encoding="utf-8").split("## random")
+    assert LINE in test
+    assert LINE in random
+    assert test.count("| paper |") == 2
+    assert "| paper |" not in random
+
+
+def test_two_studies_together_have_the_runs_of_both(
+    study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = tmp_path / "more"
+    more.mkdir()
+    rows = pd.read_csv(study / "episodes.csv").query("method == 'per' and seed == 0")
+    write_table(rows, more / "episodes.csv")
+    report.main([str(study), str(more), "--output", str(tmp_path / "both")])
+    assert "| ddpg | per | 0.0% | 0.0%, 0.0%, 0.0% |" in capsys.readouterr().out
 
 
 def test_the_figures_may_go_elsewhere(study: Path, tmp_path: Path) -> None:
@@ -73,7 +105,14 @@ def test_a_folder_without_rows_is_refused(
 ) -> None:
     with pytest.raises(SystemExit):
         report.main([str(tmp_path)])
-    assert "has no episodes.csv with rows" in capsys.readouterr().err
+    assert "no episodes.csv with rows" in capsys.readouterr().err
+
+
+def test_runs_on_other_pairs_are_not_compared(study: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    write_table(rows.iloc[:-1], study / "episodes.csv")
+    with pytest.raises(ValueError, match="not tested on the same pairs"):
+        report.main([str(study)])
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
@@ -87,19 +126,56 @@ def test_ties_count_half_in_the_probability_of_improvement() -> None:
     assert probability_of_improvement(ours, theirs) == pytest.approx((0.25 + 1.0) / 2)
 
 
-def test_the_bootstrap_draws_runs_and_keeps_tasks() -> None:
-    # Runs agree on each task: whatever runs are drawn, the mean is the same.
-    scores = np.array([[0.0, 1.0, 2.0]] * 4)
-    rng = np.random.default_rng(0)
-    assert stratified_bootstrap(lambda x: float(x.mean()), scores, rng=rng) == (1.0, 1.0)
+def test_many_episodes_of_one_policy_do_not_narrow_the_interval_over_runs() -> None:
+    # Each run has a level of its own, and all of its pairs have that.
+    few = np.random.default_rng(0).normal(0.5, 0.1, (6, 1)) * np.ones((6, 4))
+    many = np.repeat(few, 100, axis=1)
+    for interval in (t_interval, lambda x: bootstrap_runs(mean, x, rng=np.random.default_rng(1))):
+        a, b = interval(few), interval(many)
+        assert (b.low, b.high) == pytest.approx((a.low, a.high))
+        assert b.high - b.low > 0.05
 
 
-def test_the_bootstrap_covers_the_mean_as_often_as_it_says() -> None:
+@pytest.mark.parametrize("runs", [4, 12])
+def test_the_t_interval_covers_the_mean_as_often_as_it_says(runs: int) -> None:
     rng = np.random.default_rng(1)
     covered = 0
-    for _ in range(200):
-        scores = rng.normal(0.3, 1.0, (20, 3))
-        low, high = stratified_bootstrap(lambda x: float(x.mean()), scores, rng=rng, draws=200)
-        covered += low <= 0.3 <= high
-    # 95 % but for the narrowness of twenty runs: 200 trials vary by 3 %.
-    assert 0.86 <= covered / 200 <= 0.99
+    for _ in range(400):
+        scores = rng.normal(0.3, 1.0, (runs, 1)) + rng.normal(0.0, 1.0, (runs, 5))
+        interval = t_interval(scores)
+        covered += interval.low <= 0.3 <= interval.high
+    assert 0.92 <= covered / 400 <= 0.98
+
+
+def test_resampling_pairs_as_well_widens_the_interval_where_pairs_differ() -> None:
+    # All runs agree: other runs would say the same, other pairs would not.
+    scores = np.tile(np.arange(10.0), (5, 1))
+    rng = np.random.default_rng(0)
+    runs = bootstrap_runs(mean, scores, rng=rng)
+    both = bootstrap_runs_and_pairs(mean, scores, rng=rng)
+    assert (runs.low, runs.high) == (4.5, 4.5)
+    assert both.high - both.low > 2.0
+
+
+def test_the_permutation_test_is_exact() -> None:
+    ours, theirs = np.array([[3.0], [5.0], [9.0]]), np.array([[1.0], [2.0]])
+    values = np.concatenate([ours, theirs])[:, 0]
+    gap = abs(ours.mean() - theirs.mean())
+    gaps = [
+        abs(values[list(chosen)].mean() - np.delete(values, list(chosen)).mean())
+        for chosen in itertools.combinations(range(5), 3)
+    ]
+    assert permutation_p(ours, theirs) == pytest.approx(np.mean(np.array(gaps) >= gap - 1e-12))
+    assert least_p(3, 3) == pytest.approx(0.1)
+    assert least_p(9, 3) == pytest.approx(1 / 220)
+
+
+def test_the_runs_that_it_takes_find_the_difference_as_often_as_promised() -> None:
+    rng = np.random.default_rng(0)
+    runs = runs_needed(1.95, 2.0)
+    assert runs == 16
+    found = [
+        stats.ttest_ind(rng.normal(0, 1.95, runs), rng.normal(2, 1.95, runs)).pvalue < 0.05
+        for _ in range(400)
+    ]
+    assert 0.75 <= np.mean(found) <= 0.86

@@ -9,44 +9,51 @@ import pytest
 import report
 
 DOCS = Path(__file__).parents[2] / "docs"
+PAGES = {
+    "results": "results.md",
+    "results/first": "first_study.md",
+}
 
 
-STUDIES = {"results.md": "results", "first_study.md": "results/first"}
+def tables(folder: Path, *studies: str) -> str:
+    report.main([*(str(DOCS / study) for study in studies), "--output", str(folder)])
+    return (folder / "tables.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("page", "study"), STUDIES.items())
-def test_every_table_of_the_results_is_made_of_the_rows_that_are_kept(
-    page: str, study: str, tmp_path: Path
-) -> None:
-    report.main([str(DOCS / study), "--output", str(tmp_path)])
-    text = (DOCS / page).read_text(encoding="utf-8")
-    tables = (tmp_path / "tables.md").read_text(encoding="utf-8").strip().splitlines()
-    assert len([line for line in tables if line.startswith("|")]) > 20
-    assert [line for line in tables if line and line not in text] == []
+def missing(text: str, page: str) -> list[str]:
+    """Lines of a report that a page does not have."""
+    written = (DOCS / page).read_text(encoding="utf-8").splitlines()
+    lines = [line for line in text.splitlines() if line and not line.startswith("## ")]
+    assert len(lines) >= 3
+    return [line for line in lines if line not in written]
+
+
+@pytest.mark.parametrize(("study", "page"), PAGES.items())
+def test_every_table_of_a_study_is_made_of_its_rows(study: str, page: str, tmp_path: Path) -> None:
+    assert missing(tables(tmp_path, study), page) == []
 
 
 @pytest.mark.parametrize("runs", ["results/more", "results/overlap"])
 def test_the_tables_of_the_further_runs_are_made_of_their_rows(runs: str, tmp_path: Path) -> None:
-    report.main([str(DOCS / runs), "--output", str(tmp_path)])
-    text = (DOCS / "results.md").read_text(encoding="utf-8")
-    tables = (tmp_path / "tables.md").read_text(encoding="utf-8").splitlines()
-    found = [line for line in tables if line.startswith("| ddpg | mpfa_per |")]
+    text = tables(tmp_path, runs)
+    found = [line for line in text.splitlines() if line.startswith("| ddpg | mpfa_per |")]
     assert len(found) == 2
-    assert [line for line in found if line not in text] == []
-    (further,) = report.by_method(report.read_rows(DOCS / runs / "episodes.csv")).values()
-    study = report.by_method(report.read_rows(DOCS / "results/episodes.csv"))
-    of_study = next(iter(next(iter(study.values())).values()))
-    assert len(further) == 3
-    for rows in further.values():
-        assert [r["shortest_path"] for r in rows] == [r["shortest_path"] for r in of_study]
+    assert missing("\n".join([*found, found[0]]), "results.md") == []
 
 
-@pytest.mark.parametrize("study", STUDIES.values())
+def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_path: Path) -> None:
+    text = tables(tmp_path, "results", "results/more", "results/overlap")
+    test = text.split("## random")[0]
+    assert "| ddpg/mpfa_per | 9 | success |" in test
+    # Outcomes of single runs are in the tables of their folders.
+    intervals = test[test.index("|  | runs |") :]
+    assert missing(intervals, "results.md") == []
+
+
+@pytest.mark.parametrize("study", PAGES)
 def test_every_run_of_a_study_was_tested_on_the_same_two_hundred_pairs(study: str) -> None:
-    methods = report.by_method(report.read_rows(DOCS / study / "episodes.csv"))
-    assert len(methods) >= 4
-    runs = [rows for seeds in methods.values() for rows in seeds.values()]
-    assert all(len(seeds) == 3 for seeds in methods.values())
-    assert all(len(rows) == 200 for rows in runs)
-    pairs = [[row["shortest_path"] for row in rows] for rows in runs]
-    assert all(each == pairs[0] for each in pairs)
+    rows = report.read_studies([DOCS / study]).query("world == 'test'")
+    assert rows["arm"].nunique() >= 4
+    assert (rows.groupby("arm")["run"].nunique() == 3).all()
+    assert (rows.groupby(["arm", "run"]).size() == 200).all()
+    assert (rows.groupby("episode")["shortest_path"].nunique() == 1).all()

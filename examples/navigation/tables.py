@@ -1,0 +1,182 @@
+"""Tables of studies in Markdown, out of the rows of their episodes and evaluations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+
+from mpfa_envs import Interval
+from navigation.intervals import (
+    Array,
+    bootstrap_runs,
+    bootstrap_runs_and_pairs,
+    interquartile_mean,
+    least_p,
+    mean,
+    permutation_p,
+    probability_of_improvement,
+    runs_needed,
+    t_interval,
+)
+
+PAPER = {"MPFA-PER": (0.905, 19, 27.3), "PER": (0.855, 29, 31.8)}
+"""Success, collisions of 200 and mean time [s] in the paper's tests."""
+GOAL = 0.9
+_DIFFERENCES = (0.02, 0.05)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def scores(rows: pd.DataFrame, column: str) -> Array:
+    """Values of a column, shape ``[runs, pairs]``; flags are 0 and 1.
+
+    Args:
+        rows: Evaluation episodes of one arm, each of its runs on the same pairs.
+        column: Its name.
+
+    Returns:
+        The values, runs in the order in which they come first.
+
+    Raises:
+        ValueError: If a run lacks pairs that another one has.
+    """
+    matrix = rows.pivot(index="run", columns=["world", "episode"], values=column)
+    matrix = matrix.loc[rows["run"].unique()].astype(float)
+    if matrix.isna().to_numpy().any():
+        raise ValueError(f"the runs {', '.join(matrix.index)} were not tested on the same pairs")
+    return matrix.to_numpy()
+
+
+def outcome_table(rows: pd.DataFrame, *, with_paper: bool) -> str:
+    """Success of each run, and means over the runs; beside the paper's if they compare."""
+    lines = []
+    for arm, found in rows.groupby("arm", sort=False):
+        success, time = scores(found, "success"), scores(found, "time_s")
+        reached = time[success == 1.0]
+        rates = [f"{scores(found, name).mean():.1%}" for name in ("collision", "timeout")]
+        lines.append(
+            [
+                *str(arm).split("/"),
+                f"{success.mean():.1%}",
+                ", ".join(f"{value:.1%}" for value in success.mean(axis=1)),
+                *rates,
+                f"{scores(found, 'spl').mean():.3f}",
+                f"{reached.mean():.1f}" if reached.size else "",
+            ]
+        )
+    for name, (rate, collisions, seconds) in PAPER.items() if with_paper else ():
+        of_all = f"{collisions / 200:.1%}"
+        lines.append(["paper", name, f"{rate:.1%}", "", of_all, "", "", f"{seconds:.1f}"])
+    head = ["learner", "method", "success", "of each run", "collision", "timeout", "SPL"]
+    return table([*head, "time [s]"], lines)
+
+
+def interval_table(rows: pd.DataFrame) -> str:
+    """Means of each arm with intervals for other runs, and for other runs and pairs."""
+    rng = np.random.default_rng(0)
+    lines = []
+    for arm, found in rows.groupby("arm", sort=False):
+        for column, label in (("success", "success"), ("spl", "SPL")):
+            values = scores(found, column)
+            intervals = (
+                t_interval(values),
+                bootstrap_runs(mean, values, rng=rng),
+                bootstrap_runs_and_pairs(mean, values, rng=rng),
+            )
+            middle = bootstrap_runs(interquartile_mean, values, rng=rng)
+            lines.append(
+                [
+                    str(arm),
+                    f"{len(values)}",
+                    label,
+                    f"{values.mean():.3f}",
+                    *(_ends(each) for each in intervals),
+                    f"{middle.value:.3f} {_ends(middle)}" if column == "spl" else "",
+                ]
+            )
+    head = ["", "runs", "", "mean", "t over runs", "bootstrap over runs", "over runs and pairs"]
+    return table([*head, "interquartile mean, over runs"], lines)
+
+
+def comparison_table(rows: pd.DataFrame) -> str:
+    """Differences between arms, tested over runs; empty for one arm."""
+    rng = np.random.default_rng(0)
+    arms = {str(arm): found for arm, found in rows.groupby("arm", sort=False)}
+    lines = []
+    for a, b in combinations(arms, 2):
+        success = [scores(arms[name], "success") for name in (a, b)]
+        spl = [scores(arms[name], "spl") for name in (a, b)]
+        better = bootstrap_runs(probability_of_improvement, *spl, rng=rng)
+        lines.append(
+            [
+                f"{a} − {b}",
+                *(_difference(*pair) for pair in (success, spl)),
+                f"{least_p(len(spl[0]), len(spl[1])):.3f}",
+                f"{better.value:.3f} {_ends(better)}",
+            ]
+        )
+    if not lines:
+        return ""
+    head = ["", "success, p", "SPL, p", "least p there can be"]
+    return table([*head, "SPL of a pair: probability of improvement, over runs"], lines)
+
+
+def power_lines(rows: pd.DataFrame) -> str:
+    """How many runs it takes to see a difference, by what each learner varies from run to run."""
+    lines = []
+    for learner, arms in rows.groupby("learner", sort=False):
+        runs = [scores(rows, "success").mean(axis=1) for _, rows in arms.groupby("arm")]
+        freedom = sum(len(each) - 1 for each in runs)
+        squares = sum(float(((each - each.mean()) ** 2).sum()) for each in runs)
+        if squares == 0.0:
+            continue
+        deviation = math.sqrt(squares / freedom)
+        needed = " and ".join(
+            f"{runs_needed(deviation, difference)} for {100 * difference:g} points"
+            for difference in _DIFFERENCES
+        )
+        lines.append(
+            f"Success of {learner} varies from run to run by {100 * deviation:.2f} points "
+            f"(standard deviation, {freedom} degrees of freedom). Runs of each method until a "
+            f"t-test finds a difference with 80 % power: {needed}."
+        )
+    return "\n\n".join(lines)
+
+
+def speed_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
+    """Steps until nine of ten validation goals are found, and area under that curve."""
+    lines = []
+    for arm, runs in curves.items():
+        firsts, areas = [], []
+        for found in runs.values():
+            reached = found.loc[found["success"] >= GOAL, "total_steps"]
+            firsts.append(f"{reached.iloc[0]:,.0f}" if len(reached) else "never")
+            areas.append(area_under(found["total_steps"], found["success"]))
+        each = ", ".join(f"{value:.3f}" for value in areas)
+        lines.append([*arm.split("/"), "; ".join(firsts), f"{np.mean(areas):.3f}", each])
+    head = ["learner", "method", f"steps to {GOAL:.0%}, each run", "area under the curve"]
+    return table([*head, "of each run"], lines)
+
+
+def area_under(steps: pd.Series, values: pd.Series) -> float:
+    """Mean height of a curve that starts at zero, over its steps."""
+    x, y = np.concatenate(([0.0], steps)), np.concatenate(([0.0], values))
+    return float(np.trapezoid(y, x) / x[-1])
+
+
+def _ends(interval: Interval) -> str:
+    if math.isnan(interval.low):
+        return "one run"
+    return f"[{interval.low:.3f}, {interval.high:.3f}]"
+
+
+def _difference(ours: Array, theirs: Array) -> str:
+    return f"{ours.mean() - theirs.mean():+.3f}, p = {permutation_p(ours, theirs):.3f}"
