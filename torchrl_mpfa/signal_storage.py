@@ -16,7 +16,7 @@ from torchrl_mpfa.dumps import open_dump, seal_dump
 from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
 from torchrl_mpfa.signals import SignalTable
-from torchrl_mpfa.storage_state import check_data_state, check_length, read_length
+from torchrl_mpfa.storage_state import check_data_state, check_length, read_metadata
 
 _FORMAT = 1
 _FILE = "signals.pt"
@@ -86,6 +86,8 @@ class SignalStorageMixin:
             # TorchRL counts the rows before it writes them.
             self._len = size
             raise
+        if self.max_size > self.signal_table.capacity:
+            self.signal_table.grow(self.max_size)
         table, slots = self.signal_table, self._slots(cursor)
         table.write(slots, table.blank(len(slots)) if admitted.rows is None else admitted.rows)
         table.size = len(self)  # type: ignore[arg-type]
@@ -121,7 +123,10 @@ class SignalStorageMixin:
                     f"transitions must come {[*expected]} at a time, as the first ones did, got "
                     f"{[*across]}"
                 )
-        elif self.max_size % across.numel():
+        elif self.max_size % across.numel() and (
+            # TorchRL rounds up; the sampler that fuses, or the file of the signals, could not.
+            self.needs_signals or not self.signal_table.in_memory
+        ):
             raise ValueError(
                 f"max_size must be a multiple of the {across.numel()} transitions that come at a "
                 f"time, got {self.max_size}"
@@ -244,8 +249,8 @@ class SignalStorageMixin:
             raise KeyError(f"the saved storage has no signals: {path / _FILE} is missing")
         state: dict[str, Any] = load_safely(path / _FILE)
         self._check_signals(state)
-        length = read_length(path, self.max_size, state["_signals"]["size"])
-        if (path / "meta.json").exists():
+        length, is_tree = read_metadata(path, self.max_size, state["_signals"]["size"])
+        if not is_tree:
             self._check_data(TensorDict.load_memmap(path), length)
         return state
 

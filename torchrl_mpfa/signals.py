@@ -125,6 +125,7 @@ class SignalTable:
     ) -> None:
         made = as_signals(signals)
         self.capacity = capacity
+        self.in_memory = file is None
         self.learned = [s for s in made if s.known_at == "update"]
         self.written = [s for s in made if s.known_at == "write"]
         self.reward_key = reward_key
@@ -147,6 +148,11 @@ class SignalTable:
         """Forget every slot; the count of writes goes on, so that old batches stay old."""
         self.rows.copy_(self._blank)
         self.size = 0
+
+    def grow(self, capacity: int) -> None:
+        """Add slots at the end; only for a table in memory."""
+        more = self._blank.expand(capacity - self.capacity, -1)
+        self.rows, self.capacity = torch.cat([self.rows, more]), capacity
 
     @property
     def rewards(self) -> Tensor:

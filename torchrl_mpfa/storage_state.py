@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -36,11 +36,19 @@ def check_length(found: Any, max_size: int, signals: int) -> int:
     return found
 
 
-def read_length(folder: Path, max_size: int, signals: int) -> int:
-    """The number of filled slots that TorchRL wrote to a folder, checked as above."""
-    file = folder / "storage_metadata.json"
-    found = json.loads(file.read_text(encoding="utf-8"))["len"] if file.exists() else signals
-    return check_length(found, max_size, signals)
+def read_metadata(folder: Path, max_size: int, signals: int) -> tuple[int, bool]:
+    """What TorchRL wrote about a storage to a folder.
+
+    Args:
+        folder: The folder.
+        max_size: Capacity of the storage.
+        signals: Number of filled slots in the saved signals.
+
+    Returns:
+        The number of filled slots, checked as above, and whether the data are no tensordict.
+    """
+    found = json.loads((folder / "storage_metadata.json").read_text(encoding="utf-8"))
+    return check_length(found["len"], max_size, signals), bool(found["is_pytree"])
 
 
 def check_data_state(
@@ -102,7 +110,7 @@ def _leaves(data: Any) -> dict[str, Tensor]:
     """Tensors by name, nested names joined by dots as in a tensordict's state."""
     if isinstance(data, Tensor):
         return {"": data}
-    if isinstance(data, TensorDictBase):
+    if is_tensor_collection(data):
         found = data.items(include_nested=True, leaves_only=True)
         return {".".join(as_path(key)): v for key, v in found if isinstance(v, Tensor)}
     if isinstance(data, Mapping):
