@@ -20,11 +20,16 @@ import pytest
 
 SUITES = {
     "prioritized": ["test/rb/test_prioritized.py"],
-    "samplers": ["test/rb/test_samplers.py", "-k", "prb or prioritized"],
+    "samplers": [
+        "test/rb/test_samplers.py",
+        "-k",
+        "prb or prioritized or SignalSampler or MPFASampler",
+    ],
     "composable": [
         "test/rb/test_composable.py::TestComposableBuffers",
         "-k",
-        "PrioritizedSampler and tensordict and LazyTensorStorage and not recompile",
+        "(PrioritizedSampler or SignalSampler or MPFASampler) and tensordict and "
+        "(LazyTensorStorage or SignalTensorStorage) and not recompile",
     ],
     "storages": [
         "test/rb/test_storages.py::TestStorages",
@@ -33,7 +38,7 @@ SUITES = {
         "not compile",
     ],
 }
-"""Tests of each suite, as arguments of pytest."""
+"""Tests of each suite, as arguments of pytest; names of classes are part of the tests' names."""
 
 PLACES = (
     "torchrl.data",

@@ -286,6 +286,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         if self._checks:
             self.check_state(state_dict)
         super().load_state_dict(state_dict)
+        self._tell_last_cursor()
 
     def dumps(self, path: str | Path) -> None:
         """Save in a folder, whole or not at all, with a checksum of each file.
@@ -312,6 +313,14 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
             if isinstance(part, TreeSampler | SignalStorageMixin):
                 part.check_dump(folder / name)
         super().loads(folder)
+        self._tell_last_cursor()
+
+    def _tell_last_cursor(self) -> None:
+        """Tell the storage what was written last, which TorchRL keeps no record of."""
+        cursor = getattr(self._writer, "_cursor", None)
+        if self._checks and cursor is not None and len(self._storage):
+            around = self._storage._len_along_dim0
+            self._storage._set_last_cursor((cursor - 1) % around)
 
     def _dump_prefetch_state(self, path: Path, prefetch_state: dict[str, Any]) -> None:
         """Nothing: TorchRL would pickle it, and what is pickled can execute anything."""

@@ -135,7 +135,8 @@ class SignalStorageMixin:
     def _known_schema(self) -> Schema | None:
         """Schema of the stored tensordict; None if there is none yet."""
         stored = getattr(self, "_storage", None)
-        if type(stored) is not TensorDict:
+        # What an empty storage was restored from is a tensordict without entries.
+        if not self.initialized or type(stored) is not TensorDict:  # type: ignore[attr-defined]
             return None
         if self._schema is None or not self._schema.describes(stored):
             self._schema = Schema(stored, self.ndim, self._allow_nonfinite)

@@ -1,0 +1,278 @@
+"""Buffers against a model of plain Python, under any sequence of calls, lawful or refused."""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from tensordict import TensorDict
+
+from tests.mpfa.transitions import same, seeded, snapshot, write_signals
+from torchrl_mpfa import (
+    MPFASampler,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    load_safely,
+    save_atomically,
+)
+
+CAPACITY = 7
+
+
+def make_rows(numbers):
+    """Transitions whose every entry tells their number."""
+    number = torch.tensor(numbers, dtype=torch.float32).unsqueeze(1)
+    return TensorDict(
+        {
+            "observation": number.expand(-1, 3).contiguous(),
+            "done": number.long() % 2 == 0,
+            "next": {"reward": -number, "observation": number + 0.5},
+        },
+        [len(numbers)],
+    )
+
+
+def without(key):
+    return lambda data: data.exclude(key)
+
+
+def with_entry(key, change):
+    return lambda data: data.set(key, change(data[key]))
+
+
+def spoiled(key, value):
+    def change(entry):
+        entry = entry.clone()
+        entry[-1] = value
+        return entry
+
+    return with_entry(key, change)
+
+
+REFUSED = [
+    without("observation"),
+    without(("next", "reward")),
+    without("next"),
+    lambda data: data.set("more", torch.zeros(len(data))),
+    with_entry("observation", lambda entry: entry[:, :1]),
+    with_entry(("next", "reward"), lambda entry: entry.double()),
+    with_entry("done", lambda entry: entry.long()),
+    spoiled("observation", torch.nan),
+    spoiled(("next", "observation"), -torch.inf),
+    spoiled(("next", "reward"), torch.nan),
+]
+
+
+class Replay(RuleBasedStateMachine):
+    """A buffer, and beside it what plain Python says must be in it."""
+
+    @initialize(memmap=st.booleans(), seed=st.integers(0, 9))
+    def make(self, memmap, seed):
+        self.folder = Path(tempfile.mkdtemp())
+        self.memmap, self.seed, self.made = memmap, seed, 0
+        self.buffer = self.new_buffer(seed)
+        self.slots, self.signals = {}, {}
+        self.cursor = self.next_number = 0
+
+    def new_buffer(self, seed):
+        self.made += 1
+        if self.memmap:
+            storage = SignalMemmapStorage(CAPACITY, scratch_dir=self.folder / f"data-{self.made}")
+        else:
+            storage = SignalTensorStorage(CAPACITY)
+        return SignalReplayBuffer(
+            storage=storage,
+            sampler=MPFASampler(CAPACITY, entropy_refresh=0.5),
+            batch_size=4,
+            generator=seeded(seed),
+        )
+
+    def teardown(self):
+        if hasattr(self, "folder"):
+            shutil.rmtree(self.folder)
+
+    def write(self, count):
+        """Number the next transitions, and put them where a ring has them."""
+        numbers = list(range(self.next_number, self.next_number + count))
+        self.next_number += count
+        expected = []
+        for number in numbers:
+            self.slots[self.cursor] = number
+            self.signals.pop(self.cursor, None)
+            expected.append(self.cursor)
+            self.cursor = (self.cursor + 1) % CAPACITY
+        return numbers, expected
+
+    @rule(count=st.integers(0, 2 * CAPACITY + 1))
+    def extend(self, count):
+        numbers, expected = self.write(count)
+        assert self.buffer.extend(make_rows(numbers)).tolist() == expected
+
+    @rule()
+    def add(self):
+        numbers, expected = self.write(1)
+        assert self.buffer.add(make_rows(numbers)[0]) == expected[0]
+
+    @precondition(lambda self: self.slots)
+    @rule(seed=st.integers(0, 99), late=st.integers(0, 3), size=st.integers(1, 4))
+    def sample_and_update(self, seed, late, size):
+        batch = self.buffer.sample()
+        numbers = [self.slots[slot] for slot in batch["index"].tolist()]
+        assert batch["observation"][:, 2].tolist() == numbers
+        assert batch["next", "reward"][:, 0].tolist() == [-number for number in numbers]
+        weight = batch["priority_weight"]
+        assert bool(((weight > 0) & (weight <= 1 + 1e-6)).all())
+        # Some slots may be overwritten between the draw and the update.
+        gone = set()
+        if late:
+            written, slots = self.write(late)
+            self.buffer.extend(make_rows(written))
+            gone = set(slots)
+        batch = write_signals(batch[:size], seed=seed)
+        self.buffer.update_tensordict_priority(batch)
+        for slot, error in zip(
+            batch["index"].tolist(), batch["signals", "td_error"].tolist(), strict=True
+        ):
+            if slot not in gone:
+                self.signals[slot] = error
+
+    @rule()
+    def empty(self):
+        self.buffer.empty()
+        self.slots, self.signals, self.cursor = {}, {}, 0
+
+    @rule(seed=st.integers(0, 9))
+    def save_and_load(self, seed):
+        save_atomically(self.buffer.state_dict(), self.folder / "state.pt")
+        if not self.buffer.storage.initialized and self.memmap:
+            return
+        self.go_on_with(
+            seed, lambda new: new.load_state_dict(load_safely(self.folder / "state.pt"))
+        )
+
+    @precondition(lambda self: self.slots)
+    @rule(seed=st.integers(0, 9))
+    def dump_and_load(self, seed):
+        self.buffer.dumps(self.folder / "dump")
+        self.go_on_with(seed, lambda new: new.loads(self.folder / "dump"))
+
+    def go_on_with(self, seed, load):
+        new = self.new_buffer(seed)
+        if self.memmap and self.buffer.storage.initialized:
+            new.extend(make_rows([0]))
+        load(new)
+        assert same(snapshot(self.buffer), snapshot(new))
+        self.buffer = new
+
+    @precondition(lambda self: self.slots)
+    @rule(spoil=st.sampled_from(REFUSED), count=st.integers(1, CAPACITY + 2), one=st.booleans())
+    def refused_extend(self, spoil, count, one):
+        before = snapshot(self.buffer)
+        data = spoil(make_rows([99] * count))
+        with pytest.raises((KeyError, ValueError)):
+            self.buffer.add(data[-1]) if one else self.buffer.extend(data)
+        assert same(before, snapshot(self.buffer))
+
+    @precondition(lambda self: self.slots)
+    @rule(
+        wrong=st.sampled_from([torch.nan, -1.0, torch.inf]),
+        name=st.sampled_from(["td_error", "action_gradient"]),
+        how=st.sampled_from(["value", "missing", "index", "shape"]),
+    )
+    def refused_update(self, wrong, name, how):
+        batch = write_signals(self.buffer.sample())
+        if how == "value":
+            batch["signals", name][1] = wrong
+        elif how == "missing":
+            del batch["signals", name]
+        elif how == "index":
+            batch["index"][2] = CAPACITY
+        else:
+            batch["signals", name] = torch.ones(4, 2)
+        before = snapshot(self.buffer)
+        with pytest.raises((KeyError, ValueError, IndexError)):
+            self.buffer.update_tensordict_priority(batch)
+        assert same(before, snapshot(self.buffer))
+
+    @rule(
+        path=st.sampled_from(
+            [
+                ("_storage", "_len"),
+                ("_storage", "_signals", "rows"),
+                ("_storage", "_signals", "size"),
+                ("_sampler", "_eps"),
+                ("_sampler", "_sum_tree"),
+                ("_writer", "_cursor"),
+                ("_rng",),
+            ]
+        ),
+        value=st.sampled_from([None, "0.6", 10**18, -1, torch.full((3,), torch.nan)]),
+    )
+    def refused_load(self, path, value):
+        state = snapshot(self.buffer)
+        place = state
+        for key in path[:-1]:
+            place = place[key]
+        if path == ("_rng",) and value is None:
+            return
+        place[path[-1]] = value
+        before = snapshot(self.buffer)
+        with pytest.raises((KeyError, ValueError, TypeError)):
+            self.buffer.load_state_dict(state)
+        assert same(before, snapshot(self.buffer))
+
+    @invariant()
+    def the_buffer_holds_what_the_model_holds(self):
+        if not hasattr(self, "buffer"):
+            return
+        assert len(self.buffer) == len(self.slots)
+        if not self.slots:
+            return
+        table = self.buffer.storage.signal_table
+        rows = self.buffer[:]
+        for slot, number in self.slots.items():
+            assert rows["observation"][slot].tolist() == [number] * 3
+            assert rows["next", "observation"][slot] == number + 0.5
+            assert bool(rows["done"][slot]) == (number % 2 == 0)
+            assert table.rewards[slot] == -number
+            error = table.rows[slot, table.column["td_error"]].item()
+            assert error == self.signals[slot] if slot in self.signals else error != error
+
+
+def drive(examples, steps, **kwargs):
+    run_state_machine_as_test(
+        Replay,
+        settings=settings(
+            max_examples=examples,
+            stateful_step_count=steps,
+            deadline=None,
+            database=None,
+            derandomize=True,
+            suppress_health_check=list(HealthCheck),
+            **kwargs,
+        ),
+    )
+
+
+# TorchRL recommends a memory map that was allocated before.
+@pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized TensorDict")
+def test_a_buffer_does_what_the_model_does_for_some_hundred_steps():
+    drive(12, 30, phases=[Phase.generate])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized TensorDict")
+def test_a_buffer_does_what_the_model_does_for_ten_thousand_steps():
+    drive(200, 50)
