@@ -53,7 +53,7 @@ def by_losses(name, loss, batch, actor_batch=None, **kwargs):
         {"loss_function": "smooth_l1"},
         {"importance": "none", "signals": ["td_error"]},
         {"signals": []},
-        {"signals": ["value"], "loss_function": "pal"},
+        {"signals": ["value"], "loss_function": "pal", "pal_alpha": 0.7},
         {"target_average": 3},
     ],
     ids=str,
@@ -149,8 +149,8 @@ def test_what_cannot_be_one_program_is_refused_by_name():
         DDPGLearner(make_ddpg_loss(wrapped, critic), compile=True)
     with pytest.raises(ValueError, match="importance"):
         DDPGLearner(make_loss("ddpg", importance="torchrl"), compile=True)
-    with pytest.raises(ValueError, match="reduction = 'mean' in the loss, got 'none'"):
-        DDPGLearner(make_loss("ddpg", reduction="none"), compile=True)
+    with pytest.raises(ValueError, match="reduction = 'mean' in the loss, got 'sum'"):
+        DDPGLearner(make_loss("ddpg", reduction="sum"), compile=True)
 
 
 @pytest.mark.slow

@@ -188,6 +188,13 @@ def test_a_loss_of_another_learner_is_refused_by_both_names(kind, name):
         kind(loss)
 
 
+def test_a_loss_that_is_not_reduced_is_refused():
+    loss = make_ddpg_loss(*make_networks(), reduction="none")
+    with pytest.raises(ValueError, match="reduction of the loss must be 'mean' or 'sum'"):
+        DDPGLearner(loss)
+    DDPGLearner(make_ddpg_loss(*make_networks(), reduction="sum")).update(make_batch())
+
+
 def test_sac_has_no_compile():
     with pytest.raises(TypeError, match="compile"):
         SACLearner(make_learner("sac").loss, compile=True)

@@ -99,6 +99,8 @@ class ActorCriticLearner:
                 f"loss of a {type(self).__name__} must be a {self.loss_type.__name__}, got "
                 f"{type(loss).__name__}"
             )
+        if loss.reduction == "none":  # type: ignore[attr-defined]
+            raise ValueError("reduction of the loss must be 'mean' or 'sum', got 'none'")
         check_rate("actor_lr", actor_lr)
         check_rate("critic_lr", critic_lr)
         check_range("critic_weight_decay", critic_weight_decay, low=0.0)
@@ -171,7 +173,8 @@ class ActorCriticLearner:
         """
         self.optimizer.zero_grad(set_to_none=True)
         losses, log = self.loss.losses(batch, actor_batch, loss_function=loss_function)
-        sum(losses.values()).backward()
+        # The loss of a temperature that is fixed has no gradient.
+        torch.autograd.backward([loss for loss in losses.values() if loss.requires_grad])
         self.loss.write_action_gradient(batch)
         return {**losses, **log}
 
