@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from mpfa_envs import (
+    PAPER_TASK,
     WORLDS,
     Lidar,
     NavigationEnv,
@@ -121,7 +122,7 @@ def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
     try:
         entries, rates = [], {}
         for physics in ("wheels", "kinematic"):
-            env = NavigationEnv(world="D", physics=physics)
+            env = NavigationEnv(world="D", physics=physics, action_repeat=1)
             rates[physics] = _rate(_stepper(env), seconds)
             share = _physics_share(env, max(20, round(rates[physics] * seconds / ROUNDS)))
             env.close()
@@ -141,7 +142,12 @@ def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
             ("torchrl_env_batch_of_8", 8, None),
         ):
             batch = make_navigation_env(
-                "D", physics="kinematic", num_envs=num_envs, info_keys=keys, seed=0
+                "D",
+                physics="kinematic",
+                action_repeat=1,
+                num_envs=num_envs,
+                info_keys=keys,
+                seed=0,
             )
 
             def run(count: int, env: Any = batch) -> None:
@@ -209,7 +215,7 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
         How the episode ended and the way of the robot.
     """
     start, goal = options["start"][:2], options["goal"]
-    for radius in (env.robot.collision_distance, env.robot.radius):
+    for radius in (PAPER_TASK["collision_distance"], env.robot.radius):
         path = PathPlanner(env.world, radius=radius).find(start, goal)
         if path is not None:
             return _follow(env, options, path[1:])
@@ -265,11 +271,12 @@ def describe_world(world: World) -> dict[str, float]:
         "path at 0.35 m": sum(wide.find(p.start[:2], p.goal) is not None for p in pairs) / PAIRS,
     }
     for name, rule, drive in (
-        ("straight fails, 0.35 m", None, drive_straight),
+        ("straight fails, 0.35 m", 0.35, drive_straight),
         ("straight fails, contact", "contact", drive_straight),
         ("A* fails, contact", "contact", drive_shortest_path),
     ):
-        env = NavigationEnv(world=world, physics="kinematic", collision_distance=rule)  # type: ignore[arg-type]
+        task = {**PAPER_TASK, "collision_distance": rule}
+        env = NavigationEnv(world=world, physics="kinematic", **task)
         fails = [drive(env, pair._asdict())[0] != "success" for pair in pairs]
         row[name] = sum(fails) / PAIRS
     return row

@@ -18,7 +18,7 @@ from mpfa_envs.evaluation import (
 )
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.maps import WORLDS
-from mpfa_envs.navigation import NavigationEnv
+from mpfa_envs.navigation import PAPER_TASK, NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
 from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mpfa_envs.mirror import Mirror, RandomMirror
     from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
 
-ENV_IDS = tuple(f"mpfa/Navigation-{name}-v0" for name in WORLDS)
+ENV_IDS = tuple(f"mpfa/Navigation-{name}-v1" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start one's own from."""
@@ -44,6 +44,7 @@ __all__ = [
     "EXAMPLE_WORLD",
     "INFO_TYPES",
     "OBSERVATION",
+    "PAPER_TASK",
     "ROBOTS",
     "WORLDS",
     "Box",

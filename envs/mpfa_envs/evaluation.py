@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mpfa_envs.checks import check_count
 from mpfa_envs.maps import resolve_world
 from mpfa_envs.navigation import NavigationEnv, Physics
 from mpfa_envs.policy import Policy
@@ -123,9 +124,8 @@ def evaluate(
     """
     if envs_at_once is None:
         envs_at_once = ENVS_AT_ONCE if isinstance(policy, Policy) else 1
-    for name, count in (("episodes", episodes), ("envs_at_once", envs_at_once)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ValueError(f"{name} must be a positive integer, got {count!r}")
+    check_count("episodes", episodes)
+    check_count("envs_at_once", envs_at_once)
     arguments = {**getattr(policy, "env_arguments", {}), **env_arguments}
     if physics is not None:
         arguments["physics"] = physics

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from mpfa_envs.checks import check_count, check_number, check_positive
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -27,10 +29,12 @@ class Lidar:
     Args:
         world: What the rays hit.
         sectors: Number of equal sectors of the 180 degrees.
-        rays_per_sector: Rays in each sector, at the middles of its equal parts.
+        rays_per_sector: Rays in each sector, at the middles of its equal parts. One each, as the
+            paper may have it, leaves gaps of 10 degrees, 17 cm at 1 m, that hide a table leg.
         reduction: ``"min"`` reports the nearest return of a sector, ``"median"`` the median, and
             ``"single"`` casts only the ray through the middle of the sector.
-        max_range: A ray that meets nothing within this distance reports this distance [m].
+        max_range: A ray that meets nothing within this distance reports this distance [m]. The
+            default is a side of the built-in rooms.
         noise: Standard deviation of Gaussian noise on each ray [m].
 
     Raises:
@@ -53,20 +57,16 @@ class Lidar:
         max_range: float = 10.0,
         noise: float = 0.0,
     ) -> None:
-        for name, count in (("sectors", sectors), ("rays_per_sector", rays_per_sector)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} must be a positive integer, got {count!r}")
         if reduction not in get_args(Reduction):
             raise ValueError(f"reduction must be one of {get_args(Reduction)}, got {reduction!r}")
-        if not (math.isfinite(max_range) and max_range > 0):
-            raise ValueError(f"max_range must be a positive length, got {max_range}")
-        if not (math.isfinite(noise) and noise >= 0):
-            raise ValueError(f"noise must be a non-negative length, got {noise}")
-        self.sectors = sectors
-        self.rays_per_sector = 1 if reduction == "single" else rays_per_sector
+        self.sectors = check_count("sectors", sectors)
+        count = check_count("rays_per_sector", rays_per_sector)
+        self.rays_per_sector = 1 if reduction == "single" else count
         self.reduction = reduction
-        self.max_range = float(max_range)
-        self.noise = float(noise)
+        self.max_range = check_positive("max_range", max_range)
+        self.noise = check_number("noise", noise)
+        if self.noise < 0:
+            raise ValueError(f"noise must not be negative, got {noise}")
         rays = sectors * self.rays_per_sector
         self.angles = math.pi * (0.5 - (np.arange(rays) + 0.5) / rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
+from mpfa_envs.checks import check_share
 from mpfa_envs.observation import observation_slices
 
 
@@ -92,10 +93,8 @@ class RandomMirror(Transform):
     def __init__(
         self, *, chance: float = 0.5, sectors: int = 18, generator: torch.Generator | None = None
     ) -> None:
-        if not 0.0 <= chance <= 1.0:
-            raise ValueError(f"chance must be in [0, 1], got {chance!r}")
         super().__init__()
-        self.chance = float(chance)
+        self.chance = check_share("chance", chance)
         self.mirror = Mirror(sectors=sectors)
         self.generator = generator
 

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from collections.abc import Mapping
+from functools import partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box as BoxSpace
 
+from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
-from mpfa_envs.lidar import Lidar, Reduction
+from mpfa_envs.lidar import Lidar
 from mpfa_envs.maps import resolve_world
-from mpfa_envs.observation import (
-    CLOSENESS_DISTANCE,
-    observation_bounds,
-    observation_slices,
-    observe,
-)
+from mpfa_envs.observation import observation_bounds, observation_slices, observe
 from mpfa_envs.path import planner_for
-from mpfa_envs.reward import RewardFunction, RewardTerms, StepOutcome, navigation_reward
+from mpfa_envs.reward import (
+    PROGRESS_SCALE,
+    RewardFunction,
+    RewardTerms,
+    StepOutcome,
+    navigation_reward,
+)
 from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.tasks import Task, check_task, sample_task
 
@@ -32,6 +37,19 @@ if TYPE_CHECKING:
 
 Physics = Literal["kinematic", "wheels"]
 """How the robot moves."""
+PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "action_repeat": 1,
+        "progress_scale": 15.0,
+        "collision_distance": 0.35,
+        "closeness_distance": 0.35,
+        "detour_chance": 0.0,
+    }
+)
+"""Arguments of :class:`NavigationEnv` for the paper's task, with its robot, the TurtleBot2.
+
+The paper gives no ε_p; 15 is that of the public code which it most likely grew out of.
+"""
 
 
 class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
@@ -82,28 +100,26 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         max_steps: Time limit of an episode in time steps.
         time_step: Duration of a time step [s].
         action_repeat: Time steps for which an action is held. Their rewards add up, and the episode
-            may end after any of them.
+            may end after any of them. The default is half as many decisions as time steps.
         goal_radius: Distance of the robot's center from the goal that reaches it [m].
         collision_distance: Distance of the robot's center from an obstacle or wall that is a
-            collision [m]. None: that of the paper, the robot's radius and 0.17 m, which is 0.35 m
-            for the TurtleBot2. ``"contact"``: the robot's radius.
+            collision [m]. None: the robot's radius and 0.07 m, 0.25 m for the TurtleBot2.
+            ``"contact"``: the robot's radius.
         progress_scale: The paper's ε_p in Eq. (25), reward per meter of approach [1/m].
-        goal_reward: Reward for the goal.
-        collision_reward: Reward for a collision.
-        reward: Computes the reward instead of Eq. (25); the three arguments above do not reach it.
-        sectors: Sectors of the lidar.
-        rays_per_sector: Rays in a sector. One ray each, as the paper may have it, leaves gaps of
-            10 degrees, 17 cm at 1 m, that hide a table leg.
-        reduction: How the rays of a sector become one range, see :class:`~mpfa_envs.Lidar`.
-        max_range: Longest range of the lidar [m]. The default is a side of the room; farther
-            away the closeness is below 0.035 and changes by less than 0.01.
-        lidar_noise: Standard deviation of the noise of a ray [m].
-        closeness_distance: A range of this or less has closeness one [m].
-        min_goal_distance: Least distance between a drawn start and goal [m].
-        detour_chance: Chance that a drawn task must have an obstacle in its way; 0: as it comes.
+        reward: Computes the reward in place of Eq. (25), and without progress_scale;
+            ``functools.partial(navigation_reward, goal_reward=20.0)``, say.
+        lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``.
+        closeness_distance: A range of this or less has closeness one [m]. None: the default of
+            collision_distance, whatever that is.
+        min_goal_distance: Least distance between a sampled start and goal [m].
+        detour_chance: Chance that a sampled task must have an obstacle in its way; 0: as it comes.
         render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
 
+    The defaults are the task that the study trains on. :data:`PAPER_TASK` holds what the paper says
+    or suggests where that differs: ``NavigationEnv(world="D", **PAPER_TASK)``.
+
     Raises:
+        ImportError: If there is no PyBullet and physics is ``"wheels"``.
         ValueError: If an argument is out of its range; nothing is built then.
 
     Examples:
@@ -112,7 +128,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         >>> observation, info = env.reset(seed=0)
         >>> observation, reward, terminated, truncated, info = env.step([1.0, 1.0])
         >>> observation.shape, info["sim_time"]
-        ((24,), 0.1)
+        ((24,), 0.2)
         >>> env.close()
     """
 
@@ -130,76 +146,54 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         physics: Physics = "wheels",
         max_steps: int = 500,
         time_step: float = 0.1,
-        action_repeat: int = 1,
+        action_repeat: int = 2,
         goal_radius: float = 0.5,
         collision_distance: float | Literal["contact"] | None = None,
-        progress_scale: float = 15.0,
-        goal_reward: float = 10.0,
-        collision_reward: float = -5.0,
+        progress_scale: float = PROGRESS_SCALE,
         reward: RewardFunction | None = None,
-        sectors: int = 18,
-        rays_per_sector: int = 3,
-        reduction: Reduction = "min",
-        max_range: float = 10.0,
-        lidar_noise: float = 0.0,
-        closeness_distance: float = CLOSENESS_DISTANCE,
+        lidar: Mapping[str, Any] | None = None,
+        closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
-        detour_chance: float = 0.0,
+        detour_chance: float = 0.8,
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         self.world = resolve_world(world)
         self.robot = resolve_robot(robot)
         if physics not in get_args(Physics):
             raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
-        for name, count in (("max_steps", max_steps), ("action_repeat", action_repeat)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"{name} must be a positive integer, got {count!r}")
-        lengths = {"time_step": time_step, "goal_radius": goal_radius}
-        lengths["closeness_distance"] = closeness_distance
-        for name, value in lengths.items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be positive, got {value}")
-        if not min_goal_distance > goal_radius:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        if reward is not None and not callable(reward):
+            raise ValueError(f"reward must be callable or None, got {reward!r}")
+        scale = check_number("progress_scale", progress_scale)
+        self._reward = reward or partial(navigation_reward, progress_scale=scale)
+        self.physics = physics
+        self.render_mode = render_mode
+        self.max_steps = check_count("max_steps", max_steps)
+        self.time_step = check_positive("time_step", time_step)
+        self.action_repeat = check_count("action_repeat", action_repeat)
+        self.goal_radius = check_positive("goal_radius", goal_radius)
+        self.min_goal_distance = check_positive("min_goal_distance", min_goal_distance)
+        if not self.min_goal_distance > self.goal_radius:
             raise ValueError(
                 f"min_goal_distance must be above goal_radius = {goal_radius}, "
                 f"got {min_goal_distance}"
             )
-        if not 0.0 <= detour_chance <= 1.0:
-            raise ValueError(f"detour_chance must be in [0, 1], got {detour_chance}")
-        scales = {
-            "progress_scale": progress_scale,
-            "goal_reward": goal_reward,
-            "collision_reward": collision_reward,
-        }
-        for name, value in scales.items():
-            if not math.isfinite(value):
-                raise ValueError(f"{name} must be finite, got {value}")
-        if reward is not None and not callable(reward):
-            raise ValueError(f"reward must be callable or None, got {reward!r}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.detour_chance = check_share("detour_chance", detour_chance)
         self.collision_distance = resolve_collision_distance(collision_distance, self.robot)
-        self.lidar = Lidar(
-            self.world,
-            sectors=sectors,
-            rays_per_sector=rays_per_sector,
-            reduction=reduction,
-            max_range=max_range,
-            noise=lidar_noise,
+        self.closeness_distance = (
+            self.robot.collision_distance
+            if closeness_distance is None
+            else check_positive("closeness_distance", closeness_distance)
         )
-        self.physics = physics
-        self.max_steps = max_steps
-        self.time_step = float(time_step)
-        self.action_repeat = action_repeat
-        self.goal_radius = float(goal_radius)
-        self.closeness_distance = float(closeness_distance)
-        self.min_goal_distance = float(min_goal_distance)
-        self.detour_chance = float(detour_chance)
-        self.render_mode = render_mode
-        self._reward = reward
-        self._reward_scales = {name: float(value) for name, value in scales.items()}
-        self.observation_slices = observation_slices(sectors)
-        low, high = observation_bounds(sectors, self.world.diagonal)
+        try:
+            self.lidar = Lidar(self.world, **(lidar or {}))
+        except TypeError as error:
+            raise ValueError(
+                f"lidar must hold arguments of Lidar, got {lidar!r}: {error}"
+            ) from error
+        self.observation_slices = observation_slices(self.lidar.sectors)
+        low, high = observation_bounds(self.lidar.sectors, self.world.diagonal)
         self.observation_space = BoxSpace(low, high, dtype=np.float32)
         self.action_space = BoxSpace(-1.0, 1.0, (2,), np.float32)
         self._task: Task | None = None
@@ -235,8 +229,11 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             Observation and info.
 
         Raises:
-            ValueError: If the options are not a task that can be driven; the episode goes on then.
+            ValueError: If the seed is negative or the options are not a task that can be driven;
+                the episode goes on then.
         """
+        if seed is not None:
+            check_count("seed", seed, least=0)
         task = self.check_task(options) if options else None
         super().reset(seed=seed)
         if task is None:
@@ -308,11 +305,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         collision = not success and to_obstacle <= self.collision_distance
         speeds = motion.linear_speed, motion.angular_speed
         outcome = StepOutcome(previous, self._distance, success, collision, clearance, *speeds)
-        terms = (
-            navigation_reward(outcome, **self._reward_scales)
-            if self._reward is None
-            else self._reward(outcome)
-        )
+        terms = self._reward(outcome)
         truncated = not (success or collision) and self._steps >= self.max_steps
         self._running = not (success or collision or truncated)
         return success, collision, truncated, terms

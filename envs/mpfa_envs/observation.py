@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from mpfa_envs.drives import Motion
     from mpfa_envs.robot import RobotModel
 
-CLOSENESS_DISTANCE: Final = 0.35
-"""By default a range of this or less has closeness one [m]."""
 GOAL_CLOSENESS_DISTANCE: Final = 0.3
 """A goal at this distance or nearer has closeness one [m]."""
 DISTANCE_SCALE: Final = 10.0
@@ -101,7 +99,7 @@ def observe(
     goal: tuple[float, float],
     distance: float,
     robot: RobotModel,
-    closeness_distance: float = CLOSENESS_DISTANCE,
+    closeness_distance: float,
 ) -> NDArray[np.float32]:
     """Build an observation.
 

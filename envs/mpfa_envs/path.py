@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpfa_envs.checks import check_positive
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -54,10 +56,8 @@ class PathPlanner:
     """
 
     def __init__(self, world: World, *, radius: float) -> None:
-        if not (math.isfinite(radius) and radius > 0):
-            raise ValueError(f"radius must be a positive length, got {radius}")
         self.world = world
-        self.radius = float(radius)
+        self.radius = check_positive("radius", radius)
         reach = self.radius - _TOUCH
         boxes: list[tuple[float, float, float, float]] = []
         circles: list[tuple[float, float, float]] = []

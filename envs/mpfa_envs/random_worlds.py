@@ -6,6 +6,7 @@ import math
 import random
 from typing import Final
 
+from mpfa_envs.checks import check_count
 from mpfa_envs.worlds import Box, World
 
 _HALF: Final = 5.0
@@ -47,9 +48,8 @@ def random_world(seed: int, *, boxes: int = _BOXES, passage: float = _PASSAGE) -
         >>> NavigationEnv(world="random-7").world == world
         True
     """
-    for argument, value, least in (("seed", seed, 0), ("boxes", boxes, 1)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"{argument} must be an integer of at least {least}, got {value!r}")
+    check_count("seed", seed, least=0)
+    check_count("boxes", boxes)
     if not 0.0 < passage < 2 * _HALF:
         raise ValueError(f"passage must be between 0 and {2 * _HALF} m, got {passage!r}")
     usual = (boxes, passage) == (_BOXES, _PASSAGE)

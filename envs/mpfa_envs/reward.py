@@ -6,7 +6,14 @@ The equation is from https://doi.org/10.3389/fnbot.2023.1281166.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Final, NamedTuple
+
+PROGRESS_SCALE: Final = 5.0
+"""ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
+
+With 15 the way pays more than the arrival, so that a place near the goal is worth less than one
+far away, and a critic that is a little too smooth would rather circle than arrive.
+"""
 
 
 class StepOutcome(NamedTuple):
@@ -50,7 +57,7 @@ RewardFunction = Callable[[StepOutcome], RewardTerms]
 def navigation_reward(
     outcome: StepOutcome,
     *,
-    progress_scale: float = 15.0,
+    progress_scale: float = PROGRESS_SCALE,
     goal_reward: float = 10.0,
     collision_reward: float = -5.0,
 ) -> RewardTerms:
@@ -66,7 +73,7 @@ def navigation_reward(
 
     Args:
         outcome: What the step led to.
-        progress_scale: ε_p, reward per meter of approach [1/m]. The paper names no value.
+        progress_scale: ε_p, reward per meter of approach [1/m].
         goal_reward: Reward for the goal.
         collision_reward: Reward for a collision.
 
@@ -77,7 +84,7 @@ def navigation_reward(
         >>> from mpfa_envs import StepOutcome, navigation_reward
         >>> step = StepOutcome(2.0, 1.96, False, False, 1.0, 0.4, 0.0)
         >>> round(navigation_reward(step).total, 6)
-        0.6
+        0.2
     """
     if outcome.success:
         return RewardTerms(goal=goal_reward)

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+TRAINING_CLEARANCE: Final = 0.07
+"""Clearance of the robot's rim below which training counts a collision [m]."""
+PAPER_CLEARANCE: Final = 0.17
+"""That of the paper, 0.35 m from the center of a TurtleBot2 [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RobotModel:
     """A disc-shaped robot with two driven wheels on one axle through its center.
@@ -86,11 +92,12 @@ class RobotModel:
 
     @property
     def collision_distance(self) -> float:
-        """Distance of the center from an obstacle that the paper's training calls a collision [m].
+        """Distance of the center from an obstacle that training counts as a collision [m].
 
-        The TurtleBot2's 0.35 m are its radius and 0.17 m; the other robots keep the 0.17 m.
+        Its radius and a clearance of 0.07 m. At the paper's 0.17 m, 0.35 m for the TurtleBot2, a
+        passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it.
         """
-        return round(self.radius + 0.17, 9)
+        return round(self.radius + TRAINING_CLEARANCE, 9)
 
     def wheel_speeds(self, action: NDArray[np.float32]) -> tuple[float, float]:
         """Read an action.
@@ -255,7 +262,7 @@ def resolve_collision_distance(
 
     Args:
         value: A distance of the robot's center from an obstacle [m], ``"contact"`` for the robot's
-            radius, or None for that of the paper's training.
+            radius, or None for :attr:`RobotModel.collision_distance`.
         robot: The robot.
 
     Returns:

@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from mpfa_envs.checks import check_count
 from mpfa_envs.maps import resolve_world
 from mpfa_envs.path import planner_for
-from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
+from mpfa_envs.robot import (
+    PAPER_CLEARANCE,
+    RobotModel,
+    resolve_collision_distance,
+    resolve_robot,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -186,16 +192,17 @@ def evaluation_pairs(
         world: A name, the path of a YAML file or a world.
         n: Number of tasks.
         seed: Seed of the draw; the first tasks of a longer list are those of a shorter one.
-        robot: Whose radius and collision distance count.
-        collision_distance: What the start, the goal and a path between them keep [m];
-            None: the robot's own, for the TurtleBot2 0.35 m; ``"contact"``: its radius.
+        robot: Whose radius counts.
+        collision_distance: What the start, the goal and a path between them keep [m]. None: the
+            paper's, the robot's radius and 0.17 m, whatever it trained with; ``"contact"``: its
+            radius.
         min_goal_distance: Least distance between start and goal [m].
 
     Returns:
         The tasks.
 
     Raises:
-        ValueError: If n is not a positive integer, or the world has no room for a task.
+        ValueError: If n or the seed is out of its range, or the world has no room for a task.
 
     Examples:
         >>> from mpfa_envs import NavigationEnv, evaluation_pairs
@@ -205,10 +212,16 @@ def evaluation_pairs(
         >>> (info["x"], info["y"]) == task.start[:2]
         True
     """
-    if isinstance(n, bool) or not isinstance(n, int) or n < 1:
-        raise ValueError(f"n must be a positive integer, got {n!r}")
+    check_count("n", n)
+    check_count("seed", seed, least=0)
     world = resolve_world(world)
-    distance = resolve_collision_distance(collision_distance, resolve_robot(robot))
+    robot = resolve_robot(robot)
+    # Not the distance of training: settings may change it, and the tasks must stay the same.
+    distance = (
+        round(robot.radius + PAPER_CLEARANCE, 9)
+        if collision_distance is None
+        else resolve_collision_distance(collision_distance, robot)
+    )
     # A stream of its own: an environment with the same seed must not train on these tasks.
     rng = np.random.default_rng((_EVALUATION_STREAM, seed))
     return [

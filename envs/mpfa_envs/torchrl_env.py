@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 
+from mpfa_envs.checks import check_count
 from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, observation_bounds
 
@@ -276,7 +277,5 @@ def make_navigation_env(
 
 
 def _check_num_envs(num_envs: int | None) -> None:
-    if num_envs is not None and (
-        isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1
-    ):
-        raise ValueError(f"num_envs must be a positive integer or None, got {num_envs!r}")
+    if num_envs is not None:
+        check_count("num_envs", num_envs)

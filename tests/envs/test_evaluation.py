@@ -23,6 +23,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.evaluation import bootstrap, wilson
 from mpfa_envs.layers import Linear, Tanh
+from tests.envs.paper import paper_env
 
 POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.npz"))
 
@@ -123,7 +124,7 @@ def test_turning_to_the_goal_succeeds_on_the_empty_map_and_circling_never_does(
 
 @pytest.mark.parametrize("physics", ["kinematic", "wheels"])
 def test_results_do_not_depend_on_how_many_run_at_once(physics: str) -> None:
-    policy = steering_policy(max_steps=60, lidar_noise=0.01)
+    policy = steering_policy(max_steps=60, lidar={"noise": 0.01})
     alone, three, eight = (
         evaluate(policy, "B", episodes=9, physics=physics, envs_at_once=count)
         for count in (1, 3, 8)
@@ -164,7 +165,7 @@ def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
 
 
 def test_a_trajectory_starts_at_the_start_and_ends_at_the_goal() -> None:
-    env = NavigationEnv(world="A", physics="kinematic")
+    env = paper_env(world="A", physics="kinematic")
     task = evaluation_pairs("A", 1, seed=2)[0]
     seen: list[tuple[float, float]] = []
     trails: list[list[tuple[float, float]]] = []

@@ -17,19 +17,21 @@ from mpfa_envs import (
     ENV_IDS,
     INFO_TYPES,
     OBSERVATION,
+    PAPER_TASK,
     ROBOTS,
     Box,
     NavigationEnv,
     RewardTerms,
     World,
 )
+from tests.envs.paper import paper_env
 
 STRAIGHT = {"start": (0.0, 0.0, 0.0), "goal": (2.98, 0.0)}
 
 
 def rolled(physics: str, *, world: str = "D", episodes_before: int = 0) -> str:
     """Hash of a seeded drive, after other episodes in the same environment."""
-    env = NavigationEnv(world=world, physics=physics)
+    env = paper_env(world=world, physics=physics)
     rng = np.random.default_rng(99)
     for _ in range(episodes_before):
         env.reset(seed=int(rng.integers(1000)))
@@ -80,7 +82,7 @@ def test_the_same_seed_gives_the_same_bits_after_other_episodes(physics: str) ->
 
 def test_the_first_step_is_the_same_bits_after_a_reset(physics: str) -> None:
     # PyBullet keeps the contacts of a robot that is moved until it looks for contacts anew.
-    env = NavigationEnv(physics=physics)
+    env = paper_env(physics=physics)
     seen = []
     for seed in (123, 123, 4, 123):
         env.reset(seed=seed)
@@ -102,8 +104,8 @@ def test_the_same_seed_gives_the_same_bits_in_another_process(physics: str) -> N
 
 
 def test_environments_side_by_side_do_not_know_each_other(physics: str) -> None:
-    alone = NavigationEnv(world="B", physics=physics)
-    envs = [NavigationEnv(world="B", physics=physics) for _ in range(2)]
+    alone = paper_env(world="B", physics=physics)
+    envs = [paper_env(world="B", physics=physics) for _ in range(2)]
     for env in (alone, *envs):
         env.reset(seed=1)
     for step in range(10):
@@ -117,7 +119,7 @@ def test_environments_side_by_side_do_not_know_each_other(physics: str) -> None:
 def test_close_twice_is_fine_and_the_server_is_gone() -> None:
     import pybullet
 
-    env = NavigationEnv(physics="wheels")
+    env = paper_env(physics="wheels")
     client = env._drive.simulation.client
     assert pybullet.isConnected(physicsClientId=client)
     env.close()
@@ -126,7 +128,7 @@ def test_close_twice_is_fine_and_the_server_is_gone() -> None:
 
 
 def test_the_observation_says_where_the_goal_is() -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     observation, info = env.reset(options={"start": (0, 0, math.pi / 2), "goal": (3, 0)})
     np.testing.assert_allclose(observation[OBSERVATION["goal_direction"]], [0, -1], atol=1e-6)
     assert observation[OBSERVATION["goal_distance"]] == pytest.approx(0.3)
@@ -138,7 +140,7 @@ def test_the_observation_says_where_the_goal_is() -> None:
 
 
 def test_a_goal_behind_does_not_make_the_observation_jump() -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     seen = [
         env.reset(options={"start": (0, 0, math.pi + turn), "goal": (3, 0)})[0]
         for turn in (-1e-4, 1e-4)
@@ -147,7 +149,7 @@ def test_a_goal_behind_does_not_make_the_observation_jump() -> None:
 
 
 def test_the_goal_ends_an_episode_with_success() -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     env.reset(options=STRAIGHT)
     for _ in range(49):
         _, reward, terminated, _, info = env.step([1.0, 1.0])
@@ -162,15 +164,15 @@ def test_the_goal_ends_an_episode_with_success() -> None:
 
 
 def test_leaving_the_goal_costs_what_approaching_pays() -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     env.reset(options={"start": (0, 0, math.pi), "goal": (3, 0)})
     assert env.step([1.0, 1.0])[1] == pytest.approx(-15 * 0.05)
 
 
-@pytest.mark.parametrize(("rule", "distance"), [(None, 0.35), ("contact", 0.18), (0.4, 0.4)])
+@pytest.mark.parametrize(("rule", "distance"), [(None, 0.25), ("contact", 0.18), (0.4, 0.4)])
 def test_a_collision_ends_an_episode_at_its_distance(rule: object, distance: float) -> None:
     world = World(name="post", boxes=(Box(1.0, -0.5, 2.0, 0.5),))
-    env = NavigationEnv(world=world, physics="kinematic", collision_distance=rule)
+    env = paper_env(world=world, physics="kinematic", collision_distance=rule)
     env.reset(options=STRAIGHT)
     while True:
         _, reward, terminated, truncated, info = env.step([1.0, 1.0])
@@ -183,7 +185,7 @@ def test_a_collision_ends_an_episode_at_its_distance(rule: object, distance: flo
 
 
 def test_the_time_limit_truncates_and_does_not_terminate() -> None:
-    env = NavigationEnv(physics="kinematic", max_steps=3)
+    env = paper_env(physics="kinematic", max_steps=3)
     env.reset(options=STRAIGHT)
     ends = [env.step([1.0, 1.0]) for _ in range(3)]
     assert [end[2] for end in ends] == [False, False, False]
@@ -193,7 +195,7 @@ def test_the_time_limit_truncates_and_does_not_terminate() -> None:
 
 
 def test_a_goal_in_the_last_step_is_no_timeout() -> None:
-    env = NavigationEnv(physics="kinematic", max_steps=50)
+    env = paper_env(physics="kinematic", max_steps=50)
     env.reset(options=STRAIGHT)
     for _ in range(50):
         _, _, terminated, truncated, info = env.step([1.0, 1.0])
@@ -201,7 +203,7 @@ def test_a_goal_in_the_last_step_is_no_timeout() -> None:
 
 
 def test_the_info_has_the_same_keys_and_types_always(physics: str) -> None:
-    env = NavigationEnv(world="C", physics=physics, max_steps=30)
+    env = paper_env(world="C", physics=physics, max_steps=30)
     for seed in range(3):
         _, info = env.reset(seed=seed)
         done = False
@@ -215,7 +217,7 @@ def test_the_info_has_the_same_keys_and_types_always(physics: str) -> None:
 
 
 def test_a_reward_of_your_own_replaces_the_equation() -> None:
-    env = NavigationEnv(
+    env = paper_env(
         physics="kinematic", reward=lambda outcome: RewardTerms(other=outcome.clearance)
     )
     env.reset(options=STRAIGHT)
@@ -225,7 +227,7 @@ def test_a_reward_of_your_own_replaces_the_equation() -> None:
 
 
 def test_actions_beyond_the_box_are_clipped() -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     env.reset(options=STRAIGHT)
     assert env.step([9.0, 9.0])[4]["x"] == pytest.approx(0.05)
 
@@ -238,7 +240,7 @@ def test_actions_beyond_the_box_are_clipped() -> None:
     ],
 )
 def test_a_bad_action_moves_nothing(action: list[float], message: str) -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     env.reset(options=STRAIGHT)
     with pytest.raises(ValueError, match=message):
         env.step(action)
@@ -246,7 +248,7 @@ def test_a_bad_action_moves_nothing(action: list[float], message: str) -> None:
 
 
 def test_a_step_outside_an_episode_asks_for_a_reset() -> None:
-    env = NavigationEnv(physics="kinematic", max_steps=1, render_mode="rgb_array")
+    env = paper_env(physics="kinematic", max_steps=1, render_mode="rgb_array")
     with pytest.raises(ResetNeeded, match="reset"):
         env.step([0.0, 0.0])
     with pytest.raises(ResetNeeded, match="reset"):
@@ -272,7 +274,7 @@ def test_a_step_outside_an_episode_asks_for_a_reset() -> None:
 def test_a_bad_task_is_refused_and_the_episode_goes_on(
     options: dict[str, object], message: str
 ) -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     env.reset(options=STRAIGHT)
     env.step([1.0, 1.0])
     with pytest.raises(ValueError, match=message):
@@ -289,20 +291,24 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
         ("max_steps", 0, "max_steps must be a positive integer, got 0"),
         ("max_steps", True, "max_steps must be a positive integer, got True"),
         ("time_step", 0.0, "time_step must be positive, got 0.0"),
-        ("goal_radius", math.nan, "goal_radius must be positive, got nan"),
+        ("time_step", "1", "time_step must be a finite number, got '1'"),
+        ("time_step", None, "time_step must be a finite number, got None"),
+        ("goal_radius", math.nan, "goal_radius must be a finite number, got nan"),
         ("min_goal_distance", 0.3, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
         ("closeness_distance", 0.0, "closeness_distance must be positive, got 0.0"),
         ("detour_chance", 1.1, r"detour_chance must be in \[0, 1\], got 1.1"),
-        ("detour_chance", math.nan, r"detour_chance must be in \[0, 1\], got nan"),
-        ("progress_scale", math.inf, "progress_scale must be finite, got inf"),
+        ("detour_chance", math.nan, "detour_chance must be a finite number, got nan"),
+        ("progress_scale", math.inf, "progress_scale must be a finite number, got inf"),
         ("collision_distance", 0.1, "collision_distance must be .*0.18, got 0.1"),
         ("collision_distance", "touch", "collision_distance must be .*got 'touch'"),
         ("reward", 3, "reward must be callable or None, got 3"),
         ("render_mode", "human", "render_mode must be None or 'rgb_array', got 'human'"),
-        ("sectors", 0, "sectors must be a positive integer, got 0"),
-        ("reduction", "mean", "reduction must be one of .*got 'mean'"),
-        ("max_range", -1.0, "max_range must be a positive length, got -1.0"),
-        ("lidar_noise", -1.0, "noise must be a non-negative length, got -1.0"),
+        ("lidar", {"sectors": 0}, "sectors must be a positive integer, got 0"),
+        ("lidar", {"reduction": "mean"}, "reduction must be one of .*got 'mean'"),
+        ("lidar", {"max_range": -1.0}, r"max_range must be positive, got -1\.0"),
+        ("lidar", {"noise": -1.0}, r"noise must not be negative, got -1\.0"),
+        ("lidar", {"sector": 3}, "lidar must hold arguments of Lidar, got {'sector': 3}"),
+        ("lidar", 18, "lidar must hold arguments of Lidar, got 18"),
     ],
 )
 def test_a_bad_argument_is_named_with_its_value(argument: str, value: object, message: str) -> None:
@@ -315,14 +321,14 @@ def test_closeness_is_one_at_its_distance_and_falls_beyond() -> None:
     task = {"start": (0.6, 0.0, 0.0), "goal": (3.0, 0.0)}
     ahead = []
     for distance in (0.25, 0.4, 0.8):
-        env = NavigationEnv(world=world, physics="kinematic", closeness_distance=distance)
+        env = paper_env(world=world, physics="kinematic", closeness_distance=distance)
         ahead.append(float(env.reset(options=task)[0][9]))
     # The sector's nearest ray is a little off the axis.
     assert ahead == pytest.approx([0.25 / 0.4, 1.0, 1.0], abs=0.01)
 
 
 def test_lidar_noise_is_drawn_from_the_seed() -> None:
-    env = NavigationEnv(physics="kinematic", lidar_noise=0.05)
+    env = paper_env(physics="kinematic", lidar={"noise": 0.05})
     first, second = (env.reset(seed=3, options=STRAIGHT)[0] for _ in range(2))
     np.testing.assert_array_equal(first, second)
     assert not np.array_equal(first, env.reset(seed=4, options=STRAIGHT)[0])
@@ -332,7 +338,7 @@ def test_lidar_noise_is_drawn_from_the_seed() -> None:
 def test_wheels_and_kinematics_agree_once_the_robot_is_up_to_speed(robot: str) -> None:
     ends = []
     for physics in ("kinematic", "wheels"):
-        env = NavigationEnv(robot=robot, physics=physics)
+        env = paper_env(robot=robot, physics=physics)
         env.reset(options={"start": (-2, -2, 0), "goal": (4, 4)})
         for step in range(40):
             info = env.step([0.2, 0.3] if step % 20 < 10 else [0.8, 0.6])[4]
@@ -341,3 +347,41 @@ def test_wheels_and_kinematics_agree_once_the_robot_is_up_to_speed(robot: str) -
     # The motors take up to 0.3 s to reach a speed, so after four changes they are 10 cm behind.
     np.testing.assert_allclose(ends[0][:2], ends[1][:2], atol=0.12)
     assert ends[0][2] == pytest.approx(ends[1][2], abs=0.08)
+
+
+def test_the_ids_are_the_class_with_its_defaults() -> None:
+    for env_id in ENV_IDS:
+        env = gymnasium.make(env_id, physics="kinematic").unwrapped
+        plain = NavigationEnv(world=env.world, physics="kinematic")
+        values = [
+            {name: value for name, value in vars(each).items() if isinstance(value, (int, float))}
+            for each in (env, plain)
+        ]
+        assert values[0] == values[1]
+        assert env.collision_distance == env.closeness_distance == pytest.approx(0.25)
+        assert (env.action_repeat, env.detour_chance) == (2, 0.8)
+    assert (
+        gymnasium.make(ENV_IDS[0], physics="kinematic", action_repeat=3).unwrapped.action_repeat
+        == 3
+    )
+
+
+def test_the_papers_task_counts_collisions_farther_away_and_pays_more_for_an_approach() -> None:
+    study, paper = (
+        NavigationEnv(physics="kinematic", **task)
+        for task in ({}, {**PAPER_TASK, "action_repeat": 2})
+    )
+    assert (study.collision_distance, paper.collision_distance) == (0.25, 0.35)
+    for env in (study, paper):
+        env.reset(seed=0, options=STRAIGHT)
+    rewards = [env.step([1.0, 1.0])[1] for env in (study, paper)]
+    assert rewards == pytest.approx([5.0 * 0.1, 15.0 * 0.1])
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "1", True])
+def test_a_bad_seed_is_refused_and_the_episode_goes_on(seed: object) -> None:
+    env = paper_env(physics="kinematic")
+    env.reset(options=STRAIGHT)
+    with pytest.raises(ValueError, match=f"seed must be an integer of at least 0, got {seed!r}"):
+        env.reset(seed=seed)  # type: ignore[arg-type]
+    assert env.step([1.0, 1.0])[4]["x"] == pytest.approx(0.05)

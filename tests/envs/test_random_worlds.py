@@ -111,7 +111,7 @@ def test_a_name_that_is_no_random_room_is_refused(name: str) -> None:
     [
         ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
         ({"seed": True}, "seed must be an integer of at least 0, got True"),
-        ({"seed": 1, "boxes": 0}, "boxes must be an integer of at least 1, got 0"),
+        ({"seed": 1, "boxes": 0}, "boxes must be a positive integer, got 0"),
         ({"seed": 1, "passage": 0.0}, "passage must be between 0 and 10.0 m, got 0.0"),
         ({"seed": 1, "passage": math.nan}, "passage must be between 0 and 10.0 m, got nan"),
         ({"seed": 1, "boxes": 9, "passage": 4.0}, "boxes = 9 with passage = 4.0 m between them do"),

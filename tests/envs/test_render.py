@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpfa_envs import WORLDS, NavigationEnv, World, render_trajectories
+from mpfa_envs import WORLDS, World, render_trajectories
 from mpfa_envs.render import FLOOR, GOAL, OBSTACLE, OUTCOMES, TRAIL, WALL
+from tests.envs.paper import paper_env
 
 
 def pixel(picture: np.ndarray, x: float, y: float) -> tuple[int, ...]:
@@ -15,7 +16,7 @@ def pixel(picture: np.ndarray, x: float, y: float) -> tuple[int, ...]:
 
 
 def test_a_picture_shows_the_room_the_goal_the_robot_and_its_trail() -> None:
-    env = NavigationEnv(world="B", physics="kinematic", render_mode="rgb_array")
+    env = paper_env(world="B", physics="kinematic", render_mode="rgb_array")
     env.reset(options={"start": (-1.0, 0.5, 0.0), "goal": (1.6, 2.6)})
     for _ in range(30):
         env.step([1.0, 1.0])
@@ -32,7 +33,7 @@ def test_a_picture_shows_the_room_the_goal_the_robot_and_its_trail() -> None:
 
 
 def test_without_a_render_mode_nothing_is_drawn() -> None:
-    env = NavigationEnv(physics="kinematic")
+    env = paper_env(physics="kinematic")
     env.reset(seed=0)
     assert env.render() is None
 

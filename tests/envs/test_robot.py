@@ -100,5 +100,5 @@ def test_a_robot_that_cannot_be_is_refused(change: dict[str, object], message: s
 def test_the_turtlebot2_has_the_measures_of_the_paper() -> None:
     robot = ROBOTS["turtlebot2"]
     assert (robot.radius, robot.wheel_base, robot.wheel_radius) == (0.18, 0.23, 0.035)
-    assert robot.collision_distance == 0.35
+    assert robot.collision_distance == 0.25
     assert robot.max_angular_speed == pytest.approx(1.9565, abs=1e-4)

@@ -48,11 +48,11 @@ def test_a_seed_gives_the_same_episodes_again(num_envs: int | None) -> None:
 
 
 def test_a_time_limit_is_truncated_and_a_collision_terminated() -> None:
-    env = make_navigation_env("A", physics="kinematic", max_steps=4, seed=0)
+    env = make_navigation_env("A", physics="kinematic", max_steps=4, action_repeat=1, seed=0)
     env.set_task((0.0, 0.0, 0.0), (3.0, 3.0))
     last = env.rollout(10)[-1]["next"]
     assert (last["truncated"].item(), last["terminated"].item(), last["done"].item()) == (1, 0, 1)
-    env.set_task((4.6, 0.0, 0.0), (-3.0, 3.0))
+    env.set_task((4.7, 0.0, 0.0), (-3.0, 3.0))
     last = env.rollout(10)[-1]["next"]
     assert (last["truncated"].item(), last["terminated"].item(), last["done"].item()) == (0, 1, 1)
     assert last["info", "collision"].item() and last["reward"].item() == -5.0
@@ -72,7 +72,7 @@ def test_a_task_holds_for_the_next_episode_of_its_environment_only() -> None:
 
 
 def test_a_rollout_can_wait_for_the_last_episode_of_a_batch() -> None:
-    env = make_navigation_env("A", num_envs=2, physics="kinematic", seed=0)
+    env = make_navigation_env("A", num_envs=2, physics="kinematic", action_repeat=1, seed=0)
     env.set_task((0.0, 0.0, 0.0), (1.0, 0.0), index=0)
     env.set_task((0.0, 0.0, 0.0), (2.0, 0.0), index=1)
 
@@ -120,7 +120,7 @@ def test_info_keys_choose_what_is_handed_on() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be a positive integer or None, got 0"),
+        ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
         ({"parallel": True}, "num_envs must be a positive integer with parallel=True, got None"),
         ({"info_keys": ("succes",)}, "info_keys must be among .*got 'succes'"),
         ({"max_steps": -1}, "max_steps must be a positive integer, got -1"),

@@ -120,7 +120,7 @@ def test_regions_hold_the_starts_and_the_goals() -> None:
 @pytest.mark.parametrize(
     ("world", "message"),
     [
-        (World(name="closet", size=(0.9, 0.9)), "'closet' has no free start"),
+        (World(name="closet", size=(0.7, 0.7)), "'closet' has no free start"),
         (World(name="small", size=(2.2, 2.2)), "'small' has no start and goal"),
         (
             World(
