@@ -63,23 +63,23 @@ def make_transitions(count: int, *, seed: int = 0) -> TensorDict:
     )
 
 
-def make_mpfa_buffer(capacity: int) -> SignalReplayBuffer:
+def make_mpfa_buffer(capacity: int, batch_size: int = BATCH_SIZE) -> SignalReplayBuffer:
     """A full buffer of this package with the paper's sampler."""
     buffer = SignalReplayBuffer(
         storage=SignalTensorStorage(capacity),
         sampler=MPFASampler(capacity, ALPHA, BETA),
-        batch_size=BATCH_SIZE,
+        batch_size=batch_size,
         generator=torch.Generator().manual_seed(0),
     )
     return _fill(buffer, capacity)
 
 
-def make_stock_buffer(capacity: int) -> TensorDictReplayBuffer:
+def make_stock_buffer(capacity: int, batch_size: int = BATCH_SIZE) -> TensorDictReplayBuffer:
     """A full buffer of TorchRL with its prioritized sampler."""
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity),
         sampler=PrioritizedSampler(capacity, ALPHA, BETA),
-        batch_size=BATCH_SIZE,
+        batch_size=batch_size,
         priority_key="td_error",
     )
     return _fill(buffer, capacity)
@@ -91,10 +91,10 @@ def _fill(buffer: TensorDictReplayBuffer, capacity: int) -> TensorDictReplayBuff
     return buffer
 
 
-def make_mpfa_update(buffer: SignalReplayBuffer) -> Call:
+def make_mpfa_update(buffer: SignalReplayBuffer, count: int = BATCH_SIZE) -> Call:
     """One sample and one update of priorities; signals are written as the loss writes them."""
     generator = torch.Generator().manual_seed(1)
-    td_error, action_gradient = torch.rand(2, BATCH_SIZE, generator=generator).unbind()
+    td_error, action_gradient = torch.rand(2, count, generator=generator).unbind()
 
     def update() -> None:
         batch = buffer.sample()
@@ -105,9 +105,9 @@ def make_mpfa_update(buffer: SignalReplayBuffer) -> Call:
     return update
 
 
-def make_stock_update(buffer: TensorDictReplayBuffer) -> Call:
+def make_stock_update(buffer: TensorDictReplayBuffer, count: int = BATCH_SIZE) -> Call:
     """The same with TorchRL's buffer, which takes one number a transition."""
-    td_error = torch.rand(BATCH_SIZE, generator=torch.Generator().manual_seed(1))
+    td_error = torch.rand(count, generator=torch.Generator().manual_seed(1))
 
     def update() -> None:
         batch = buffer.sample()
@@ -133,6 +133,21 @@ def measure_sample_update(
     ours = make_mpfa_update(make_mpfa_buffer(capacity))
     stock = make_stock_update(make_stock_buffer(capacity))
     return compare(name, ours, stock, quick=quick)
+
+
+def measure_sample_16x256(*, quick: bool) -> list[Entry]:
+    """Sample and update sixteen batches in one call, as many robots at once ask for.
+
+    Args:
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        An entry for each replay; ours has the ratio.
+    """
+    count = 16 * BATCH_SIZE
+    ours = make_mpfa_update(make_mpfa_buffer(100_000, count), count)
+    stock = make_stock_update(make_stock_buffer(100_000, count), count)
+    return compare("sample_16x256", ours, stock, quick=quick)
 
 
 def measure_extend_one(

@@ -58,6 +58,7 @@ def measure_sample_update_1e6(*, quick: bool) -> list[Entry]:
 BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "sample_update_1e5": replay.measure_sample_update,
     "sample_update_1e6": measure_sample_update_1e6,
+    "sample_16x256": replay.measure_sample_16x256,
     "update_growth": replay.measure_growth,
     "extend_one": replay.measure_extend_one,
     "loss": loss.measure,

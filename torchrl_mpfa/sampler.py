@@ -19,7 +19,7 @@ from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import one_sided
 from torchrl_mpfa.signals import Signal, SignalTable, as_signals
-from torchrl_mpfa.slots import as_slots
+from torchrl_mpfa.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.statistics import batch_statistics
 from torchrl_mpfa.tree import TreeSampler, in_dimensions_of
@@ -257,8 +257,11 @@ class SignalSampler(TreeSampler):
 
         weighing = self._weigh(table, slots)
         priority = self._fused(table, rows, slots, weighing)
-        highest = self._checked(priority)
+        highest = self._checked(priority, "adjusted priorities")
         self._weighing = weighing
+        if len(slots) > SERIAL and (last := last_of_each(slots)) is not None:
+            slots, rows, priority = slots[last], rows[last], priority[last]
+            highest = bounds(priority)[1]
         table.rows.index_copy_(0, slots, rows)
         self._set(slots, priority, highest)
         return stale
@@ -278,13 +281,7 @@ class SignalSampler(TreeSampler):
             raise ValueError(
                 f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
             )
-        priority = priority.to(torch.double)
-        low, high = bounds(priority)
-        if not (low >= 0 and high < math.inf):
-            raise ValueError(
-                f"adjusted priorities must be finite and not negative, got [{low}, {high}]"
-            )
-        return priority
+        return priority.to(torch.double)
 
     def bind(self, storage: Storage) -> SignalTable:
         """Take the signals of a storage as those to fuse.

@@ -7,6 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+SERIAL = 2048
+"""Rows up to which writing by index goes in their order."""
+
 
 def as_slots(index: Any, storage: Any = None) -> Tensor:
     """Slots as numbers, whatever names them.

@@ -11,12 +11,10 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range, seeded_generator
 from torchrl_mpfa.priorities import importance_weights
-from torchrl_mpfa.slots import as_slots, last_of_each
+from torchrl_mpfa.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.tree_state import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
-_SERIAL = 8192
-"""Rows up to which writing by index goes in their order."""
 
 
 class TreeSampler(SavedTrees):
@@ -259,6 +257,7 @@ class TreeSampler(SavedTrees):
         if len(kept) == 0:
             return
         value = value if len(kept) == len(slots) else value[slots >= 0]
+        check_finite("priority", value)
         inherited = self._inherited(kept, value)
         value = value + self._eps
         highest = self._checked(value)
@@ -277,12 +276,11 @@ class TreeSampler(SavedTrees):
         fresh = torch.as_tensor(self._max_tree[slots]).reshape(-1) > 0
         return fresh & (value.float() == torch.tensor(self.default_priority).float())
 
-    def _checked(self, priority: Tensor) -> float:
+    def _checked(self, priority: Tensor, name: str = "priority") -> float:
         """The highest of priorities, eps included, which are refused if they poison a tree."""
         low, high = bounds(priority)
         if not (low >= 0 and high < math.inf):
-            check_finite("priority", priority - self._eps)
-            check_finite("priority", priority)
+            check_finite(name, priority)
         if high > 0 and self._alpha * math.log(high) + math.log(self._max_capacity) > _LOG_LARGEST:
             raise ValueError(f"priority must not be so high that sums overflow, got {high}")
         return high
@@ -295,7 +293,7 @@ class TreeSampler(SavedTrees):
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees."""
-        if len(slots) > _SERIAL and (last := last_of_each(slots)) is not None:
+        if len(slots) > SERIAL and (last := last_of_each(slots)) is not None:
             slots, priority = slots[last], priority[last]
         self._priorities.index_copy_(0, slots, priority)
         self._max_tree[slots] = -priority if learned else torch.full_like(priority, math.inf)

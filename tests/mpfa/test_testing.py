@@ -159,8 +159,8 @@ class ForgetsAlpha(SignalSampler):
 
 
 class TakesEverything(SignalSampler):
-    def _checked(self, priority):
-        return 1.0
+    def update_priority(self, index, priority, *, storage=None):
+        super().update_priority(index, priority.nan_to_num(1.0).abs(), storage=storage)
 
 
 class ChangesFirst(SignalSampler):

@@ -62,8 +62,8 @@ class LA3PSampler(SignalSampler):
         super()._write_leaves(slots, leaf)
         self._inverse_tree[slots] = 1.0 / leaf
 
-    def _checked(self, priority: Tensor) -> float:
-        highest = super()._checked(priority)
+    def _checked(self, priority: Tensor, name: str = "priority") -> float:
+        highest = super()._checked(priority, name)
         # Not so low that the inverse overflows, which a priority of zero would be.
         lowest = priority.min().item()
         least = (math.log(self._max_capacity) - _LOG_LARGEST) / max(self._alpha, _TINY)
