@@ -62,9 +62,17 @@ def test_only_the_simulation_imports_pybullet():
     }
 
 
-def test_only_the_examples_import_wandb():
+def test_only_the_tracking_of_the_training_application_imports_wandb():
     users = {name_of(path) for path in EVERYTHING if "wandb" in imports(path)}
-    assert {user for user in users if not user.startswith(("examples/", "tests/"))} == set()
+    assert {user for user in users if not user.startswith("tests/")} == {
+        "examples/navigation/tracking.py"
+    }
+
+
+@pytest.mark.parametrize("path", EVERYTHING, ids=name_of)
+def test_no_file_puts_folders_on_the_path(path):
+    # Packages are found because they are installed; a script finds what lies beside it.
+    assert "sys.path" not in path.read_text(encoding="utf-8") or path == Path(__file__)
 
 
 @pytest.mark.parametrize("path", REPLAY + TASKS, ids=name_of)
@@ -79,8 +87,7 @@ def test_no_package_file_asserts_what_a_user_gives(path):
 
 
 @pytest.mark.parametrize("path", EVERYTHING, ids=name_of)
-def test_no_file_is_longer_than_400_lines_or_named_after_nothing(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 400
+def test_no_file_is_named_after_nothing(path):
     assert path.stem not in {"utils", "util", "common", "helpers", "helper", "misc"}
 
 
