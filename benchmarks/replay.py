@@ -151,12 +151,13 @@ def measure_sample_16x256(*, quick: bool) -> list[Entry]:
 
 
 def measure_extend_one(
-    name: str = "extend_one", *, capacity: int = 100_000, quick: bool
+    name: str = "extend_one", *, rows: int = 1, capacity: int = 100_000, quick: bool
 ) -> list[Entry]:
-    """Write one transition in a full buffer.
+    """Write one transition in a full buffer, checks of what is written included.
 
     Args:
         name: Name of the entry.
+        rows: Transitions in a call.
         capacity: Slots of each buffer.
         quick: Fewer and shorter rounds.
 
@@ -167,10 +168,26 @@ def measure_extend_one(
     # A round with other priorities than the first ones, as training has them.
     make_mpfa_update(ours)()
     make_stock_update(stock)()
-    transition = make_transitions(1)
+    transitions = make_transitions(rows)
     return compare(
-        name, lambda: ours.extend(transition), lambda: stock.extend(transition), quick=quick
+        name, lambda: ours.extend(transitions), lambda: stock.extend(transitions), quick=quick
     )
+
+
+def measure_extend_16(
+    name: str = "extend_16", *, capacity: int = 100_000, quick: bool
+) -> list[Entry]:
+    """Write sixteen transitions in one call, as sixteen environments bring them.
+
+    Args:
+        name: Name of the entry.
+        capacity: Slots of each buffer.
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        An entry for each replay; ours has the ratio.
+    """
+    return measure_extend_one(name, rows=16, capacity=capacity, quick=quick)
 
 
 def measure_growth(*, capacities: Sequence[int] = GROWTH_CAPACITIES, quick: bool) -> list[Entry]:

@@ -1,0 +1,150 @@
+"""States that do not fit are refused before anything is loaded."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.mpfa.transitions import make_buffer, make_transitions, same, snapshot, train_rounds
+from torchrl_mpfa import SignalReplayBuffer, SignalSampler, SignalTensorStorage, TreeSampler
+from torchrl_mpfa.methods import RankSampler
+
+
+@pytest.fixture
+def pair():
+    """The state of one buffer, and another buffer in the middle of its training."""
+    first, second = make_buffer(8), make_buffer(8, seed=5)
+    first.extend(make_transitions(8))
+    train_rounds(first, 2)
+    second.extend(make_transitions(6, seed=3))
+    train_rounds(second, 2)
+    return snapshot(first), second
+
+
+def spoil(state, path, value):
+    *way, last = path
+    for key in way:
+        state = state[key]
+    if value is MISSING:
+        del state[last]
+    else:
+        state[last] = value
+
+
+MISSING = object()
+NAN = float("nan")
+SPOILS = [
+    (("_storage",), MISSING, "'_storage' is missing in the saved buffer"),
+    (("_sampler",), MISSING, "'_sampler' is missing in the saved buffer"),
+    (("_writer",), MISSING, "'_writer' is missing in the saved buffer"),
+    (("_rng",), MISSING, "'_rng' is missing in the saved buffer"),
+    (("_rng",), (torch.zeros(3), "cpu"), "'_rng' of the saved buffer cannot be restored|no state"),
+    (("_batch_size",), 0, "'_batch_size' of the saved buffer must be positive, got 0"),
+    (("_writer", "_cursor"), MISSING, "'_cursor' is missing in the saved writer"),
+    (("_writer", "_cursor"), 8, r"'_cursor' of the saved writer must be in \[0, 8\), got 8"),
+    (("_writer", "_cursor"), "1", r"'_cursor' of the saved writer must be in \[0, 8\), got '1'"),
+    (("_writer", "_write_count"), -1, "'_write_count' of the saved writer must not be negative"),
+    (("_storage", "_len"), MISSING, "'_len' is missing in the saved storage"),
+    (("_storage", "_len"), 10**18, r"'_len' of the saved storage must be in \[0, 8\], got 1000"),
+    (("_storage", "_len"), 7, "the saved storage has 7 rows, its signals 8"),
+    (("_storage", "initialized"), MISSING, "'initialized' is missing in the saved storage"),
+    (("_storage", "_storage", "observation"), MISSING, "entry 'observation' is missing in the sa"),
+    (
+        ("_storage", "_storage", "observation"),
+        torch.ones(8, 2),
+        r"entry 'observation' of the saved storage has shape \[8, 2\] .* \[8, 1\]",
+    ),
+    (
+        ("_storage", "_storage", "observation"),
+        torch.ones(8, 1, dtype=torch.double),
+        r"entry 'observation' of the saved storage has .* torch.float64, .* torch.float32",
+    ),
+    (
+        ("_storage", "_storage", "more"),
+        torch.ones(8, 1),
+        "entry 'more' of the saved storage",
+    ),
+    (
+        ("_storage", "_storage", "observation"),
+        torch.tensor([[NAN]] + [[1.0]] * 7),
+        "entry 'observation' of the saved storage must be finite",
+    ),
+    (("_storage", "_signals", "rows"), MISSING, "'rows' is missing in the saved signals"),
+    (
+        ("_storage", "_signals", "rows"),
+        torch.ones(7, 6, dtype=torch.double),
+        r"rows of the saved signals must be double of shape \[8, 6\]",
+    ),
+    (
+        ("_storage", "_signals", "rows"),
+        torch.ones(8, 6),
+        "rows of the saved signals must be double",
+    ),
+    (("_storage", "_signals", "size"), 9, r"size of the saved signals must be in \[0, 8\], got 9"),
+    (("_storage", "_signals", "writes"), -1, "writes of the saved signals must not be negative"),
+    (("_storage", "_signals", "writes"), 2, r"times of writing in \[0, 2\)"),
+    (("_sampler", "_eps"), MISSING, "_eps"),
+    (("_sampler", "_alpha"), "0.6", "_alpha"),
+    (("_sampler", "_sum_tree"), MISSING, "_sum_tree"),
+    (("_sampler", "_sum_tree"), torch.full((8,), NAN), "_sum_tree"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), SPOILS)
+def test_a_state_that_does_not_fit_is_refused_and_the_next_batches_are_the_same(
+    pair, path, value, message
+):
+    state, buffer = pair
+    spoil(state, path, value)
+    before, twin = snapshot(buffer), deepcopy(buffer)
+    with pytest.raises((KeyError, ValueError, TypeError), match=message):
+        buffer.load_state_dict(state)
+    assert same(before, snapshot(buffer))
+    assert train_rounds(buffer, 3).equal(train_rounds(twin, 3))
+
+
+@pytest.mark.parametrize("column", range(6))
+@pytest.mark.parametrize("wrong", [torch.inf, -1.0])
+def test_signals_that_cannot_be_are_refused(pair, column, wrong):
+    state, buffer = pair
+    if column == buffer.storage.signal_table.reward_column and wrong == -1.0:
+        return
+    state["_storage"]["_signals"]["rows"][3, column] = wrong
+    before = snapshot(buffer)
+    with pytest.raises(ValueError, match=r"saved (signals|rewards)"):
+        buffer.load_state_dict(state)
+    assert same(before, snapshot(buffer))
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs"),
+    [
+        (SignalSampler, RankSampler),
+        (RankSampler, SignalSampler),
+        (SignalSampler, TreeSampler),
+        (RankSampler, TreeSampler),
+        (TreeSampler, RankSampler),
+    ],
+)
+def test_the_state_of_another_sampler_is_refused(mine, theirs):
+    def make(kind, value):
+        buffer = SignalReplayBuffer(
+            storage=SignalTensorStorage(8), sampler=kind(8, 0.6, 0.4), batch_size=2
+        )
+        rows = torch.full((8, 1), value)
+        buffer.extend(TensorDict({"observation": rows, "next": {"reward": rows.clone()}}, [8]))
+        return buffer
+
+    buffer, state = make(mine, 1.0), snapshot(make(theirs, 2.0))
+    before = snapshot(buffer)
+    with pytest.raises(ValueError, match="sampler"):
+        buffer.load_state_dict(state)
+    assert same(before, snapshot(buffer))
+
+
+def test_an_empty_buffer_is_restored_and_filled():
+    first, second = make_buffer(8), make_buffer(8, seed=5)
+    second.load_state_dict(snapshot(first))
+    second.extend(make_transitions(3))
+    assert len(second) == 3
