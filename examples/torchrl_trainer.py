@@ -115,7 +115,7 @@ def report(trainer: Trainer) -> list[str]:
     buffer, stepper = trainer.replay_buffer, trainer.optimization_stepper
     lines = [
         f"frames collected        {trainer.collected_frames}",
-        f"transitions in replay   {len(buffer)}, drawn by {type(buffer.sampler).__name__}",
+        f"transitions in replay   {len(buffer)}, sampled by {type(buffer.sampler).__name__}",
         f"steps of the optimizer  {trainer._optim_count}",
     ]
     if isinstance(stepper, PriorityStepper):

@@ -177,7 +177,7 @@ def check_priority_updates(trainer: Trainer, *, replay_buffer: Any | None = None
 
     Raises:
         ValueError: If there is no replay buffer.
-        RuntimeError: If the buffer's sampler draws by priorities, and the stepper does not
+        RuntimeError: If the buffer's sampler samples by priorities, and the stepper does not
             declare ``updates_replay_priority``.
     """
     if _updates_remotely(trainer):
@@ -189,7 +189,7 @@ def check_priority_updates(trainer: Trainer, *, replay_buffer: Any | None = None
         return
     raise RuntimeError(
         f"optimization_stepper {_name(stepper)} does not update priorities, and a trainer with a "
-        f"stepper skips the stage that would: {_name(sampler)} would draw by the priorities of "
+        f"stepper skips the stage that would: {_name(sampler)} would sample by the priorities of "
         f"fresh transitions for ever. Wrap it, PriorityStepper({_name(stepper)}(...)), or call "
         "trainer.replay_buffer.update_tensordict_priority(sub_batch) in its step() and set "
         "updates_replay_priority = True"

@@ -193,7 +193,7 @@ def test_the_check_asks_of_prioritized_samplers_of_torchrl_alone(prioritized: bo
         replay_buffer=buffer, optimization_stepper=DefaultOptimizationStepper()
     )
     if prioritized:
-        with pytest.raises(RuntimeError, match="PrioritizedSampler would draw by the priorities"):
+        with pytest.raises(RuntimeError, match="PrioritizedSampler would sample by the priorities"):
             check_priority_updates(trainer)
         assert TD3OptimizationStepper.updates_replay_priority
         trainer.optimization_stepper = PriorityStepper()

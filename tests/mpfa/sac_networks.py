@@ -41,7 +41,7 @@ def make_learner(seed=0, *, of_loss=None, **kwargs):
 
 
 def evaluate(loss, batch, seed=1):
-    torch.manual_seed(seed)  # Actions are drawn.
+    torch.manual_seed(seed)  # Actions are random.
     return loss(batch)
 
 

@@ -108,8 +108,8 @@ def test_random_actions_have_the_density_of_torchrls_distribution():
     torch.testing.assert_close(action, expected[0], rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(log_density, expected[1], rtol=1e-4, atol=1e-4)
     with set_exploration_type(ExplorationType.RANDOM):
-        drawn = policy(TensorDict(inputs, [50]))["action"]
-    assert bool(((drawn >= torch.tensor(LOW)) & (drawn <= torch.tensor(HIGH))).all())
+        sampled = policy(TensorDict(inputs, [50]))["action"]
+    assert bool(((sampled >= torch.tensor(LOW)) & (sampled <= torch.tensor(HIGH))).all())
 
 
 def test_the_density_integrates_to_one():
@@ -123,9 +123,9 @@ def test_the_density_integrates_to_one():
     total = float((normal - jacobian).exp().sum() * (action[1] - action[0]))
     assert total == pytest.approx(1.0, abs=1e-2)
     torch.manual_seed(0)
-    drawn, log_density, loc = policy.sample({"observation": torch.zeros(1000, 1)})
+    sampled, log_density, loc = policy.sample({"observation": torch.zeros(1000, 1)})
     deviation = policy.module[0].outputs({"observation": torch.zeros(1000, 1)})["scale"]
-    at = torch.atanh((drawn - 5.0) / 5.0)
+    at = torch.atanh((sampled - 5.0) / 5.0)
     expected = torch.distributions.Normal(loc, deviation).log_prob(at)
     expected = (expected - torch.log1p(-at.tanh().square()) - math.log(5.0)).sum(-1)
     inside = at.squeeze(-1).abs() < 2
@@ -173,7 +173,9 @@ def test_sac_equals_torchrls_within_these_bounds():
 def test_the_compiled_update_keeps_to_the_bounds_too():
     expected, batch = batch_of_seed(), batch_of_seed()
     losses = [
-        make_td3_loss(*networks(make_actor), gamma=GAMMA, action_spec=SPEC, policy_noise=3.0)
+        make_td3_loss(
+            *networks(make_actor), gamma=GAMMA, action_spec=SPEC, policy_noise=3.0, noise_clip=9.0
+        )
         for _ in range(2)
     ]
     losses[1].load_state_dict(losses[0].state_dict())

@@ -25,7 +25,7 @@ def make_learner(name, average, seed=0, **kwargs):
 
 
 def target_of(learner, batch, seed=7):
-    torch.manual_seed(seed)  # TD3 draws noise.
+    torch.manual_seed(seed)  # TD3 has noise in its targets.
     update = {"ddpg": "loss_value", "td3": "value_loss"}
     kind = "ddpg" if isinstance(learner, DDPGLearner) else "td3"
     with torch.no_grad():

@@ -61,7 +61,7 @@ def by_losses(name, loss, batch, actor_batch=None, **kwargs):
 def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, options):
     expected, batch = (make_batch(weighted=weighted) for _ in range(2))
     loss, whole = make_loss(name, **options), make_loss(name, **options)
-    torch.manual_seed(5)  # TD3 draws the noise of its targets.
+    torch.manual_seed(5)  # TD3 has noise in its targets.
     gradients, log = by_losses(name, loss, expected, expected)
     torch.manual_seed(5)
     found = CompiledGradients(whole, compile=None)(batch, actor_batch=batch)

@@ -1,4 +1,4 @@
-"""The stochastic policy: what it draws, and what it does when it is not to explore."""
+"""The stochastic policy: what it samples, and what it does when it is not to explore."""
 
 import pytest
 import torch
@@ -18,14 +18,14 @@ def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
     assert found["action"].equal(found["preactivation"].tanh())
     torch.testing.assert_close(policy(observed.copy())["action"], found["action"])
     with set_exploration_type(ExplorationType.RANDOM):
-        drawn = []
+        sampled = []
         for _ in range(2):
             torch.manual_seed(3)
-            drawn.append(policy.outputs(observed)["action"])
+            sampled.append(policy.outputs(observed)["action"])
         torch.manual_seed(3)
-        torch.testing.assert_close(policy(observed.copy())["action"], drawn[0])
-    assert drawn[0].equal(drawn[1])
-    assert not drawn[0].equal(found["action"])
+        torch.testing.assert_close(policy(observed.copy())["action"], sampled[0])
+    assert sampled[0].equal(sampled[1])
+    assert not sampled[0].equal(found["action"])
 
 
 def test_the_sizes_of_a_policy_can_be_read_from_its_weights():

@@ -14,7 +14,7 @@ from torchrl_mpfa.selection import Draw
 
 
 def refuse_unfinished(losses: Mapping[str, Tensor], draw: Draw) -> None:
-    """Refuse a draw of which a loss is not finite.
+    """Refuse an update of which a loss is not finite.
 
     One NaN in an observation would make all weights NaN. Losses are looked at and not the batch,
     as that is one number for each.
