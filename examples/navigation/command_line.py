@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 from hydra import compose, initialize
@@ -16,6 +16,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from navigation.checks import check_settings
 from navigation.settings import GROUPS, TrainSettings, as_settings
+
+_WITH_A_WORD = ("--cfg", "-c", "--package", "-p", "--info", "-i")
+"""Options of Hydra that are followed by a word of their own."""
 
 
 def known_settings(settings: Any = TrainSettings, prefix: str = "") -> Iterator[str]:
@@ -42,12 +45,18 @@ def parse_overrides(arguments: Sequence[str]) -> list[Override]:
     Raises:
         ValueError: If one cannot be read, is unknown, or an unknown choice; with the nearest one.
     """
-    # Options of Hydra may have a word of their own, as in `--cfg job`.
-    texts = [text for text in arguments if "=" in text and not text.startswith("-")]
-    try:
-        parsed = OverridesParser.create().parse_overrides(texts)
-    except HydraException as error:
-        raise ValueError(_one_line(error)) from error
+    texts = [
+        text
+        for before, text in pairwise(["", *arguments])
+        if not text.startswith("-") and before not in _WITH_A_WORD
+    ]
+    parser = OverridesParser.create()
+    parsed = []
+    for text in texts:
+        try:
+            parsed.append(parser.parse_override(text))
+        except HydraException as error:
+            raise ValueError(f"{text!r} is no NAME=VALUE: {_one_line(error)}") from error
     known = list(known_settings())
     overrides = [each for each in parsed if not each.key_or_group.startswith("hydra")]
     for override in overrides:

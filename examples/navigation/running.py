@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from hydra.core.override_parser.types import Override
 
@@ -57,8 +56,12 @@ def start(settings: TrainSettings, folder: Path) -> int:
                     f"{folder} holds a run: go on with it by resume={folder}, or start anew by "
                     "overwrite=true"
                 )
+            prepare_process(settings)
+            settings = replace(settings, run_dir=str(folder))
+            training = TrainingRun(settings, folder)
+            # Only now: a setting that the parts refuse leaves the old run in its place.
             files.set_aside(folder)
-            training = _prepared(settings, folder, None)
+            write_settings(settings, folder / files.SETTINGS)
         return _train(training)
 
 
@@ -85,15 +88,10 @@ def resume(folder: Path, overrides: list[Override]) -> int:
             settings = changed(state["settings"], overrides)
             check_settings(settings)
             check_lawful(as_settings(state["settings"]), settings, folder)
-            training = _prepared(settings, folder, state)
+            prepare_process(settings)
+            training = TrainingRun(settings, folder, state)
+            write_settings(settings, folder / files.SETTINGS)
         return _train(training)
-
-
-def _prepared(settings: TrainSettings, folder: Path, state: dict[str, Any] | None) -> TrainingRun:
-    prepare_process(settings)
-    training = TrainingRun(settings, folder, state)
-    write_settings(settings, folder / files.SETTINGS)
-    return training
 
 
 def _train(training: TrainingRun) -> int:

@@ -110,6 +110,14 @@ def test_a_run_started_anew_and_killed_at_once_cannot_resume_the_old_one(
     assert (tmp_path / files.PREVIOUS / CHECKPOINT).read_bytes() == old
 
 
+def test_a_setting_that_the_parts_refuse_leaves_the_old_run_in_its_place(tmp_path: Path) -> None:
+    begin(tmp_path, episodes=1)
+    before = contents(tmp_path)
+    with pytest.raises(Refused, match="layers must be at least 2"):
+        begin(tmp_path, "overwrite=true", "learner.layers=1")
+    assert contents(tmp_path) == before
+
+
 def test_a_run_goes_on_with_more_episodes_and_in_another_world(tmp_path: Path) -> None:
     begin(tmp_path / "run", episodes=2)
     assert go_on(tmp_path / "run", STAGES.format(3), "evaluation.every=10") == 0
