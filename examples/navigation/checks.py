@@ -27,10 +27,18 @@ def choice(*names: str) -> Rule:
     return lambda value: value in names, f"one of {', '.join(names)}"
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 POSITIVE: Rule = (lambda value: 0.0 < value < math.inf, "positive and finite")
 NOT_NEGATIVE: Rule = (lambda value: 0.0 <= value < math.inf, "finite and not negative")
 SHARE: Rule = (lambda value: 0.0 <= value <= 1.0, "in [0, 1]")
 OPEN_SHARE: Rule = (lambda value: 0.0 < value <= 1.0, "in (0, 1]")
+LEVEL: Rule = (
+    lambda value: value == "mean" or (_is_number(value) and math.isfinite(value)),
+    "a finite number or mean",
+)
 NAME: Rule = (
     lambda value: re.fullmatch(r"[\w.+-]+", value) is not None,
     "letters, digits and any of . _ + -, as it names a folder",
@@ -43,6 +51,7 @@ RULES: dict[str, Rule] = {
     "method.name": NAME,
     "method.selection": choice("prioritized", "uniform", "newest", "rank", "capped", "split"),
     "method.fusion": choice("entropy", "fixed", "scaled", "value_schedule"),
+    "method.positive_above": LEVEL,
     "method.population": choice("buffer", "batch"),
     "method.boost_bound": choice("floor", "cap", "none"),
     "method.decay_position": choice("batch", "rank", "count"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 
 from mpfa_envs import NavigationEnv
@@ -35,3 +37,20 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     assert judging.closeness_distance == pytest.approx(0.28)
     training.close()
     judging.close()
+
+
+def test_the_defaults_are_those_of_the_environment_itself() -> None:
+    training = make_training_env("B", EnvironmentSettings(physics="kinematic"))
+    plain = NavigationEnv(world="B", physics="kinematic", render_mode=None)
+    ours = vars(training.envs[0])
+    values = (bool, int, float, str, type(None))
+    same = {name: each for name, each in vars(plain).items() if isinstance(each, values)}
+    assert {"max_steps", "action_repeat", "collision_distance"} <= set(same)
+    assert {name: ours[name] for name in same} == same
+    assert ours["robot"] == plain.robot
+    assert ours["_reward"].keywords == vars(plain)["_reward"].keywords
+    defaults = inspect.signature(NavigationEnv).parameters
+    for name in ("robot", "physics", "max_steps", "action_repeat", "detour_chance"):
+        assert getattr(EnvironmentSettings(), name) == defaults[name].default
+    training.close()
+    plain.close()
