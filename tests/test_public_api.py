@@ -13,7 +13,7 @@ import pytest
 import torchrl_mpfa
 
 MODULES = ["torchrl_mpfa"] + [
-    f"torchrl_mpfa.{module.name}" for module in pkgutil.iter_modules(torchrl_mpfa.__path__)
+    module.name for module in pkgutil.walk_packages(torchrl_mpfa.__path__, "torchrl_mpfa.")
 ]
 NAMES = [name for name in torchrl_mpfa.__all__ if name.upper() != name]
 
