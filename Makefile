@@ -28,12 +28,17 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest
 
-# PyBullet has wheels for Python 3.9 to 3.11, this project needs 3.10. An interpreter is asked
-# rather than trusted by its name: the shims of version managers may exist and not run.
-CANDIDATES := python3.11 python3.10 python3 python
+# This project needs Python 3.10 and PyBullet has wheels up to 3.11; on later ones all runs but the
+# simulated wheels. An interpreter is asked rather than trusted by its name: the shims of version
+# managers may exist and not run.
+CANDIDATES := python3.11 python3.10 python3 python python3.13 python3.12
 FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))
+LATER := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 12))
 HOME_OF := import sys; print(sys.base_prefix)
 WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
+NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simulated wheels; demo and train use physics=kinematic
+# What the scripts get there, evaluated when they are called: before, there may be no .venv.
+PHYSICS = `$(BIN)/python -c "import sys; print('environment.physics=kinematic' * (sys.version_info >= (3, 12)))"`
 
 help: ## Print this list
 	@echo "usage: make TARGET"
@@ -43,12 +48,12 @@ help: ## Print this list
 
 demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minutes)
 	@echo "== training on map A, $(EPISODES) episodes; Ctrl-C stops after the current one"
-	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: A, episodes: $(EPISODES)}]' $(ARGS)
+	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: A, episodes: $(EPISODES)}]' $(PHYSICS) $(ARGS)
 	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
 	$(BIN)/python examples/evaluate.py runs/demo --worlds A --episodes $(EPISODES)
 
 train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='method=per seed=1'
-	$(BIN)/python examples/train.py curriculum=paper learner.compile=$(COMPILE) $(ARGS)
+	$(BIN)/python examples/train.py curriculum=paper learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
 	$(PYTEST) $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)
@@ -83,21 +88,24 @@ clean: ## Remove builds and caches; runs/ and .venv stay
 $(STAMP): pyproject.toml
 	@rm -f $(STAMP); \
 	if [ -n "$(PYTHON)" ]; then \
-	  if ! "$(PYTHON)" -c "$(FITS)" >/dev/null 2>&1; then \
-	    echo "make: PYTHON=$(PYTHON) is not a Python 3.10 or 3.11 that runs and can make a venv (PyBullet has no wheels for others); $(WAY_OUT)" >&2; exit 1; \
-	  fi; \
 	  python="$(PYTHON)"; \
-	elif "$(BIN)/python" -c "import pip; $(FITS)" >/dev/null 2>&1; then \
-	  python="$(BIN)/python"; \
+	  if ! "$$python" -c "$(FITS)" >/dev/null 2>&1 && ! "$$python" -c "$(LATER)" >/dev/null 2>&1; then \
+	    echo "make: PYTHON=$(PYTHON) is not a Python 3.10 or later that runs and can make a venv; $(WAY_OUT)" >&2; exit 1; \
+	  fi; \
 	else \
 	  python=; \
-	  for candidate in $(CANDIDATES); do \
-	    if "$$candidate" -c "$(FITS)" >/dev/null 2>&1; then python="$$candidate"; break; fi; \
+	  for wanted in "$(FITS)" "$(LATER)"; do \
+	    for candidate in "$(BIN)/python" $(CANDIDATES); do \
+	      case "$$candidate" in $(BIN)/*) wanted="import pip; $$wanted" ;; esac; \
+	      [ -n "$$python" ] || ! "$$candidate" -c "$$wanted" >/dev/null 2>&1 || python="$$candidate"; \
+	      wanted="$${wanted#import pip; }"; \
+	    done; \
 	  done; \
 	  if [ -z "$$python" ]; then \
-	    echo "make: no Python 3.10 or 3.11 found that runs and can make a venv (PyBullet has no wheels for others); $(WAY_OUT)" >&2; exit 1; \
+	    echo "make: no Python 3.10 or later found that runs and can make a venv; $(WAY_OUT)" >&2; exit 1; \
 	  fi; \
 	fi; \
+	"$$python" -c "$(FITS)" >/dev/null 2>&1 || echo "make: $$python $(NO_WHEELS); $(WAY_OUT)" >&2; \
 	home=`"$$python" -c "$(HOME_OF)"`; \
 	if [ "`"$(BIN)/python" -c "import pip; $(HOME_OF)" 2>/dev/null`" != "$$home" ]; then \
 	  echo "== making $(VENV) with $$python"; \

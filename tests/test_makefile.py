@@ -22,7 +22,8 @@ case "$*" in
 esac
 """
 SHIM_THAT_FAILS = "#!/bin/sh\necho 'pyenv: python: command not found' >&2\nexit 127\n"
-TOO_NEW = "#!/bin/sh\nexit 1\n"
+TOO_OLD = "#!/bin/sh\nexit 1\n"
+LATER = PRETENDER.replace("esac", '  *"(3, 11)"*) exit 1 ;;\nesac')
 
 
 @pytest.fixture
@@ -91,7 +92,10 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
         (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--worlds A --episodes 2"]),
         (
             ["train", "COMPILE=false", "ARGS=method=per seed=1"],
-            ["python examples/train.py curriculum=paper learner.compile=false method=per seed=1"],
+            [
+                "python examples/train.py curriculum=paper learner.compile=false",
+                "method=per seed=1",
+            ],
         ),
         (["test"], ["python -m pytest"]),
         (["test", "SLOW=1"], ["python -m pytest -m 'slow or not slow'"]),
@@ -119,26 +123,26 @@ def test_the_tests_run_once_when_checks_and_tests_are_asked_for(installed: Path)
     assert [line.strip().endswith("-m pytest") for line in lines].count(True) == 1
 
 
-@pytest.mark.parametrize("program", [SHIM_THAT_FAILS, TOO_NEW])
+@pytest.mark.parametrize("program", [SHIM_THAT_FAILS, TOO_OLD])
 def test_a_given_python_that_does_not_fit_is_refused_in_one_line(copy: Path, program: str) -> None:
     add_program(copy / "bin" / "python3.11", PRETENDER)
     add_program(copy / "python", program)
     done = make(copy, "PYTHON=./python", "demo")
     assert done.returncode != 0
     line, *rest = done.stderr.splitlines()
-    assert "PYTHON=./python is not a Python 3.10 or 3.11" in line
+    assert "PYTHON=./python is not a Python 3.10 or later" in line
     assert "make PYTHON=/path/to/python3.11 demo" in line
     assert all("Error" in other for other in rest), done.stderr  # That make stops, no more.
     assert pip_calls(copy) == []
 
 
 def test_without_a_python_that_fits_one_line_says_the_way_out(copy: Path) -> None:
-    for name, program in (("python3.11", SHIM_THAT_FAILS), ("python3", TOO_NEW)):
+    for name, program in (("python3.11", SHIM_THAT_FAILS), ("python3", TOO_OLD)):
         add_program(copy / "bin" / name, program)
     done = make(copy, "test")
     assert done.returncode != 0
     line, *rest = done.stderr.splitlines()
-    assert "no Python 3.10 or 3.11 found" in line
+    assert "no Python 3.10 or later found" in line
     assert "make PYTHON=/path/to/python3.11 test" in line
     assert all("Error" in other for other in rest), done.stderr
 
@@ -149,6 +153,28 @@ def test_a_shim_that_fails_is_passed_over(copy: Path) -> None:
     done = make(copy, "bench")
     assert done.returncode == 0, done.stderr
     assert "making .venv with python3\n" in done.stdout
+
+
+def test_a_later_python_is_taken_if_there_is_no_other_and_its_lack_is_told(copy: Path) -> None:
+    add_program(copy / "bin" / "python3", LATER)
+    done = make(copy, "test")
+    assert done.returncode == 0, done.stderr
+    assert "making .venv with python3\n" in done.stdout
+    (line,) = done.stderr.splitlines()
+    assert "python3 is later than Python 3.11, so that there is no PyBullet" in line
+    shutil.rmtree(copy / ".venv")
+    done = make(copy, "PYTHON=python3", "test")
+    assert done.returncode == 0, done.stderr
+    assert "no PyBullet" in done.stderr
+
+
+def test_an_earlier_python_goes_before_a_later_one(copy: Path) -> None:
+    add_program(copy / "bin" / "python3", LATER)
+    add_program(copy / "bin" / "python", PRETENDER)
+    done = make(copy, "test")
+    assert done.returncode == 0, done.stderr
+    assert "making .venv with python\n" in done.stdout
+    assert "PyBullet" not in done.stderr
 
 
 def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: Path) -> None:

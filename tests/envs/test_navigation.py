@@ -68,6 +68,28 @@ def test_the_package_can_be_imported_twice_and_needs_no_torch() -> None:
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, env=_path())
 
 
+def test_without_pybullet_kinematics_drives_and_wheels_say_what_they_need() -> None:
+    code = """
+import sys
+sys.modules["pybullet"] = None  # As where it is not installed.
+from mpfa_envs import NavigationEnv, evaluate
+ahead = lambda seen: [1.0, 1.0]
+assert len(evaluate(ahead, "B", episodes=2, physics="kinematic")) == 2
+for make in (NavigationEnv, lambda: evaluate(ahead, "B", episodes=2)):
+    try:
+        make()
+    except ImportError as error:
+        print(error)
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=_path()
+    )
+    lines = result.stdout.splitlines()
+    assert len(lines) == 2
+    assert all("Python 3.11 and earlier" in line for line in lines)
+    assert all("physics='kinematic'" in line for line in lines)
+
+
 def _path() -> dict[str, str]:
     return {"PYTHONPATH": str(mpfa_envs.EXAMPLE_WORLD.parents[3])}
 
