@@ -98,7 +98,7 @@ class TreeSampler(SavedTrees):
         highest = self._highest_priority()
         if highest is None:
             return None, None
-        if not self._max_priority_within_buffer:
+        if not self._max_priority_within_buffer or self._alpha == 0:
             return max(highest - self._eps, 0.0), self._highest_slot
         leaves = torch.as_tensor(self._max_tree[torch.arange(self._max_capacity)]).reshape(-1)
         return max(highest - self._eps, 0.0), int(leaves.argmin())
@@ -111,7 +111,8 @@ class TreeSampler(SavedTrees):
 
     def _highest_priority(self) -> float | None:
         """Highest priority, eps included; None if no update was made."""
-        if self._max_priority_within_buffer:
+        # With alpha = 0 all slots are drawn alike, and TorchRL keeps the highest ever seen.
+        if self._max_priority_within_buffer and self._alpha > 0:
             highest = -self._max_tree.query(0, self._max_capacity)
             return None if highest < 0 else float(highest)
         return self._highest

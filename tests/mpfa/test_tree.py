@@ -261,3 +261,15 @@ def test_transitions_may_be_plain_tensor_dicts_in_a_buffer_of_torchrl():
     batch, info = buffer.sample(return_info=True)
     assert set(info) >= {"index", "priority_weight"}
     assert batch["observation"].min() >= 4
+
+
+def test_alpha_may_leave_zero_exactly():
+    """TorchRL keeps but the powers, all 1 at an exponent of 0, and warns that it cannot go back."""
+    sampler = TreeSampler(10, 0.0, 0.4, 0.0)
+    filled(sampler, 8, 10)
+    priority = torch.rand(8, generator=seeded(3)) + 0.1
+    sampler.update_priority(torch.arange(8), priority)
+    assert leaves(sampler, 10).tolist() == [1.0] * 8 + [0.0] * 2
+    sampler.alpha = 0.5
+    torch.testing.assert_close(leaves(sampler, 8), priority.double().sqrt())
+    assert leaves(sampler, 10)[8:].tolist() == [0.0, 0.0]
