@@ -139,13 +139,13 @@ def power_lines(rows: pd.DataFrame) -> str:
         if squares == 0.0:
             continue
         deviation = math.sqrt(squares / freedom)
-        needed = " and ".join(
+        needed = ", ".join(
             f"{runs_needed(deviation, difference)} for {100 * difference:g} points"
             for difference in _DIFFERENCES
         )
         lines.append(
             f"Success of {learner} varies from run to run by {100 * deviation:.2f} points "
-            f"(standard deviation, {freedom} degrees of freedom). Runs of each method until a "
+            f"(standard deviation, {freedom} degrees of freedom).\nRuns of each method until a "
             f"t-test finds a difference with 80 % power: {needed}."
         )
     return "\n\n".join(lines)
