@@ -72,7 +72,7 @@ class RandomMirror(Transform):
     Args:
         chance: Share of the transitions that are mirrored, in [0, 1].
         sectors: Number of sectors of the lidar.
-        generator: Source of the draws; None: PyTorch's own.
+        generator: Source of the choices; None: PyTorch's own.
 
     Raises:
         ValueError: If chance is not in [0, 1].
@@ -107,8 +107,8 @@ class RandomMirror(Transform):
         Returns:
             The same.
         """
-        drawn = torch.rand(tensordict.batch_size, generator=self.generator)
-        chosen = (drawn < self.chance).unsqueeze(-1).to(tensordict.get("action").device)
+        number = torch.rand(tensordict.batch_size, generator=self.generator)
+        chosen = (number < self.chance).unsqueeze(-1).to(tensordict.get("action").device)
         for key in ("observation", ("next", "observation")):
             seen = tensordict.get(key)
             tensordict.set(key, torch.where(chosen, self.mirror.observation(seen), seen))

@@ -48,7 +48,7 @@ PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
 )
 """Arguments of :class:`NavigationEnv` for the paper's task, with its robot, the TurtleBot2.
 
-The paper gives no ε_p; 15 is that of the public code which it most likely grew out of.
+The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
 """
 
 
@@ -221,9 +221,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         """Start an episode.
 
         Args:
-            seed: Seed of this and all following draws.
+            seed: Seed of this and all following episodes.
             options: ``{"start": (x, y, heading), "goal": (x, y)}`` [m, m, rad] fixes the task; None
-                draws one.
+                samples one.
 
         Returns:
             Observation and info.
@@ -311,7 +311,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         return success, collision, truncated, terms
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the room from above.
+        """Render the room from above.
 
         Returns:
             Picture of shape ``[480, 480, 3]``, or None without a render mode.

@@ -22,13 +22,13 @@ _DRAWS: Final = 200_000
 
 
 def random_world(seed: int, *, boxes: int = _BOXES, passage: float = _PASSAGE) -> World:
-    """Draw a room of 10 x 10 m with boxes that leave a way between any two of them.
+    """Sample a room of 10 x 10 m with boxes that leave a way between any two of them.
 
     The name ``"random-7"`` stands for ``random_world(7)`` wherever a world is asked for; with other
     arguments than the defaults a room says so in its own name.
 
     Args:
-        seed: Seed of the draw, at least 0.
+        seed: Seed, at least 0.
         boxes: Number of boxes, 0.5 m thick and 0.5 to 2.6 m long. About half of them touch a wall,
             where they make dead ends.
         passage: Least width of the way between two boxes, or a box and a wall that it does not
@@ -64,7 +64,7 @@ def random_world(seed: int, *, boxes: int = _BOXES, passage: float = _PASSAGE) -
                 return World(name=name, boxes=tuple(placed))
     raise ValueError(
         f"boxes = {boxes} with passage = {passage} m between them do not fit the room: after "
-        f"{_DRAWS} draws there are {len(placed)}"
+        f"{_DRAWS} samples there are {len(placed)}"
     )
 
 

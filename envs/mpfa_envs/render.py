@@ -1,4 +1,4 @@
-"""Pictures of a world from above, drawn without a display."""
+"""Pictures of a world from above, rendered without a display."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def render_scene(
     rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     size: int = 480,
 ) -> NDArray[np.uint8]:
-    """Draw one moment of an episode.
+    """Render one moment of an episode.
 
     Args:
         world: The room and its obstacles.
@@ -248,7 +248,7 @@ def render_trajectories(
     title: str = "",
     size: int = 480,
 ) -> NDArray[np.uint8]:
-    """Draw the ways of many episodes into one picture of their world.
+    """Render the paths of many episodes into one picture of their world.
 
     A ring marks a start, a red dot a goal and a cross a collision. The strip below counts how the
     episodes ended.

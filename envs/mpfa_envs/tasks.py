@@ -50,7 +50,7 @@ def sample_task(
     min_goal_distance: float = 2.0,
     detour_chance: float = 0.0,
 ) -> Task:
-    """Draw a start and a goal uniformly over the free space of their regions.
+    """Sample a start and a goal uniformly over the free space of their regions.
 
     The two are joined by a path that keeps the collision distance, so every task can be solved.
 
@@ -82,9 +82,9 @@ def sample_task(
     detour = detour_chance > 0.0 and obstacles and rng.random() < detour_chance
     straight: Task | None = None
     for _ in range(_STARTS):
-        start = _draw_point(world, rng, world.start_regions, start_clearance, "start")
+        start = _sample_point(world, rng, world.start_regions, start_clearance, "start")
         for _ in range(_GOALS_PER_START):
-            goal = _draw_point(world, rng, world.goal_regions, goal_clearance, "goal")
+            goal = _sample_point(world, rng, world.goal_regions, goal_clearance, "goal")
             far = math.dist(start, goal) >= min_goal_distance
             if not (far and planner.is_reachable(start, goal)):
                 continue
@@ -153,14 +153,14 @@ def check_task(
     return Task((x, y, heading), goal)
 
 
-def _draw_point(
+def _sample_point(
     world: World,
     rng: np.random.Generator,
     regions: tuple[Box, ...],
     clearance: float,
     what: str,
 ) -> tuple[float, float]:
-    """Draw a point with the clearance [m] from the union of the regions."""
+    """Sample a point with the clearance [m] from the union of the regions."""
     regions = regions or (world.room,)
     shares = np.cumsum([region.area for region in regions])
     for _ in range(_DRAWS):
@@ -172,7 +172,7 @@ def _draw_point(
         if world.clearance(x, y) >= clearance:
             return x, y
     raise ValueError(
-        f"world {world.name!r} has no free {what}: {_DRAWS} draws found no point "
+        f"world {world.name!r} has no free {what}: {_DRAWS} samples found no point "
         f"{clearance:.2f} m from every obstacle and wall"
     )
 
@@ -186,7 +186,7 @@ def evaluation_pairs(
     collision_distance: float | Literal["contact"] | None = None,
     min_goal_distance: float = 2.0,
 ) -> list[Task]:
-    """Draw a fixed list of tasks, the same for everyone who asks with the same arguments.
+    """Sample a fixed list of tasks, the same for everyone who asks with the same arguments.
 
     Args:
         world: A name, the path of a YAML file or a world.

@@ -7,6 +7,7 @@ import inspect
 import pytest
 
 from mpfa_envs import NavigationEnv
+from mpfa_envs.reward import PROGRESS_SCALE
 from navigation.environments import env_arguments, make_training_env
 from navigation.settings import EnvironmentSettings
 
@@ -54,3 +55,15 @@ def test_the_defaults_are_those_of_the_environment_itself() -> None:
         assert getattr(EnvironmentSettings(), name) == defaults[name].default
     training.close()
     plain.close()
+
+
+def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> None:
+    settings = EnvironmentSettings(physics="kinematic")
+    trained, plain = make_training_env("D", settings).envs[0], NavigationEnv(physics="kinematic")
+    for name in (
+        "max_steps", "time_step", "action_repeat", "goal_radius", "collision_distance",
+        "closeness_distance", "min_goal_distance", "detour_chance", "robot",
+    ):  # fmt: skip
+        assert getattr(trained, name) == getattr(plain, name), name
+    assert settings.progress_scale == PROGRESS_SCALE
+    assert EnvironmentSettings().physics == "wheels"
