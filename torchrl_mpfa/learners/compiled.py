@@ -95,7 +95,13 @@ class CompiledGradients:
         self._preactivation = keys.preactivation
         self._call: Callable[..., Any] = self._gradients
         if compile is not None:
-            self._call = torch.compile(self._gradients, fullgraph=True, dynamic=False, **compile)
+            # Apart from other learners, whose recompilations would count against this one's limit.
+            self._call = torch.compile(
+                self._gradients,
+                fullgraph=True,
+                dynamic=False,
+                **{"isolate_recompiles": True, **compile},
+            )
 
     def __call__(
         self,
