@@ -221,7 +221,7 @@ class Replay(RuleBasedStateMachine):
         value=st.sampled_from([None, "0.6", 10**18, -1, torch.full((3,), torch.nan)]),
     )
     def refused_load(self, path, value):
-        if path == ("_rng",) and value is None or path[-1] == "_eps" and value == 10**18:
+        if (path == ("_rng",) and value is None) or (path[-1] == "_eps" and value == 10**18):
             return  # These may be.
         state = snapshot(self.buffer)
         place = state
