@@ -19,7 +19,7 @@ from navigation import files, tracking
 from navigation.checkpoints import read_checkpoint
 from navigation.command_line import composed, parse_overrides
 from navigation.files import CHECKPOINT, FolderInUse, lock
-from navigation.records import read_table
+from navigation.records import EpisodeRecord, read_table
 from navigation.running import Refused, resume, start
 from navigation.settings import register
 from navigation.training import TrainingRun
@@ -226,7 +226,7 @@ def test_a_killed_run_goes_on_and_signals_save(tmp_path: Path) -> None:
     episode = read_checkpoint(folder)["episode"]
     assert episode >= 1
 
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGTERM,):
         (folder / files.STATUS).unlink()
         resumed = popen(f"resume={folder}", "checkpoint_every=10000")
         wait_for(folder / files.STATUS, resumed)
@@ -240,12 +240,18 @@ def test_a_killed_run_goes_on_and_signals_save(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_ctrl_c_stops_after_the_episode_and_twice_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_after_the_episode_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])
     run = TrainingRun(settings, tmp_path)
-    assert run.train(lambda record: record.episode == 1 and os.kill(os.getpid(), 2)) is False  # type: ignore[arg-type, func-returns-value]
-    assert (run.episode, run.stop.exit_status) == (2, 130)
+
+    def stop(record: EpisodeRecord) -> None:
+        if record.episode == 1:
+            os.kill(os.getpid(), number)
+
+    assert run.train(stop) is False
+    assert (run.episode, run.stop.exit_status) == (2, 128 + number)
     assert read_checkpoint(tmp_path)["episode"] == 2
     run.close()
     with pytest.raises(KeyboardInterrupt):
-        run.stop.ask(signal.SIGINT)
+        run.stop.ask(number)
