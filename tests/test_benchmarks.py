@@ -85,7 +85,7 @@ def test_check_fails_if_a_ratio_is_above_its_target(
     ratio += 0.01
     assert run.main(arguments) == 1
     assert run.main(arguments[1:]) == 0
-    assert "loss: ratio 1.16 is above its target 1.15" in capsys.readouterr().err
+    assert f"loss: ratio {ratio + 0.01:.2f} is above its target {ratio}" in capsys.readouterr().err
 
 
 def test_every_target_belongs_to_a_benchmark() -> None:
