@@ -13,7 +13,6 @@ from torchrl_mpfa.losses import (
     make_td3_loss,
 )
 from torchrl_mpfa.moving_fusion import Annealed, ScaledFusion, ScheduledFusion
-from torchrl_mpfa.mpfa import MPFASampler
 from torchrl_mpfa.networks import (
     DirectModule,
     make_actor,
@@ -21,7 +20,7 @@ from torchrl_mpfa.networks import (
     make_stochastic_actor,
 )
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.samplers import MPFASampler, SignalSampler, TreeSampler
 from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 from torchrl_mpfa.selection import Draw, Selection, one_batch
 from torchrl_mpfa.signals import (
@@ -30,10 +29,8 @@ from torchrl_mpfa.signals import (
     REWARD,
     TD_ERROR,
     Signal,
-    SignalTable,
 )
-from torchrl_mpfa.storage import SignalMemmapStorage, SignalTensorStorage
-from torchrl_mpfa.tree import TreeSampler
+from torchrl_mpfa.storages import SignalMemmapStorage, SignalTable, SignalTensorStorage
 
 __version__ = "0.1.0"
 

@@ -21,6 +21,12 @@ def check_range(name: str, value: float, *, low: float) -> None:
         raise ValueError(f"{name} must be finite and at least {low}, got {value}")
 
 
+def check_count(name: str, value: int) -> None:
+    """Refuse what is no positive integer."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a positive integer, got {value!r}")
+
+
 def bounds(values: Tensor) -> tuple[float, float]:
     """Lowest and highest value; both NaN if any is."""
     low, high = values.aminmax()

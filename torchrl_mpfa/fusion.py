@@ -40,7 +40,7 @@ from torch import Tensor
 from torchrl_mpfa.positive import Level, check_level
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.signals import SignalTable
+    from torchrl_mpfa.storages.table import SignalTable
 
 
 def binary_entropy(first: Tensor, second: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_mpfa.fusion import FixedFusion, Fusion
 
 if TYPE_CHECKING:
-    from torchrl_mpfa.signals import SignalTable
+    from torchrl_mpfa.storages.table import SignalTable
 
 
 @runtime_checkable

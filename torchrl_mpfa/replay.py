@@ -15,9 +15,9 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl_mpfa.checks import check_finite, seeded_generator
 from torchrl_mpfa.dumps import new_dump, open_dump
 from torchrl_mpfa.replay_state import check_batch_size, check_generator_state, check_writer_state
-from torchrl_mpfa.sampler import SignalSampler
-from torchrl_mpfa.signal_storage import SignalStorageMixin
-from torchrl_mpfa.tree import TreeSampler
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.tree import TreeSampler
+from torchrl_mpfa.storages.base import SignalStorageMixin
 
 _MISSING = (
     "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "

@@ -27,9 +27,10 @@ from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.sampler import SignalSampler
-from torchrl_mpfa.signals import Signal, SignalTable, as_signals
-from torchrl_mpfa.storage import SignalTensorStorage
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.signals import Signal, as_signals
+from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
 _DRAWS = 50_000
 _SPREAD = 5.0

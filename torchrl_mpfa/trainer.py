@@ -17,7 +17,7 @@ from torchrl.trainers import (
     TrainerHookBase,
 )
 
-from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 
 
 class PriorityStepper(OptimizationStepper):

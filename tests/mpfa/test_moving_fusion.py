@@ -4,7 +4,7 @@ import pytest
 
 from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
 from torchrl_mpfa import Annealed, FixedFusion, Fusion, ScaledFusion, ScheduledFusion
-from torchrl_mpfa.signals import SignalTable
+from torchrl_mpfa.storages.table import SignalTable
 
 NAMES = ["td_error", "reward"]
 

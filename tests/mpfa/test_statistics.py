@@ -15,7 +15,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import FixedFusion
-from torchrl_mpfa.statistics import effective_sample_size, signal_shares
+from torchrl_mpfa.samplers.statistics import effective_sample_size, signal_shares
 
 NAMES = ["td_error", "action_gradient", "reward"]
 

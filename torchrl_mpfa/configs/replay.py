@@ -13,10 +13,10 @@ from torchrl.trainers.algorithms.configs import (
 )
 from torchrl.trainers.algorithms.configs.data import SamplerConfig
 
-from torchrl_mpfa.mpfa import MPFASampler
-from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.samplers.mpfa import MPFASampler
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
-from torchrl_mpfa.storage import SignalMemmapStorage, SignalTensorStorage
+from torchrl_mpfa.storages import SignalMemmapStorage, SignalTensorStorage
 
 
 def _mpfa_signals() -> list[Any]:

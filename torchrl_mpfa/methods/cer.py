@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torchrl.data import RandomSampler, Storage
 
-from torchrl_mpfa.tree_state import entry, refuse
+from torchrl_mpfa.samplers.states import entry, refuse
 
 _FILE = "newest.json"
 

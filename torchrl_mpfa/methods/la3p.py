@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.states import refuse
 from torchrl_mpfa.selection import Draw
-from torchrl_mpfa.tree_state import refuse
 
 Part = Literal["uniform", "prioritized", "inverse"]
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0

@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.sampler import SignalSampler
-from torchrl_mpfa.signals import SignalTable
-from torchrl_mpfa.tree_state import check_tensor
-from torchrl_mpfa.weighing import Weighing
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.states import check_tensor
+from torchrl_mpfa.samplers.weighing import Weighing
+from torchrl_mpfa.storages.table import SignalTable
 
 _NO_LEAF = float("inf")
 

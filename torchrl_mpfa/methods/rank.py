@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_range
-from torchrl_mpfa.sampler import SignalSampler
-from torchrl_mpfa.tree_state import check_count, check_tensor, refuse
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.states import check_count, check_tensor, refuse
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:

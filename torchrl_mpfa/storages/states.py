@@ -12,7 +12,7 @@ from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.schema import as_path
+from torchrl_mpfa.storages.schema import as_path
 
 
 def check_length(found: Any, max_size: int, signals: int) -> int:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.fusion import Fusion
-from torchrl_mpfa.signals import SignalTable
+from torchrl_mpfa.storages.table import SignalTable
 
 
 def effective_sample_size(weight: Tensor) -> float:

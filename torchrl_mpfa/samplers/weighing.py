@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import check_finite
 from torchrl_mpfa.fusion import Fusion
-from torchrl_mpfa.signals import SignalTable
-from torchrl_mpfa.tree_state import check_count, check_number, entry, refuse
+from torchrl_mpfa.samplers.states import check_count, check_number, entry, refuse
+from torchrl_mpfa.storages.table import SignalTable
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,19 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts
-from torchrl_mpfa.binding import signal_table_of
 from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range
 from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import one_sided
-from torchrl_mpfa.signals import Signal, SignalTable, as_signals
-from torchrl_mpfa.slots import SERIAL, as_slots, last_of_each
+from torchrl_mpfa.samplers.binding import signal_table_of
+from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
+from torchrl_mpfa.samplers.states import entry
+from torchrl_mpfa.samplers.statistics import batch_statistics
+from torchrl_mpfa.samplers.tree import TreeSampler, in_dimensions_of
+from torchrl_mpfa.samplers.weighing import Weighing, check_weighing, weights_of
+from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
-from torchrl_mpfa.statistics import batch_statistics
-from torchrl_mpfa.tree import TreeSampler, in_dimensions_of
-from torchrl_mpfa.tree_state import entry
-from torchrl_mpfa.weighing import Weighing, check_weighing, weights_of
+from torchrl_mpfa.storages.table import SignalTable
 
 _ENTROPY_REFRESH = 1 / 256
 

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchrl_mpfa.dumps import open_dump, seal_dump
 from torchrl_mpfa.saving import load_safely, save_atomically
-from torchrl_mpfa.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
-from torchrl_mpfa.signals import SignalTable
-from torchrl_mpfa.storage_state import check_data_state, check_length, read_metadata
+from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
+from torchrl_mpfa.storages.states import check_data_state, check_length, read_metadata
+from torchrl_mpfa.storages.table import SignalTable
 
 _FORMAT = 1
 _FILE = "signals.pt"

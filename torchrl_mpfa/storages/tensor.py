@@ -1,4 +1,4 @@
-"""Storages that keep the signals of every slot beside the data, in memory or memory-mapped."""
+"""The storage whose data and signals lie in memory."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.data import LazyTensorStorage
 
-from torchrl_mpfa.checks import bounds
-from torchrl_mpfa.signal_storage import SignalStorageMixin
-from torchrl_mpfa.signals import MPFA_SIGNALS, Signal, SignalTable
+from torchrl_mpfa.checks import bounds, check_count
+from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
+from torchrl_mpfa.storages.base import SignalStorageMixin
+from torchrl_mpfa.storages.table import SignalTable
 
 
 class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
@@ -47,7 +48,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         allow_nonfinite: Sequence[NestedKey] = (),
         **kwargs: Any,
     ) -> None:
-        _check_max_size(max_size)
+        check_count("max_size", max_size)
         self._allow_nonfinite = tuple(allow_nonfinite)
         self.signal_table = SignalTable(max_size, signals, reward_key=reward_key)
         self._looked_at: Any = None
@@ -102,58 +103,6 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         if self._looked_at is not self._storage:
             self._looked_at, self._where = self._storage, _common_device(self._storage)
         return self._where
-
-
-class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
-    """:class:`~torchrl.data.LazyMemmapStorage` with the signals of every slot beside the data.
-
-    With ``scratch_dir`` the signals are memory-mapped too, to ``scratch_dir/signals.memmap``;
-    without it they stay in memory, 8 bytes a column and slot.
-
-    Args:
-        max_size: Capacity ``N``.
-        signals: The signals to keep, as objects or names; those of the paper by default.
-        reward_key: Where the signed reward of a transition is read.
-        allow_nonfinite: As in :class:`SignalTensorStorage`.
-        scratch_dir: Folder of the memory-mapped files; a temporary one by default.
-        existsok: Whether files that an earlier storage left in ``scratch_dir`` are overwritten.
-        **kwargs: As in :class:`SignalTensorStorage`, for :class:`~torchrl.data.LazyMemmapStorage`.
-
-    Raises:
-        ValueError: As :class:`SignalTensorStorage`.
-        FileExistsError: If ``scratch_dir`` holds the files of an earlier storage and ``existsok``
-            is false, or a living storage, of this process or another, uses it.
-
-    Examples:
-        >>> import tempfile
-        >>> storage = SignalMemmapStorage(1000, scratch_dir=tempfile.mkdtemp())
-        >>> storage.signal_table.rows.shape
-        torch.Size([1000, 6])
-    """
-
-    def __init__(
-        self,
-        max_size: int,
-        *,
-        signals: Sequence[Signal | str] = MPFA_SIGNALS,
-        reward_key: NestedKey = ("next", "reward"),
-        allow_nonfinite: Sequence[NestedKey] = (),
-        scratch_dir: str | Path | None = None,
-        existsok: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        _check_max_size(max_size)
-        self._allow_nonfinite = tuple(allow_nonfinite)
-        file = None if scratch_dir is None else Path(scratch_dir) / "signals.memmap"
-        self.signal_table = SignalTable(
-            max_size, signals, reward_key=reward_key, file=file, existsok=existsok
-        )
-        super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
-
-
-def _check_max_size(max_size: int) -> None:
-    if isinstance(max_size, bool) or not isinstance(max_size, int) or max_size < 1:
-        raise ValueError(f"max_size must be a positive integer, got {max_size}")
 
 
 def _common_device(data: Any) -> torch.device | None:

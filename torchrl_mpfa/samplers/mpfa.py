@@ -7,7 +7,7 @@ from typing import Any
 from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
 from torchrl_mpfa.fusion import EntropyFusion
 from torchrl_mpfa.positive import Level, check_level
-from torchrl_mpfa.sampler import SignalSampler
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.signals import MPFA_SIGNALS
 
 

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from torchrl.data import Storage
 
-from torchrl_mpfa.signals import Signal, SignalTable
+from torchrl_mpfa.signals import Signal
+from torchrl_mpfa.storages.table import SignalTable
 
 
 def signal_table_of(storage: Storage, signals: Sequence[Signal], capacity: int) -> SignalTable:

@@ -11,8 +11,8 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range, seeded_generator
 from torchrl_mpfa.priorities import importance_weights
-from torchrl_mpfa.slots import SERIAL, as_slots, last_of_each
-from torchrl_mpfa.tree_state import SavedTrees
+from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
+from torchrl_mpfa.samplers.states import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 

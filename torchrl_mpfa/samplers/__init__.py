@@ -1,0 +1,7 @@
+"""Samplers: from segment trees, by fused signals, and with the paper's choices."""
+
+from torchrl_mpfa.samplers.mpfa import MPFASampler
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.tree import TreeSampler
+
+__all__ = ["MPFASampler", "SignalSampler", "TreeSampler"]

@@ -1,0 +1,254 @@
+"""The signals of every slot of a storage, in one contiguous tensor."""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_mpfa.signals import Signal, as_signals
+
+
+class SignalTable:
+    """Signals, reward, replay count and age of every slot: one contiguous tensor.
+
+    The columns are the learned signals, those known at the write, the signed reward, the replay
+    count and the time of writing. A value that is not known yet is NaN. Double precision keeps
+    counts and times exact.
+
+    Args:
+        capacity: Number of slots ``N``.
+        signals: The signals to keep.
+        reward_key: Where the signed reward of a transition is read.
+        file: Memory-map the table to this file in place of keeping it in memory. No other table
+            may be mapped to it as long as this one lives.
+        existsok: Whether the file may be there already, and is overwritten.
+
+    Raises:
+        FileExistsError: If the file is there and ``existsok`` is false, or another table, of this
+            process or another, is mapped to it.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        signals: Sequence[Signal | str],
+        *,
+        reward_key: NestedKey = ("next", "reward"),
+        file: Path | None = None,
+        existsok: bool = False,
+    ) -> None:
+        made = as_signals(signals)
+        self.capacity = capacity
+        self.in_memory = file is None
+        self.learned = [s for s in made if s.known_at == "update"]
+        self.written = [s for s in made if s.known_at == "write"]
+        self.reward_key = reward_key
+        self.names = [s.name for s in (*self.learned, *self.written)]
+        self.column = {name: place for place, name in enumerate(self.names)}
+        self.reward_column = len(self.names)
+        self.count_column = self.reward_column + 1
+        self.time_column = self.reward_column + 2
+        width = self.reward_column + 3
+        if file is None:
+            self.rows = torch.empty(capacity, width, dtype=torch.double)
+        else:
+            self.rows = torch.from_numpy(_map(file, (capacity, width), existsok=existsok))
+        self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
+        self._blank[0, self.count_column] = 0.0
+        self.writes = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every slot; the count of writes goes on, so that old batches stay old."""
+        self.rows.copy_(self._blank)
+        self.size = 0
+
+    def grow(self, capacity: int) -> None:
+        """Add slots at the end; only for a table in memory."""
+        more = self._blank.expand(capacity - self.capacity, -1)
+        self.rows, self.capacity = torch.cat([self.rows, more]), capacity
+
+    @property
+    def rewards(self) -> Tensor:
+        """Signed rewards of the filled slots, shape ``[size]``."""
+        return self.rows[: self.size, self.reward_column]
+
+    def blank(self, count: int) -> Tensor:
+        """Rows of transitions of which nothing is known, not yet written."""
+        return self._blank.expand(count, -1).clone()
+
+    def read(self, data: Any, count: int) -> Tensor:
+        """Rows for new transitions, checked and not yet written.
+
+        Args:
+            data: The transitions, batch size ``[count]``, or ``[]`` for one.
+            count: Their number.
+
+        Returns:
+            One row each; an entry that ``data`` does not have is NaN.
+
+        Raises:
+            ValueError: If a reward or a signal is not finite, a signal is negative, or either
+                has not one number a transition.
+        """
+        rows = self.blank(count)
+        reward = _column(data, self.reward_key, "reward", count)
+        if reward is not None:
+            rows[:, self.reward_column] = reward
+        for signal in self.written:
+            same = signal.key == self.reward_key
+            value = reward if same else _column(data, signal.key, signal.name, count)
+            if value is not None:
+                rows[:, self.column[signal.name]] = _not_negative(signal, value)
+        return rows
+
+    def missing(self, rows: Tensor) -> str | None:
+        """Name of the first entry known at the write that some of the rows lack."""
+        # Of two rewards the signal counts first: it is the one that an error should name.
+        for name in [*(s.name for s in self.written), "reward"]:
+            column = self.column.get(name, self.reward_column)
+            if rows[:, column].isnan().any():
+                return name
+        return None
+
+    def write(self, index: Tensor, rows: Tensor) -> None:
+        """Put new transitions in their slots: nothing of what was there before stays."""
+        count = len(rows)
+        if count > self.capacity:
+            # Of a slot that is named twice the last row must win, which indexing leaves open.
+            self.writes += count - self.capacity
+            index, rows = index[-self.capacity :], rows[-self.capacity :]
+            count = self.capacity
+        if count == 1:
+            rows[0, self.time_column] = self.writes
+        else:
+            rows[:, self.time_column] = torch.arange(self.writes, self.writes + count)
+        self.rows[index] = rows
+        self.writes += count
+
+    def count_replay(self, index: Tensor) -> None:
+        """Count one replay for each sampled slot, duplicates included."""
+        counts = self.rows[:, self.count_column]
+        counts.index_add_(0, index, torch.ones(index.shape, dtype=torch.double))
+
+    def written_at(self, index: Tensor) -> Tensor:
+        """When each slot was written, as a count of writes, shape ``[B]``."""
+        return self.rows[:, self.time_column].index_select(0, index)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is needed to restore the table; tensors and plain values only."""
+        return {
+            "capacity": self.capacity,
+            "names": list(self.names),
+            "size": self.size,
+            "writes": self.writes,
+            "rows": self.rows[: self.size].clone(),
+        }
+
+    def check_state(self, state: dict[str, Any]) -> None:
+        """Refuse a state that does not belong to this table, before anything changes.
+
+        Raises:
+            KeyError: If an entry is missing.
+            ValueError: If capacity or signals differ, or a value cannot be.
+        """
+        for word in ("capacity", "names", "size", "writes", "rows"):
+            if word not in state:
+                raise KeyError(f"{word!r} is missing in the saved signals")
+        for word, mine in (("capacity", self.capacity), ("names", self.names)):
+            if state[word] != mine:
+                raise ValueError(
+                    f"{word} of the saved signals is {state[word]}, of this storage {mine}"
+                )
+        size, writes, rows = state["size"], state["writes"], state["rows"]
+        if type(size) is not int or not 0 <= size <= self.capacity:
+            raise ValueError(
+                f"size of the saved signals must be in [0, {self.capacity}], got {size}"
+            )
+        if type(writes) is not int or writes < 0:
+            raise ValueError(f"writes of the saved signals must not be negative, got {writes}")
+        shape = (size, self.rows.shape[1])
+        if not isinstance(rows, Tensor) or rows.shape != shape or rows.dtype is not torch.double:
+            raise ValueError(f"rows of the saved signals must be double of shape {[*shape]}")
+        self._check_rows(rows, writes)
+
+    def _check_rows(self, rows: Tensor, writes: int) -> None:
+        signals = rows[:, : self.reward_column]
+        counts, times = rows[:, self.count_column], rows[:, self.time_column]
+        # Of what is not known yet there is NaN.
+        if not (signals.isnan() | ((signals >= 0) & (signals < math.inf))).all():
+            raise ValueError("the saved signals must be finite and not negative")
+        if rows[:, self.reward_column].isinf().any():
+            raise ValueError("the saved rewards must be finite")
+        if not ((counts >= 0) & (counts < math.inf) & (times >= 0) & (times < writes)).all():
+            raise ValueError(
+                f"replay counts of the saved signals must be finite and not negative, times of "
+                f"writing in [0, {writes})"
+            )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: See :meth:`check_state`.
+        """
+        self.check_state(state)
+        self.clear()
+        self.size, self.writes = state["size"], state["writes"]
+        self.rows[: self.size] = state["rows"]
+
+
+def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.float64]:
+    """Numbers in a file that is locked for as long as they are in use."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    # Opened without emptying it: it may be another's.
+    with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as opened:
+        try:
+            # The mapping holds on to the lock after the file is closed.
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise FileExistsError(
+                f"{file} is in use by a living storage: give each a scratch_dir of its own"
+            ) from None
+        if file.stat().st_size and not existsok:
+            raise FileExistsError(
+                f"{file} is there from an earlier storage: pass existsok=True to overwrite it"
+            )
+        opened.truncate(0)
+        return np.memmap(opened, dtype=np.float64, mode="w+", shape=shape)
+
+
+def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
+    """One finite number a transition, in double precision, shape ``[count]``; None if absent."""
+    value = data.get(key, None)
+    if value is None:
+        return None
+    if value.numel() != count:
+        raise ValueError(
+            f"{name} at {key!r} must have one number a transition, got shape {[*value.shape]} "
+            f"for {count} transitions"
+        )
+    flat = value.detach().reshape(count).to("cpu", torch.double)
+    low, high = flat.aminmax()
+    if not (low.item() > -math.inf and high.item() < math.inf):
+        bad = flat[~flat.isfinite()][0].item()
+        raise ValueError(f"{name} at {key!r} must be finite, got {bad}")
+    return flat
+
+
+def _not_negative(signal: Signal, value: Tensor) -> Tensor:
+    priority = (signal.priority or torch.abs)(value)
+    if not priority.min().item() >= 0:
+        bad = priority[~(priority >= 0)][0].item()
+        raise ValueError(f"signal {signal.name!r} must not be negative, got {bad}")
+    return priority
