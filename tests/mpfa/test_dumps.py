@@ -189,10 +189,10 @@ def test_a_dump_that_is_killed_leaves_the_old_one_or_the_new_one(tmp_path):
             cwd=Path(__file__).parents[2],
             text=True,
         )
-        process.stdout.readline()
-        time.sleep(chance.random() * 0.2)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        with process:
+            process.stdout.readline()
+            time.sleep(chance.random() * 0.2)
+            process.send_signal(signal.SIGKILL)
         buffer = make_buffer(16)
         buffer.loads(tmp_path / "buffer")
         assert 0 < len(buffer) <= 16, number
