@@ -46,13 +46,13 @@ help: ## Print this list
 	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
 	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, EPISODES, SLOW; see the top of the Makefile"
 
-demo: $(STAMP) ## Train MPFA-PER on map A for 100 episodes and evaluate it (minutes)
-	@echo "== training on map A, $(EPISODES) episodes; Ctrl-C stops after the current one"
+demo: $(STAMP) ## Train MPFA-PER in world A for 100 episodes and evaluate it (minutes)
+	@echo "== training in world A, $(EPISODES) episodes; Ctrl-C stops after the current one"
 	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: A, episodes: $(EPISODES)}]' $(PHYSICS) $(ARGS)
 	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
 	$(BIN)/python examples/evaluate.py runs/demo --worlds A --episodes $(EPISODES)
 
-train: $(STAMP) ## Train on the paper's curriculum, maps A to D (tens of minutes); ARGS='method=per seed=1'
+train: $(STAMP) ## Train on the paper's curriculum, worlds A to D (tens of minutes); ARGS='method=per seed=1'
 	$(BIN)/python examples/train.py curriculum=paper learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses

@@ -103,7 +103,7 @@ def _physics_share(env: NavigationEnv, steps: int) -> float:
 
 
 def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
-    """Measure the environment on map D.
+    """Measure the environment in world D.
 
     Args:
         seconds: CPU time for each figure [s].

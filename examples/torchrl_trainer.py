@@ -61,7 +61,7 @@ def make_trainer(
 
     Args:
         sizes: How much is collected, kept and learned.
-        world: Name of the map.
+        world: Name of the world.
         seed: Seed of networks, environment, noise and replay.
         progress_bar: Whether to show one.
 
@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=Sizes.frames)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--world", default="A", help="name of a map, A to D")
+    parser.add_argument("--world", default="A", help="name of a world, A to D")
     parser.add_argument("--no-progress", action="store_true", help="show no progress bar")
     options = parser.parse_args(arguments)
     silence()

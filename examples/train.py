@@ -1,8 +1,8 @@
 """Train a navigation policy with any method and learner.
 
-    python examples/train.py                              MPFA-PER on map A
+    python examples/train.py                              MPFA-PER in world A
     python examples/train.py method=per seed=3            another method, another seed
-    python examples/train.py curriculum=paper             maps A, B, C, D one after the other
+    python examples/train.py curriculum=paper             worlds A, B, C, D one after the other
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
     python examples/train.py resume=runs/A-mpfa_per-ddpg-0    go on with a run that was stopped
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.evaluation import (
     EpisodeResult,
     Interval,
@@ -17,7 +18,6 @@ from mpfa_envs.evaluation import (
     summarize,
 )
 from mpfa_envs.lidar import Lidar
-from mpfa_envs.maps import WORLDS
 from mpfa_envs.navigation import PAPER_TASK, NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner

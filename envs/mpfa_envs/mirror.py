@@ -66,8 +66,8 @@ class RandomMirror(Transform):
 
     The mirror image of a transition is as true as the transition itself, with the same reward and
     end. What a loss then writes, say the TD error, is that of what it was shown. A learner that
-    sees both has twice the maps to learn from, and no favorite side. Append it to a replay buffer;
-    what is stored stays as it was.
+    sees both has twice as many worlds to learn from, and no favorite side. Append it to a replay
+    buffer; what is stored stays as it was.
 
     Args:
         chance: Share of the transitions that are mirrored, in [0, 1].

@@ -14,10 +14,10 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box as BoxSpace
 
+from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.lidar import Lidar
-from mpfa_envs.maps import resolve_world
 from mpfa_envs.observation import observation_bounds, observation_slices, observe
 from mpfa_envs.path import planner_for
 from mpfa_envs.reward import (

@@ -13,7 +13,7 @@ _HALF: Final = 5.0
 """Half of a room's side [m]."""
 _THICKNESS: Final = 0.5
 _LENGTHS: Final = (0.5, 2.6)
-"""Sides of a box [m], as those of the validation and the test map."""
+"""Sides of a box [m], as those of the validation and the test world."""
 _AT_WALL: Final = 0.3
 """Share of the draws that are at a wall; such boxes find a place more easily than others."""
 _BOXES: Final = 13

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from mpfa_envs.maps import resolve_world
+from mpfa_envs.builtin_worlds import resolve_world
 
 if TYPE_CHECKING:
     import os

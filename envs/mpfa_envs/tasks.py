@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.maps import resolve_world
 from mpfa_envs.path import planner_for
 from mpfa_envs.robot import (
     PAPER_CLEARANCE,

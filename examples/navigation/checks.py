@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mpfa_envs.maps import resolve_world
+from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.robot import resolve_robot
 from navigation.settings import TrainSettings
 

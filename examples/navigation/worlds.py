@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from mpfa_envs.maps import resolve_world
+from mpfa_envs.builtin_worlds import resolve_world
 
 _LONGEST = 60
 

@@ -29,7 +29,7 @@ POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.
 
 
 def steer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Turn towards the goal, as a policy on an empty map has to; for one or many robots."""
+    """Turn towards the goal, as a policy in an empty world has to; for one or many robots."""
     turn = np.arctan2(observation[..., 19], observation[..., 18])
     return np.clip(np.stack((1.0 - 2.0 * turn, 1.0 + 2.0 * turn), axis=-1), -1, 1)
 
@@ -111,7 +111,7 @@ def test_spl_is_the_shortest_path_over_the_driven_one(
 
 
 @pytest.mark.parametrize("envs_at_once", [1, 4])
-def test_turning_to_the_goal_succeeds_on_the_empty_map_and_circling_never_does(
+def test_turning_to_the_goal_succeeds_in_the_empty_world_and_circling_never_does(
     envs_at_once: int,
 ) -> None:
     settings = {"episodes": 10, "seed": 1, "physics": "kinematic", "envs_at_once": envs_at_once}

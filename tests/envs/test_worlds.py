@@ -44,7 +44,7 @@ def test_the_training_maps_are_those_of_the_public_course() -> None:
     assert all(world.size == (10.0, 10.0) for world in WORLDS.values())
 
 
-def test_the_test_map_is_denser_than_the_densest_training_map() -> None:
+def test_the_test_world_is_denser_than_the_densest_of_training() -> None:
     dense, test = WORLDS["D"], WORLDS["test"]
     assert len(test.boxes) > len(dense.boxes) and test.covered_area > dense.covered_area
     assert not set(test.boxes) & {box for name in "ABCD" for box in WORLDS[name].boxes}

@@ -180,11 +180,11 @@ def test_reading_a_slot_that_was_never_written_is_an_error(make_storage):
 def test_entries_that_are_no_tensors_come_back():
     storage = SignalTensorStorage(4)
     data = make_transitions(3)
-    data.set_non_tensor("map", "A")
+    data.set_non_tensor("world", "A")
     storage.set(torch.arange(3), data)
     found = storage.get(torch.tensor([2, 0]))
     assert found.batch_size == (2,)
-    assert found["map"] == ["A", "A"]
+    assert found["world"] == ["A", "A"]
     assert found["observation"].squeeze(1).tolist() == [2.0, 0.0]
 
 

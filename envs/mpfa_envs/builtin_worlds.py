@@ -1,4 +1,4 @@
-"""The built-in worlds: the training maps A to D, and two that training never sees."""
+"""The built-in worlds: A to D for training, and two that training never sees."""
 
 from __future__ import annotations
 
