@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -166,7 +167,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         # Written here, where the batch is made: on its way out TorchRL's buffer would move each
         # entry to the device that it is on already, at a tenth of the cost of the whole call.
         if self._fuses:
-            with data.unlock_():
+            with data.unlock_() if data.is_locked else nullcontext():
                 for key, value in info.items():
                     data.set(key, torch.stack(value, -1) if isinstance(value, tuple) else value)
         return data, info

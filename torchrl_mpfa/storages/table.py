@@ -65,6 +65,7 @@ class SignalTable:
             self.rows = torch.from_numpy(_map(file, (capacity, width), existsok=existsok))
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
+        self._one = torch.ones((), dtype=torch.double)
         self.writes = 0
         self.clear()
 
@@ -139,7 +140,7 @@ class SignalTable:
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
         counts = self.rows[:, self.count_column]
-        counts.index_add_(0, index, torch.ones(index.shape, dtype=torch.double))
+        counts.index_add_(0, index, self._one.expand(index.shape))
 
     def written_at(self, index: Tensor) -> Tensor:
         """When each slot was written, as a count of writes, shape ``[B]``."""
