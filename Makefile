@@ -10,6 +10,7 @@
 #   COMPILE=false                  train: no compiled updates; by default if a C++ compiler is found
 #   EPISODES=100                   episodes that demo trains for and evaluates on
 #   SLOW=1                         test: the slow tests as well
+#   WORKERS=4                      test: processes, 2 by default; 0: one, with its output as it comes
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
@@ -22,6 +23,7 @@ ARGS ?=
 EPISODES ?= 100
 COMPILE ?= $(if $(shell command -v "$${CXX:-g++}" 2>/dev/null),true,false)
 SLOW ?=
+WORKERS ?= 2
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -44,7 +46,7 @@ help: ## Print this list
 	@echo "usage: make TARGET"
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' Makefile | \
 	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
-	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, EPISODES, SLOW; see the top of the Makefile"
+	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, EPISODES, SLOW, WORKERS; see the top of the Makefile"
 
 demo: $(STAMP) ## Train MPFA-PER in world A for 100 episodes and evaluate it (minutes)
 	@echo "== training in world A, $(EPISODES) episodes; Ctrl-C stops after the current one"
@@ -56,7 +58,7 @@ train: $(STAMP) ## Train on the paper's curriculum, worlds A to D (tens of minut
 	$(BIN)/python examples/train.py curriculum=paper learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
-	$(PYTEST) $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)
+	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)
 
 check: lint types doctest test ## Check format, lint, types, doctests and tests
 
