@@ -282,8 +282,8 @@ def describe_world(world: World) -> dict[str, float]:
     return row
 
 
-def draw_worlds(*, size: int = 320) -> np.ndarray[Any, Any]:
-    """Draw the built-in worlds, three in a row.
+def render_worlds(*, size: int = 320) -> np.ndarray[Any, Any]:
+    """Render the built-in worlds, three in a row.
 
     Args:
         size: Side of each [px].
@@ -304,12 +304,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=2.0, help="CPU time per figure [s]")
     parser.add_argument("--worlds", action="store_true", help="describe the worlds instead")
-    parser.add_argument("--picture", help="draw the worlds into this file instead")
+    parser.add_argument("--picture", help="render the worlds into this file instead")
     arguments = parser.parse_args()
     if arguments.picture:
         from PIL import Image
 
-        Image.fromarray(draw_worlds()).save(arguments.picture)
+        Image.fromarray(render_worlds()).save(arguments.picture)
     elif arguments.worlds:
         for number, (name, world) in enumerate(WORLDS.items()):
             row = describe_world(world)

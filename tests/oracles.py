@@ -13,11 +13,11 @@ def probabilities(priorities, alpha):
     return [p**alpha / total for p in priorities]
 
 
-def importance_weights(priorities, alpha, beta, drawn):
+def importance_weights(priorities, alpha, beta, sampled):
     """Eq. (10), N the size of the buffer, over the largest weight of the buffer."""
     number = len(priorities)
     weights = [(1 / number * 1 / p) ** beta for p in probabilities(priorities, alpha)]
-    return [weights[slot] / max(weights) for slot in drawn]
+    return [weights[slot] / max(weights) for slot in sampled]
 
 
 def entropy(*outcomes):

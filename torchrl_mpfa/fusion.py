@@ -156,7 +156,7 @@ def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
     Args:
         signals: Non-negative signals, shape ``[B, K]``.
         weights: One weight a signal, shape ``[K]``.
-        eps: The constant :math:`\epsilon` that keeps every transition drawable.
+        eps: The constant :math:`\epsilon` that gives every transition a chance to be sampled.
 
     Returns:
         Priorities, shape ``[B]``.

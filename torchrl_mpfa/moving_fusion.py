@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class Annealed(Protocol):
     """What changes as the training goes on."""
 
-    def anneal(self, progress: float) -> None:
+    def anneal(self, fraction: float) -> None:
         """Say how much of the training is done, from 0 to 1."""
         ...
 
@@ -48,27 +48,27 @@ class ScheduledFusion:
 
     def __post_init__(self) -> None:
         self._ends = FixedFusion(self.start), FixedFusion(self.end)
-        self._progress = 0.0
+        self._fraction = 0.0
 
     @property
     def signal_names(self) -> tuple[str, ...]:
         """Signals that must be fused."""
         return tuple(dict.fromkeys((*self.start, *self.end)))
 
-    def anneal(self, progress: float) -> None:
+    def anneal(self, fraction: float) -> None:
         """Say how much of the training is done, from 0 to 1.
 
         Raises:
-            ValueError: If ``progress`` is outside.
+            ValueError: If ``fraction`` is outside.
         """
-        if not 0.0 <= progress <= 1.0:
-            raise ValueError(f"progress must be in [0, 1], got {progress}")
-        self._progress = progress
+        if not 0.0 <= fraction <= 1.0:
+            raise ValueError(f"fraction must be in [0, 1], got {fraction}")
+        self._fraction = fraction
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """The present weights in the order of ``names``, shape ``[K]``."""
         start, end = (each.weights(names, table, index) for each in self._ends)
-        return start.lerp(end, self._progress)
+        return start.lerp(end, self._fraction)
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ class ScaledFusion:
         """As the other fusion."""
         return bool(getattr(self.fusion, "every_batch", False))
 
-    def anneal(self, progress: float) -> None:
+    def anneal(self, fraction: float) -> None:
         """Tell the other fusion how much of the training is done, if it wants to know."""
         if isinstance(self.fusion, Annealed):
-            self.fusion.anneal(progress)
+            self.fusion.anneal(fraction)
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Weights divided by the means of the signals, shape ``[K]``."""

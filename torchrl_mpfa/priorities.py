@@ -76,7 +76,7 @@ def proportional_priority(td_error: Tensor, *, eps: float) -> Tensor:
 
     Args:
         td_error: Temporal-difference errors :math:`\delta_i`, shape ``[B]``.
-        eps: The constant :math:`\epsilon` that keeps every transition drawable.
+        eps: The constant :math:`\epsilon` that gives every transition a chance to be sampled.
 
     Returns:
         Priorities, shape ``[B]``.
@@ -91,12 +91,12 @@ def proportional_priority(td_error: Tensor, *, eps: float) -> Tensor:
 def sampling_probabilities(priority: Tensor, *, alpha: float) -> Tensor:
     r"""Probability of each transition, :math:`P(i) = p_i^\alpha / \sum_k p_k^\alpha` (Eq. 8).
 
-    The sampler draws from these with a segment tree; this is the same in the open, for tests and
+    The sampler samples by these with a segment tree; this is the same in the open, for tests and
     figures.
 
     Args:
         priority: Priorities of the whole buffer, shape ``[N]``.
-        alpha: Exponent :math:`\alpha`; 0 draws uniformly.
+        alpha: Exponent :math:`\alpha`; 0 samples uniformly.
 
     Returns:
         Probabilities that sum to one, shape ``[N]``.

@@ -77,7 +77,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         if self._prefetch_cap and isinstance(self._sampler, PrioritizedSampler):
             raise ValueError(
                 f"prefetch must be 0 with a prioritized sampler, got {self._prefetch_cap}: batches "
-                "that are drawn ahead know nothing of the update before them, and one seed would "
+                "that are sampled ahead know nothing of the update before them, and one seed would "
                 "not always give the same batches"
             )
 

@@ -32,7 +32,7 @@ from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.storages.table import SignalTable
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
-_DRAWS = 50_000
+_SAMPLES = 50_000
 _SPREAD = 5.0
 """Standard deviations by which a frequency may miss its probability."""
 
@@ -98,9 +98,9 @@ def check_fusion(
         >>> check_fusion(EntropyFusion())
     """
     _require(isinstance(fusion, Fusion), "a fusion must have a method 'weights'")
-    for progress in (0.0, 0.5, 1.0) if isinstance(fusion, Annealed) else (None,):
-        if isinstance(fusion, Annealed) and progress is not None:
-            fusion.anneal(progress)
+    for fraction in (0.0, 0.5, 1.0) if isinstance(fusion, Annealed) else (None,):
+        if isinstance(fusion, Annealed) and fraction is not None:
+            fusion.anneal(fraction)
         for scale, offset in ((1.0, 0.0), (1.0, 9.0), (1.0, -9.0), (0.0, 0.0)):
             table = _table(signals, scale=scale, offset=offset)
             _check_weights(fusion, table, torch.arange(0, table.size, 3))
@@ -148,13 +148,13 @@ def _table(signals: Sequence[Signal | str], *, scale: float, offset: float) -> S
 def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int = 16) -> None:
     """Check a sampler in a buffer: frequencies, weights, saving and refusals.
 
-    Slots are drawn in proportion to the leaves of its tree, weights are finite and in (0, 1], what
-    is drawn after loading equals what is drawn without, to the last bit, and a refused update or
-    state changes nothing.
+    Slots are sampled in proportion to the leaves of its tree, weights are finite and in (0, 1],
+    batches after loading equal those without, to the last bit, and a refused update or state
+    changes nothing.
 
     Args:
         make_sampler: Makes a new sampler, the same each time.
-        batch_size: ``B`` of the batches that are drawn.
+        batch_size: ``B`` of the batches that are sampled.
 
     Raises:
         AssertionError: If one of them does not hold.
@@ -191,14 +191,14 @@ def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalRepl
 
 
 def _train(buffer: SignalReplayBuffer, rounds: int, *, seed: int = 2) -> Tensor:
-    """Sample and update; all slots that were drawn."""
+    """Sample and update; all slots that were sampled."""
     generator = torch.Generator().manual_seed(seed)
-    drawn = []
+    sampled = []
     for _ in range(rounds):
         batch = buffer.sample()
-        drawn.append(batch["index"].clone())
+        sampled.append(batch["index"].clone())
         buffer.update_tensordict_priority(_with_signals(buffer, batch, generator))
-    return torch.cat(drawn)
+    return torch.cat(sampled)
 
 
 def _with_signals(buffer: SignalReplayBuffer, batch: Any, generator: torch.Generator) -> Any:
@@ -238,9 +238,9 @@ def _check_round_trip(first: SignalReplayBuffer, second: SignalReplayBuffer) -> 
         "a sampler that loaded a state must have that state",
     )
     third = copy.deepcopy(first.state_dict())
-    drawn = [_train(buffer, 6, seed=4) for buffer in (first, second)]
+    sampled = [_train(buffer, 6, seed=4) for buffer in (first, second)]
     _require(
-        torch.equal(*drawn), "a sampler that loaded a state must draw as the one that saved it"
+        torch.equal(*sampled), "a sampler that loaded a state must sample as the one that saved it"
     )
     first.load_state_dict(third)
 
@@ -276,17 +276,19 @@ def _check_frequencies(buffer: SignalReplayBuffer) -> None:
     slots = torch.arange(len(buffer))
     leaf = torch.as_tensor(buffer.sampler._sum_tree[slots]).reshape(-1).double()
     expected = leaf / leaf.sum()
-    # Not more at once than a sampler with a cap can draw by priority.
+    # Not more at once than a sampler with a cap can sample by priority.
     at_once = len(buffer)
-    rounds = math.ceil(_DRAWS / at_once)
-    drawn = torch.cat([buffer.sampler._sampled(buffer.storage, at_once)[0] for _ in range(rounds)])
-    found = torch.bincount(drawn, minlength=len(buffer)).double() / len(drawn)
-    sigma = (expected * (1 - expected) / len(drawn)).sqrt()
+    rounds = math.ceil(_SAMPLES / at_once)
+    sampled = torch.cat(
+        [buffer.sampler._sampled(buffer.storage, at_once)[0] for _ in range(rounds)]
+    )
+    found = torch.bincount(sampled, minlength=len(buffer)).double() / len(sampled)
+    sigma = (expected * (1 - expected) / len(sampled)).sqrt()
     off = (found - expected).abs() - _SPREAD * sigma
     worst = int(off.argmax())
     _require(
         bool(off[worst] < 1e-9),
-        f"slot {worst} must be drawn with probability {expected[worst]:.4f}, as its leaf has it, "
+        f"slot {worst} must be sampled with probability {expected[worst]:.4f}, as its leaf has it, "
         f"and was with {found[worst]:.4f}",
     )
 

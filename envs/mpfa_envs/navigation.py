@@ -322,8 +322,8 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         if self.render_mode is None:
             return None
         if self._task is None:
-            raise ResetNeeded("there is nothing to draw: call reset() before render()")
-        # Imported here because training does not draw.
+            raise ResetNeeded("there is nothing to render: call reset() before render()")
+        # Imported here because training does not render.
         from mpfa_envs.render import render_scene
 
         motion = self._motion

@@ -15,10 +15,10 @@ _THICKNESS: Final = 0.5
 _LENGTHS: Final = (0.5, 2.6)
 """Sides of a box [m], as those of the validation and the test world."""
 _AT_WALL: Final = 0.3
-"""Share of the draws that are at a wall; such boxes find a place more easily than others."""
+"""Share of the sampled boxes that are at a wall; such boxes find a place more easily."""
 _BOXES: Final = 13
 _PASSAGE: Final = 0.9
-_DRAWS: Final = 200_000
+_ATTEMPTS: Final = 200_000
 
 
 def random_world(seed: int, *, boxes: int = _BOXES, passage: float = _PASSAGE) -> World:
@@ -56,19 +56,19 @@ def random_world(seed: int, *, boxes: int = _BOXES, passage: float = _PASSAGE) -
     name = f"random-{seed}" if usual else f"random-{seed}, {boxes} boxes, {passage:g} m"
     rng = random.Random(seed)
     placed: list[Box] = []
-    for _ in range(_DRAWS):
-        box = _draw(rng)
+    for _ in range(_ATTEMPTS):
+        box = _sample_box(rng)
         if _leaves_way(box, placed, passage):
             placed.append(box)
             if len(placed) == boxes:
                 return World(name=name, boxes=tuple(placed))
     raise ValueError(
         f"boxes = {boxes} with passage = {passage} m between them do not fit the room: after "
-        f"{_DRAWS} samples there are {len(placed)}"
+        f"{_ATTEMPTS} samples there are {len(placed)}"
     )
 
 
-def _draw(rng: random.Random) -> Box:
+def _sample_box(rng: random.Random) -> Box:
     """A box somewhere in the room or at one of its walls."""
     width, depth = rng.uniform(*_LENGTHS), _THICKNESS
     if rng.random() < 0.5:

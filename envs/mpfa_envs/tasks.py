@@ -29,7 +29,7 @@ START_SLACK = 0.15
 """A start is at least this much farther from an obstacle than a collision is [m]."""
 _STARTS = 60
 _GOALS_PER_START = 50
-_DRAWS = 1000
+_ATTEMPTS = 1000
 _EVALUATION_STREAM = 1281166
 
 
@@ -56,7 +56,7 @@ def sample_task(
 
     Args:
         world: The room, its obstacles and its regions.
-        rng: Source of the draw.
+        rng: Source of randomness.
         collision_distance: Distance of the center from an obstacle that is a collision [m].
         min_goal_distance: Least distance between start and goal [m].
         detour_chance: Chance that the straight line between them must come too near to an obstacle,
@@ -163,7 +163,7 @@ def _sample_point(
     """Sample a point with the clearance [m] from the union of the regions."""
     regions = regions or (world.room,)
     shares = np.cumsum([region.area for region in regions])
-    for _ in range(_DRAWS):
+    for _ in range(_ATTEMPTS):
         pick, across, up = rng.random(3).tolist()
         index = int(np.searchsorted(shares, pick * shares[-1], side="right"))
         region = regions[min(index, len(regions) - 1)]
@@ -172,7 +172,7 @@ def _sample_point(
         if world.clearance(x, y) >= clearance:
             return x, y
     raise ValueError(
-        f"world {world.name!r} has no free {what}: {_DRAWS} samples found no point "
+        f"world {world.name!r} has no free {what}: {_ATTEMPTS} samples found no point "
         f"{clearance:.2f} m from every obstacle and wall"
     )
 
@@ -191,7 +191,7 @@ def evaluation_pairs(
     Args:
         world: A name, the path of a YAML file or a world.
         n: Number of tasks.
-        seed: Seed of the draw; the first tasks of a longer list are those of a shorter one.
+        seed: Seed of the sampling; the first tasks of a longer list are those of a shorter one.
         robot: Whose radius counts.
         collision_distance: What the start, the goal and a path between them keep [m]. None: the
             paper's, the robot's radius and 0.17 m, whatever it trained with; ``"contact"``: its

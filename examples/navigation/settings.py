@@ -121,8 +121,8 @@ class ExplorationSettings:
     annealing_steps: int = 5_000
     """Steps from one to the other."""
     varied: bool = True
-    """Whether each episode has a share of the noise, drawn uniformly from [0, 1]. With noise of one
-    size the robot is thrown out of every loop, and never learns what a loop is worth."""
+    """Whether each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
+    one size the robot is thrown out of every loop, and never learns what a loop is worth."""
 
 
 @dataclass
@@ -153,7 +153,7 @@ CURRICULA = {
     "D": [Stage("D", 400)],
     "paper": [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)],
 }
-"""The paper's episodes on each of its maps, and all of them one after the other."""
+"""The paper's episodes in each of its worlds, and all of them one after the other."""
 _LONGEST_NAME = 60
 
 

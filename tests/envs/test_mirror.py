@@ -80,7 +80,7 @@ def test_each_transition_is_mirrored_as_a_whole_and_half_of_them_are() -> None:
     as_it_was = torch.stack(list(same.values())).all(0)
     in_the_mirror = torch.stack(list(swapped.values())).all(0)
     assert (as_it_was ^ in_the_mirror).all()
-    # 400 draws of one half: five standard deviations are 50.
+    # 400 samples of one half: five standard deviations are 50.
     assert 150 < in_the_mirror.sum() < 250
     assert batch["next", "reward"].equal(stored["next", "reward"])
 

@@ -349,7 +349,7 @@ def test_closeness_is_one_at_its_distance_and_falls_beyond() -> None:
     assert ahead == pytest.approx([0.25 / 0.4, 1.0, 1.0], abs=0.01)
 
 
-def test_lidar_noise_is_drawn_from_the_seed() -> None:
+def test_lidar_noise_is_sampled_from_the_seed() -> None:
     env = paper_env(physics="kinematic", lidar={"noise": 0.05})
     first, second = (env.reset(seed=3, options=STRAIGHT)[0] for _ in range(2))
     np.testing.assert_array_equal(first, second)

@@ -66,7 +66,7 @@ def test_each_side_of_random_rooms_has_boxes_that_make_dead_ends() -> None:
 def test_a_seed_is_one_room_for_ever(
     seed: int, place: int, edges: tuple[float, float, float, float]
 ) -> None:
-    # Results refer to rooms by their seed. The last box depends on all that were drawn before.
+    # Results refer to rooms by their seed. The last box depends on all that were sampled before.
     box = random_world(seed).boxes[place]
     assert (box.x_min, box.y_min, box.x_max, box.y_max) == pytest.approx(edges, abs=2e-6)
 

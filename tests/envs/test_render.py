@@ -32,7 +32,7 @@ def test_a_picture_shows_the_room_the_goal_the_robot_and_its_trail() -> None:
     assert not np.array_equal(picture, env.render())
 
 
-def test_without_a_render_mode_nothing_is_drawn() -> None:
+def test_without_a_render_mode_nothing_is_rendered() -> None:
     env = paper_env(physics="kinematic")
     env.reset(seed=0)
     assert env.render() is None

@@ -78,11 +78,11 @@ def test_a_detour_has_something_in_its_way(name: str) -> None:
     world, rng = WORLDS[name], np.random.default_rng(0)
     planner = planner_for(world, 0.25)
     for chance, low, high in ((1.0, 1.0, 1.0), (0.5, 0.6, 0.95), (0.0, 0.3, 0.8)):
-        drawn = [
+        sampled = [
             sample_task(world, rng, collision_distance=0.25, detour_chance=chance)
             for _ in range(80)
         ]
-        blocked = [not planner.is_straight(start[:2], goal) for start, goal in drawn]
+        blocked = [not planner.is_straight(start[:2], goal) for start, goal in sampled]
         assert low <= sum(blocked) / len(blocked) <= high
 
 

@@ -65,7 +65,7 @@ def test_the_capped_replay_lets_go_of_what_it_drew_most() -> None:
     assert capped["goal"] < per["goal"]
 
 
-def test_a_figure_is_drawn_and_an_unknown_method_refused(
+def test_a_figure_is_plotted_and_an_unknown_method_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["per", "--output", str(tmp_path)]) == 0

@@ -195,7 +195,7 @@ def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: P
         read_checkpoint(tmp_path / "elsewhere")
 
 
-def test_the_learning_curve_is_drawn(tmp_path: Path) -> None:
+def test_the_learning_curve_is_plotted(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
     plot_learning_curve(as_table(run.records, EpisodeRecord), tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes()[:4] == b"\x89PNG"

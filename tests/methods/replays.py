@@ -51,8 +51,8 @@ def frequencies(indices, capacity):
     return counts / counts.sum()
 
 
-def assert_shares(indices, expected, *, draws):
+def assert_shares(indices, expected, *, samples):
     """The frequencies of slots are their probabilities, as far as chance allows."""
     found = frequencies(indices, len(expected))
-    sigma = (expected * (1 - expected) / draws).sqrt()
+    sigma = (expected * (1 - expected) / samples).sqrt()
     assert ((found - expected).abs() <= SPREAD * sigma + 1e-9).all(), (found, expected)

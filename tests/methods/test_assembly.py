@@ -65,12 +65,12 @@ def test_a_storage_may_be_given_and_its_size_is_that_of_the_sampler(kind):
 
 
 def test_batches_follow_the_generator():
-    def drawn():
+    def sampled():
         replay = make_replay("per", capacity=100, batch_size=20, generator=seeded(5))
         replay.buffer.extend(make_transitions(100))
         return replay.buffer.sample()["index"]
 
-    assert drawn().equal(drawn())
+    assert sampled().equal(sampled())
 
 
 def test_the_exponent_of_pal_is_that_of_the_method():

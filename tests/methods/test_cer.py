@@ -24,7 +24,7 @@ def test_of_several_transitions_the_last_is_the_newest():
     assert int(buffer.sample()["index"][0]) == 3
 
 
-def test_the_others_are_drawn_uniformly():
+def test_the_others_are_sampled_uniformly():
     buffer = make_combined(8, 4001, 8)
     others = torch.cat([buffer.sample()["index"][1:] for _ in range(5)])
     shares = torch.bincount(others, minlength=8) / len(others)

@@ -19,11 +19,11 @@ from torchrl_mpfa.methods import (
 KAPPA, EPS = 0.25, 0.01
 
 
-def by_hand(values, errors, counts, progress):
+def by_hand(values, errors, counts, fraction):
     """Priorities in plain loops."""
     mean = sum(values) / len(values)
     spread = math.sqrt(sum((v - mean) ** 2 for v in values) / len(values))
-    share = 0.5 * progress
+    share = 0.5 * fraction
     found = []
     for value, error, count in zip(values, errors, counts, strict=True):
         high = 1 / (1 + math.exp(-(value - mean) / spread))
@@ -32,8 +32,8 @@ def by_hand(values, errors, counts, progress):
     return found
 
 
-@pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
-def test_priorities_are_those_of_the_formula(progress):
+@pytest.mark.parametrize("fraction", [0.0, 0.4, 1.0])
+def test_priorities_are_those_of_the_formula(fraction):
     sampler = SignalSampler(
         6,
         0.6,
@@ -44,9 +44,9 @@ def test_priorities_are_those_of_the_formula(progress):
         adjustments=[ReplayPenalty(penalty=KAPPA, floor=EPS)],
     )
     buffer = make_buffer(sampler, 6, 9, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
-    sampler.anneal(progress)
+    sampler.anneal(fraction)
     batch = buffer.sample()
-    # A row for each slot that was drawn, as of a slot that is in a batch twice the last counts.
+    # A row for each slot that was sampled, as of a slot that is in a batch twice the last counts.
     index, first = batch["index"].unique(), {}
     for row, slot in enumerate(batch["index"].tolist()):
         first.setdefault(slot, row)
@@ -59,7 +59,7 @@ def test_priorities_are_those_of_the_formula(progress):
     counts = table.rows[index, table.count_column]
     buffer.update_tensordict_priority(batch)
     found = -torch.as_tensor(sampler._max_tree[index])
-    expected = by_hand(values.tolist(), errors.tolist(), counts.tolist(), progress)
+    expected = by_hand(values.tolist(), errors.tolist(), counts.tolist(), fraction)
     assert found.tolist() == pytest.approx(expected, abs=1e-5)
 
 
@@ -103,5 +103,5 @@ def test_what_is_out_of_range_is_refused():
         ReplayPenalty(floor=0)
     with pytest.raises(ValueError, match=r"final_share must be in \[0, 1\], got 2"):
         value_schedule(final_share=2)
-    with pytest.raises(ValueError, match=r"progress must be in \[0, 1\], got 1.5"):
+    with pytest.raises(ValueError, match=r"fraction must be in \[0, 1\], got 1.5"):
         value_schedule().anneal(1.5)

@@ -79,7 +79,7 @@ def test_uniformly_random_actions_do_not_score_better_than_the_policys(sigma, sp
     assert share > 0
 
 
-def drawn(policy, shifts, *, count=64, sigma=0.2):
+def sampled(policy, shifts, *, count=64, sigma=0.2):
     """Batches whose actions are the policy's with noise, each shifted by so much."""
     observation = torch.randn(len(shifts) * count, 6, generator=seeded(0))
     action = policy(TensorDict({"observation": observation}, [len(observation)]))["action"]
@@ -97,7 +97,7 @@ def test_the_batch_of_the_current_policy_is_chosen(best):
     policy = make_actor(6, 2, width=16)
     shifts = [0.7, 0.7, 0.7]
     shifts[best] = 0.0
-    batch = LowestDivergence(policy, sigma=0.2)(drawn(policy, shifts))
+    batch = LowestDivergence(policy, sigma=0.2)(sampled(policy, shifts))
     assert batch["number"].tolist() == list(range(64 * best, 64 * (best + 1)))
 
 
@@ -105,8 +105,8 @@ def test_the_present_noise_is_asked_for_at_each_batch():
     policy = make_actor(6, 2, width=16)
     asked = iter([0.2, 0.7])
     select = LowestDivergence(policy, batches=2, sigma=lambda: next(asked))
-    wide = drawn(policy, [0.0, 0.0], sigma=0.7)
-    shifted = drawn(policy, [0.4, 0.4], sigma=0.1)
+    wide = sampled(policy, [0.0, 0.0], sigma=0.7)
+    shifted = sampled(policy, [0.4, 0.4], sigma=0.1)
     both = torch.cat([shifted[:64], wide[64:]])
     assert select(both)["number"][0] == 0
     assert select(both)["number"][0] == 64
@@ -115,7 +115,7 @@ def test_the_present_noise_is_asked_for_at_each_batch():
 def test_of_what_a_buffer_draws_one_batch_is_left_with_its_index():
     policy = make_actor(6, 2, width=16)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=30)
-    buffer.extend(drawn(policy, [0.0, 0.5]))
+    buffer.extend(sampled(policy, [0.0, 0.5]))
     batch = LowestDivergence(policy, batches=3, sigma=0.2)(buffer.sample())
     assert batch.batch_size == (10,)
     assert batch["number"].equal(batch["index"])
@@ -128,6 +128,6 @@ def test_wrong_arguments_are_refused_by_name():
     with pytest.raises(ValueError, match="sigma must be finite"):
         LowestDivergence(policy, sigma=-1.0)
     with pytest.raises(ValueError, match="64 transitions cannot be 3 batches"):
-        LowestDivergence(policy, sigma=0.2)(drawn(policy, [0.0]))
+        LowestDivergence(policy, sigma=0.2)(sampled(policy, [0.0]))
     with pytest.raises(ValueError, match="variance must be positive"):
         gaussian_divergence(torch.zeros(4, 2), variance=0.0)

@@ -33,19 +33,19 @@ def shares_by_hand(errors):
     ]
 
 
-def assert_parts(buffer, errors, *, draws):
+def assert_parts(buffer, errors, *, samples):
     first, second = split_draws(buffer)
     indices = (first.batch["index"], second.batch["index"], second.actor_batch["index"])
     for index, expected in zip(indices, shares_by_hand(errors.tolist()), strict=True):
-        assert len(index) == draws
-        assert_shares(index, expected, draws=draws)
+        assert len(index) == samples
+        assert_shares(index, expected, samples=samples)
 
 
 def test_the_parts_are_uniform_by_priority_and_by_its_inverse():
     errors = torch.rand(15, generator=seeded(3)) * 10
     buffer = make_la3p(15, 40_000)
     set_signals(buffer, td_error=errors)
-    assert_parts(buffer, errors, draws=20_000)
+    assert_parts(buffer, errors, samples=20_000)
 
 
 def test_the_parts_are_right_after_the_ring_buffer_has_wrapped():
@@ -55,7 +55,7 @@ def test_the_parts_are_right_after_the_ring_buffer_has_wrapped():
     buffer.extend(make_transitions(4, seed=9))  # Wraps: slots 0 to 3 are new.
     errors = torch.rand(15, generator=seeded(4)) * 10
     set_signals(buffer, td_error=errors)
-    assert_parts(buffer, errors, draws=20_000)
+    assert_parts(buffer, errors, samples=20_000)
 
 
 def test_the_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
@@ -64,7 +64,7 @@ def test_the_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
     set_signals(first, td_error=errors)
     second.load_state_dict(first.state_dict())
     for buffer in (first, second):
-        assert_parts(buffer, errors, draws=20_000)
+        assert_parts(buffer, errors, samples=20_000)
 
 
 @pytest.mark.parametrize(("fraction", "expected"), [(0.5, (128, 128, 128)), (0.25, (64, 192, 192))])
@@ -165,4 +165,4 @@ def test_a_whole_batch_outside_of_a_training_step_is_by_priority():
     errors = torch.rand(15, generator=seeded(3)) * 10
     buffer = make_la3p(15, 20_000)
     set_signals(buffer, td_error=errors)
-    assert_shares(buffer.sample()["index"], shares_by_hand(errors.tolist())[1], draws=20_000)
+    assert_shares(buffer.sample()["index"], shares_by_hand(errors.tolist())[1], samples=20_000)

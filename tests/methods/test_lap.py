@@ -21,7 +21,7 @@ def test_probabilities_are_those_of_the_larger_of_error_and_one():
     expected = torch.tensor([value / sum(leaf) for value in leaf], dtype=torch.double)
     assert (errors < 1).any()
     assert (errors > 1).any()
-    assert_shares(buffer.sample()["index"], expected, draws=50_000)
+    assert_shares(buffer.sample()["index"], expected, samples=50_000)
 
 
 @pytest.mark.parametrize("floor", [0.0, -1.0, float("inf")])

@@ -1,4 +1,4 @@
-"""The cap on replays: what was replayed often enough is left out, and a batch is still drawn."""
+"""The cap on replays: what was replayed often enough is left out, and a batch is still sampled."""
 
 import pytest
 import torch
@@ -36,20 +36,20 @@ def train(buffer, td_error=1.0):
     return batch
 
 
-def test_a_transition_that_reached_the_cap_is_not_drawn_again():
+def test_a_transition_that_reached_the_cap_is_not_sampled_again():
     buffer = make_capped(40, 4, 3)
     for _ in range(400):
         spent = set((counts_of(buffer) >= 3).nonzero().squeeze(1).tolist())
         left = 40 - len(spent)
-        drawn = set(train(buffer)["index"].tolist())
+        sampled = set(train(buffer)["index"].tolist())
         if left < 4:
             break
-        assert not drawn & spent
+        assert not sampled & spent
     else:
         pytest.fail("the cap was never reached")
 
 
-def test_a_pool_that_is_used_up_is_drawn_from_uniformly():
+def test_a_pool_that_is_used_up_is_sampled_from_uniformly():
     buffer = make_capped(10, 8, 1)
     for _ in range(60):
         train(buffer)

@@ -27,12 +27,12 @@ def test_the_share_of_a_rank_is_its_formula():
     assert found.tolist() == pytest.approx([1.0, 2.0**-ALPHA, 10.0**-ALPHA])
 
 
-def test_transitions_are_drawn_by_their_rank():
+def test_transitions_are_sampled_by_their_rank():
     errors = torch.rand(20, generator=seeded(1)) * 5
     buffer = make_buffer(make_sampler(20, rank_refresh=0), 20, 50_000)
     set_signals(buffer, td_error=errors)
     expected = shares_by_hand(errors.tolist())
-    assert_shares(buffer.sample()["index"], expected, draws=50_000)
+    assert_shares(buffer.sample()["index"], expected, samples=50_000)
 
 
 def test_an_outlier_changes_nothing_but_its_own_rank():

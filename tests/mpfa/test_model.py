@@ -134,7 +134,7 @@ class Replay(RuleBasedStateMachine):
         assert batch["next", "reward"][:, 0].tolist() == [-number for number in numbers]
         weight = batch["priority_weight"]
         assert bool(((weight > 0) & (weight <= 1 + 1e-6)).all())
-        # Some slots may be overwritten between the draw and the update.
+        # Some slots may be overwritten between the sampling and the update.
         gone = set()
         if late:
             written, slots = self.write(late)

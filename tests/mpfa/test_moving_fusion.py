@@ -22,8 +22,8 @@ def make_table(rows):
 def test_scheduled_weights_go_in_a_line_from_start_to_end():
     fusion = ScheduledFusion({"td_error": 1.0}, {"td_error": 0.2, "reward": 0.8})
     found = []
-    for progress in (0.0, 0.25, 1.0):
-        fusion.anneal(progress)
+    for fraction in (0.0, 0.25, 1.0):
+        fusion.anneal(fraction)
         found.append(fusion.weights(NAMES, None, None).tolist())
     assert found == [pytest.approx(w) for w in ([1.0, 0.0], [0.8, 0.2], [0.2, 0.8])]
     assert isinstance(fusion, Fusion)
@@ -56,13 +56,13 @@ def test_a_sampler_tells_its_fusion_how_much_of_the_training_is_done():
     fusion = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
     buffer = make_buffer(24, 6, fusion=fusion)
     buffer.extend(make_transitions(24))
-    for progress, expected in ((0.0, 1.0), (1.0, 0.0)):
-        buffer.sampler.anneal(progress)
+    for fraction, expected in ((0.0, 1.0), (1.0, 0.0)):
+        buffer.sampler.anneal(fraction)
         train_rounds(buffer, 1)
         assert buffer.sampler.weights["td_error"] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("progress", [-0.1, 1.1])
-def test_a_progress_outside_of_the_training_is_refused(progress):
-    with pytest.raises(ValueError, match=rf"progress must be in \[0, 1\], got {progress}"):
-        ScheduledFusion({"td_error": 1.0}, {"td_error": 1.0}).anneal(progress)
+@pytest.mark.parametrize("fraction", [-0.1, 1.1])
+def test_a_fraction_outside_of_the_training_is_refused(fraction):
+    with pytest.raises(ValueError, match=rf"fraction must be in \[0, 1\], got {fraction}"):
+        ScheduledFusion({"td_error": 1.0}, {"td_error": 1.0}).anneal(fraction)

@@ -1,4 +1,4 @@
-"""Draws in double precision, and stratified ones: frequencies within the noise of chi-square."""
+"""Sampling in double precision, and stratified: frequencies within the noise of chi-square."""
 
 import math
 
@@ -24,8 +24,8 @@ def filled(sampler, count, *, spread=3.0):
 
 def score(index, probability):
     """Standard score of chi-square over the slots that are expected five times or more."""
-    count, draws = torch.bincount(index, minlength=len(probability)), len(index)
-    expected = probability * draws
+    count, samples = torch.bincount(index, minlength=len(probability)), len(index)
+    expected = probability * samples
     often = expected >= 5
     # All others together are one more cell.
     found = torch.cat((count[often], count[~often].sum().reshape(1)))
@@ -36,20 +36,20 @@ def score(index, probability):
     return (square - degrees) / math.sqrt(2 * degrees)
 
 
-def drawn(sampler, storage, draws):
-    return torch.cat([sampler.sample(storage, draws // 10)[0] for _ in range(10)])
+def sampled(sampler, storage, samples):
+    return torch.cat([sampler.sample(storage, samples // 10)[0] for _ in range(10)])
 
 
 def test_single_slots_have_their_frequencies_among_a_hundred_thousand():
     sampler = TreeSampler(100_000, 1.0, 0.4, 0.0)
     storage, probability = filled(sampler, 100_000, spread=0.3)
-    assert abs(score(drawn(sampler, storage, 2_000_000), probability)) < 4
+    assert abs(score(sampled(sampler, storage, 2_000_000), probability)) < 4
 
 
 def test_single_slots_have_their_frequencies_among_a_million():
     sampler = TreeSampler(1_000_000, 1.0, 0.4, 0.0)
     storage, probability = filled(sampler, 1_000_000, spread=0.3)
-    assert abs(score(drawn(sampler, storage, 6_000_000), probability)) < 4
+    assert abs(score(sampled(sampler, storage, 6_000_000), probability)) < 4
 
 
 @pytest.mark.slow
@@ -57,14 +57,14 @@ def test_in_single_precision_they_have_not():
     """A mass of 24 bits names each of a million slots by some seventeen values."""
     sampler = PrioritizedSampler(1_000_000, 1.0, 0.4, 0.0)
     storage, probability = filled(sampler, 1_000_000, spread=0.3)
-    assert score(drawn(sampler, storage, 20_000_000), probability) > 7
+    assert score(sampled(sampler, storage, 20_000_000), probability) > 7
 
 
 @pytest.mark.slow
-def test_single_slots_have_their_frequencies_in_a_hundred_million_draws():
+def test_single_slots_have_their_frequencies_in_a_hundred_million_samples():
     sampler = TreeSampler(1_000_000, 1.0, 0.4, 0.0)
     storage, probability = filled(sampler, 1_000_000, spread=0.3)
-    index = torch.cat([drawn(sampler, storage, 10_000_000) for _ in range(10)])
+    index = torch.cat([sampled(sampler, storage, 10_000_000) for _ in range(10)])
     assert abs(score(index, probability)) < 4
 
 
@@ -75,7 +75,7 @@ def test_stratified_batches_take_one_slot_from_each_part_of_the_priority():
     for _ in range(20):
         index, _ = sampler.sample(storage, 64)
         count = torch.bincount(index, minlength=50)
-        # A slot that has a share of the priority is drawn so often, give or take one.
+        # A slot that has a share of the priority is sampled so often, give or take one.
         whole = (64 * edges).floor() - (64 * (edges - probability)).ceil()
         assert (count >= whole.clamp_min(0)).all()
         assert ((count - 64 * probability).abs() < 2).all()
@@ -86,7 +86,7 @@ def test_stratified_batches_have_the_same_frequencies_and_come_in_no_order():
     storage, probability = filled(sampler, 200, spread=0.5)
     batches = torch.stack([sampler.sample(storage, 64)[0] for _ in range(3000)])
     found = torch.bincount(batches.flatten(), minlength=200) / batches.numel()
-    # Less than the noise of independent draws.
+    # Less than the noise of independent samples.
     sigma = (probability * (1 - probability) / batches.numel()).sqrt()
     assert ((found - probability).abs() < 4 * sigma).all()
     # No place of a batch holds other slots than another one does.

@@ -88,10 +88,10 @@ def test_importance_weights_of_a_hand_example():
 @pytest.mark.parametrize("beta", [0.0, 0.4, 1.0])
 def test_importance_weights_equal_the_oracle_and_do_not_depend_on_the_batch(beta):
     priority = torch.rand(60, generator=seeded(3)) + 0.01
-    drawn = torch.randint(60, (16,), generator=seeded(4))
+    sampled = torch.randint(60, (16,), generator=seeded(4))
     probability = sampling_probabilities(priority, alpha=0.6)
-    found = importance_weights(probability[drawn], beta=beta, lowest=probability.min())
-    expected = oracles.importance_weights(priority.tolist(), 0.6, beta, drawn.tolist())
+    found = importance_weights(probability[sampled], beta=beta, lowest=probability.min())
+    expected = oracles.importance_weights(priority.tolist(), 0.6, beta, sampled.tolist())
     assert found.tolist() == pytest.approx(expected, rel=1e-4)
 
 

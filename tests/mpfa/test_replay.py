@@ -173,25 +173,25 @@ def test_changing_a_batch_does_not_change_the_buffer():
 
 
 def test_two_buffers_of_one_seed_draw_the_same_and_another_seed_draws_otherwise():
-    drawn = []
+    sampled = []
     for seed in (1, 1, 2):
         buffer = make_buffer(64, 16, seed=seed)
         buffer.extend(make_transitions(64))
-        drawn.append(train_rounds(buffer, 5))
-    assert drawn[0].equal(drawn[1])
-    assert not drawn[0].equal(drawn[2])
+        sampled.append(train_rounds(buffer, 5))
+    assert sampled[0].equal(sampled[1])
+    assert not sampled[0].equal(sampled[2])
 
 
 def test_without_a_generator_the_global_seed_rules():
-    drawn = []
+    sampled = []
     for _ in range(2):
         torch.manual_seed(11)
         buffer = SignalReplayBuffer(
             storage=SignalTensorStorage(64), sampler=MPFASampler(64), batch_size=16
         )
         buffer.extend(make_transitions(64))
-        drawn.append(train_rounds(buffer, 3))
-    assert drawn[0].equal(drawn[1])
+        sampled.append(train_rounds(buffer, 3))
+    assert sampled[0].equal(sampled[1])
 
 
 def test_prefetching_is_refused_with_priorities_for_the_reason_that_is_given():

@@ -40,12 +40,12 @@ def make_kind(kind, folder, seed=0):
 
 
 def go_on(buffer):
-    """A hundred more rounds with new transitions among them; everything that was drawn."""
-    drawn = []
+    """A hundred more rounds with new transitions among them; everything that was sampled."""
+    sampled = []
     for number in range(ROUNDS // 10):
         buffer.extend(make_transitions(2, seed=number, first=1000 + number))
-        drawn.append(train_rounds(buffer, 10, seed=number))
-    return torch.cat(drawn)
+        sampled.append(train_rounds(buffer, 10, seed=number))
+    return torch.cat(sampled)
 
 
 def by_state_dict(first, second, folder):

@@ -35,7 +35,7 @@ def test_the_sizes_of_a_policy_can_be_read_from_its_weights():
 
 
 @pytest.mark.parametrize("loc", [0.0, 1.5, -30.0])
-def test_drawn_actions_and_densities_are_torchrls(loc):
+def test_sampled_actions_and_densities_are_torchrls(loc):
     means, deviations = torch.full((100, 2), loc), torch.linspace(0.01, 2, 200).reshape(100, 2)
     torch.manual_seed(0)
     action, log_density = sample_tanh_normal(means, deviations)

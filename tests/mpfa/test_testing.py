@@ -123,33 +123,33 @@ def test_broken_fusions_are_caught(weigh, message):
         check_fusion(object())
 
 
-class DrawsSlotZero(SignalSampler):
-    def _draw(self, size, batch_size):
-        index, weight = super()._draw(size, batch_size)
+class SamplesSlotZero(SignalSampler):
+    def _sample_slots(self, size, batch_size):
+        index, weight = super()._sample_slots(size, batch_size)
         return torch.where(torch.rand(batch_size, generator=self._rng) < 0.1, 0, index), weight
 
 
 class GivesNegativeWeights(SignalSampler):
-    def _draw(self, size, batch_size):
-        index, weight = super()._draw(size, batch_size)
+    def _sample_slots(self, size, batch_size):
+        index, weight = super()._sample_slots(size, batch_size)
         return index, -weight
 
 
-class DrawsTooFew(SignalSampler):
-    def _draw(self, size, batch_size):
-        index, weight = super()._draw(size, batch_size)
+class SamplesTooFew(SignalSampler):
+    def _sample_slots(self, size, batch_size):
+        index, weight = super()._sample_slots(size, batch_size)
         return index[1:], weight[1:]
 
 
 class KeepsACountToItself(SignalSampler):
-    """Draws depend on a count that is not saved."""
+    """Batches depend on a count that is not saved."""
 
-    drawn = 0
+    calls = 0
 
-    def _draw(self, size, batch_size):
-        self.drawn += 1
-        index, weight = super()._draw(size, batch_size)
-        return (index + self.drawn) % size, weight
+    def _sample_slots(self, size, batch_size):
+        self.calls += 1
+        index, weight = super()._sample_slots(size, batch_size)
+        return (index + self.calls) % size, weight
 
 
 class ForgetsAlpha(SignalSampler):
@@ -181,10 +181,10 @@ class LoadsAnything(SignalSampler):
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
-        (DrawsSlotZero, "slot 0 must be drawn with probability"),
+        (SamplesSlotZero, "slot 0 must be sampled with probability"),
         (GivesNegativeWeights, r"priority_weight must be in \(0, 1\]"),
-        (DrawsTooFew, "a batch must have 16 integer slots"),
-        (KeepsACountToItself, "must draw as the one that saved it"),
+        (SamplesTooFew, "a batch must have 16 integer slots"),
+        (KeepsACountToItself, "must sample as the one that saved it"),
         (ForgetsAlpha, "must have that state"),
         (TakesEverything, "a priority of nan must be refused"),
         (ChangesFirst, "was refused, but changed the sampler"),

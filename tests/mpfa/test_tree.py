@@ -69,8 +69,8 @@ def test_a_histogram_of_50000_draws_has_the_probabilities_of_eq_8(alpha):
     priority = torch.rand(20, generator=seeded(1)) + 0.05
     sampler.update_priority(torch.arange(20), priority)
     sampler._rng = seeded(2)
-    drawn = torch.cat([sampler.sample(storage, 1000)[0] for _ in range(50)])
-    found = torch.bincount(drawn, minlength=20) / 50_000
+    sampled = torch.cat([sampler.sample(storage, 1000)[0] for _ in range(50)])
+    found = torch.bincount(sampled, minlength=20) / 50_000
     expected = torch.tensor(oracles.probabilities(priority.tolist(), alpha))
     # Five standard deviations of a binomial share.
     tolerance = 5 * (expected * (1 - expected) / 50_000).sqrt()
@@ -194,7 +194,7 @@ def test_arguments_out_of_range_are_refused(argument, value):
         TreeSampler(**arguments)
 
 
-def test_a_batch_of_one_can_be_drawn_from_a_buffer_of_one():
+def test_a_batch_of_one_can_be_sampled_from_a_buffer_of_one():
     # The tree gives a bare number for one slot, which has no pow.
     sampler = TreeSampler(1, 0.6, 0.4)
     index, info = sampler.sample(filled(sampler, 1, 1), 1)
@@ -203,13 +203,13 @@ def test_a_batch_of_one_can_be_drawn_from_a_buffer_of_one():
 
 
 def test_without_a_generator_of_the_buffer_draws_follow_the_global_seed():
-    drawn = []
+    sampled = []
     for _ in range(2):
         torch.manual_seed(5)
         sampler = TreeSampler(50, 0.6, 0.4)
-        drawn.append(sampler.sample(filled(sampler, 50, 50), 20)[0])
-    assert drawn[0].equal(drawn[1])
-    assert not sampler.sample(filled(sampler, 50, 50), 20)[0].equal(drawn[0])
+        sampled.append(sampler.sample(filled(sampler, 50, 50), 20)[0])
+    assert sampled[0].equal(sampled[1])
+    assert not sampler.sample(filled(sampler, 50, 50), 20)[0].equal(sampled[0])
 
 
 def test_a_new_buffer_over_a_filled_storage_can_be_sampled():

@@ -100,13 +100,13 @@ def test_training_goes_on_bit_for_bit_in_two_dimensions(tmp_path):
     second.load_state_dict(first.state_dict())
     first.dumps(tmp_path / "buffer")
     third.loads(tmp_path / "buffer")
-    drawn = []
+    sampled = []
     for buffer in (first, second, third):
         buffer.extend(make_trajectories(9, steps=3))
-        drawn.append(buffer.sample())
+        sampled.append(buffer.sample())
     assert same(snapshot(first), snapshot(second))
-    assert same(drawn[0].to_dict(), drawn[1].to_dict())
-    assert same(drawn[0].to_dict(), drawn[2].to_dict())
+    assert same(sampled[0].to_dict(), sampled[1].to_dict())
+    assert same(sampled[0].to_dict(), sampled[2].to_dict())
 
 
 def test_another_number_of_environments_is_refused_and_nothing_changes():
@@ -152,7 +152,7 @@ def test_a_collector_of_several_environments_fills_the_buffer(ndim):
 # TorchRL's own sampler numbers slots of two dimensions in a way that NumPy is about to drop.
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 @pytest.mark.parametrize("ndim", [1, 2])
-def test_torchrls_slices_are_drawn_from_our_storage(ndim):
+def test_torchrls_slices_are_sampled_from_our_storage(ndim):
     sampler = PrioritizedSliceSampler(
         CAPACITY, alpha=0.6, beta=0.4, slice_len=2, end_key=("next", "done"), strict_length=False
     )

@@ -52,16 +52,16 @@ def write_signals(batch, *, seed=0, generator=None):
 
 
 def train_rounds(buffer, rounds, *, seed=0):
-    """Sample and update; give everything that was drawn."""
+    """Sample and update; give everything that was sampled."""
     generator = seeded(seed)
-    drawn = []
+    sampled = []
     for _ in range(rounds):
         batch = buffer.sample()
-        drawn.append(
+        sampled.append(
             torch.cat((batch["index"].double().flatten(), batch["priority_weight"].double()))
         )
         buffer.update_tensordict_priority(write_signals(batch, generator=generator))
-    return torch.stack(drawn)
+    return torch.stack(sampled)
 
 
 def same(first, second):

@@ -88,8 +88,8 @@ class LowestDivergence:
         >>> from tensordict import TensorDict
         >>> from torchrl_mpfa import make_actor
         >>> select = LowestDivergence(make_actor(24, 2), batches=2, sigma=0.2)
-        >>> drawn = TensorDict({"observation": torch.rand(8, 24), "action": torch.rand(8, 2)}, [8])
-        >>> select(drawn).batch_size
+        >>> seen = TensorDict({"observation": torch.rand(8, 24), "action": torch.rand(8, 2)}, [8])
+        >>> select(seen).batch_size
         torch.Size([4])
     """
 
@@ -115,13 +115,13 @@ class LowestDivergence:
         """Choose a batch.
 
         Args:
-            tensordict: What the buffer drew, batch size ``[K * B]``.
+            tensordict: What the buffer gave, batch size ``[K * B]``.
 
         Returns:
             The batch, batch size ``[B]``.
 
         Raises:
-            ValueError: If what was drawn is no multiple of the number of batches.
+            ValueError: If what it gave is no multiple of the number of batches.
         """
         count = len(tensordict)
         if count % self.batches:

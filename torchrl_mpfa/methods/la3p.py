@@ -94,7 +94,7 @@ class LA3PSampler(SignalSampler):
         finally:
             self._part = before
 
-    def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+    def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         count = batch_size
         if self._part is not None:
             count = self.sizes(batch_size)[self._part != "uniform"]

@@ -1,4 +1,4 @@
-r"""Reward-TD replay with a cap: once replayed often enough, a transition is drawn no more.
+r"""Reward-TD replay with a cap: once replayed often enough, a transition is sampled no more.
 
 Zhao et al. (2023), MW-MADDPG, https://doi.org/10.3389/fnbot.2023.1243174. **A reduction to one
 robot, and a reconstruction**: of that method, which is for several robots and learns to learn,
@@ -25,8 +25,8 @@ _NO_LEAF = float("inf")
 class CappedSampler(SignalSampler):
     """Excludes a transition that was replayed often enough.
 
-    Where fewer transitions are left than a batch has, a batch is drawn uniformly from all, so that
-    the training goes on. Mind the number: with one update of 256 transitions a step, each is
+    Where fewer transitions are left than a batch has, a batch is sampled uniformly from all, so
+    that the training goes on. Mind the number: with one update of 256 transitions a step, each is
     replayed 256 times on average, and a cap below would leave little but the newest.
 
     Args:
@@ -69,13 +69,13 @@ class CappedSampler(SignalSampler):
         spent = slots[self._spent[slots]]
         if len(spent):
             self._sum_tree[spent] = torch.zeros(len(spent), dtype=torch.double)
-            # The lowest share of those that can be drawn is what weights are relative to.
+            # The lowest share of those that can be sampled is what weights are relative to.
             self._min_tree[spent] = torch.full((len(spent),), _NO_LEAF, dtype=torch.double)
 
-    def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+    def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         left = size - int(self._spent[:size].sum())
         if left >= batch_size:
-            return super()._draw(size, batch_size)
+            return super()._sample_slots(size, batch_size)
         return self._uniform(size, batch_size), torch.ones(batch_size)
 
     def state_dict(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torchrl_mpfa.samplers.states import check_count, check_tensor, refuse
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
-    r"""What a transition is drawn in proportion to, :math:`(1 / \mathrm{rank}(i))^\alpha`.
+    r"""What a transition is sampled in proportion to, :math:`(1 / \mathrm{rank}(i))^\alpha`.
 
     Args:
         rank: Places by falling priority, counted from 1, shape ``[B]``.

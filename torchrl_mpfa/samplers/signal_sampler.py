@@ -35,7 +35,7 @@ class SignalSampler(TreeSampler):
 
     The signals of a slot lie in the storage (:class:`~torchrl_mpfa.SignalTensorStorage`). After
     each training step :meth:`update_signals` stores the new ones of the batch, fuses them (Eq. 21),
-    adjusts the result (Eqs. 22-24) and writes it to the segment tree that Eq. (8) draws from::
+    adjusts the result (Eqs. 22-24) and writes it to the segment tree that Eq. (8) samples from::
 
         signals [B, K] --fusion--> p_i [B] --adjustments--> p'_i [B] --alpha--> tree
 
@@ -133,13 +133,13 @@ class SignalSampler(TreeSampler):
             return {}
         return dict(zip(self._names, self._weighing.weights.tolist(), strict=True))
 
-    def anneal(self, progress: float) -> None:
+    def anneal(self, fraction: float) -> None:
         """Tell the fusion how much of the training is done, from 0 to 1, if it wants to know."""
         if isinstance(self.fusion, Annealed):
-            self.fusion.anneal(progress)
+            self.fusion.anneal(fraction)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
-        """Draw slots by Eq. (8), and count a replay for each.
+        """Sample slots by Eq. (8), and count a replay for each.
 
         Args:
             storage: The storage to sample from.

@@ -20,10 +20,10 @@ _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 class TreeSampler(SavedTrees):
     r"""Proportional sampling from segment trees, Eqs. (8) and (10).
 
-    The draws and weights of :class:`~torchrl.data.replay_buffers.PrioritizedSampler`, with
-    its sharp edges taken off: draws are in double precision, as single precision is not enough for
-    a million slots; the highest priority in the buffer costs O(log N) in place of O(N); draws come
-    from a generator that ``torch.manual_seed`` reaches and that is saved; a priority that is
+    The batches and weights of :class:`~torchrl.data.replay_buffers.PrioritizedSampler`, with
+    these differences: it samples in double precision, as single precision is not enough for
+    a million slots; the highest priority in the buffer costs O(log N) instead of O(N); randomness
+    comes from a generator that ``torch.manual_seed`` reaches and that is saved; a priority that is
     negative or not finite is refused where it enters; a saved state holds tensors and numbers
     only, and one that does not fit is refused before anything changes.
 
@@ -111,7 +111,7 @@ class TreeSampler(SavedTrees):
 
     def _highest_priority(self) -> float | None:
         """Highest priority, eps included; None if no update was made."""
-        # With alpha = 0 all slots are drawn alike, and TorchRL keeps the highest ever seen.
+        # With alpha = 0 all slots are sampled alike, and TorchRL keeps the highest ever seen.
         if self._max_priority_within_buffer and self._alpha > 0:
             highest = -self._max_tree.query(0, self._max_capacity)
             return None if highest < 0 else float(highest)
@@ -169,10 +169,10 @@ class TreeSampler(SavedTrees):
         size = len(storage)
         if size == 0:
             raise RuntimeError("cannot sample from an empty buffer: len(storage) is 0")
-        slots, weight = self._draw(size, batch_size)
+        slots, weight = self._sample_slots(size, batch_size)
         return slots, weight.to(self.dtype)
 
-    def _draw(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+    def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Slots and their weights, each of shape ``[B]``, out of the first ``size`` slots."""
         total, lowest = self._sum_tree.query(0, size), self._min_tree.query(0, size)
         if not (total > 0 and lowest > 0):
@@ -186,13 +186,13 @@ class TreeSampler(SavedTrees):
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
 
     def _uniform(self, size: int, batch_size: int) -> Tensor:
-        """Slots drawn uniformly, shape ``[B]``."""
+        """Slots sampled uniformly, shape ``[B]``."""
         if self.stratified:
             return self._mass(batch_size).mul_(size).long().clamp_max_(size - 1)
         return torch.randint(size, (batch_size,), generator=self._rng)
 
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
-        """Slots drawn in proportion to the leaves of a tree of sums, shape ``[B]``."""
+        """Slots sampled in proportion to the leaves of a tree of sums, shape ``[B]``."""
         mass = self._mass(batch_size).mul_(tree.query(0, size))
         index = torch.as_tensor(tree.scan_lower_bound(mass)).reshape(-1)
         # Rounding can carry the last bit of mass past the last slot.
@@ -301,12 +301,12 @@ class TreeSampler(SavedTrees):
         self._write_leaves(slots, self._leaf(priority))
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
-        """Write what slots are drawn in proportion to, shape ``[B]``."""
+        """Write what slots are sampled in proportion to, shape ``[B]``."""
         self._sum_tree[slots] = leaf
         self._min_tree[slots] = leaf
 
     def _leaf(self, priority: Tensor) -> Tensor:
-        """What slots are drawn in proportion to, priorities to the power of alpha, ``[B]``."""
+        """What slots are sampled in proportion to, priorities to the power of alpha, ``[B]``."""
         return priority.pow(self._alpha)
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
