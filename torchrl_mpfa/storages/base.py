@@ -15,7 +15,12 @@ from torch import Tensor
 from torchrl_mpfa.dumps import open_dump, seal_dump
 from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
-from torchrl_mpfa.storages.states import check_data_state, check_length, read_metadata
+from torchrl_mpfa.storages.states import (
+    check_data_state,
+    check_length,
+    read_metadata,
+    signals_of_data,
+)
 from torchrl_mpfa.storages.table import SignalTable
 
 _FORMAT = 1
@@ -105,11 +110,15 @@ class SignalStorageMixin:
             elif self.strict:
                 check_finite_entries(data, lead, self._allow_nonfinite)
         rows = self.signal_table.read(data, data.shape[:lead].numel())
+        self._check_known(rows)
+        return _Admitted(data, rows, pairs)
+
+    def _check_known(self, rows: Tensor) -> None:
+        """Refuse rows of the signal table that lack what the sampler needs."""
         if self.needs_signals and (name := self.signal_table.missing(rows)) is not None:
             keys = {s.name: s.key for s in self.signal_table.written}
             key = keys.get(name, self.signal_table.reward_key)
             raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
-        return _Admitted(data, rows, pairs)
 
     def _check_shape(self, data: TensorDictBase) -> None:
         """Refuse rows of another width than those of a storage of several dimensions."""
@@ -196,16 +205,29 @@ class SignalStorageMixin:
         """Refuse a state that does not fit, before anything changes.
 
         Raises:
-            KeyError: If the state lacks an entry.
+            KeyError: If the state lacks an entry, or a reward or signal that the sampler needs.
             ValueError: If format, capacity, signals, or the form of the data differ, or the data
                 are not finite.
         """
-        self._check_signals(state_dict)
+        self._checked_signals(state_dict)
+
+    def _checked_signals(self, state: dict[str, Any]) -> dict[str, Any]:
+        """The signals of a state that was checked, saved or, in TorchRL's own, made of the data."""
+        foreign = "_signals" not in state and "_signals_format" not in state
+        if not foreign:
+            self._check_signals(state)
         for key in ("_storage", "_len", "initialized"):
-            if key not in state_dict:
+            if key not in state:
                 raise KeyError(f"{key!r} is missing in the saved storage")
-        length = check_length(state_dict["_len"], self.max_size, state_dict["_signals"]["size"])
-        self._check_data(state_dict["_storage"], length)
+        rows = None if foreign else state["_signals"]["size"]
+        length = check_length(state["_len"], self.max_size, rows)
+        self._check_data(state["_storage"], length)
+        if not foreign:
+            signals: dict[str, Any] = state["_signals"]
+            return signals
+        signals = signals_of_data(self.signal_table, state["_storage"], length)
+        self._check_known(signals["rows"])
+        return signals
 
     def _check_signals(self, state: dict[str, Any]) -> None:
         if "_signals" not in state:
@@ -226,14 +248,18 @@ class SignalStorageMixin:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore data and signals.
 
+        The state of one of TorchRL's own storages has no signals: its transitions count as written
+        now, in the order of their slots. Their rewards are read from the data, and what a learner
+        would have computed is not known yet.
+
         Raises:
             KeyError: See :meth:`check_state`.
             ValueError: See :meth:`check_state`.
         """
-        self.check_state(state_dict)
+        signals = self._checked_signals(state_dict)
         super().load_state_dict(state_dict)  # type: ignore[misc]
         self._schema = None
-        self.signal_table.load_state_dict(state_dict["_signals"])
+        self.signal_table.load_state_dict(signals)
 
     def dumps(self, path: str | Path) -> None:
         """Save data and signals in a folder, with a checksum of each of its files."""

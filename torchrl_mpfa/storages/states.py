@@ -8,20 +8,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.storages.schema import as_path
+from torchrl_mpfa.storages.table import SignalTable
 
 
-def check_length(found: Any, max_size: int, signals: int) -> int:
+def check_length(found: Any, max_size: int, signals: int | None) -> int:
     """Refuse a number of filled slots that cannot be.
 
     Args:
         found: The saved number.
         max_size: Capacity of the storage.
-        signals: Number of filled slots in the saved signals.
+        signals: Number of filled slots in the saved signals; None if there are none.
 
     Returns:
         The number.
@@ -31,7 +33,7 @@ def check_length(found: Any, max_size: int, signals: int) -> int:
     """
     if type(found) is not int or not 0 <= found <= max_size:
         raise ValueError(f"'_len' of the saved storage must be in [0, {max_size}], got {found!r}")
-    if found != signals:
+    if signals is not None and found != signals:
         raise ValueError(f"the saved storage has {found} rows, its signals {signals}")
     return found
 
@@ -100,6 +102,31 @@ def check_data_state(
             filled = value.reshape(max_size, -1)[:length]
             if name not in allowed and not _all_finite(filled):
                 raise ValueError(f"entry {name!r} of the saved storage must be finite")
+
+
+def signals_of_data(table: SignalTable, data: Any, length: int) -> dict[str, Any]:
+    """The signals that saved data would have got at their write, as a state of a table.
+
+    Args:
+        table: The table of the storage; it is not changed.
+        data: The saved data, as a tensor, a tensordict or its state, checked for their form.
+        length: Number of filled slots that are saved.
+
+    Returns:
+        What :meth:`SignalTable.load_state_dict` takes. Times go on from those of the table, so
+        that a batch sampled before is known to be old.
+
+    Raises:
+        ValueError: If a reward or a signal is not one finite number a transition.
+    """
+    leaves, entries = _leaves(data), {}
+    for key in (table.reward_key, *(signal.key for signal in table.written)):
+        if (leaf := leaves.get(".".join(as_path(key)))) is not None:
+            entries[key] = leaf.reshape(table.capacity, -1)[:length]
+    rows = table.read(entries, length) if length else table.blank(0)
+    writes = table.writes + length
+    rows[:, table.time_column] = torch.arange(table.writes, writes)
+    return {**table.state_dict(), "size": length, "writes": writes, "rows": rows}
 
 
 def _all_finite(value: Tensor) -> bool:
