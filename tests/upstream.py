@@ -23,12 +23,12 @@ SUITES = {
     "samplers": [
         "test/rb/test_samplers.py",
         "-k",
-        "prb or prioritized or SignalSampler or MPFASampler",
+        "prb or prioritized or SignalSampler or MPFASampler or TreeSampler",
     ],
     "composable": [
         "test/rb/test_composable.py::TestComposableBuffers",
         "-k",
-        "(PrioritizedSampler or SignalSampler or MPFASampler) and tensordict and "
+        "(PrioritizedSampler or SignalSampler or MPFASampler or TreeSampler) and tensordict and "
         "(LazyTensorStorage or SignalTensorStorage) and not recompile",
     ],
     "storages": [
@@ -61,6 +61,11 @@ KINDS: dict[str, dict[str, str]] = {
     "MPFASampler": {"PrioritizedSampler": "MPFASampler", **_STORAGES},
     "SignalReplayBuffer": {
         "PrioritizedSampler": "SignalSampler",
+        "TensorDictReplayBuffer": "SignalReplayBuffer",
+        **_STORAGES,
+    },
+    "TreeSampler": {
+        "PrioritizedSampler": "TreeSampler",
         "TensorDictReplayBuffer": "SignalReplayBuffer",
         **_STORAGES,
     },
