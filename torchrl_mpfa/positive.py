@@ -52,9 +52,10 @@ def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
             attribute ``positive_above``.
 
     Returns:
-        The sentence; None where both sides are there, or too few rewards to tell.
+        The sentence; None where both sides are there, where all rewards are equal, which no level
+        tells apart, or too few rewards to tell.
     """
-    if len(rewards) < _ENOUGH:
+    if len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
         return None
     # A fusion may stand around another one.
     found = (getattr(getattr(part, "fusion", part), "positive_above", "mean") for part in parts)

@@ -46,6 +46,16 @@ def test_rewards_that_are_all_positive_are_told_of_too():
         train_rounds(buffer, 1)
 
 
+@pytest.mark.parametrize("reward", [0.0, -1.0])
+def test_rewards_that_are_all_equal_need_no_cure(reward):
+    buffer = make_buffer(2000, 32)
+    buffer.extend(make_transitions(1000, rewards=torch.full((1000,), reward)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train_rounds(buffer, 1)
+    assert [*buffer.sampler.weights.values()] == pytest.approx([1 / 3] * 3)
+
+
 @pytest.mark.parametrize("level", ["mean", -8.0])
 def test_the_cure_gives_every_signal_its_weight(level):
     buffer = make_buffer(2000, 64, positive_above=level, entropy_refresh=0)
