@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -16,14 +17,18 @@ def seeded_generator() -> torch.Generator:
 
 
 def check_range(name: str, value: float, *, low: float) -> None:
-    """Refuse a number below ``low`` or not finite."""
-    if not low <= value < math.inf:
+    """Refuse what is no number, below ``low`` or not finite."""
+    try:
+        inside = low <= value < math.inf
+    except TypeError:
+        raise TypeError(f"{name} must be a number, got {value!r}") from None
+    if not inside:
         raise ValueError(f"{name} must be finite and at least {low}, got {value}")
 
 
 def check_count(name: str, value: int) -> None:
     """Refuse what is no positive integer."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
         raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 

@@ -99,6 +99,19 @@ def test_a_mistake_is_refused_in_one_sentence(arguments, message):
         make_replay(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"method": 3}, "method must be a name or a Method, got 3"),
+        ({"beta": "x"}, "beta must be a number, got 'x'"),
+        ({"alpha": None}, "alpha must be a number, got None"),
+    ],
+)
+def test_what_is_of_another_type_is_named(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        make_replay(**arguments)
+
+
 def test_a_storage_that_lacks_a_signal_is_refused():
     with pytest.raises(ValueError, match=r"signals .*action_gradient.* are not in the storage"):
         make_replay("mpfa_per", storage=SignalTensorStorage(10, signals=["td_error", "reward"]))

@@ -284,11 +284,12 @@ def test_weights_are_counted_over_the_whole_buffer_and_not_the_batch():
         ("fusion", object(), TypeError),
         ("adjustments", [3], TypeError),
         ("alpha", -0.1, ValueError),
+        ("max_capacity", 2.5, ValueError),
     ],
 )
 def test_arguments_out_of_range_are_refused(argument, value, error):
     with pytest.raises(error, match=argument):
-        MPFASampler(8, **{argument: value})
+        MPFASampler(**{"max_capacity": 8, argument: value})
 
 
 def test_defaults_are_those_of_the_paper():

@@ -252,6 +252,8 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
         if method not in METHODS:
             raise ValueError(unknown("method", method, METHODS))
         method = METHODS[method]
+    elif not isinstance(method, Method):
+        raise TypeError(f"method must be a name or a Method, got {method!r}")
     known = [field.name for field in fields(Method)]
     for name in settings:
         if name not in known:

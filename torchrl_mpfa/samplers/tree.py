@@ -9,7 +9,14 @@ import torch
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range, seeded_generator
+from torchrl_mpfa.checks import (
+    bounds,
+    check_count,
+    check_finite,
+    check_index,
+    check_range,
+    seeded_generator,
+)
 from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.samplers.states import SavedTrees
@@ -65,7 +72,7 @@ class TreeSampler(SavedTrees):
         *,
         stratified: bool = False,
     ) -> None:
-        check_range("max_capacity", max_capacity, low=1)
+        check_count("max_capacity", max_capacity)
         for name, value in (("alpha", alpha), ("beta", beta), ("eps", eps)):
             check_range(name, value, low=0)
         if dtype not in (torch.float, torch.double):
