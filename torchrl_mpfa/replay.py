@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,15 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import check_finite, seeded_generator
+from torchrl_mpfa.checks import check_count, check_finite, seeded_generator
 from torchrl_mpfa.dumps import new_dump, open_dump
-from torchrl_mpfa.replay_state import check_batch_size, check_generator_state, check_writer_state
+from torchrl_mpfa.replay_state import (
+    check_batch_size,
+    check_generator_state,
+    check_sampler_state,
+    check_writer_state,
+)
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.storages.base import SignalStorageMixin
 
 _MISSING = (
@@ -193,8 +196,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
                 back to :meth:`update_tensordict_priority`.
             ValueError: If ``batch_size`` is not a positive integer.
         """
-        if batch_size is not None and not (isinstance(batch_size, Integral) and batch_size > 0):
-            raise ValueError(f"batch_size must be a positive integer, got {batch_size!r}")
+        if batch_size is not None:
+            check_count("batch_size", batch_size)
         if return_info or include_info is not None or not self._fuses:
             return super().sample(batch_size, return_info, include_info)
         self._check_returned()
@@ -230,7 +233,6 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         if not self._fuses:
             super().update_tensordict_priority(data)
             return
-        self._unreturned, self._handed_out = 0, None
         index = data.get("index", None)
         if index is None:
             raise KeyError(f"'index' is missing in the batch, got {sorted(data.keys())}")
@@ -248,6 +250,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
                 index, signals, storage=self._storage, written_at=data.get("written_at", None)
             )
         self.stale_updates += stale
+        self._unreturned, self._handed_out = 0, None
 
     def stats(self) -> dict[str, Any]:
         """TorchRL's counters, and the sampler's statistics of signals and batch."""
@@ -269,9 +272,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         for key in ("_storage", "_sampler", "_writer", "_transforms", "_batch_size", "_rng"):
             if key not in state_dict:
                 raise KeyError(f"{key!r} is missing in the saved buffer")
-        for part, key in ((self._sampler, "_sampler"), (self._storage, "_storage")):
-            if isinstance(part, TreeSampler | SignalStorageMixin):
-                part.check_state(state_dict[key])
+        check_sampler_state(self._sampler, state_dict["_sampler"])
+        self._storage.check_state(state_dict["_storage"])
         size = self._storage._max_size_along_dim0 if self._storage.ndim == 1 else None
         check_writer_state(state_dict["_writer"], None if size is None else size())
         check_batch_size(state_dict["_batch_size"])
@@ -311,7 +313,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         """
         folder = open_dump(path)
         for part, name in ((self._sampler, "sampler"), (self._storage, "storage")):
-            if isinstance(part, TreeSampler | SignalStorageMixin):
+            if hasattr(part, "check_dump"):
                 part.check_dump(folder / name)
         super().loads(folder)
         self._tell_last_cursor()

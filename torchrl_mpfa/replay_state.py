@@ -30,6 +30,24 @@ def check_writer_state(state: Any, slots: int | None) -> None:
         raise ValueError(f"'_write_count' of the saved writer must not be negative, got {count!r}")
 
 
+def check_sampler_state(sampler: Any, state: Any) -> None:
+    """Refuse the state of another sampler.
+
+    Args:
+        sampler: The sampler; one of TorchRL's own has no check, and would leave out what it lacks.
+        state: The state.
+
+    Raises:
+        ValueError: If it is that of another.
+    """
+    if hasattr(sampler, "check_state"):
+        sampler.check_state(state)
+    elif isinstance(state, Mapping) and "_kind" in state:
+        raise ValueError(
+            f"the saved sampler is {state['_kind']!r}, this one a {type(sampler).__name__}"
+        )
+
+
 def check_batch_size(found: Any) -> None:
     """Refuse a batch size that is neither None nor a positive integer."""
     if found is not None and (type(found) is not int or found < 1):

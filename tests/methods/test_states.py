@@ -5,6 +5,7 @@ import torch
 
 from tests.methods.replays import make_transitions, seeded
 from tests.mpfa.transitions import same
+from torchrl_mpfa import MPFASampler, TreeSampler
 from torchrl_mpfa.methods import make_replay
 
 METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer"]
@@ -134,3 +135,26 @@ def test_a_state_of_another_sampler_is_refused(trained, method):
         assert same(before, second.state_dict())
     with pytest.raises(ValueError, match="the saved sampler must be a mapping, got list"):
         second.load_state_dict([1])
+
+
+def test_a_sampler_of_one_priority_refuses_the_state_of_one_that_fuses_signals():
+    sampler = TreeSampler(12, 0.6, 0.4)
+    before = sampler.state_dict()
+    with pytest.raises(ValueError, match="saved sampler is 'signals', this one 'proportional'"):
+        sampler.load_state_dict(MPFASampler(12).state_dict())
+    assert same(before, sampler.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("ddpg", "the saved sampler is 'signals', this one a RandomSampler"),
+        ("cer", "'_newest' is missing in the saved sampler"),
+    ],
+)
+def test_a_uniform_buffer_refuses_the_state_of_a_prioritized_one(method, message):
+    first, second = make_trained("mpfa_per"), make_trained(method, seed=3)
+    before = second.buffer.state_dict()
+    with pytest.raises(ValueError, match=message):
+        second.buffer.load_state_dict(first.buffer.state_dict())
+    assert same(before, second.buffer.state_dict())

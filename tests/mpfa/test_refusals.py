@@ -71,6 +71,19 @@ def test_a_signal_of_the_wrong_shape_is_named_with_its_shape(buffer, shape):
     assert same(before, snapshot(buffer))
 
 
+def test_times_of_writing_for_half_of_the_batch_are_refused(buffer):
+    batch = write_signals(buffer.sample())
+    before = snapshot(buffer)
+    with pytest.raises(ValueError, match=r"written_at must have one .*shape \[2\] for 4 slots"):
+        buffer.sampler.update_signals(
+            batch["index"],
+            dict(batch["signals"].items()),
+            storage=buffer.storage,
+            written_at=batch["written_at"][:2],
+        )
+    assert same(before, snapshot(buffer))
+
+
 @pytest.mark.parametrize("slot", [10, 16, 1000, -2, -1])
 def test_a_slot_that_was_never_filled_is_refused(buffer, slot):
     batch = write_signals(buffer.sample())

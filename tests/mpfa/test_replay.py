@@ -307,3 +307,21 @@ def test_a_loop_that_updates_priorities_now_and_then_is_not_stopped():
         batch = write_signals(buffer.sample())
         if number % 50 == 0:
             buffer.update_tensordict_priority(batch)
+
+
+def test_an_update_that_is_refused_does_not_count_as_one():
+    buffer = make_buffer()
+    buffer.extend(make_transitions(10))
+    with pytest.raises(RuntimeError, match="100 batches in a row"):
+        for _ in range(101):
+            batch = write_signals(buffer.sample())
+            with pytest.raises(KeyError, match="'index' is missing"):
+                buffer.update_tensordict_priority(batch.exclude("index"))
+
+
+@pytest.mark.parametrize("wrong", [0, -1, 2.5, True])
+def test_a_batch_size_that_is_no_count_is_refused(wrong):
+    buffer = make_buffer()
+    buffer.extend(make_transitions(10))
+    with pytest.raises(ValueError, match=f"batch_size must be a positive integer, got {wrong}"):
+        buffer.sample(wrong)

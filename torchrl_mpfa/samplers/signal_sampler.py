@@ -73,6 +73,8 @@ class SignalSampler(TreeSampler):
         FixedFusion(values={'td_error': 1.0})
     """
 
+    KIND = "signals"
+
     def __init__(
         self,
         max_capacity: int,
@@ -223,7 +225,8 @@ class SignalSampler(TreeSampler):
         Raises:
             KeyError: If a signal that the sampler fuses is missing.
             IndexError: If a slot is outside the filled part of the buffer.
-            ValueError: If a signal has the wrong shape, is negative or not finite.
+            ValueError: If a signal or ``written_at`` has the wrong shape, or a signal is negative
+                or not finite.
             TypeError: If the storage keeps no signals, or the index holds anything but integers.
         """
         table = self.bind(storage)
@@ -248,6 +251,11 @@ class SignalSampler(TreeSampler):
             rows.select(1, table.column[name]).copy_(value)
         stale = 0
         if written_at is not None:
+            if written_at.numel() != slots.numel():
+                raise ValueError(
+                    "written_at must have one number a transition, got shape "
+                    f"{[*written_at.shape]} for {slots.numel()} slots"
+                )
             live = rows.select(1, table.time_column) == written_at.reshape(-1)
             if not live.all():
                 stale = int((~live).sum())
