@@ -15,14 +15,13 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
 import sys
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks import environment, loss, method_steps, replay, training
 from benchmarks.timing import Entry
+from torchrl_mpfa import write_text_atomically
 
 LATEST = Path(__file__).with_name("latest.json")
 
@@ -92,21 +91,6 @@ def missed_targets(entries: Sequence[Entry]) -> list[str]:
     ]
 
 
-def write_atomically(entries: Sequence[Entry], path: Path) -> None:
-    """Write the entries as JSON, whole or not at all."""
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=path.parent, prefix=path.name, suffix=".tmp", delete=False
-    ) as file:
-        try:
-            json.dump(list(entries), file, indent=2)
-            file.write("\n")
-            file.close()
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
-
-
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(
@@ -139,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"measuring {name}", file=sys.stderr, flush=True)
         entries += BENCHMARKS[name](quick=options.quick)
     print(f"\n{format_table(entries)}")
-    write_atomically(entries, options.output)
+    write_text_atomically(json.dumps(entries, indent=2) + "\n", options.output)
     print(f"\nwritten: {options.output}")
     missed = missed_targets(entries) if options.check else []
     for sentence in missed:

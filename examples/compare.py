@@ -32,6 +32,7 @@ from navigation.settings import GROUPS, register
 from navigation.stopping import Stop
 from navigation.studies import Evaluation, Job, collect
 from navigation.worlds import parse_worlds
+from torchrl_mpfa.spelling import unknown
 
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
@@ -56,7 +57,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         names = getattr(options, f"{group}s")
         for number, name in enumerate(names):
             if group in GROUPS and name not in GROUPS[group]:
-                parser.error(f"unknown {group} {name!r}; there are: {', '.join(GROUPS[group])}")
+                parser.error(unknown(group, name, GROUPS[group]))
             if name in names[:number]:
                 parser.error(f"--{group}s has {name} twice")
     for option in ("jobs", "episodes"):

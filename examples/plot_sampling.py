@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
+from torchrl_mpfa.spelling import unknown
 
 COUNT = 2_000
 BATCH_SIZE = 128
@@ -211,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     for name in options.methods:
         if name not in METHODS:
-            parser.error(f"unknown method {name!r}; there are: {', '.join(METHODS)}")
+            parser.error(unknown("method", name, METHODS))
     names = options.methods or [name for name in METHODS if name not in ALIASES]
     torch.set_num_threads(1)
     # TorchRL announces each storage in the middle of the progress bar.

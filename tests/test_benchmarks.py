@@ -93,16 +93,6 @@ def test_every_target_belongs_to_a_benchmark() -> None:
     assert set(run.TARGETS) <= set(run.BENCHMARKS)
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "latest.json"
-    run.write_atomically([entry("a", 1.0, "us")], path)
-    before = path.read_text(encoding="utf-8")
-    with pytest.raises(TypeError):
-        run.write_atomically([entry("a", object(), "us")], path)  # type: ignore[arg-type]
-    assert path.read_text(encoding="utf-8") == before
-    assert [file.name for file in tmp_path.iterdir()] == ["latest.json"]
-
-
 def test_calls_take_turns_and_a_ratio_is_the_median_of_the_rounds() -> None:
     calls: list[str] = []
     timing.take_turns(

@@ -26,10 +26,18 @@ def check_range(name: str, value: float, *, low: float) -> None:
         raise ValueError(f"{name} must be finite and at least {low}, got {value}")
 
 
-def check_count(name: str, value: int) -> None:
-    """Refuse what is no positive integer."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise ValueError(f"{name} must be a positive integer, got {value!r}")
+def check_counts(**counts: object) -> None:
+    """Refuse what is no positive integer, by its name.
+
+    Examples:
+        >>> check_counts(width=64, layers=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: layers must be a positive integer, got 0
+    """
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+            raise ValueError(f"{name} must be a positive integer, got {value!r}")
 
 
 def bounds(values: Tensor) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import check_count, check_finite, seeded_generator
+from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
 from torchrl_mpfa.dumps import new_dump, open_dump
 from torchrl_mpfa.replay_state import (
     check_batch_size,
@@ -197,7 +197,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
             ValueError: If ``batch_size`` is not a positive integer.
         """
         if batch_size is not None:
-            check_count("batch_size", batch_size)
+            check_counts(batch_size=batch_size)
         if return_info or include_info is not None or not self._fuses:
             return super().sample(batch_size, return_info, include_info)
         self._check_returned()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from mpfa_envs.checks import did_you_mean
 from mpfa_envs.random_worlds import random_world
 from mpfa_envs.worlds import Box, World
 
@@ -113,8 +113,7 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         from mpfa_envs.world_file import load_world
 
         return load_world(world)
-    near = get_close_matches(str(world), WORLDS, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
     raise ValueError(
         f"world must be a World, the path of a .yaml file, 'random-SEED' or one of "
         f"{list(WORLDS)}, got {world!r}{hint}"

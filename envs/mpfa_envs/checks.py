@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 
@@ -73,3 +75,14 @@ def check_count(name: str, value: Any, *, least: int = 1) -> int:
         what = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} must be {what}, got {value!r}")
     return int(value)
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """The question that ends an error about an unknown name; empty if no known one is near.
+
+    Examples:
+        >>> did_you_mean("burgr", ["burger", "waffle"])
+        "did you mean 'burger'?"
+    """
+    near = get_close_matches(str(name), list(known), n=1)
+    return f"did you mean {near[0]!r}?" if near else ""

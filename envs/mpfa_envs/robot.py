@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
+
+from mpfa_envs.checks import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -250,8 +251,7 @@ def resolve_robot(robot: str | RobotModel) -> RobotModel:
         return robot
     if isinstance(robot, str) and robot in ROBOTS:
         return ROBOTS[robot]
-    near = get_close_matches(str(robot), ROBOTS, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    hint = f" ({question})" if (question := did_you_mean(robot, ROBOTS)) else ""
     raise ValueError(f"robot must be a RobotModel or one of {sorted(ROBOTS)}, got {robot!r}{hint}")
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import yaml
 
+from mpfa_envs.checks import did_you_mean
 from mpfa_envs.worlds import Box, Cylinder, World
 
 if TYPE_CHECKING:
@@ -137,8 +137,7 @@ class _Reader:
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
             if name not in keys:
-                near = get_close_matches(str(name), keys, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(keys)}"
+                hint = did_you_mean(name, keys) or f"known are {', '.join(keys)}"
                 raise self.error(key, f"unknown key {name!r} in {what}; {hint}")
             if name in entries:
                 raise self.error(key, f"key {name!r} appears twice in {what}")

@@ -13,6 +13,7 @@ import torch
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.robot import resolve_robot
 from navigation.settings import TrainSettings
+from torchrl_mpfa.methods.assembly import WORDS
 
 Rule = tuple[Callable[[Any], bool], str]
 
@@ -49,15 +50,8 @@ RULES: dict[str, Rule] = {
     "threads": at_least(1),
     "checkpoint_every": at_least(1),
     "method.name": NAME,
-    "method.selection": choice("prioritized", "uniform", "newest", "rank", "capped", "split"),
-    "method.fusion": choice("entropy", "fixed", "scaled", "value_schedule"),
+    **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
     "method.positive_above": LEVEL,
-    "method.population": choice("buffer", "batch"),
-    "method.boost_bound": choice("floor", "cap", "none"),
-    "method.decay_position": choice("batch", "rank", "count"),
-    "method.importance": choice("critic", "torchrl", "none"),
-    "method.loss_function": choice("l2", "smooth_l1", "pal"),
-    "method.optimizer": choice("adam", "radam"),
     "method.capacity": at_least(1),
     "method.batch_size": at_least(1),
     "method.candidates": at_least(1),

@@ -72,7 +72,7 @@ def test_a_figure_is_plotted_and_an_unknown_method_refused(
     assert (tmp_path / "per.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(SystemExit):
         main(["prr"])
-    assert "unknown method 'prr'; there are: mpfa_per" in capsys.readouterr().err
+    assert "unknown method 'prr': did you mean 'per'?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", NAMES)

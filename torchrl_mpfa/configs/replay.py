@@ -133,26 +133,24 @@ def _make_mpfa_sampler(*, signals: Sequence[Any], **kwargs: Any) -> MPFASampler:
     return MPFASampler(signals=_signals(signals), **kwargs)
 
 
-def _make_tensor_storage(
-    *, signals: Sequence[Any], reward_key: Any, allow_nonfinite: Sequence[Any], **kwargs: Any
-) -> SignalTensorStorage:
-    return SignalTensorStorage(
-        signals=_signals(signals),
-        reward_key=_key(reward_key),
-        allow_nonfinite=[_key(key) for key in allow_nonfinite],
-        **kwargs,
-    )
+def _make_tensor_storage(**options: Any) -> SignalTensorStorage:
+    return SignalTensorStorage(**_with_keys(**options))
 
 
-def _make_memmap_storage(
-    *, signals: Sequence[Any], reward_key: Any, allow_nonfinite: Sequence[Any], **kwargs: Any
-) -> SignalMemmapStorage:
-    return SignalMemmapStorage(
-        signals=_signals(signals),
-        reward_key=_key(reward_key),
-        allow_nonfinite=[_key(key) for key in allow_nonfinite],
-        **kwargs,
-    )
+def _make_memmap_storage(**options: Any) -> SignalMemmapStorage:
+    return SignalMemmapStorage(**_with_keys(**options))
+
+
+def _with_keys(
+    *, signals: Sequence[Any], reward_key: Any, allow_nonfinite: Sequence[Any], **others: Any
+) -> dict[str, Any]:
+    """Options of a storage, with nested keys where a configuration has lists."""
+    return {
+        "signals": _signals(signals),
+        "reward_key": _key(reward_key),
+        "allow_nonfinite": [_key(key) for key in allow_nonfinite],
+        **others,
+    }
 
 
 def _key(key: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.learners.compiled import CompilableLearner
 from torchrl_mpfa.losses import SignalTD3Loss
 
@@ -35,7 +36,6 @@ class TD3Learner(CompilableLearner):
     loss_type = SignalTD3Loss
 
     def __init__(self, loss: SignalTD3Loss, *, policy_delay: int = 2, **kwargs: Any) -> None:
-        if policy_delay < 1:
-            raise ValueError(f"policy_delay must be at least 1, got {policy_delay}")
+        check_counts(policy_delay=policy_delay)
         super().__init__(loss, **kwargs)
         self.policy_delay = policy_delay

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.checks import check_counts, check_range
 from torchrl_mpfa.losses.averaging import AveragedNetwork, PastCritics
 from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
 from torchrl_mpfa.losses.functional import DISTANCES, action_gradient, critic_loss, saturation
@@ -114,8 +114,7 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         check_range("saturation_penalty", saturation_penalty, low=0.0)
         check_range("saturation_limit", saturation_limit, low=0.0)
         check_range("pal_alpha", pal_alpha, low=0.0)
-        if isinstance(target_average, bool) or target_average < 1:
-            raise ValueError(f"target_average must be at least 1, got {target_average}")
+        check_counts(target_average=target_average)
         if target_average > 1 and not isinstance(critic_network, DirectModule):
             raise ValueError(
                 f"target_average = {target_average} needs a DirectModule as critic, "

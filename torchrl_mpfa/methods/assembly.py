@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import RandomSampler, Storage
 
 from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.methods.catalogue import METHODS, Method
 from torchrl_mpfa.methods.cer import CombinedSampler
@@ -54,7 +55,7 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "capped": CappedSampler,
     "split": LA3PSampler,
 }
-_WORDS: dict[str, set[str]] = {
+WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
     "fusion": set(_FUSIONS),
     "boost_bound": {"floor", "cap", "none"},
@@ -64,7 +65,7 @@ _WORDS: dict[str, set[str]] = {
     "loss_function": {"l2", "smooth_l1", "pal"},
     "optimizer": {"adam", "radam"},
 }
-"""The settings that are one of several words."""
+"""What the settings of a method that are words may be."""
 
 
 @dataclass(frozen=True)
@@ -259,12 +260,10 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
         if name not in known:
             raise ValueError(unknown("setting", name, known))
     made = replace(method, **settings)
-    for name, words in _WORDS.items():
+    for name, words in WORDS.items():
         if getattr(made, name) not in words:
             raise ValueError(unknown(name, getattr(made, name), words))
     check_level(made.positive_above)
-    for name in ("capacity", "batch_size", "candidates", "target_average"):
-        value = getattr(made, name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    counts = ("capacity", "batch_size", "candidates", "target_average")
+    check_counts(**{name: getattr(made, name) for name in counts})
     return made

@@ -54,7 +54,7 @@ class CombinedSampler(RandomSampler):
             self._newest = stored[-1].tolist()
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Any]]:
-        """Draw slots.
+        """Sample slots.
 
         Args:
             storage: The storage to sample from.

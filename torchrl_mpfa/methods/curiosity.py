@@ -17,6 +17,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_mpfa.checks import check_counts
+
 
 def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
     r"""Bonus of a transition, :math:`\tfrac{\eta}{2} \lVert \hat\phi' - \phi' \rVert^2`.
@@ -96,9 +98,7 @@ class Curiosity(nn.Module):
         reward_key: NestedKey = "reward",
     ) -> None:
         super().__init__()
-        for name, size in (("features", features), ("width", width)):
-            if size < 1:
-                raise ValueError(f"{name} must be at least 1, got {size}")
+        check_counts(features=features, width=width)
         for name, value in (("scale", scale), ("lr", lr)):
             if not 0.0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")

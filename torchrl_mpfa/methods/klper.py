@@ -21,6 +21,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from torchrl_mpfa.checks import check_counts
+
 _LEAST_VARIANCE = 1e-3
 
 
@@ -101,8 +103,7 @@ class LowestDivergence:
         sigma: float | Callable[[], float],
         action_key: NestedKey = "action",
     ) -> None:
-        if isinstance(batches, bool) or not isinstance(batches, int) or batches < 1:
-            raise ValueError(f"batches must be a positive integer, got {batches!r}")
+        check_counts(batches=batches)
         if not callable(sigma) and not 0.0 <= sigma < math.inf:
             raise ValueError(f"sigma must be finite and not negative, got {sigma}")
         self.policy = policy

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.states import check_tensor
 from torchrl_mpfa.samplers.weighing import Weighing
@@ -45,8 +46,7 @@ class CappedSampler(SignalSampler):
     KIND = "capped"
 
     def __init__(self, *args: Any, replay_cap: int = 1024, **kwargs: Any) -> None:
-        if isinstance(replay_cap, bool) or not isinstance(replay_cap, int) or replay_cap < 1:
-            raise ValueError(f"replay_cap must be a positive integer, got {replay_cap!r}")
+        check_counts(replay_cap=replay_cap)
         self.replay_cap = replay_cap
         super().__init__(*args, **kwargs)
 

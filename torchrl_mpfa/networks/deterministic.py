@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.direct import DirectModule, check_sizes, hidden_layers, last_layer
+from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
 
 
 class Actor(nn.Module):
@@ -109,7 +110,7 @@ def make_actor(
         A module for TorchRL's losses and collectors.
 
     Raises:
-        ValueError: If a size is below one, or the spec not one of bounded actions of this size.
+        ValueError: If a size is no positive integer, or the spec not that of such bounded actions.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -118,7 +119,7 @@ def make_actor(
         >>> actor(TensorDict({"observation": torch.rand(5, 3)}, [5]))["action"].shape
         torch.Size([5, 1])
     """
-    check_sizes(
+    check_counts(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     actor = Actor(
@@ -158,13 +159,13 @@ def make_critic(
         A module for TorchRL's losses.
 
     Raises:
-        ValueError: If a size is below one, or a late action has no second layer to join.
+        ValueError: If a size is no positive integer, or a late action has no second layer to join.
 
     Examples:
         >>> make_critic(24, 2).out_keys
         ['state_action_value']
     """
-    check_sizes(
+    check_counts(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     if late_action and layers < 2:

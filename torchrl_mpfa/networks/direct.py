@@ -81,17 +81,3 @@ def last_layer(inputs: int, outputs: int, final_init: float | None) -> nn.Linear
         nn.init.uniform_(layer.weight, -final_init, final_init)
         nn.init.uniform_(layer.bias, -final_init, final_init)
     return layer
-
-
-def check_sizes(**sizes: int) -> None:
-    """Refuse sizes below one.
-
-    Raises:
-        ValueError: If there is one, by its name.
-
-    Examples:
-        >>> check_sizes(width=64, layers=2)
-    """
-    for name, value in sizes.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")

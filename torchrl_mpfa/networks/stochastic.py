@@ -15,8 +15,9 @@ from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.direct import DirectModule, check_sizes, hidden_layers, last_layer
+from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
 
 _SCALE_BIAS = math.log(math.e - 1.0)
 """The softplus of this is one."""
@@ -194,7 +195,7 @@ def make_stochastic_actor(
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
 
     Raises:
-        ValueError: If a size is below one, or the spec not one of bounded actions of this size.
+        ValueError: If a size is no positive integer, or the spec not that of such bounded actions.
 
     Examples:
         >>> policy = make_stochastic_actor(24, 2)
@@ -203,7 +204,7 @@ def make_stochastic_actor(
         >>> torch.allclose(found["action"], found["preactivation"].tanh())
         True
     """
-    check_sizes(
+    check_counts(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     network = StochasticNetwork(

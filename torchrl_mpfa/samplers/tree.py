@@ -11,7 +11,7 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.checks import (
     bounds,
-    check_count,
+    check_counts,
     check_finite,
     check_index,
     check_range,
@@ -72,7 +72,7 @@ class TreeSampler(SavedTrees):
         *,
         stratified: bool = False,
     ) -> None:
-        check_count("max_capacity", max_capacity)
+        check_counts(max_capacity=max_capacity)
         for name, value in (("alpha", alpha), ("beta", beta), ("eps", eps)):
             check_range(name, value, low=0)
         if dtype not in (torch.float, torch.double):
@@ -171,8 +171,7 @@ class TreeSampler(SavedTrees):
             # TorchRL would fall back on NumPy's global generator, which torch.manual_seed
             # does not reach.
             self._rng = seeded_generator()
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
+        check_counts(batch_size=batch_size)
         size = len(storage)
         if size == 0:
             raise RuntimeError("cannot sample from an empty buffer: len(storage) is 0")

@@ -9,7 +9,7 @@ from typing import Any
 from tensordict.utils import NestedKey
 from torchrl.data import LazyMemmapStorage
 
-from torchrl_mpfa.checks import check_count
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.table import SignalTable
@@ -53,7 +53,7 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         existsok: bool = False,
         **kwargs: Any,
     ) -> None:
-        check_count("max_size", max_size)
+        check_counts(max_size=max_size)
         self._allow_nonfinite = tuple(allow_nonfinite)
         file = None if scratch_dir is None else Path(scratch_dir) / "signals.memmap"
         self.signal_table = SignalTable(

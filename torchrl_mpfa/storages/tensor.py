@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
-from torchrl_mpfa.checks import bounds, check_count
+from torchrl_mpfa.checks import bounds, check_counts
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.table import SignalTable
@@ -48,7 +48,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         allow_nonfinite: Sequence[NestedKey] = (),
         **kwargs: Any,
     ) -> None:
-        check_count("max_size", max_size)
+        check_counts(max_size=max_size)
         self._allow_nonfinite = tuple(allow_nonfinite)
         self.signal_table = SignalTable(max_size, signals, reward_key=reward_key)
         self._looked_at: Any = None
