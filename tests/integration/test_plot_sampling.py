@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
 
 import plot_sampling
-from plot_sampling import KINDS, count_samples, main
+from plot_sampling import COLORS, KINDS, count_samples, main
 from torchrl_mpfa.methods import ALIASES, METHODS
 
 DOCS = Path(__file__).parents[2] / "docs" / "methods"
@@ -60,16 +62,27 @@ def test_combined_replay_has_the_newest_in_every_batch() -> None:
     assert found["critic"].argmax() == len(found["critic"]) - 1
 
 
-def test_the_capped_replay_lets_go_of_what_it_drew_most() -> None:
+def test_the_capped_replay_lets_go_of_what_it_sampled_most() -> None:
     capped, per = means_by_kind("mw"), means_by_kind("td_reward")
     assert capped["goal"] < per["goal"]
 
 
-def test_a_figure_is_plotted_and_an_unknown_method_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_bars_of_a_figure_are_as_high_as_what_they_count(tmp_path: Path) -> None:
     assert main(["per", "--output", str(tmp_path)]) == 0
-    assert (tmp_path / "per.png").read_bytes()[:4] == b"\x89PNG"
+    with Image.open(tmp_path / "per.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    bars = pixels[:, pixels.shape[1] // 3 : 2 * pixels.shape[1] // 3]
+    counted = means_by_kind("per")
+    height = {}
+    for kind, color in zip(KINDS, COLORS, strict=True):
+        filled = (abs(bars - 255 * np.array(to_rgb(color))) <= 2).all(-1)
+        height[kind] = int(filled.sum(0).max())
+    for kind in KINDS[1:]:
+        ratio = height[kind] / height[KINDS[0]]
+        assert ratio == pytest.approx(counted[kind] / counted[KINDS[0]], rel=0.05)
+
+
+def test_an_unknown_method_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["prr"])
     assert "unknown method 'prr': did you mean 'per'?" in capsys.readouterr().err

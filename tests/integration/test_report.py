@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 from scipy import stats
 
 import report
@@ -68,8 +69,9 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
     # Two runs against two: six ways to deal them out, two of which differ as much.
     assert "| ddpg/mpfa_per − ddpg/per | +0.875, p = 0.333 | +0.700, p = 0.333 | 0.333 |" in text
     assert "Success of ddpg varies from run to run by 12.50 points" in text
-    for name in ("training.png", "evaluations.png"):
-        assert (study / name).stat().st_size > 5000
+    for name, width in (("training.png", 1200), ("evaluations.png", 840)):
+        with Image.open(study / name) as picture:
+            assert picture.width == width
 
 
 def test_random_worlds_have_tables_of_their_own_without_the_paper(study: Path) -> None:

@@ -15,9 +15,7 @@ from torchrl.data import RandomSampler
 
 from mpfa_envs import load_policy
 from navigation.checkpoints import read_checkpoint
-from navigation.figures import plot_learning_curve
 from navigation.files import CHECKPOINT
-from navigation.records import EpisodeRecord, as_table
 from navigation.settings import GROUPS, Stage, TrainSettings
 from navigation.training import TrainingRun, prepare_process
 from tests.integration.tiny_runs import rows, tiny, train
@@ -193,12 +191,6 @@ def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: P
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match="resume"):
         read_checkpoint(tmp_path / "elsewhere")
-
-
-def test_the_learning_curve_is_plotted(tmp_path: Path) -> None:
-    run = train(tmp_path, tiny())
-    plot_learning_curve(as_table(run.records, EpisodeRecord), tmp_path / "curve.png")
-    assert (tmp_path / "curve.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_an_episode_that_fails_leaves_a_checkpoint_of_the_one_before(tmp_path: Path) -> None:
