@@ -19,9 +19,11 @@ SignalMemmapStorage(int(sys.argv[2]), scratch_dir=sys.argv[1], existsok=True)
 """
 
 
-@pytest.mark.parametrize("capacity", [100, 16, 3])
-@pytest.mark.parametrize("where", ["this process", "another process"])
-def test_a_folder_in_use_is_refused_and_the_user_of_it_goes_on(tmp_path, capacity, where):
+@pytest.mark.parametrize(
+    ("where", "capacity"),
+    [("this process", 100), ("this process", 16), ("this process", 3), ("another process", 3)],
+)
+def test_a_folder_in_use_is_refused_and_the_user_of_it_goes_on(tmp_path, where, capacity):
     buffer = make_buffer(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
     buffer.extend(make_transitions(16))
     before = buffer.storage.signal_table.rows.clone()
