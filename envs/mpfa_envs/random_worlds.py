@@ -1,4 +1,4 @@
-"""Random rooms: as many unseen worlds as one likes, the same ones for everyone."""
+"""Random worlds: as many unseen ones as you like, the same for everyone."""
 
 from __future__ import annotations
 
