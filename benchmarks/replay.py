@@ -106,7 +106,7 @@ def make_mpfa_update(buffer: SignalReplayBuffer, count: int = BATCH_SIZE) -> Cal
 
 
 def make_stock_update(buffer: TensorDictReplayBuffer, count: int = BATCH_SIZE) -> Call:
-    """The same with TorchRL's buffer, which takes one number a transition."""
+    """The same with TorchRL's buffer, which takes one number per transition."""
     td_error = torch.rand(count, generator=torch.Generator().manual_seed(1))
 
     def update() -> None:

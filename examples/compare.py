@@ -130,7 +130,7 @@ def run_all(
     """
     running: list[Running] = []
     failed: list[Job] = []
-    stop = Stop("saving the runs; the same command goes on with them")
+    stop = Stop("saving the runs; the same command continues them")
     with stop.listening():
         while (waiting or running) and not stop:
             while waiting and len(running) < options.jobs:

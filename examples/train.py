@@ -4,7 +4,7 @@
     python examples/train.py method=per seed=3            another method, another seed
     python examples/train.py curriculum=paper             worlds A, B, C, D one after the other
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
-    python examples/train.py resume=runs/A-mpfa_per-ddpg-0    go on with a run that was stopped
+    python examples/train.py resume=runs/A-mpfa_per-ddpg-0    continue a run that was stopped
 
 ``navigation/settings.py`` has every setting; ``--help`` prints them with their values. Ctrl-C,
 SIGTERM and SIGHUP let the episode end and save. Exit status: 0; 1 after an error, the last finished

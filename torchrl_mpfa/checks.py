@@ -27,7 +27,7 @@ def check_range(name: str, value: float, *, low: float) -> None:
 
 
 def check_counts(**counts: object) -> None:
-    """Refuse what is no positive integer, by its name.
+    """Refuse, by name, what is not a positive integer.
 
     Examples:
         >>> check_counts(width=64, layers=0)

@@ -74,14 +74,14 @@ def open_dump(path: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: If there is no such folder.
-        ValueError: If it is no whole dump, a file is missing, unknown or damaged, or a file could
-            execute something when it is read.
+        ValueError: If it is not a complete dump, a file is missing, unknown or damaged, or a file
+            could execute something when it is read.
     """
     path = Path(path).absolute()
     if not path.is_dir():
         raise FileNotFoundError(f"no such folder: {path}")
     if not (path / MANIFEST).exists():
-        raise ValueError(f"{path} is no whole dump of this package: it has no {MANIFEST}")
+        raise ValueError(f"{path} is not a complete dump of this package: it has no {MANIFEST}")
     try:
         manifest: dict[str, Any] = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
         name, files, found = manifest["folder"], dict(manifest["files"]), manifest["format"]

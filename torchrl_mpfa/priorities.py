@@ -91,7 +91,7 @@ def proportional_priority(td_error: Tensor, *, eps: float) -> Tensor:
 def sampling_probabilities(priority: Tensor, *, alpha: float) -> Tensor:
     r"""Probability of each transition, :math:`P(i) = p_i^\alpha / \sum_k p_k^\alpha` (Eq. 8).
 
-    The sampler samples by these with a segment tree; this is the same in the open, for tests and
+    The sampler samples by these with a segment tree; this is the same written out, for tests and
     figures.
 
     Args:

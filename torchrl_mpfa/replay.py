@@ -26,7 +26,7 @@ from torchrl_mpfa.storages.base import SignalStorageMixin
 _MISSING = (
     "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "
     "SignalSACLoss write td_error and action_gradient; with another loss, or a signal of your own, "
-    "write batch[{key!r}] = ..., one number a transition"
+    "write batch[{key!r}] = ..., one number per transition"
 )
 _UNRETURNED = 100
 """Batches in a row with signals that were not handed back, after which sampling is refused."""

@@ -65,5 +65,5 @@ def check_generator_state(found: Any) -> None:
         torch.Generator(device=device).set_state(state)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"'_rng' of the saved buffer is no state of a generator: {error}"
+            f"'_rng' of the saved buffer is not the state of a generator: {error}"
         ) from None

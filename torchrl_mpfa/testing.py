@@ -1,4 +1,4 @@
-"""Checks of a sampler, a fusion or an adjustment of one's own, for one's own tests.
+"""Checks of your own samplers, fusions and adjustments, for your own tests.
 
 Each function raises an :class:`AssertionError` with a sentence that says what is wrong, and returns
 nothing otherwise::

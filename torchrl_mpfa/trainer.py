@@ -190,7 +190,7 @@ def check_priority_updates(trainer: Trainer, *, replay_buffer: Any | None = None
     raise RuntimeError(
         f"optimization_stepper {_name(stepper)} does not update priorities, and a trainer with a "
         f"stepper skips the stage that would: {_name(sampler)} would sample by the priorities of "
-        f"fresh transitions for ever. Wrap it, PriorityStepper({_name(stepper)}(...)), or call "
+        f"fresh transitions forever. Wrap it, PriorityStepper({_name(stepper)}(...)), or call "
         "trainer.replay_buffer.update_tensordict_priority(sub_batch) in its step() and set "
         "updates_replay_priority = True"
     )

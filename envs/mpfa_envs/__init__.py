@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 ENV_IDS = tuple(f"mpfa/Navigation-{name}-v1" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
-"""A world file to start one's own from."""
+"""A world file to start your own from."""
 
 __all__ = [
     "ENV_IDS",

@@ -12,7 +12,7 @@ def check_number(name: str, value: Any) -> float:
     """A finite number.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not.
 
     Examples:
         >>> check_number("goal_reward", 10)
@@ -33,7 +33,7 @@ def check_positive(name: str, value: Any) -> float:
     """A finite number above zero.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not.
 
     Examples:
         >>> check_positive("time_step", "0.1")
@@ -51,7 +51,7 @@ def check_share(name: str, value: Any) -> float:
     """A number in [0, 1].
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not.
     """
     number = check_number(name, value)
     if not 0.0 <= number <= 1.0:
@@ -63,7 +63,7 @@ def check_count(name: str, value: Any, *, least: int = 1) -> int:
     """An integer of at least ``least``.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If it is not.
 
     Examples:
         >>> check_count("seed", -1, least=0)

@@ -1,4 +1,4 @@
-"""Greedy episodes of a policy between fixed starts and goals, and what they amount to."""
+"""Greedy episodes of a policy between fixed starts and goals, and their statistics."""
 
 from __future__ import annotations
 

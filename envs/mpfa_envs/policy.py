@@ -207,7 +207,7 @@ def _read(content: bytes) -> Policy:
         # The checksums, once over everything: arrays are read no further than their shape says.
         damaged = archive.testzip()
     if damaged is not None:
-        raise ValueError(f"the checksum of {damaged!r} does not fit")
+        raise ValueError(f"the checksum of {damaged!r} does not match")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         about = json.loads(bytes(arrays[_ABOUT]).decode())
         if about["format"] != _FORMAT:

@@ -47,7 +47,7 @@ class NavigationTorchEnv(EnvBase):
     Args:
         num_envs: Number of environments in this process; None: one, without a batch dimension.
         device: Where the tensors live; the simulation runs on the CPU.
-        info_keys: Which entries of the info to hand on; None: all. Each costs TorchRL some 20 µs a
+        info_keys: Which entries of the info to pass on; None: all. Each costs TorchRL some 20 µs a
             step, which is more than it costs to compute.
         **kwargs: Arguments of :class:`~mpfa_envs.NavigationEnv`.
 

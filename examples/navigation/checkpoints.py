@@ -32,7 +32,7 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
     try:
         state: Any = load_safely(file)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
-        raise ValueError(f"{file} is damaged or no checkpoint") from error
+        raise ValueError(f"{file} is damaged or not a checkpoint") from error
     found = state.get("format") if isinstance(state, dict) else None
     if found != FORMAT:
         raise ValueError(f"{file} has format {found}, this version reads {FORMAT}")

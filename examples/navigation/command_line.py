@@ -56,7 +56,7 @@ def parse_overrides(arguments: Sequence[str]) -> list[Override]:
         try:
             parsed.append(parser.parse_override(text))
         except HydraException as error:
-            raise ValueError(f"{text!r} is no NAME=VALUE: {_one_line(error)}") from error
+            raise ValueError(f"{text!r} is not NAME=VALUE: {_one_line(error)}") from error
     known = list(known_settings())
     overrides = [each for each in parsed if not each.key_or_group.startswith("hydra")]
     for override in overrides:
@@ -114,7 +114,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:
-    # Most mistakes are a slip of the pen, or a setting without the section it is in.
+    # Most mistakes are typos, or settings without the section they are in.
     names = list(known)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     inside = [name for name in names if name.split(".")[-1] == word.split(".")[-1]]

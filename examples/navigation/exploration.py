@@ -1,4 +1,4 @@
-"""How the robot acts while it learns: a policy with noise, or one that is random by itself."""
+"""How the robot acts while it learns: a policy with noise, or a stochastic one."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class NoisyPolicy:
 
 
 class RandomPolicy:
-    """A policy that is random by itself, as SAC's is.
+    """A stochastic policy, as SAC's is.
 
     Args:
         policy: The stochastic policy.

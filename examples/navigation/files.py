@@ -45,9 +45,7 @@ def lock(folder: Path) -> Iterator[None]:
     try:
         held.acquire()
     except Timeout:
-        raise FolderInUse(
-            f"another process is at work in {folder}: wait for it, or end it"
-        ) from None
+        raise FolderInUse(f"another process is using {folder}: wait for it, or stop it") from None
     try:
         for pattern in (".*.tmp", f".{POLICY}.*"):
             for half_written in folder.glob(pattern):

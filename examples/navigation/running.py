@@ -45,7 +45,7 @@ def start(settings: TrainSettings, folder: Path) -> int:
         Exit status: 0, or 128 and the number of the signal that stopped the run.
 
     Raises:
-        Refused: If the folder holds a run and ``overwrite`` is false, if another run is at work in
+        Refused: If the folder holds a run and ``overwrite`` is false, if another run is using
             it, or if the parts refuse a setting.
     """
     with ExitStack() as held:
@@ -53,7 +53,7 @@ def start(settings: TrainSettings, folder: Path) -> int:
             held.enter_context(files.lock(folder))
             if (folder / files.CHECKPOINT).exists() and not settings.overwrite:
                 raise ValueError(
-                    f"{folder} holds a run: go on with it by resume={folder}, or start anew by "
+                    f"{folder} holds a run: continue it with resume={folder}, or start anew with "
                     "overwrite=true"
                 )
             prepare_process(settings)
@@ -77,7 +77,7 @@ def resume(folder: Path, overrides: list[Override]) -> int:
 
     Raises:
         Refused: If there is no checkpoint, if it cannot be read, if a setting may not change, or if
-            another run is at work in the folder.
+            another run is using the folder.
     """
     with ExitStack() as held:
         with refusing():
@@ -108,7 +108,7 @@ def _train(training: TrainingRun) -> int:
     if finished:
         print(f"policy: {folder / files.POLICY}   curve: {curve}")
         return 0
-    print(f"stopped after episode {training.episode}; go on with: train.py resume={folder}")
+    print(f"stopped after episode {training.episode}; continue with: train.py resume={folder}")
     return training.stop.exit_status
 
 

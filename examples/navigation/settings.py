@@ -86,7 +86,7 @@ class TD3Settings(LearnerSettings):
 
 @dataclass
 class SACSettings(LearnerSettings):
-    """SAC with networks and rates of the DDPG learner, and a policy that is random by itself."""
+    """SAC with networks and rates of the DDPG learner, and a stochastic policy."""
 
     name: str = "sac"
     algorithm: str = "sac"
@@ -268,7 +268,7 @@ class TrainSettings:
     overwrite: bool = False
     """Whether to start anew in a folder that holds a run; its files are moved to ``previous/``."""
     resume: str | None = None
-    """Folder of a run to go on with, with its own settings. More episodes, tracking, threads and
+    """Folder of a run to continue, with its own settings. More episodes, tracking, threads and
     how often to evaluate and to save may be changed; anything else is refused."""
     checkpoint_every: int = 25
     """Episodes between two checkpoints."""

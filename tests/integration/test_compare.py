@@ -169,7 +169,7 @@ def test_two_studies_do_not_work_in_one_folder(
 ) -> None:
     with files.lock(tmp_path):
         assert compare.main(study(tmp_path)) == 2
-    assert f"another process is at work in {tmp_path}" in capsys.readouterr().err
+    assert f"another process is using {tmp_path}" in capsys.readouterr().err
 
 
 def test_defaults_of_a_study_give_way_to_its_command_line() -> None:

@@ -68,7 +68,7 @@ def test_a_second_run_in_the_same_folder_is_refused_while_the_first_is_at_work(
     with lock(tmp_path):
         before = contents(tmp_path)
         for again in (lambda: begin(tmp_path, "overwrite=true"), lambda: go_on(tmp_path)):
-            with pytest.raises(Refused, match=f"another process is at work in {tmp_path}"):
+            with pytest.raises(Refused, match=f"another process is using {tmp_path}"):
                 again()
         assert contents(tmp_path) == before
         with pytest.raises(FolderInUse), lock(tmp_path):
@@ -86,7 +86,7 @@ def test_what_a_killed_save_left_is_removed(tmp_path: Path) -> None:
 def test_a_folder_with_a_run_is_not_written_over_unless_asked_to(tmp_path: Path) -> None:
     begin(tmp_path, "seed=1", episodes=1)
     before = contents(tmp_path)
-    with pytest.raises(Refused, match=f"{tmp_path} holds a run: go on with it by resume="):
+    with pytest.raises(Refused, match=f"{tmp_path} holds a run: continue it with resume="):
         begin(tmp_path, "seed=2", episodes=1)
     assert contents(tmp_path) == before
 
@@ -233,7 +233,7 @@ def test_a_killed_run_goes_on_and_signals_save(tmp_path: Path) -> None:
         resumed.send_signal(number)
         out, err = resumed.communicate(timeout=120)
         assert resumed.returncode == 128 + number, err
-        assert f"go on with: train.py resume={folder}" in out
+        assert f"continue with: train.py resume={folder}" in out
         reached = read_checkpoint(folder)["episode"]
         assert reached > episode
         episode = reached

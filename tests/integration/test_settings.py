@@ -135,8 +135,8 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
         ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
         ("seed=0,-1", "seed must be at least 0, got -1"),
-        ("learner.gamma=[", r"'learner.gamma=\[' is no NAME=VALUE"),
-        ("gamma", "'gamma' is no NAME=VALUE"),
+        ("learner.gamma=[", r"'learner.gamma=\[' is not NAME=VALUE"),
+        ("gamma", "'gamma' is not NAME=VALUE"),
     ],
 )
 def test_a_value_that_cannot_be_is_one_sentence_with_its_name(arguments: str, message: str) -> None:

@@ -127,7 +127,7 @@ def test_wrong_arguments_are_refused_by_name():
         LowestDivergence(policy, batches=0, sigma=0.2)
     with pytest.raises(ValueError, match="sigma must be finite"):
         LowestDivergence(policy, sigma=-1.0)
-    with pytest.raises(ValueError, match="64 transitions cannot be 3 batches"):
+    with pytest.raises(ValueError, match="64 transitions cannot make 3 equal batches"):
         LowestDivergence(policy, sigma=0.2)(sampled(policy, [0.0]))
     with pytest.raises(ValueError, match="variance must be positive"):
         gaussian_divergence(torch.zeros(4, 2), variance=0.0)

@@ -65,7 +65,9 @@ def test_what_torchrl_wrote_is_refused_and_not_unpickled(tmp_path):
     (tmp_path / "buffer").mkdir()
     (tmp_path / "buffer/prefetch.pkl").write_bytes(pickle.dumps(Trap(str(trap))))
     for buffer in (make_buffer(16), SignalReplayBuffer(storage=SignalTensorStorage(4))):
-        with pytest.raises(ValueError, match=r"buffer is no whole dump .*: it has no manifest"):
+        with pytest.raises(
+            ValueError, match=r"buffer is not a complete dump .*: it has no manifest"
+        ):
             buffer.loads(tmp_path / "buffer")
     assert not trap.exists()
 

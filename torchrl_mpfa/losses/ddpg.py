@@ -1,4 +1,4 @@
-"""DDPG loss that writes the signals of each transition, out of one forward pass of the critic."""
+"""DDPG loss that writes the signals of each transition, in one forward pass of the critic."""
 
 from __future__ import annotations
 

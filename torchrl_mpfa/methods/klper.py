@@ -126,7 +126,7 @@ class LowestDivergence:
         """
         count = len(tensordict)
         if count % self.batches:
-            raise ValueError(f"{count} transitions cannot be {self.batches} batches of one size")
+            raise ValueError(f"{count} transitions cannot make {self.batches} equal batches")
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             chosen = self.policy(tensordict.select(*self.policy.in_keys)).get(self.action_key)
         deviation = tensordict.get(self.action_key) - chosen

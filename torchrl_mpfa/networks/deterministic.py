@@ -110,7 +110,7 @@ def make_actor(
         A module for TorchRL's losses and collectors.
 
     Raises:
-        ValueError: If a size is no positive integer, or the spec not that of such bounded actions.
+        ValueError: If a size is not a positive integer, or the spec has other actions.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -159,7 +159,7 @@ def make_critic(
         A module for TorchRL's losses.
 
     Raises:
-        ValueError: If a size is no positive integer, or a late action has no second layer to join.
+        ValueError: If a size is not a positive integer, or a late action has no second layer.
 
     Examples:
         >>> make_critic(24, 2).out_keys

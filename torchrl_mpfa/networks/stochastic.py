@@ -195,7 +195,7 @@ def make_stochastic_actor(
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
 
     Raises:
-        ValueError: If a size is no positive integer, or the spec not that of such bounded actions.
+        ValueError: If a size is not a positive integer, or the spec has other actions.
 
     Examples:
         >>> policy = make_stochastic_actor(24, 2)

@@ -242,7 +242,7 @@ class SignalSampler(TreeSampler):
             value = signals[name].detach()
             if value.numel() != slots.numel():
                 raise ValueError(
-                    f"signal {name!r} must have one number a transition, got shape "
+                    f"signal {name!r} must have one number per transition, got shape "
                     f"{[*value.shape]} for {slots.numel()} slots"
                 )
             value = value.reshape(-1)
@@ -253,7 +253,7 @@ class SignalSampler(TreeSampler):
         if written_at is not None:
             if written_at.numel() != slots.numel():
                 raise ValueError(
-                    "written_at must have one number a transition, got shape "
+                    "written_at must have one number per transition, got shape "
                     f"{[*written_at.shape]} for {slots.numel()} slots"
                 )
             live = rows.select(1, table.time_column) == written_at.reshape(-1)

@@ -30,7 +30,7 @@ def effective_sample_size(weight: Tensor) -> float:
 def signal_shares(signals: Tensor, weights: Tensor) -> Tensor:
     """Share of each signal in the mean fused priority.
 
-    Weights say what a method wants; shares say what it gets, as signals differ in scale.
+    Weights say what a method intends; shares say what results, as signals differ in scale.
 
     Args:
         signals: Non-negative signals, shape ``[B, K]``.

@@ -117,7 +117,7 @@ def signals_of_data(table: SignalTable, data: Any, length: int) -> dict[str, Any
         that a batch sampled before is known to be old.
 
     Raises:
-        ValueError: If a reward or a signal is not one finite number a transition.
+        ValueError: If a reward or a signal is not one finite number per transition.
     """
     leaves, entries = _leaves(data), {}
     for key in (table.reward_key, *(signal.key for signal in table.written)):

@@ -100,7 +100,7 @@ class SignalTable:
 
         Raises:
             ValueError: If a reward or a signal is not finite, a signal is negative, or either
-                has not one number a transition.
+                has not one number per transition.
         """
         rows = self.blank(count)
         reward = _column(data, self.reward_key, "reward", count)
@@ -230,13 +230,13 @@ def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.fl
 
 
 def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
-    """One finite number a transition, in double precision, shape ``[count]``; None if absent."""
+    """One finite number per transition, in double precision, shape ``[count]``; None if absent."""
     value = data.get(key, None)
     if value is None:
         return None
     if value.numel() != count:
         raise ValueError(
-            f"{name} at {key!r} must have one number a transition, got shape {[*value.shape]} "
+            f"{name} at {key!r} must have one number per transition, got shape {[*value.shape]} "
             f"for {count} transitions"
         )
     flat = value.detach().reshape(count).to("cpu", torch.double)
