@@ -10,9 +10,11 @@ from typing import Any
 
 import torch
 
+from mpfa_envs import NavigationEnv
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.robot import resolve_robot
-from navigation.settings import TrainSettings
+from navigation.environments import collision_distance
+from navigation.settings import EnvironmentSettings, TrainSettings
 from torchrl_mpfa.methods.assembly import WORDS
 
 Rule = tuple[Callable[[Any], bool], str]
@@ -142,13 +144,14 @@ def check_settings(settings: TrainSettings) -> None:
             allowed, wanted = RULES[name]
             if not allowed(value):
                 raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    _resolve("environment.robot", resolve_robot, settings.environment.robot)
     for number, stage in enumerate(settings.curriculum.stages):
         where = f"curriculum.stages[{number}]"
         if stage.episodes < 1:
             raise ValueError(f"{where}.episodes must be at least 1, got {stage.episodes}")
         _resolve(f"{where}.world", resolve_world, stage.world)
+        _check_room(f"{where}.world", stage.world, settings.environment)
     _resolve("evaluation.world", resolve_world, settings.evaluation.world)
-    _resolve("environment.robot", resolve_robot, settings.environment.robot)
     method = settings.method
     if method.capacity < method.batch_size * method.candidates:
         raise ValueError(
@@ -166,6 +169,22 @@ def _resolve(name: str, resolve: Callable[[str], Any], value: str) -> None:
         resolve(value)
     except (ValueError, OSError) as error:
         raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
+
+
+def _check_room(name: str, world: str, settings: EnvironmentSettings) -> None:
+    """Refuse a world in which no episode can begin, as the robot has to keep too far away."""
+    env = NavigationEnv(
+        world=world,
+        robot=settings.robot,
+        physics="kinematic",
+        collision_distance=collision_distance(settings),
+    )
+    try:
+        env.reset(seed=0)
+    except ValueError as error:
+        raise ValueError(f"{name}, environment.clearance={settings.clearance}: {error}") from error
+    finally:
+        env.close()
 
 
 def _check_device(device: str) -> None:

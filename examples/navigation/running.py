@@ -83,6 +83,9 @@ def resume(folder: Path, overrides: list[Override]) -> int:
         with refusing():
             if not folder.is_dir():
                 raise FileNotFoundError(f"resume: there is no folder {folder}")
+            for name in (each.key_or_group for each in overrides):
+                if name in ("run_dir", "overwrite"):
+                    raise ValueError(f"resume: {name} is of no use, a run goes on in its folder")
             held.enter_context(files.lock(folder))
             state = read_checkpoint(folder)
             settings = changed(state["settings"], overrides)

@@ -132,6 +132,10 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
         ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
         ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
+        (
+            "environment.clearance=99",
+            r"stages\[0\].world, environment.clearance=99.0: world 'A' has no free start",
+        ),
         ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
         ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
         ("seed=0,-1", "seed must be at least 0, got -1"),
