@@ -39,7 +39,7 @@ SPOILS = [
     (("_sampler",), MISSING, "'_sampler' is missing in the saved buffer"),
     (("_writer",), MISSING, "'_writer' is missing in the saved buffer"),
     (("_rng",), MISSING, "'_rng' is missing in the saved buffer"),
-    (("_rng",), (torch.zeros(3), "cpu"), "'_rng' of the saved buffer is not the state of a generator"),
+    (("_rng",), (torch.zeros(3), "cpu"), "'_rng' of the saved buffer is not the state"),
     (("_batch_size",), 0, "'_batch_size' of the saved buffer must be positive, got 0"),
     (("_writer", "_cursor"), MISSING, "'_cursor' is missing in the saved writer"),
     (("_writer", "_cursor"), 8, r"'_cursor' of the saved writer must be in \[0, 8\), got 8"),
