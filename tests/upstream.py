@@ -114,10 +114,15 @@ def run_suite(checkout: Path, suite: str, kind: str) -> dict[str, str]:
             _OUTCOMES: str(outcomes),
             "PYTHONPATH": os.pathsep.join(paths),
         }
+        chosen = [str(checkout / each) if "/" in each else each for each in SUITES[suite]]
         command = [sys.executable, "-m", "pytest", "-q", "--tb=line", "-o", "addopts="]
         subprocess.run(
-            [*command, "-p", "no:cacheprovider", "-p", "tests.upstream", *SUITES[suite]],
-            cwd=checkout,
+            [
+                *(*command, "-p", "no:cacheprovider", "-p", "tests.upstream"),
+                *(f"--rootdir={checkout}", *chosen),
+            ],
+            # Not in the checkout, whose torchrl, without its compiled part, would be imported.
+            cwd=folder,
             env=environment,
             stdout=subprocess.DEVNULL,
             check=False,
@@ -142,15 +147,18 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.checkout / "test/rb").is_dir():
         parser.error(f"{arguments.checkout} is no checkout of pytorch/rl: it has no test/rb")
+    checkout = arguments.checkout.resolve()
     differences: dict[str, list[str]] = {}
     sys.stdout.write(" | ".join(["| suite", "TorchRL", *arguments.kinds]) + " |\n")
     sys.stdout.write("|---" * (2 + len(arguments.kinds)) + "|\n")
     for suite in arguments.suites:
-        stock = run_suite(arguments.checkout, suite, "TorchRL")
+        stock = run_suite(checkout, suite, "TorchRL")
         passed = {name for name, outcome in stock.items() if outcome == "passed"}
+        if not passed:
+            parser.error(f"none of the tests of {suite!r} passes with TorchRL's own parts")
         cells = [f"| {suite}", str(len(passed))]
         for kind in arguments.kinds:
-            found = run_suite(arguments.checkout, suite, kind)
+            found = run_suite(checkout, suite, kind)
             lost = sorted(name for name in passed if found.get(name) != "passed")
             cells.append(f"{len(passed) - len(lost)} of {len(passed)}")
             for name in lost:
