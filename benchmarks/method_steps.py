@@ -38,10 +38,11 @@ def make_step(method: Method) -> Call:
     def step() -> None:
         buffer.extend(transition)
         for draw in replay.select(buffer):
-            if curiosity is not None:
+            if curiosity is not None and draw.gives_signals:
                 curiosity(draw.batch)
             learner.update(draw)
-            buffer.update_tensordict_priority(draw.batch)
+            if draw.gives_signals:
+                buffer.update_tensordict_priority(draw.batch)
 
     return step
 

@@ -124,12 +124,12 @@ def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[s
     own = False
     for number in range(2 * ROUNDS):
         for draw in replay.select(buffer):
-            actor_batch = draw.batch if draw.actor_batch is None else draw.actor_batch
-            own = own or draw.actor_batch is not None
+            own = own or draw.trains != "both"
             if number >= ROUNDS:
-                for who, batch in (("critic", draw.batch), ("actor", actor_batch)):
-                    counts[who] += torch.bincount(batch["index"], minlength=COUNT)
-            _update(buffer, draw.batch, transitions, replay.signals)
+                for who in counts if draw.trains == "both" else (draw.trains,):
+                    counts[who] += torch.bincount(draw.batch["index"], minlength=COUNT)
+            if draw.gives_signals:
+                _update(buffer, draw.batch, transitions, replay.signals)
     found = {who: (each / each.mean()).double().numpy() for who, each in counts.items()}
     return transitions, found if own else {"critic": found["critic"]}
 

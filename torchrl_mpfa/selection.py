@@ -1,17 +1,20 @@
 """Selection: from a replay buffer to the batches of one training step.
 
 Most methods sample one batch, of which critic and actor learn both. A method that chooses among
-several batches, or gives the actor one of its own, is another callable of the same form.
+several batches, or gives critic and actor one each, is another callable of the same form.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
+
+Trains = Literal["both", "critic", "actor"]
+"""Who learns from a batch."""
 
 
 @dataclass(frozen=True)
@@ -19,22 +22,35 @@ class Draw:
     """What one update of a learner is made from.
 
     Attributes:
-        batch: What the critic learns from, and whose signals are updated, batch size ``[B]``.
-        actor_batch: What the actor learns from; None: the same.
+        batch: What is learned from, batch size ``[B]``.
+        trains: Who learns from it: ``"both"``, the ``"critic"`` or the ``"actor"`` alone. The
+            target networks move with the actor.
         loss_function: Distance of the critic's loss; None: the loss's own.
         new_step: Whether a new training step begins; false for the further draws of one, which a
             delay of the actor does not count.
 
+    Raises:
+        ValueError: If ``trains`` is unknown.
+
     Examples:
         >>> from tensordict import TensorDict
-        >>> Draw(TensorDict({}, [4])).actor_batch is None
-        True
+        >>> Draw(TensorDict({}, [4]), trains="actor").gives_signals
+        False
     """
 
     batch: TensorDictBase
-    actor_batch: TensorDictBase | None = None
+    trains: Trains = "both"
     loss_function: str | None = None
     new_step: bool = True
+
+    def __post_init__(self) -> None:
+        if self.trains not in get_args(Trains):
+            raise ValueError(f"trains must be one of {get_args(Trains)}, got {self.trains!r}")
+
+    @property
+    def gives_signals(self) -> bool:
+        """Whether the update writes signals in the batch: the actor's loss has none."""
+        return self.trains != "actor"
 
 
 @runtime_checkable
@@ -45,7 +61,8 @@ class Selection(Protocol):
 
         for draw in select(buffer):
             losses = learner.update(draw)
-            buffer.update_tensordict_priority(draw.batch)
+            if draw.gives_signals:
+                buffer.update_tensordict_priority(draw.batch)
     """
 
     def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[Draw]:

@@ -29,7 +29,7 @@ from navigation.records import EpisodeRecord, EvaluationRecord, as_table, write_
 from navigation.settings import Stage, TrainSettings
 from navigation.stopping import Stop
 from navigation.tracking import Tracker
-from torchrl_mpfa import Draw, SignalSampler, save_atomically
+from torchrl_mpfa import SignalSampler, save_atomically
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.saving import write_text_atomically
 
@@ -226,14 +226,19 @@ class TrainingRun:
         if len(self.buffer) < self.settings.method.batch_size:
             return
         device = self.settings.device
-        for sampled in self.select(self.buffer):
-            draw = sampled if device == "cpu" else _moved(sampled, device)
-            bonus = {} if self.curiosity is None else self.curiosity(draw.batch)
-            losses = self.learner.update(draw)
-            batch = draw.batch if device == "cpu" else draw.batch.to("cpu")
-            self.buffer.update_tensordict_priority(batch)
+        values: dict[str, torch.Tensor] = {}
+        for draw in self.select(self.buffer):
+            if device != "cpu":
+                draw = replace(draw, batch=draw.batch.to(device))
+            # Rewards are the critic's business.
+            if self.curiosity is not None and draw.gives_signals:
+                values.update(self.curiosity(draw.batch))
+            values.update(self.learner.update(draw))
+            if draw.gives_signals:
+                batch = draw.batch if device == "cpu" else draw.batch.to("cpu")
+                self.buffer.update_tensordict_priority(batch)
         if self.step % self.settings.tracking.log_every == 0:
-            self.tracker.log_update(self.step, {**losses, **bonus}, self.buffer, batch)
+            self.tracker.log_update(self.step, values, self.buffer, batch)
 
     def _anneal(self) -> None:
         """Move what changes with the episodes: beta of Eq. (10), fusion and learning rates."""
@@ -304,12 +309,6 @@ class TrainingRun:
         """Release the simulation and finish the log."""
         self.driver.close()
         self.tracker.close()
-
-
-def _moved(draw: Draw, device: str) -> Draw:
-    """The batches of a draw on another device."""
-    actor_batch = None if draw.actor_batch is None else draw.actor_batch.to(device)
-    return replace(draw, batch=draw.batch.to(device), actor_batch=actor_batch)
 
 
 def episode_seed(seed: int, episode: int) -> int:

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
-from torchrl_mpfa import DDPGLearner, Draw, SignalSampler, TD3Learner, make_actor, make_critic
-from torchrl_mpfa.losses import make_ddpg_loss, make_td3_loss
+from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods import LA3PSampler, PriorityFloor, split_draws
 
 ALPHA = 0.4
@@ -34,8 +33,7 @@ def shares_by_hand(errors):
 
 
 def assert_parts(buffer, errors, *, samples):
-    first, second = split_draws(buffer)
-    indices = (first.batch["index"], second.batch["index"], second.actor_batch["index"])
+    indices = [draw.batch["index"] for draw in split_draws(buffer)]
     for index, expected in zip(indices, shares_by_hand(errors.tolist()), strict=True):
         assert len(index) == samples
         assert_shares(index, expected, samples=samples)
@@ -70,67 +68,22 @@ def test_the_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
 @pytest.mark.parametrize(("fraction", "expected"), [(0.5, (128, 128, 128)), (0.25, (64, 192, 192))])
 def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
     buffer = make_la3p(300, 256, uniform_fraction=fraction)
-    first, second = split_draws(buffer)
-    sizes = (len(first.batch), len(second.batch), len(second.actor_batch))
-    assert sizes == expected
-    assert first.actor_batch is None
-    assert (first.loss_function, second.loss_function) == ("pal", "smooth_l1")
+    draws = list(split_draws(buffer))
+    assert tuple(len(draw.batch) for draw in draws) == expected
+    assert [draw.trains for draw in draws] == ["both", "critic", "actor"]
+    assert [draw.loss_function for draw in draws][:2] == ["pal", "smooth_l1"]
+    assert [draw.new_step for draw in draws] == [True, False, False]
 
 
 def test_both_halves_of_the_critics_batch_update_priorities():
     buffer = make_la3p(400, 64)
     for draw in split_draws(buffer):
+        if not draw.gives_signals:
+            continue
         draw.batch["signals", "td_error"] = torch.full((len(draw.batch),), 7.0)
         buffer.update_tensordict_priority(draw.batch)
         leaves = torch.as_tensor(buffer.sampler._sum_tree[draw.batch["index"]])
         torch.testing.assert_close(leaves, torch.full_like(leaves, 7.0**ALPHA))
-
-
-def test_a_delayed_actor_counts_training_steps_and_not_their_batches():
-    networks = make_actor(24, 2, width=8), make_critic(24, 2, width=8)
-    loss = make_td3_loss(*networks, bounds=(-1.0, 1.0))
-    learner = TD3Learner(loss, policy_delay=2)
-    batch = whole_transitions(12)
-    logs = [
-        learner.update(Draw(batch[:4], actor_batch=batch[8:], new_step=new))
-        for new in (True, False, True, False)
-    ]
-    assert ["loss_actor" in log for log in logs] == [False, False, True, True]
-
-
-def test_the_actor_learns_from_its_own_batch():
-    """With a batch of its own the actor's step is as if the whole update had been that batch."""
-    steps = []
-    whole = whole_transitions(12)
-    for kwargs in ({}, {"actor_batch": whole[6:]}):
-        torch.manual_seed(0)
-        loss = make_ddpg_loss(make_actor(24, 2, width=8), make_critic(24, 2, width=8))
-        learner = DDPGLearner(loss)
-        learner.update(Draw((whole[:6] if kwargs else whole[6:]).clone(), **kwargs))
-        steps.append([value.clone() for value in learner.policy.parameters()])
-    # Adam's first step has the sign of the gradient alone: compare its direction.
-    for one, other in zip(*steps, strict=True):
-        torch.testing.assert_close(one, other)
-
-
-def whole_transitions(count):
-    from tensordict import TensorDict
-
-    generator = seeded(6)
-    end = torch.zeros(count, 1, dtype=torch.bool)
-    return TensorDict(
-        {
-            "observation": torch.randn(count, 24, generator=generator),
-            "action": torch.rand(count, 2, generator=generator) * 2 - 1,
-            "next": {
-                "observation": torch.randn(count, 24, generator=generator),
-                "reward": torch.randn(count, 1, generator=generator),
-                "terminated": end,
-                "done": end.clone(),
-            },
-        },
-        [count],
-    )
 
 
 def test_what_cannot_be_parted_is_refused():
@@ -143,22 +96,60 @@ def test_what_cannot_be_parted_is_refused():
         next(split_draws(other))
 
 
-def test_the_second_part_knows_the_priorities_that_the_first_one_learned():
-    """Where the uniform part finds one large error, the prioritized part finds it as well."""
-    errors = torch.zeros(2000)
-    buffer = make_la3p(2000, 400)
+def test_each_part_is_sampled_by_the_priorities_that_the_part_before_it_learned(monkeypatch):
+    """Errors kept in a list, updated part by part; a spy reads the trees when they are asked."""
+    buffer = make_la3p(60, 20)
+    errors = torch.rand(60, generator=seeded(1)).mul(10).tolist()
     set_signals(buffer, td_error=errors)
+    sampler, sample = buffer.sampler, buffer.sampler._sample_slots
+    seen = []
+
+    def spy(size, batch_size):
+        slots = torch.arange(60)
+        leaves = [torch.as_tensor(t[slots]) for t in (sampler._sum_tree, sampler._inverse_tree)]
+        seen.append((sampler._part, *leaves))
+        return sample(size, batch_size)
+
+    monkeypatch.setattr(sampler, "_sample_slots", spy)
+    for step in range(20):
+        for number, draw in enumerate(split_draws(buffer)):
+            part, leaf, inverse = seen.pop()
+            assert not seen
+            assert part == ("uniform", "prioritized", "inverse")[number]
+            expected = torch.tensor([max(error, 1.0) ** ALPHA for error in errors]).double()
+            torch.testing.assert_close(leaf.double(), expected, rtol=1e-6, atol=0)
+            torch.testing.assert_close(inverse.double(), 1 / expected, rtol=1e-6, atol=0)
+            if draw.gives_signals:
+                values = torch.rand(10, generator=seeded(100 * step + number)) * 10
+                draw.batch["signals", "td_error"] = values
+                buffer.update_tensordict_priority(draw.batch)
+                for slot, value in zip(draw.batch["index"].tolist(), values.tolist(), strict=True):
+                    errors[slot] = value
+
+
+def test_the_critics_part_finds_the_large_error_that_the_uniform_part_learned():
+    buffer = make_la3p(2000, 400)
+    set_signals(buffer, td_error=torch.zeros(2000))
     draws = split_draws(buffer)
     first = next(draws)
-    assert first.new_step
     slot = int(first.batch["index"][0])
     learned = (first.batch["index"] == slot).float() * 1e9  # To the power of 0.4: 4,000.
     first.batch["signals", "td_error"] = learned
     buffer.update_tensordict_priority(first.batch)
+    assert (next(draws).batch["index"] == slot).sum() > 60
+    assert (next(draws).batch["index"] != slot).all()
+
+
+def test_the_actors_part_finds_the_small_errors_that_the_critics_part_learned():
+    buffer = make_la3p(2000, 400)
+    set_signals(buffer, td_error=torch.full((2000,), 1e9))
+    draws = split_draws(buffer)
+    next(draws)  # Its priorities stay.
     second = next(draws)
-    assert not second.new_step
-    assert (second.batch["index"] == slot).sum() > 60
-    assert (second.actor_batch["index"] != slot).all()
+    second.batch["signals", "td_error"] = torch.zeros(len(second.batch))
+    buffer.update_tensordict_priority(second.batch)
+    small = torch.isin(next(draws).batch["index"], second.batch["index"])
+    assert small.float().mean() > 0.95
 
 
 def test_a_whole_batch_outside_of_a_training_step_is_by_priority():

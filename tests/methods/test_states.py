@@ -18,9 +18,10 @@ def make_trained(name, *, seed=0, capacity=12):
     replay.buffer.extend(make_transitions(9, seed=seed))
     for _ in range(4):
         for draw in replay.select(replay.buffer):
-            for signal in replay.signals:
-                draw.batch["signals", signal] = torch.rand(len(draw.batch), generator=seeded(seed))
-            if replay.signals:
+            if replay.signals and draw.gives_signals:
+                for name in replay.signals:
+                    values = torch.rand(len(draw.batch), generator=seeded(seed))
+                    draw.batch["signals", name] = values
                 replay.buffer.update_tensordict_priority(draw.batch)
     return replay
 

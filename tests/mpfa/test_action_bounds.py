@@ -182,7 +182,7 @@ def test_the_compiled_update_keeps_to_the_bounds_too():
     torch.manual_seed(4)
     log = losses[0].value_loss(expected)[1]
     torch.manual_seed(4)
-    found = CompiledGradients(losses[1], compile=None)(batch, actor_batch=batch)
+    found = CompiledGradients(losses[1], compile=None)(batch)
     torch.testing.assert_close(found["target_value"], log["target_value"])
     torch.testing.assert_close(batch["signals"].to_dict(), expected["signals"].to_dict())
 

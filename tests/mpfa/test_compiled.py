@@ -26,19 +26,20 @@ def make_loss(name, **options):
     return loss
 
 
-def by_losses(name, loss, batch, actor_batch=None, **kwargs):
+def by_losses(name, loss, batch, trains="both", **kwargs):
     """Gradients and values for the log as TorchRL's interface gives them."""
     of_critic, of_actor = {
         "ddpg": ("loss_value", "loss_actor"),
         "td3": ("value_loss", "actor_loss"),
     }[name]
-    total, log = getattr(loss, of_critic)(batch, **kwargs)
-    log = {"loss_value": total, **log}
-    if actor_batch is not None:
-        log["loss_actor"], more = getattr(loss, of_actor)(actor_batch)
+    log = {}
+    if trains != "actor":
+        log["loss_value"], more = getattr(loss, of_critic)(batch, **kwargs)
         log.update(more)
-        total = total + log["loss_actor"]
-    total.backward()
+    if trains != "critic":
+        log["loss_actor"], more = getattr(loss, of_actor)(batch)
+        log.update(more)
+    sum(value for key, value in log.items() if key.startswith("loss")).backward()
     return {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}, log
 
 
@@ -62,9 +63,9 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
     expected, batch = (make_batch(weighted=weighted) for _ in range(2))
     loss, whole = make_loss(name, **options), make_loss(name, **options)
     torch.manual_seed(5)  # TD3 has noise in its targets.
-    gradients, log = by_losses(name, loss, expected, expected)
+    gradients, log = by_losses(name, loss, expected)
     torch.manual_seed(5)
-    found = CompiledGradients(whole, compile=None)(batch, actor_batch=batch)
+    found = CompiledGradients(whole, compile=None)(batch)
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
@@ -78,33 +79,41 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
 
 
 @pytest.mark.parametrize("name", MAKE)
-def test_the_actor_may_learn_from_another_batch_and_the_critic_by_another_distance(name):
-    expected, batch = (make_batch(count=6) for _ in range(2))
-    other = make_batch(count=4, seed=1)
+def test_the_critic_may_learn_by_another_distance(name):
+    expected, batch = (make_batch() for _ in range(2))
     loss, whole = make_loss(name), make_loss(name)
     torch.manual_seed(5)
-    gradients, _ = by_losses(name, loss, expected, other, loss_function="smooth_l1")
+    gradients, _ = by_losses(name, loss, expected, loss_function="smooth_l1")
     torch.manual_seed(5)
-    CompiledGradients(whole, compile=None)(batch, actor_batch=other, loss_function="smooth_l1")
+    CompiledGradients(whole, compile=None)(batch, loss_function="smooth_l1")
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
         torch.testing.assert_close(again[key], value, rtol=1e-4, atol=1e-6)
 
 
-def test_without_the_actor_only_the_critics_get_gradients():
-    loss, whole = make_loss("td3"), make_loss("td3")
+@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("trains", ["critic", "actor"])
+def test_critic_or_actor_alone_get_the_gradients_of_their_loss(name, trains):
+    options = {"saturation_penalty": 2.0, "saturation_limit": 0.1}
+    loss, whole = make_loss(name, **options), make_loss(name, **options)
     torch.manual_seed(5)
-    gradients, _ = by_losses("td3", loss, make_batch())
+    gradients, log = by_losses(name, loss, make_batch(), trains)
     gradients_of = CompiledGradients(whole, compile=None)
-    # The actor's gradients of an earlier batch must not move it again.
-    gradients_of(make_batch(), actor_batch=make_batch())
+    gradients_of(make_batch())  # Gradients of an earlier batch must not move the other again.
     torch.manual_seed(5)
-    log = gradients_of(make_batch(), actor_batch=None)
-    assert "loss_actor" not in log
+    batch = make_batch()
+    found = gradients_of(batch, trains=trains)
+    assert ("signals" in batch.keys()) == (trains == "critic")  # noqa: SIM118
+    assert {key for key in found if key.startswith("loss")} == {
+        "loss_value" if trains == "critic" else "loss_actor"
+    }
+    for key, value in found.items():
+        torch.testing.assert_close(value.reshape(log[key].shape), log[key].detach())
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
-    assert all(key.startswith("qvalue") for key in again)
+    for key, value in gradients.items():
+        torch.testing.assert_close(again[key], value, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", LEARNERS)

@@ -71,14 +71,22 @@ def test_after_a_refused_batch_the_next_one_gives_what_it_would_have_given():
     assert same(snapshot(learner), snapshot(other))
 
 
-@pytest.mark.parametrize("name", ["ddpg", "td3", "sac"])
-def test_an_actors_batch_of_its_own_is_named_as_well(name):
-    learner = make_learner(name)
+@pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
+@pytest.mark.parametrize("trains", ["critic", "actor"])
+def test_a_batch_for_one_of_them_alone_is_refused_alike(name, options, trains):
+    learner = make_learner(name, **options)
     before = snapshot(learner)
-    draw = Draw(make_batch(), actor_batch=spoiled("observation", float("inf")))
-    with pytest.raises(ValueError, match="actor_batch must be finite, got inf in 'observation'"):
+    draw = Draw(spoiled("observation", float("inf")), trains=trains)
+    with pytest.raises(ValueError, match="batch must be finite, got inf in 'observation'"):
         learner.update(draw)
     assert same(snapshot(learner), before)
+
+
+@pytest.mark.parametrize("trains", ["critics", "", None, ["actor"]])
+def test_a_draw_for_whom_there_is_not_is_refused(trains):
+    words = re.escape(f"trains must be one of ('both', 'critic', 'actor'), got {trains!r}")
+    with pytest.raises(ValueError, match=words):
+        Draw(make_batch(), trains=trains)
 
 
 @pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)

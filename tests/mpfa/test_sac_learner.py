@@ -71,10 +71,13 @@ def test_an_update_moves_everything_but_the_target_critics_follow_by_tau():
         torch.testing.assert_close(values[name], expected.detach())
 
 
-def test_actor_and_temperature_may_learn_from_a_batch_of_their_own():
-    log = make_learner().update(Draw(make_batch(6), actor_batch=make_batch(4), loss_function="pal"))
-    assert log["state_action_value_actor"].shape == (4,)
-    assert log["pred_value"].shape == (2, 6)
+def test_the_temperature_moves_with_the_actor():
+    learner = make_learner()
+    found = [learner.loss.log_alpha.item()]
+    for trains in ("critic", "actor"):
+        learner.update(Draw(make_batch(), trains=trains))
+        found.append(learner.loss.log_alpha.item())
+    assert found[0] == found[1] != found[2]
 
 
 def test_a_restored_learner_goes_on_bit_for_bit():

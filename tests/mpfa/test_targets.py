@@ -111,7 +111,7 @@ def test_a_compiled_update_has_the_targets_of_several_steps_too(name, column):
     loss.importance = "critic"
     expected = targets_of(loss, batch.clone())
     torch.manual_seed(3)
-    log = CompiledGradients(loss, compile=None)(batch, actor_batch=None)
+    log = CompiledGradients(loss, compile=None)(batch, trains="critic")
     torch.testing.assert_close(log["target_value"], expected)
 
 
@@ -182,6 +182,6 @@ def test_a_discount_that_is_set_later_reaches_the_compiled_update():
     gradients, batch = CompiledGradients(loss, compile=None), make_batch()
     for gamma in (0.5, 0.0):
         loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        log = gradients(batch, actor_batch=None)
+        log = gradients(batch, trains="critic")
         torch.testing.assert_close(log["target_value"], loss(batch.clone())["target_value"])
     torch.testing.assert_close(log["target_value"], batch["next", "reward"].squeeze(1))

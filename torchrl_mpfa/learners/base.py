@@ -18,7 +18,7 @@ from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.learners.states import check_state, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import Draw, Trains
 
 OptimizerName = Literal["adam", "radam"]
 
@@ -33,10 +33,10 @@ class Learner(Protocol):
         """Train on a draw, write the signals in its batch, and give values for the log.
 
         Args:
-            draw: The batches of an update; a batch of size ``[B]`` alone is ``Draw(batch)``.
+            draw: What an update is made from; a batch of size ``[B]`` alone is ``Draw(batch)``.
 
         Returns:
-            Detached values for the log.
+            Detached values for the log, of those losses that were computed.
         """
         ...
 
@@ -131,48 +131,49 @@ class ActorCriticLearner:
         """One step of the networks and of the target networks, as far as they are due.
 
         Args:
-            draw: The batches of an update; a batch of size ``[B]`` alone is ``Draw(batch)``. The
-                loss writes the signals in ``draw.batch``. If ``draw.new_step`` is false, it is a
-                further batch of the same training step, which a delay of the actor does not count.
+            draw: What an update is made from; a batch of size ``[B]`` alone is ``Draw(batch)``. The
+                critics' loss writes the signals in the batch; the target networks move with the
+                actor. If ``draw.new_step`` is false, it is a further batch of the same training
+                step, which a delay of the actor does not count.
 
         Returns:
-            Detached values for the log.
+            Detached values for the log; none where the actor alone is to learn, and is not due.
 
         Raises:
-            KeyError: If a batch lacks an entry.
+            KeyError: If the batch lacks an entry.
             ValueError: If a loss is not finite. Nothing of the learner is changed then.
         """
         if not isinstance(draw, Draw):
             draw = Draw(draw)
         updates = self.updates + draw.new_step
+        trains, log = draw.trains, {}
         due = updates % self.policy_delay == 0
-        actor_batch = draw.batch if draw.actor_batch is None else draw.actor_batch
-        log = self._differentiate(draw.batch, actor_batch if due else None, draw.loss_function)
-        refuse_unfinished(log, draw)
-        self.optimizer.step()
-        if due:
-            self.targets.step()
+        if trains == "both" and not due:
+            trains = "critic"
+        if trains == "critic" or due:
+            log = self._differentiate(draw.batch, trains, draw.loss_function)
+            refuse_unfinished(log, draw.batch)
+            self.optimizer.step()
+            if trains != "critic":
+                self.targets.step()
         self.updates = updates
         return {key: value.detach() for key, value in log.items()}
 
     def _differentiate(
-        self,
-        batch: TensorDictBase,
-        actor_batch: TensorDictBase | None,
-        loss_function: str | None,
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
-        """Set the gradients; what has none stays as it is.
+        """Set the gradients; a parameter without one the optimizer leaves as it is, decay and all.
 
         Args:
-            batch: What the critics learn from, batch size ``[B]``.
-            actor_batch: What the actor learns from; None: the actor stays as it is.
+            batch: What is learned from, batch size ``[B]``.
+            trains: Whose losses are computed; the other's parameters get no gradients.
             loss_function: Distance of the critics' loss; None: the loss's own.
 
         Returns:
             Losses and other values for the log.
         """
         self.optimizer.zero_grad(set_to_none=True)
-        losses, log = self.loss.losses(batch, actor_batch, loss_function=loss_function)
+        losses, log = self.loss.losses(batch, trains=trains, loss_function=loss_function)
         # The loss of a temperature that is fixed has no gradient.
         torch.autograd.backward([loss for loss in losses.values() if loss.requires_grad])
         self.loss.write_action_gradient(batch)

@@ -8,7 +8,7 @@ by the same functions (:mod:`torchrl_mpfa.losses.functional`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -29,6 +29,7 @@ from torchrl_mpfa.losses.functional import (
 from torchrl_mpfa.losses.writing import VALUE
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
+from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
 Parameters = dict[str, Tensor]
@@ -61,14 +62,25 @@ class CompilableLearner(ActorCriticLearner):
             self._compiled = CompiledGradients(loss, compile=arguments)
 
     def _differentiate(
-        self,
-        batch: TensorDictBase,
-        actor_batch: TensorDictBase | None,
-        loss_function: str | None,
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
         if self._compiled is None:
-            return super()._differentiate(batch, actor_batch, loss_function)
-        return self._compiled(batch, actor_batch=actor_batch, loss_function=loss_function)
+            return super()._differentiate(batch, trains, loss_function)
+        return self._compiled(batch, trains=trains, loss_function=loss_function)
+
+
+class Transitions(NamedTuple):
+    """What the critics' loss is computed from, rows first."""
+
+    state: State
+    action: Tensor
+    after: State
+    reward: Tensor
+    terminated: Tensor
+    gamma: Tensor
+    steps: Tensor | None
+    weight: Tensor | None
+    noise: Tensor | None
 
 
 class CompiledGradients:
@@ -107,14 +119,15 @@ class CompiledGradients:
         self,
         batch: TensorDictBase,
         *,
-        actor_batch: TensorDictBase | None,
+        trains: Trains = "both",
         loss_function: str | None = None,
     ) -> dict[str, Tensor]:
         """Differentiate.
 
         Args:
-            batch: Transitions, batch size ``[B]``; gets its signals.
-            actor_batch: What the actor learns from; None: its parameters get no gradients.
+            batch: Transitions, batch size ``[B]``; gets its signals, unless ``trains`` is
+                ``"actor"``.
+            trains: Whose losses are differentiated; the other's parameters get no gradients.
             loss_function: Distance of the critics' loss; None: the loss's own.
 
         Returns:
@@ -126,23 +139,11 @@ class CompiledGradients:
         """
         loss, parts, keys = self._loss, self._parts, self._loss.tensor_keys
         _check_estimator(loss)
-        inputs = {*parts.actor.in_keys, *parts.critic.in_keys} - {self._action}
-        after, action = batch["next"], batch[self._action]
-        steps = batch.get(loss.value_estimator.tensor_keys.steps_to_next_obs, None)
-        weight = batch.get(keys.priority_weight, None) if loss.importance == "critic" else None
         of_critic, of_actor, signals, log = self._call(
             self._actor_parameters,
             parts.critic_parameters,
-            {key: batch[key] for key in inputs},
-            action,
-            {key: after[key] for key in inputs},
-            after[keys.reward].reshape(-1),
-            after[keys.terminated].reshape(-1),
-            gamma=loss.value_estimator.gamma,
-            steps=None if steps is None else steps.reshape(-1),
-            weight=None if weight is None else weight.reshape(-1),
-            noise=None if parts.target_noise is None else parts.target_noise(action),
-            actor_state=None if actor_batch is None else {key: actor_batch[key] for key in inputs},
+            transitions=None if trains == "actor" else self._transitions(batch),
+            actor_state=None if trains == "critic" else self._state(batch),
             loss_function=loss_function or loss.loss_function,
         )
         for parameters, gradients in (
@@ -156,36 +157,69 @@ class CompiledGradients:
             (ACTION_GRADIENT.name, keys.action_gradient_signal),
             (VALUE, keys.value_signal),
         ):
-            if name in loss.signals:
+            if name in loss.signals and trains != "actor":
                 batch.set(key, signals[name])
         return dict(log)
+
+    def _state(self, source: TensorDictBase) -> State:
+        """What actor and critics read beside the action."""
+        parts = self._parts
+        inputs = {*parts.actor.in_keys, *parts.critic.in_keys} - {self._action}
+        return {key: source[key] for key in inputs}
+
+    def _transitions(self, batch: TensorDictBase) -> Transitions:
+        loss, keys, noise = self._loss, self._loss.tensor_keys, self._parts.target_noise
+        after, action = batch["next"], batch[self._action]
+        steps = batch.get(loss.value_estimator.tensor_keys.steps_to_next_obs, None)
+        weight = batch.get(keys.priority_weight, None) if loss.importance == "critic" else None
+        return Transitions(
+            state=self._state(batch),
+            action=action,
+            after=self._state(after),
+            reward=after[keys.reward].reshape(-1),
+            terminated=after[keys.terminated].reshape(-1),
+            gamma=loss.value_estimator.gamma,
+            steps=None if steps is None else steps.reshape(-1),
+            weight=None if weight is None else weight.reshape(-1),
+            noise=None if noise is None else noise(action),
+        )
 
     @torch.no_grad()
     def _gradients(
         self,
         actor_parameters: Parameters,
         critic_parameters: Parameters,
-        state: State,
-        action: Tensor,
-        after: State,
-        reward: Tensor,
-        terminated: Tensor,
         *,
-        gamma: Tensor,
-        steps: Tensor | None,
-        weight: Tensor | None,
-        noise: Tensor | None,
+        transitions: Transitions | None,
         actor_state: State | None,
         loss_function: str,
     ) -> tuple[Parameters, Parameters, Parameters, Parameters]:
         """Gradients of critics and actor, signals, and values for the log; a pure function."""
+        of_critic: Parameters = {}
+        of_actor: Parameters = {}
+        signals: Parameters = {}
+        log: Parameters = {}
+        if transitions is not None:
+            of_critic, signals, log = self._critics_part(
+                critic_parameters, transitions, loss_function
+            )
+        if actor_state is not None:
+            of_actor, more = self._actors_part(actor_parameters, critic_parameters, actor_state)
+            log = {**log, **more}
+        return of_critic, of_actor, signals, log
+
+    def _critics_part(
+        self, critic_parameters: Parameters, given: Transitions, loss_function: str
+    ) -> tuple[Parameters, Parameters, Parameters]:
+        """Gradients of the critics (Eq. 11), signals (Eqs. 13-14), and values for the log."""
         parts, module = self._parts, self._parts.critic.module
+        state, action, weight = given.state, given.action, given.weight
         target = bootstrap_target(
-            reward * self._scale,
-            self._next_value(after, noise),
-            terminated,
-            gamma=gamma,
-            steps=steps,
+            given.reward * self._scale,
+            self._next_value(given.after, given.noise),
+            given.terminated,
+            gamma=given.gamma,
+            steps=given.steps,
         )
 
         def of_critics(parameters: Parameters) -> tuple[Tensor, Tensor]:
@@ -208,17 +242,22 @@ class CompiledGradients:
             "pred_value": value,
             "target_value": target,
         }
-        first = _with(module, parts.split(critic_parameters)[0])
         if self._with_slope:
+            first = self._first(critic_parameters)
             slope = grad(lambda a: self._q(first, state, a).sum())(action)
             size = action_gradient_priority(slope, order=self._order)
             signals[ACTION_GRADIENT.name] = size / self._scale
-        if actor_state is None:
-            return of_critic, {}, signals, log
+        return of_critic, signals, log
+
+    def _actors_part(
+        self, actor_parameters: Parameters, critic_parameters: Parameters, state: State
+    ) -> tuple[Parameters, Parameters]:
+        """Gradients of the actor, by the first critic, and values for the log."""
+        actor, first = self._parts.actor.module, self._first(critic_parameters)
 
         def of_policy(parameters: Parameters) -> tuple[Tensor, Parameters]:
-            chosen = self._chosen(_with(parts.actor.module, parameters), actor_state)
-            loss = -self._q(first, actor_state, chosen[self._action]).mean()
+            chosen = self._chosen(_with(actor, parameters), state)
+            loss = -self._q(first, state, chosen[self._action]).mean()
             before = chosen.get(self._preactivation)
             if before is None:
                 return loss, {}
@@ -226,10 +265,13 @@ class CompiledGradients:
                 loss = loss + self._penalty * saturation(before, limit=self._limit)
             return loss, {"preactivation": before.abs()}
 
-        of_actor, (log["loss_actor"], more) = grad_and_value(of_policy, has_aux=True)(
-            actor_parameters
-        )
-        return of_critic, of_actor, signals, {**log, **more}
+        of_actor, (loss, more) = grad_and_value(of_policy, has_aux=True)(actor_parameters)
+        return of_actor, {"loss_actor": loss, **more}
+
+    def _first(self, critic_parameters: Parameters) -> Callable[..., Any]:
+        """The first critic, whose slope counts."""
+        parts = self._parts
+        return _with(parts.critic.module, parts.split(critic_parameters)[0])
 
     def _next_value(self, after: State, noise: Tensor | None) -> Tensor:
         """Value of the next states in the targets, of the least critic, shape ``[B]``."""

@@ -10,10 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mpfa.selection import Draw
 
-
-def refuse_unfinished(losses: Mapping[str, Tensor], draw: Draw) -> None:
+def refuse_unfinished(losses: Mapping[str, Tensor], batch: TensorDictBase) -> None:
     """Refuse an update of which a loss is not finite.
 
     One NaN in an observation would make all weights NaN. Losses are looked at and not the batch,
@@ -21,7 +19,7 @@ def refuse_unfinished(losses: Mapping[str, Tensor], draw: Draw) -> None:
 
     Args:
         losses: Values for the log, of which those whose name begins with ``"loss"`` are asked.
-        draw: What they were computed of.
+        batch: What they were computed of.
 
     Raises:
         ValueError: If one is not finite, with the entry and the row that are the cause.
@@ -34,11 +32,9 @@ def refuse_unfinished(losses: Mapping[str, Tensor], draw: Draw) -> None:
     if not wrong:
         return
     name, value = next(iter(wrong.items()))
-    batches = {"batch": draw.batch, "actor_batch": draw.actor_batch}
-    for which, batch in batches.items():
-        cause = None if batch is None else _first_not_finite(batch)
-        if cause is not None:
-            raise ValueError(f"{which} must be finite, got {cause}")
+    cause = _first_not_finite(batch)
+    if cause is not None:
+        raise ValueError(f"batch must be finite, got {cause}")
     raise ValueError(f"{name} must be finite, got {value.sum().item()} of a finite batch")
 
 

@@ -19,6 +19,7 @@ from torchrl_mpfa.losses.refusals import check_networks
 from torchrl_mpfa.losses.targets import EstimatedTargets
 from torchrl_mpfa.losses.writing import DEFAULT_SIGNALS, WRITTEN, SignalWriting
 from torchrl_mpfa.networks import DirectModule
+from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import ACTION_GRADIENT
 
 Importance = Literal["critic", "torchrl", "none"]
@@ -170,25 +171,30 @@ class SignalLoss(SignalWriting, EstimatedTargets):
     def losses(
         self,
         batch: TensorDictBase,
-        actor_batch: TensorDictBase | None = None,
         *,
+        trains: Trains = "both",
         loss_function: str | None = None,
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """All losses of an update, with the signal of Eq. (14) deferred.
+        """The losses of an update, with the signal of Eq. (14) deferred.
 
         Args:
-            batch: What the critics learn from, batch size ``[B]``; gets its signals.
-            actor_batch: What the actor learns from; None: its loss is left out.
+            batch: What is learned from, batch size ``[B]``; the critics' loss writes its signals.
+            trains: Whose losses are wanted: the ``"critic"``'s, the ``"actor"``'s, or ``"both"``.
             loss_function: Distance of the critics' loss; None: the loss's own.
 
         Returns:
             Losses by name, to be summed and differentiated before :meth:`write_action_gradient`;
             and values for the log.
         """
-        loss, log = self._critics_part(batch, defer_gradient=True, loss_function=loss_function)
-        losses, values = {"loss_value": loss}, dict(log)
-        if actor_batch is not None:
-            of_actor, more = self._actors_part(actor_batch)
+        losses: dict[str, Tensor] = {}
+        values: dict[str, Tensor] = {}
+        self._deferred = None  # Of an update that failed halfway.
+        if trains != "actor":
+            loss, log = self._critics_part(batch, defer_gradient=True, loss_function=loss_function)
+            losses["loss_value"] = loss
+            values.update(log)
+        if trains != "critic":
+            of_actor, more = self._actors_part(batch)
             losses.update(of_actor)
             values.update(more)
         return losses, values

@@ -129,17 +129,17 @@ class LA3PSampler(SignalSampler):
 
 
 def split_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
-    """The two updates of an LA3P step, in the order of the authors' code.
+    """The three updates of an LA3P step, in the order of the authors' code.
 
-    Critic and actor learn from a uniform part of the batch, with the loss PAL. Its priorities are
-    to be updated before the second draw is asked for: there the critic learns from a part by
-    priority, with the Huber loss, and the actor from one by the inverse.
+    Critic and actor learn from a uniform part of the batch, with the loss PAL; then the critic from
+    a part by priority, with the Huber loss; then the actor from one by the inverse. Each is sampled
+    when it is asked for, by priorities that the draw before it is to have updated.
 
     Args:
         buffer: The buffer, with an :class:`LA3PSampler` and a batch size.
 
     Yields:
-        Two draws.
+        Three draws.
 
     Raises:
         TypeError: If the buffer has another sampler.
@@ -155,6 +155,7 @@ def split_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
     yield Draw(batch, loss_function="pal")
     with sampler.part("prioritized"):
         batch = buffer.sample()
+    yield Draw(batch, trains="critic", loss_function="smooth_l1", new_step=False)
     with sampler.part("inverse"):
-        actor_batch = buffer.sample()
-    yield Draw(batch, actor_batch=actor_batch, loss_function="smooth_l1", new_step=False)
+        batch = buffer.sample()
+    yield Draw(batch, trains="actor", new_step=False)

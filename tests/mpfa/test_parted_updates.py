@@ -1,0 +1,228 @@
+"""Updates of the critics or of the actor alone: what moves, what does not, and what is written."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+
+from tests.mpfa import sac_networks
+from tests.mpfa.losses import BOUNDS, make_batch, make_networks
+from tests.mpfa.transitions import same
+from torchrl_mpfa import (
+    DDPGLearner,
+    Draw,
+    SACLearner,
+    TD3Learner,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_td3_loss,
+)
+from torchrl_mpfa.learners.compiled import CompiledGradients
+
+# What torch.compile is given to make one program of; to trace it takes seconds.
+PURE = {"pure": True}
+RADAM = {"optimizer": "radam"}
+LEARNERS = [("ddpg", {}), ("td3", {}), ("sac", {}), ("ddpg", PURE), ("td3", PURE)]
+LEARNERS += [("ddpg", RADAM), ("sac", RADAM)]
+IDS = ["ddpg", "td3", "sac", "ddpg pure", "td3 pure", "ddpg radam", "sac radam"]
+
+
+def make_learner(name, seed=0, *, pure=False, **options):
+    learner = make_eager(name, seed, **options)
+    if pure:
+        learner._compiled = CompiledGradients(learner.loss, compile=None)
+    return learner
+
+
+def make_eager(name, seed, **options):
+    options = {"actor_lr": 1e-3, "critic_lr": 1e-3, "critic_weight_decay": 0.1, **options}
+    if name == "sac":
+        return SACLearner(make_sac_loss(*sac_networks.make_networks(seed)), **options)
+    if name == "td3":
+        return TD3Learner(make_td3_loss(*make_networks(seed), bounds=BOUNDS), **options)
+    return DDPGLearner(make_ddpg_loss(*make_networks(seed)), **options)
+
+
+def parts(learner):
+    """Copies of all that an update can move: weights and optimizer states by owner, targets."""
+    found = {
+        "targets": {
+            n: v.clone() for n, v in learner.loss.named_buffers() if n.startswith("target_")
+        }
+    }
+    owners = {
+        "actor": learner.loss.actor_parameters(),
+        "critic": learner.loss.critic_parameters(),
+    }
+    if "log_alpha" in dict(learner.loss.named_parameters()):
+        owners["actor"] = [*owners["actor"], learner.loss.log_alpha]
+    for owner, parameters in owners.items():
+        state = [deepcopy(dict(learner.optimizer.state.get(p, {}))) for p in parameters]
+        found[owner] = {
+            "weights": {str(i): p.detach().clone() for i, p in enumerate(parameters)},
+            "state": {f"{i}/{k}": v for i, s in enumerate(state) for k, v in s.items()},
+        }
+    return found
+
+
+def after_some_updates(name, **options):
+    """A learner of whose every parameter the optimizer has a state, an actor's step being due."""
+    learner = make_learner(name, **options)
+    for seed in range(4):
+        learner.update(make_batch(seed=seed))
+    return learner
+
+
+@pytest.mark.parametrize("fresh", [True, False], ids=["first", "later"])
+@pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)
+def test_an_update_of_the_critics_alone_leaves_actor_and_targets_to_the_bit(name, options, fresh):
+    learner = make_learner(name, **options) if fresh else after_some_updates(name, **options)
+    before, batch = parts(learner), make_batch(seed=7)
+    log = learner.update(Draw(batch, trains="critic", new_step=False))
+    after = parts(learner)
+    assert same(after["actor"], before["actor"])
+    assert same(after["targets"], before["targets"])
+    for key, value in after["critic"]["weights"].items():
+        assert not value.equal(before["critic"]["weights"][key])
+    assert {key for key in log if key.startswith("loss")} == {"loss_value"}
+    assert set(batch["signals"].keys()) == {"td_error", "action_gradient"}
+
+
+@pytest.mark.parametrize("fresh", [True, False], ids=["first", "later"])
+@pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)
+def test_an_update_of_the_actor_alone_leaves_the_critics_to_the_bit(name, options, fresh):
+    learner = make_learner(name, **options) if fresh else after_some_updates(name, **options)
+    before, batch = parts(learner), make_batch(seed=7)
+    entries = set(batch.keys(True, True))
+    log = learner.update(Draw(batch, trains="actor", new_step=False))
+    after = parts(learner)
+    # The decay of their weights must not move them, nor the averages of Adam.
+    assert same(after["critic"], before["critic"])
+    assert not same(after["actor"]["weights"], before["actor"]["weights"])
+    # At first the targets are the critics, and SAC has no others.
+    assert same(after["targets"], before["targets"]) == (fresh and name == "sac")
+    assert "loss_value" not in log
+    assert "loss_actor" in log
+    assert set(batch.keys(True, True)) == entries
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("ddpg", {}), ("td3", {}), ("ddpg", PURE), ("td3", PURE)], ids=str
+)
+def test_the_actor_moves_as_in_an_update_of_both(name, options):
+    """All gradients of an update are taken at the same networks, so that its halves are alike."""
+    both, alone = (after_some_updates(name, **options) for _ in range(2))
+    for learner, trains in ((both, "both"), (alone, "actor")):
+        learner.update(Draw(make_batch(seed=7), trains=trains, new_step=False))
+    found, expected = (parts(learner)["actor"]["weights"] for learner in (alone, both))
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value, rtol=1e-5, atol=1e-7)
+
+
+def test_a_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
+    learner, other = (after_some_updates("sac") for _ in range(2))
+    torch.manual_seed(3)
+    learner.update(Draw(make_batch(seed=7), trains="actor"))
+    torch.manual_seed(3)
+    loss = other.loss.actor_loss(make_batch(seed=7))[0]
+    expected = torch.autograd.grad(loss, other.loss.actor_parameters())
+    for parameter, gradient in zip(learner.loss.actor_parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient)
+
+
+@pytest.mark.parametrize("options", [{}, PURE], ids=["plain", "pure"])
+def test_a_delayed_actor_waits_for_its_training_step_whichever_draw_it_is_in(options):
+    learner = make_learner("td3", policy_delay=2, **options)
+    step = (("both", True), ("critic", False), ("actor", False))
+    found = []
+    for number in range(4):
+        for trains, new in step:
+            before = parts(learner)
+            log = learner.update(Draw(make_batch(seed=number), trains=trains, new_step=new))
+            after = parts(learner)
+            moved = [not same(after[p], before[p]) for p in ("critic", "actor", "targets")]
+            found.append((*moved, "loss_value" in log, "loss_actor" in log))
+        assert learner.updates == number + 1
+    critic_alone, nothing = (True, False, False, True, False), (False,) * 5
+    both, actor_alone = (True,) * 5, (False, True, True, False, True)
+    waiting = [critic_alone, critic_alone, nothing]
+    assert found == [*waiting, both, critic_alone, actor_alone] * 2
+
+
+def test_an_actors_draw_that_begins_a_step_is_counted_even_if_nothing_is_due():
+    learner = make_learner("td3", policy_delay=2)
+    assert learner.update(Draw(make_batch(), trains="actor")) == {}
+    assert "loss_actor" in learner.update(Draw(make_batch(), trains="actor"))
+    assert learner.updates == 2
+
+
+def train(learner, steps, begin=0):
+    """Updates in the order of LA3P."""
+    logs = []
+    for number in range(begin, begin + steps):
+        torch.manual_seed(number)
+        for place, (trains, distance) in enumerate(
+            (("both", "pal"), ("critic", "smooth_l1"), ("actor", None))
+        ):
+            batch = make_batch(seed=3 * number + place)
+            logs.append(learner.update(Draw(batch, trains, distance, new_step=place == 0)))
+    return logs
+
+
+# Python stands in for the C++ compiler: what is traced is the same.
+TRACED = {"compile": {"backend": "eager"}}
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("ddpg", PURE), ("td3", PURE), ("td3", TRACED)], ids=str
+)
+def test_as_one_function_a_learner_takes_the_same_steps(name, options):
+    plain, traced = make_learner(name), make_learner(name, **options)
+    for one, other in zip(train(plain, 6), train(traced, 6), strict=True):
+        losses = {key: value for key, value in one.items() if key.startswith("loss")}
+        assert losses.keys() == {key for key in other if key.startswith("loss")}
+        for key, value in losses.items():
+            torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-5)
+    expected = plain.loss.state_dict()
+    for key, value in traced.loss.state_dict().items():
+        torch.testing.assert_close(value, expected[key], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_a_compiled_learner_takes_the_same_steps(name):
+    plain, compiled = make_learner(name), make_learner(name, compile=True)
+    train(plain, 4)
+    train(compiled, 4)
+    expected = plain.loss.state_dict()
+    for key, value in compiled.loss.state_dict().items():
+        torch.testing.assert_close(value, expected[key], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)
+def test_a_learner_goes_on_where_it_was_saved_in_the_middle_of_a_step(name, options):
+    first, second = make_learner(name, **options), make_learner(name, seed=1, **options)
+    train(first, 3)
+    train(second, 1)
+    for trains in ("both", "critic"):
+        first.update(Draw(make_batch(seed=30), trains, new_step=trains == "both"))
+    second.load_state_dict(deepcopy(first.state_dict()))
+    for learner in (first, second):
+        torch.manual_seed(5)
+        learner.update(Draw(make_batch(seed=31), "actor", new_step=False))
+        train(learner, 2, begin=9)
+    assert same(first.state_dict(), second.state_dict())
+
+
+def test_an_update_that_failed_halfway_leaves_no_signals_to_the_next_one(monkeypatch):
+    learner = make_learner("ddpg")
+
+    def fail(losses):
+        raise RuntimeError("out of memory")
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="out of memory"):
+        patch.setattr(torch.autograd, "backward", fail)
+        learner.update(make_batch())
+    batch = make_batch()
+    learner.update(Draw(batch, trains="actor"))
+    assert "signals" not in batch.keys()  # noqa: SIM118
