@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -229,6 +230,26 @@ def test_rates_fall_linearly_in_long_runs_and_with_the_cube_in_short_ones(tmp_pa
 
     assert rate_at_half(100) == pytest.approx(1e-4 / 8)
     assert rate_at_half(1000) == pytest.approx(1e-4 / 2)
+
+
+@pytest.mark.parametrize("method", ["la3p", "mpfa_per"])
+def test_the_log_has_what_critic_and_actor_gave_whoever_learned_last(
+    tmp_path: Path, method: str
+) -> None:
+    settings = tiny(method)
+    settings.tracking.log_every = 1
+    run = TrainingRun(settings, tmp_path)
+    logged = []
+
+    def log(step: int, values: Any, buffer: Any, batch: Any) -> None:
+        logged.append({"loss_value", "loss_actor", "td_error"} <= set(values))
+        assert "td_error" in batch["signals"].keys()  # noqa: SIM118
+
+    run.tracker.log_update = log  # type: ignore[method-assign]
+    run.train()
+    run.close()
+    assert logged
+    assert all(logged)
 
 
 def test_klper_is_told_the_noise_of_the_episode_that_acts(tmp_path: Path) -> None:
