@@ -26,11 +26,20 @@ from mpfa_envs.random_worlds import random_world
 from mpfa_envs.render import render_trajectories
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
+from mpfa_envs.shapes import Box, Cylinder, Polygon
 from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
 from mpfa_envs.world_file import WorldFileError, load_world, save_world
-from mpfa_envs.worlds import Box, Cylinder, World
+from mpfa_envs.worlds import World, WorldArrays
 
 if TYPE_CHECKING:
+    from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
+    from mpfa_envs.generators import (
+        GENERATORS,
+        generate_world,
+        generator_tasks,
+        split_worlds,
+        world_seed,
+    )
     from mpfa_envs.mirror import Mirror, RandomMirror
     from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
 
@@ -42,6 +51,7 @@ EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 __all__ = [
     "ENV_IDS",
     "EXAMPLE_WORLD",
+    "GENERATORS",
     "INFO_TYPES",
     "OBSERVATION",
     "PAPER_TASK",
@@ -49,7 +59,9 @@ __all__ = [
     "WORLDS",
     "Box",
     "Cylinder",
+    "DistanceField",
     "EpisodeResult",
+    "FreeGrid",
     "Interval",
     "Lidar",
     "Mirror",
@@ -58,15 +70,19 @@ __all__ = [
     "PathPlanner",
     "Policy",
     "PolicyFileError",
+    "Polygon",
     "RandomMirror",
     "RewardTerms",
     "RobotModel",
     "StepOutcome",
     "Task",
     "World",
+    "WorldArrays",
     "WorldFileError",
     "evaluate",
     "evaluation_pairs",
+    "generate_world",
+    "generator_tasks",
     "load_policy",
     "load_world",
     "make_navigation_env",
@@ -76,10 +92,13 @@ __all__ = [
     "render_trajectories",
     "run_episodes",
     "sample_task",
+    "sample_task_on_grid",
     "save_policy",
     "save_world",
     "spl",
+    "split_worlds",
     "summarize",
+    "world_seed",
 ]
 
 for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
@@ -90,16 +109,25 @@ for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
         )
 
 
-_TORCH_PARTS = {
+_LATER = {
+    "GENERATORS": "generators",
+    "DistanceField": "distance",
+    "FreeGrid": "distance",
     "Mirror": "mirror",
     "NavigationTorchEnv": "torchrl_env",
     "RandomMirror": "mirror",
+    "generate_world": "generators",
+    "generator_tasks": "generators",
     "make_navigation_env": "torchrl_env",
+    "sample_task_on_grid": "distance",
+    "split_worlds": "generators",
+    "world_seed": "generators",
 }
+"""Names whose modules need torch, or Numba, which takes half a second to import."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import the TorchRL parts when they are first asked for: the rest needs no torch."""
-    if name in _TORCH_PARTS:
-        return getattr(import_module(f"mpfa_envs.{_TORCH_PARTS[name]}"), name)
+    """Import the parts that take long when they are first asked for."""
+    if name in _LATER:
+        return getattr(import_module(f"mpfa_envs.{_LATER[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -92,8 +92,8 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
     """Find a world by name or read it from a file; a :class:`World` is returned as it is.
 
     Args:
-        world: A name in :data:`WORLDS`, ``"random-7"`` for :func:`random_world` of 7, the path of a
-            YAML file, or a world of your own.
+        world: A name in :data:`WORLDS`, ``"bars-7"``, ``"bars-test-7"`` and the like for
+            :func:`~mpfa_envs.generate_world`, the path of a YAML file, or a world of your own.
 
     Returns:
         The world.
@@ -108,6 +108,12 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         return WORLDS[world]
     if isinstance(world, str) and (room := re.fullmatch(r"random-([0-9]{1,9})", world)):
         return random_world(int(room[1]))
+    if isinstance(world, str) and re.fullmatch(r"[a-z]+-[a-z0-9@.-]*[0-9]", world):
+        # Imported here because the generators need Numba, which takes half a second.
+        from mpfa_envs.generators import world_of_name
+
+        if (generated := world_of_name(world)) is not None:
+            return generated
     if isinstance(world, (str, os.PathLike)) and Path(world).suffix.lower() in (".yaml", ".yml"):
         # Imported here because most programs never read a world from a file.
         from mpfa_envs.world_file import load_world
@@ -115,6 +121,6 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         return load_world(world)
     hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
     raise ValueError(
-        f"world must be a World, the path of a .yaml file, 'random-SEED' or one of "
-        f"{list(WORLDS)}, got {world!r}{hint}"
+        f"world must be a World, the path of a .yaml file, 'random-SEED', a generator's "
+        f"'NAME-SEED' or one of {list(WORLDS)}, got {world!r}{hint}"
     )

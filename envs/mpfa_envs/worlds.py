@@ -1,83 +1,42 @@
-"""A world: a rectangular room with boxes and cylinders on its floor."""
+"""A world: a rectangular room with boxes, cylinders and polygons on its floor."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+
+from mpfa_envs.shapes import Box, Cylinder, Polygon, Shape
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+__all__ = ["LARGEST_SIDE", "MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
+
 LARGEST_SIDE: Final = 1000.0
 """No room is wider or deeper than this [m]."""
-MOST_OBSTACLES: Final = 200
-"""No room has more obstacles: first paths among 200 take seconds, among 2,000 they take hours."""
+MOST_OBSTACLES: Final = 1000
+"""No room has more obstacles."""
 _CHUNK: Final = 2_000_000
 """Distances between points and obstacles that are computed at once."""
 
 
-@dataclass(frozen=True)
-class Box:
-    """An upright box or a rectangular region, sides parallel to the walls.
+class WorldArrays(NamedTuple):
+    """The numbers of a world in contiguous arrays of float64, for kernels."""
 
-    Args:
-        x_min: Left edge [m].
-        y_min: Lower edge [m].
-        x_max: Right edge [m].
-        y_max: Upper edge [m].
-
-    Raises:
-        ValueError: If an edge is not finite or the box has no area.
-    """
-
-    x_min: float
-    y_min: float
-    x_max: float
-    y_max: float
-
-    def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x_min, self.y_min, self.x_max, self.y_max))):
-            raise ValueError(f"box must have finite edges, got {self}")
-        if self.x_min >= self.x_max or self.y_min >= self.y_max:
-            raise ValueError(f"box must have x_min < x_max and y_min < y_max, got {self}")
-
-    @property
-    def area(self) -> float:
-        """Area of the footprint [m²]."""
-        return (self.x_max - self.x_min) * (self.y_max - self.y_min)
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """An upright cylinder.
-
-    Args:
-        x: Center [m].
-        y: Center [m].
-        radius: Radius [m].
-
-    Raises:
-        ValueError: If a number is not finite or the radius is not positive.
-    """
-
-    x: float
-    y: float
-    radius: float
-
-    def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x, self.y, self.radius))):
-            raise ValueError(f"cylinder must have finite numbers, got {self}")
-        if self.radius <= 0:
-            raise ValueError(f"cylinder must have a positive radius, got {self}")
-
-    @property
-    def area(self) -> float:
-        """Area of the footprint [m²]."""
-        return math.pi * self.radius**2
+    half_size: NDArray[np.float64]
+    """Half of the room's width and depth [m], shape ``[2]``."""
+    boxes: NDArray[np.float64]
+    """(x_min, y_min, x_max, y_max) [m], shape ``[boxes, 4]``."""
+    circles: NDArray[np.float64]
+    """(x, y, radius) [m], shape ``[cylinders, 3]``."""
+    segments: NDArray[np.float64]
+    """Edges of the polygons (x0, y0, x1, y1) [m], counter-clockwise, shape ``[edges, 4]``."""
+    polygon_ends: NDArray[np.int64]
+    """Where each polygon's edges end in ``segments``, shape ``[polygons]``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +46,10 @@ class World:
     Args:
         name: What messages and pictures call it.
         size: Inner width and depth (x, y) [m], at most 1,000 each; the walls stand around it.
-        boxes: Obstacles with straight sides.
-        cylinders: Round obstacles; with the boxes at most 200.
+        boxes: Obstacles with sides parallel to the walls.
+        cylinders: Round obstacles.
+        polygons: Obstacles with straight sides in any direction. All obstacles may overlap; there
+            are at most 1,000.
         start_regions: Where an episode may start; empty: anywhere in the room.
         goal_regions: Where a goal may lie; empty: anywhere in the room.
 
@@ -107,6 +68,7 @@ class World:
     size: tuple[float, float] = (10.0, 10.0)
     boxes: tuple[Box, ...] = ()
     cylinders: tuple[Cylinder, ...] = ()
+    polygons: tuple[Polygon, ...] = ()
     start_regions: tuple[Box, ...] = ()
     goal_regions: tuple[Box, ...] = ()
 
@@ -115,18 +77,15 @@ class World:
             raise ValueError(f"size must be two positive lengths, got {self.size}")
         if max(self.size) > LARGEST_SIDE:
             raise ValueError(f"size must be at most {LARGEST_SIDE:g} m, got {self.size}")
-        obstacles = len(self.boxes) + len(self.cylinders)
-        if obstacles > MOST_OBSTACLES:
+        if self.obstacle_count > MOST_OBSTACLES:
             raise ValueError(
-                f"boxes and cylinders must be at most {MOST_OBSTACLES} in all, got {obstacles}"
+                f"boxes, cylinders and polygons must be at most {MOST_OBSTACLES} in all, got "
+                f"{self.obstacle_count}"
             )
-        for field in ("boxes", "start_regions", "goal_regions"):
-            for box in getattr(self, field):
-                if not self.holds(box):
-                    raise ValueError(f"{field} must lie in the room {self.room}, got {box}")
-        for cylinder in self.cylinders:
-            if not self.holds(cylinder):
-                raise ValueError(f"cylinders must lie in the room {self.room}, got {cylinder}")
+        for field in ("boxes", "cylinders", "polygons", "start_regions", "goal_regions"):
+            for shape in getattr(self, field):
+                if not self.holds(shape):
+                    raise ValueError(f"{field} must lie in the room {self.room}, got {shape}")
 
     @cached_property
     def room(self) -> Box:
@@ -140,27 +99,43 @@ class World:
         return math.hypot(*self.size)
 
     @property
+    def obstacles(self) -> tuple[Shape, ...]:
+        """Boxes, cylinders and polygons, in this order."""
+        return (*self.boxes, *self.cylinders, *self.polygons)
+
+    @property
+    def obstacle_count(self) -> int:
+        """How many obstacles there are."""
+        return len(self.boxes) + len(self.cylinders) + len(self.polygons)
+
+    @property
     def covered_area(self) -> float:
         """Area under obstacles, overlaps counted twice [m²]."""
-        boxes = sum(box.area for box in self.boxes)
-        return boxes + sum(cylinder.area for cylinder in self.cylinders)
+        return sum(obstacle.area for obstacle in self.obstacles)
 
-    def holds(self, shape: Box | Cylinder) -> bool:
+    def holds(self, shape: Shape) -> bool:
         """Tell whether a shape lies in the room; it may touch the walls."""
         room = self.room
-        if isinstance(shape, Cylinder):
-            x, y, r = shape.x, shape.y, shape.radius
-            return (
-                room.x_min <= x - r
-                and x + r <= room.x_max
-                and room.y_min <= y - r
-                and y + r <= room.y_max
-            )
+        x_min, y_min, x_max, y_max = shape.bounds
         return (
-            room.x_min <= shape.x_min
-            and shape.x_max <= room.x_max
-            and room.y_min <= shape.y_min
-            and shape.y_max <= room.y_max
+            room.x_min <= x_min
+            and x_max <= room.x_max
+            and room.y_min <= y_min
+            and y_max <= room.y_max
+        )
+
+    @cached_property
+    def arrays(self) -> WorldArrays:
+        """All numbers of the world in arrays, for kernels."""
+        circles = [(cylinder.x, cylinder.y, cylinder.radius) for cylinder in self.cylinders]
+        edges = [edge for polygon in self.polygons for edge in polygon.edges]
+        counts = [len(polygon.vertices) for polygon in self.polygons]
+        return WorldArrays(
+            np.array(self.size, dtype=np.float64) / 2,
+            np.array(self._edges, dtype=np.float64).reshape(-1, 4),
+            np.array(circles, dtype=np.float64).reshape(-1, 3),
+            np.array(edges, dtype=np.float64).reshape(-1, 4),
+            np.cumsum(counts, dtype=np.int64),
         )
 
     @cached_property
@@ -169,12 +144,9 @@ class World:
         return tuple((box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes)
 
     @cached_property
-    def _cylinder_arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _circles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centers ``[2, cylinders]`` and radii ``[cylinders]`` [m]."""
-        rows = np.array(
-            [(cylinder.x, cylinder.y, cylinder.radius) for cylinder in self.cylinders],
-            dtype=np.float64,
-        ).reshape(-1, 3)
+        rows = self.arrays.circles
         return np.ascontiguousarray(rows[:, :2].T), np.ascontiguousarray(rows[:, 2])
 
     def clearance(self, x: float, y: float) -> float:
@@ -185,7 +157,7 @@ class World:
             y: Position [m].
 
         Returns:
-            Distance [m]; zero in a box, negative in a cylinder and behind a wall.
+            Distance [m]; zero in a box, negative in a cylinder, in a polygon and behind a wall.
         """
         half_width, half_depth = self.size[0] / 2, self.size[1] / 2
         nearest = min(half_width - abs(x), half_depth - abs(y))
@@ -199,8 +171,10 @@ class World:
                 square = gap
         nearest = min(nearest, math.sqrt(square))
         if self.cylinders:
-            centers, radii = self._cylinder_arrays
+            centers, radii = self._circles
             nearest = min(nearest, float((np.hypot(*(centers - ((x,), (y,)))) - radii).min()))
+        if self.polygons:
+            nearest = min(nearest, float(self._to_polygons(np.array([[x, y]]))[0]))
         return nearest
 
     def clearances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -214,9 +188,9 @@ class World:
         """
         x, y = points[:, 0], points[:, 1]
         nearest = np.minimum(self.size[0] / 2 - np.abs(x), self.size[1] / 2 - np.abs(y))
-        edges = np.array(self._edges).reshape(-1, 4).T
-        (center_x, center_y), radii = self._cylinder_arrays
-        rows = max(1, _CHUNK // max(1, len(self._edges) + len(radii)))
+        edges = self.arrays.boxes.T
+        (center_x, center_y), radii = self._circles
+        rows = max(1, _CHUNK // max(1, len(self.boxes) + len(radii) + len(self.arrays.segments)))
         for first in range(0, len(points), rows):
             part = slice(first, first + rows)
             px, py = x[part, None], y[part, None]
@@ -229,4 +203,43 @@ class World:
             for gaps in (to_boxes, to_circles):
                 if gaps.size:
                     nearest[part] = np.minimum(nearest[part], gaps.min(axis=1))
+            if self.polygons:
+                nearest[part] = np.minimum(nearest[part], self._to_polygons(points[part]))
         return nearest
+
+    def inside_polygons(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell in which polygons points lie.
+
+        A point is inside if the line from it to the right crosses the outline an odd number of
+        times.
+
+        Args:
+            points: Positions, shape ``[N, 2]`` [m].
+
+        Returns:
+            Shape ``[N, polygons]``.
+        """
+        x, y = points[:, :1], points[:, 1:]
+        x0, y0, x1, y1 = self.arrays.segments.T
+        spans = (y0 <= y) != (y1 <= y)
+        # Left of an upward edge or right of a downward one.
+        side = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
+        crossings = spans & ((side > 0.0) == (y1 > y0))
+        return np.logical_xor.reduceat(crossings, self._polygon_starts, axis=1)
+
+    @cached_property
+    def _polygon_starts(self) -> NDArray[np.int64]:
+        """Where each polygon's edges begin in ``arrays.segments``."""
+        return np.concatenate(([0], self.arrays.polygon_ends[:-1]))
+
+    def _to_polygons(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance from points ``[N, 2]`` to the nearest polygon [m], negative in one, ``[N]``."""
+        x, y = points[:, :1], points[:, 1:]
+        x0, y0, x1, y1 = self.arrays.segments.T
+        along_x, along_y = x1 - x0, y1 - y0
+        share = (x - x0) * along_x + (y - y0) * along_y
+        share = np.clip(share / (along_x * along_x + along_y * along_y), 0.0, 1.0)
+        gaps = np.hypot(x0 + share * along_x - x, y0 + share * along_y - y)
+        to_outlines = np.minimum.reduceat(gaps, self._polygon_starts, axis=1)
+        signed = np.where(self.inside_polygons(points), -to_outlines, to_outlines)
+        return np.asarray(signed.min(axis=1))

@@ -102,7 +102,7 @@ def test_a_random_room_is_asked_for_by_its_name() -> None:
 
 @pytest.mark.parametrize("name", ["random", "random-", "random--1", "random-1.5", "random-a"])
 def test_a_name_that_is_no_random_room_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=r"world must be .*'random-SEED'.* got 'random"):
+    with pytest.raises(ValueError, match=r"world must be .*'NAME-SEED'.* got 'random"):
         evaluation_pairs(name, 1, seed=0)
 
 

@@ -83,9 +83,9 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
         ),
         ("size: [1e308, 1e308]\n", 1, r"size must be at most 1000 m, got \(1e\+308, 1e\+308\)"),
         (
-            "size: [500, 500]\nboxes:\n" + "  - {x_min: 0, x_max: 1, y_min: 0, y_max: 1}\n" * 201,
+            "size: [500, 500]\nboxes:\n" + "  - {x_min: 0, x_max: 1, y_min: 0, y_max: 1}\n" * 1001,
             1,
-            "boxes and cylinders must be at most 200 in all, got 201",
+            "boxes, cylinders and polygons must be at most 1000 in all, got 1001",
         ),
         ("size: [4, 4\nboxes: 1\n", 2, "is not YAML"),
         ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),

@@ -1,0 +1,370 @@
+"""The shortest way from everywhere in a world to a goal, on a grid.
+
+Where :mod:`~mpfa_envs.path` answers one question exactly, a field answers it for all cells at once,
+and in milliseconds however many obstacles there are: the moves between free cells and their 16
+neighbors make a graph, and SciPy's Dijkstra starts from the goal. Moves have 16 directions, hence
+a way in the open is at most 2.8 % too long. A cell around each corner comes on top of it:
+``docs/worlds.md`` has what was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from mpfa_envs.checks import check_number, check_positive, check_share
+from mpfa_envs.kernels.grid import (
+    MOVES,
+    clearance_grid,
+    fill_from_nearest,
+    interpolate,
+    neighbor_lists,
+    number_cells,
+    shortest_way,
+)
+from mpfa_envs.tasks import START_SLACK, Task
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import Box, World
+
+__all__ = ["DistanceField", "FreeGrid", "sample_task_on_grid", "shortest_way"]
+
+RESOLUTION: Final = 0.1
+"""Side of a cell unless another is asked for [m]."""
+_MOST_CELLS: Final = 4_000_000
+_ROOMY: Final = 0.1
+"""Share of the free cells with the usual clearance that a world must have to be asked for it."""
+_GOALS: Final = 30
+"""Goals that are tried before a world is said to have no task."""
+
+
+class FreeGrid:
+    """Square cells over a room, and which of them a disc's center may be in.
+
+    Args:
+        world: The room and its obstacles.
+        distance: What a free cell's center keeps from every obstacle and wall [m].
+        resolution: Side of a cell [m].
+
+    Raises:
+        ValueError: If a number is not positive, cells are so large that a move could step over
+            a thin wall, or there would be more than four million cells.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
+        >>> grid.clearance.shape, grid.origin
+        ((100, 100), (-4.95, -4.95))
+        >>> grid.index(0.0, 3.75), bool(grid.free[50, 87])  # In a box.
+        ((50, 87), False)
+    """
+
+    def __init__(self, world: World, *, distance: float, resolution: float = RESOLUTION) -> None:
+        self.world = world
+        self.distance = check_positive("distance", distance)
+        self.resolution = check_positive("resolution", resolution)
+        if self.resolution >= 2 * self.distance:
+            raise ValueError(
+                f"resolution must be below twice distance = {distance} m, got {resolution}"
+            )
+        # The grid is as wide as the room or a little wider; what is behind a wall is not free.
+        sides = [max(1, math.ceil(round(side / resolution, 6))) for side in world.size]
+        if math.prod(sides) > _MOST_CELLS:
+            raise ValueError(
+                f"resolution must leave at most {_MOST_CELLS} cells in a room of {world.size} m, "
+                f"got {resolution}"
+            )
+        self.xs, self.ys = (_centers(count, self.resolution) for count in sides)
+        """Centers of the columns ``[nx]`` and the rows ``[ny]`` [m]."""
+        self.origin = (float(self.xs[0]), float(self.ys[0]))
+        """Center of the first cell (x, y) [m]."""
+        self.clearance: NDArray[np.float32] = clearance_grid(*world.arrays, self.xs, self.ys)
+        """Distance of each center from the nearest obstacle or wall [m], ``[nx, ny]``."""
+        self.free: NDArray[np.bool_] = self.clearance >= np.float32(self.distance)
+        """Where the center keeps the distance, ``[nx, ny]``."""
+
+    @cached_property
+    def cells(self) -> NDArray[np.int64]:
+        """Column and row of each free cell, shape ``[cells, 2]``."""
+        return np.argwhere(self.free)
+
+    @cached_property
+    def _numbers(self) -> NDArray[np.int32]:
+        """Place of each free cell in :attr:`cells`, -1 for the others, ``[nx, ny]``."""
+        return number_cells(self.free)
+
+    @cached_property
+    def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+        """The moves between free cells: starts, neighbors and lengths [m]."""
+        return neighbor_lists(self.free, self._numbers, MOVES, self.resolution)
+
+    def index(self, x: float, y: float) -> tuple[int, int]:
+        """Find the cell of a position, the nearest one for a position outside.
+
+        Args:
+            x: Position [m].
+            y: Position [m].
+
+        Returns:
+            Column and row.
+        """
+        places = zip((x, y), self.origin, self.free.shape, strict=True)
+        i, j = (
+            min(max(round((at - first) / self.resolution), 0), count - 1)
+            for at, first, count in places
+        )
+        return i, j
+
+    def center(self, i: int, j: int) -> tuple[float, float]:
+        """Position (x, y) of a cell's center [m]."""
+        return float(self.xs[i]), float(self.ys[j])
+
+    def _first_cells(self, goal: tuple[float, float]) -> list[tuple[int, float]]:
+        """Numbers of the cells around a goal and how far they are from it [m]."""
+        i, j = self.index(*goal)
+        if not self.free[i, j]:
+            gaps = np.hypot(
+                self.xs[self.cells[:, 0]] - goal[0], self.ys[self.cells[:, 1]] - goal[1]
+            )
+            nearest = int(gaps.argmin())
+            return [(nearest, float(gaps[nearest]))]
+        starts, neighbors, _ = self._graph
+        number = self._numbers[i, j]
+        around = [number, *neighbors[starts[number] : starts[number + 1]]]
+        return [(int(at), math.dist(self.center(*self.cells[at]), goal)) for at in around]
+
+    def distances(self, goal: tuple[float, float]) -> NDArray[np.float64]:
+        """Measure the way from every free cell to a goal.
+
+        Args:
+            goal: Position (x, y) [m]. If its cell is not free, the nearest free one counts.
+
+        Returns:
+            Lengths [m], infinite where there is no way, one for each of :attr:`cells`.
+
+        Raises:
+            ValueError: If no cell is free.
+        """
+        if not self.free.any():
+            raise ValueError(f"grid must have a free cell, and {self.world.name!r} has none")
+        starts, neighbors, lengths = self._graph
+        first = self._first_cells(goal)
+        count = len(starts) - 1
+        # The goal is a node of its own, the last one, from which the cells around it are reached.
+        numbers, gaps = zip(*first, strict=True)
+        graph = csr_array(
+            (
+                # A gap of zero would be no edge.
+                np.concatenate((lengths, np.maximum(gaps, 1e-12))),
+                np.concatenate((neighbors, np.array(numbers, dtype=np.int32))),
+                np.append(starts, np.int32(len(neighbors) + len(first))),
+            ),
+            shape=(count + 1, count + 1),
+        )
+        return np.asarray(dijkstra(graph, indices=[count]))[0, :count]
+
+
+def _centers(count: int, resolution: float) -> NDArray[np.float64]:
+    """Middles of cells side by side around zero [m]."""
+    return resolution * (np.arange(count, dtype=np.float64) - (count - 1) / 2)
+
+
+class DistanceField:
+    """The shortest way from every cell of a grid to one goal.
+
+    Args:
+        grid: The grid.
+        goal: Position (x, y) [m]. If its cell is not free, the way ends at the nearest free one.
+
+    Raises:
+        ValueError: If the goal is not two finite numbers, or no cell is free.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, DistanceField, FreeGrid
+        >>> field = DistanceField(FreeGrid(WORLDS["B"], distance=0.18), (4.0, 0.0))
+        >>> round(field.at(3.9, 0.0), 2), round(field.at(0.0, 0.0), 1)  # [m]; a box is between
+        (0.1, 6.6)
+    """
+
+    def __init__(self, grid: FreeGrid, goal: tuple[float, float]) -> None:
+        self.grid = grid
+        self.goal = (check_number("goal", goal[0]), check_number("goal", goal[1]))
+        self.values: NDArray[np.float32] = np.full(grid.free.shape, math.inf, dtype=np.float32)
+        """Length of the shortest way [m], infinite where there is none, ``[nx, ny]``."""
+        self.values[grid.free] = grid.distances(self.goal)
+
+    @cached_property
+    def filled(self) -> NDArray[np.float32]:
+        """As :attr:`values`; cells without a way have what the nearest cell with one has."""
+        return fill_from_nearest(self.values)
+
+    def at(self, x: float, y: float) -> float:
+        """Read the length of the way from a position.
+
+        Args:
+            x: Position [m].
+            y: Position [m].
+
+        Returns:
+            Length [m], interpolated between the centers of the cells.
+        """
+        return interpolate(self.filled, *self.grid.origin, self.grid.resolution, x, y)
+
+
+def sample_task_on_grid(
+    place: FreeGrid | World,
+    rng: np.random.Generator,
+    *,
+    distance: float | None = None,
+    min_goal_distance: float = 2.0,
+    max_goal_distance: float = math.inf,
+    detour_chance: float = 0.0,
+    start_clearance: float | None = None,
+    goal_clearance: float | None = None,
+) -> tuple[Task, DistanceField]:
+    """Sample a goal, and a start from which there is a way to it, over the cells of a grid.
+
+    It takes milliseconds however many obstacles there are and however rare tasks are, where
+    :func:`~mpfa_envs.sample_task` tries points one by one.
+
+    Args:
+        place: A grid, or a world, of which one is made.
+        rng: Source of randomness.
+        distance: What the way keeps from obstacles [m]; for a world only.
+        min_goal_distance: Least distance between start and goal [m].
+        max_goal_distance: Longest way between them [m].
+        detour_chance: Chance that the task must be a detour, if the world has any: its way is more
+            than 1.08 times the straight line and 0.3 m.
+        start_clearance: What the start keeps from obstacles [m]. None: 0.15 m more than the way,
+            or no more than it where fewer than a tenth of the free cells have that.
+        goal_clearance: The same of the goal.
+
+    Returns:
+        The task, its heading uniform; and the field of its goal.
+
+    Raises:
+        ValueError: If an argument is out of its range, or the world has no such task.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import WORLDS, sample_task_on_grid
+        >>> rng = np.random.default_rng(0)
+        >>> task, field = sample_task_on_grid(WORLDS["D"], rng, distance=0.25)
+        >>> WORLDS["D"].clearance(*task.goal) >= 0.4, field.at(*task.start[:2]) < 20.0
+        (True, True)
+    """
+    check_positive("min_goal_distance", min_goal_distance)
+    if not max_goal_distance > min_goal_distance:
+        raise ValueError(
+            f"max_goal_distance must be above min_goal_distance = {min_goal_distance}, got "
+            f"{max_goal_distance}"
+        )
+    check_share("detour_chance", detour_chance)
+    grid = _as_grid(place, distance)
+    world = grid.world
+    goal_room = _clearance(grid, goal_clearance)
+    start_room = _clearance(grid, start_clearance)
+    columns, rows = grid.cells.T
+    x, y = grid.xs[columns], grid.ys[rows]
+    room = grid.clearance[columns, rows]
+    may_start = (room >= np.float32(start_room)) & _in_regions(world.start_regions, x, y)
+    goals = np.flatnonzero((room >= np.float32(goal_room)) & _in_regions(world.goal_regions, x, y))
+    detour = detour_chance > 0.0 and rng.random() < detour_chance
+    straight: tuple[Task, DistanceField] | None = None
+    for _ in range(_GOALS if len(goals) and may_start.any() else 0):
+        goal_cell = goals[rng.integers(len(goals))]
+        goal = _within_cell(grid, rng, x[goal_cell], y[goal_cell], goal_room)
+        field = DistanceField(grid, goal)
+        way = field.values[columns, rows]
+        direct = np.hypot(x - goal[0], y - goal[1])
+        # Start and goal leave the middle of their cells: by this much they may come nearer.
+        fits = may_start & (direct >= min_goal_distance + grid.resolution)
+        fits &= np.isfinite(way) & (way <= max_goal_distance - grid.resolution)
+        around = fits & (way > 1.08 * direct + 0.3)
+        wanted = detour and bool(around.any())
+        starts = np.flatnonzero(around if wanted else fits)
+        if not len(starts) or (detour and not wanted and straight is not None):
+            continue
+        cell = starts[rng.integers(len(starts))]
+        start = _within_cell(grid, rng, x[cell], y[cell], start_room)
+        task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
+        if wanted or not detour:
+            return task, field
+        straight = task, field
+    if straight is not None:  # Nothing in this world stands in anyone's way.
+        return straight
+    raise ValueError(
+        f"world {world.name!r} has no start and goal at least min_goal_distance = "
+        f"{min_goal_distance} m apart with a way of at most {max_goal_distance} m between them "
+        f"that keeps {grid.distance} m"
+    )
+
+
+def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
+    """Tell whether there is a start and a goal with a way between them.
+
+    It looks for a part of the free cells that hangs together and is wide enough in x or in y.
+
+    Args:
+        grid: The grid.
+        min_goal_distance: Least distance between start and goal [m].
+
+    Returns:
+        Whether :func:`sample_task_on_grid` finds one.
+    """
+    parts, _ = label(grid.free)
+    parts = np.where(grid.clearance >= np.float32(_clearance(grid, None)), parts, 0)
+    steps = min_goal_distance / grid.resolution + 1.0
+    return any(
+        place is not None and max(span.stop - span.start - 1 for span in place) > steps
+        for place in find_objects(parts)
+    )
+
+
+def _as_grid(place: FreeGrid | World, distance: float | None) -> FreeGrid:
+    """The grid that is meant."""
+    if isinstance(place, FreeGrid):
+        if distance is not None:
+            raise ValueError(f"distance must be None for a grid, which has one, got {distance}")
+        return place
+    if distance is None:
+        raise ValueError("distance must be given for a world, got None")
+    return FreeGrid(place, distance=distance)
+
+
+def _clearance(grid: FreeGrid, wanted: float | None) -> float:
+    """The clearance that starts or goals keep [m]."""
+    if wanted is not None:
+        return max(check_positive("clearance", wanted), grid.distance)
+    usual = grid.distance + START_SLACK
+    roomy = np.count_nonzero(grid.clearance >= np.float32(usual))
+    return usual if roomy >= _ROOMY * np.count_nonzero(grid.free) else grid.distance
+
+
+def _in_regions(
+    regions: tuple[Box, ...], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Tell which points lie in one of the regions; all do if there are none."""
+    inside = np.full(len(x), not regions)
+    for region in regions:
+        x_min, y_min, x_max, y_max = region.bounds
+        inside |= (x_min <= x) & (x <= x_max) & (y_min <= y) & (y <= y_max)
+    return inside
+
+
+def _within_cell(
+    grid: FreeGrid, rng: np.random.Generator, x: float, y: float, clearance: float
+) -> tuple[float, float]:
+    """A point of a cell that keeps the clearance, its center if no other is found."""
+    for across, up in (grid.resolution * (rng.random((4, 2)) - 0.5)).tolist():
+        if grid.world.clearance(x + across, y + up) >= clearance:
+            return float(x + across), float(y + up)
+    return float(x), float(y)

@@ -1,0 +1,230 @@
+"""Worlds without end: a generator's name and a seed are the same world for everyone, for ever.
+
+A generator is a function of a source of randomness and a difficulty. :func:`generate_world` seeds
+it, and redraws what no robot can drive in. Seeds for training, validation and test are apart by
+construction (:func:`world_seed`).
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Final, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.distance import FreeGrid, has_task, sample_task_on_grid
+from mpfa_envs.generators.bars import bars
+from mpfa_envs.generators.clutter import clutter
+from mpfa_envs.generators.rooms import rooms
+from mpfa_envs.tasks import Task
+from mpfa_envs.worlds import World
+
+Generator: TypeAlias = Callable[[random.Random, float], World]
+"""Samples a world of a difficulty in [0, 1]."""
+Split = Literal["train", "validation", "test"]
+"""What a seed is for."""
+
+GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(
+    {"rooms": rooms, "clutter": clutter, "bars": bars}
+)
+"""The generators by name."""
+ROBOT_DISTANCE: Final = 0.25
+"""In every world there is a task whose way keeps this: a TurtleBot2 with 0.07 m to spare [m]."""
+_SPLIT_SIZE: Final = 10**9
+_ATTEMPTS: Final = 100
+_TASK_STREAM: Final = 7312590
+_NAME = re.compile(r"([a-z]+)(?:-(validation|test))?-([0-9]{1,9})(?:@(1|0?\.[0-9]+|0))?")
+
+
+def world_seed(split: Split, index: int) -> int:
+    """Give the seed of a world of a split.
+
+    Args:
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        index: Number of the world in it, below 10⁹.
+
+    Returns:
+        The seed; no two splits share one.
+
+    Raises:
+        ValueError: If there is no such split or index.
+
+    Examples:
+        >>> from mpfa_envs.generators import world_seed
+        >>> world_seed("train", 7), world_seed("test", 7)
+        (7, 2000000007)
+    """
+    splits = get_args(Split)
+    if split not in splits:
+        raise ValueError(f"split must be one of {splits}, got {split!r}")
+    if check_count("index", index, least=0) >= _SPLIT_SIZE:
+        raise ValueError(f"index must be below {_SPLIT_SIZE}, got {index}")
+    return splits.index(split) * _SPLIT_SIZE + int(index)
+
+
+def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> World:
+    """Make the world of a seed.
+
+    Args:
+        name: A generator, one of :data:`GENERATORS`.
+        seed: Seed below 3 * 10⁹, as :func:`world_seed` gives them.
+        difficulty: From 0 to 1; each generator says what it means. None: the seed's own, uniform
+            over this range; 0.5 for ``"rooms"``.
+
+    Returns:
+        The world, in which there is a task for a TurtleBot2 with 0.07 m to spare. It is called
+        ``"bars-7"``, ``"bars-test-7"`` or, with a difficulty, ``"bars-7@0.5"``, which
+        :func:`~mpfa_envs.builtin_worlds.resolve_world` understands.
+
+    Raises:
+        ValueError: If there is no such generator, an argument is out of its range, or none of 100
+            attempts has a task.
+
+    Examples:
+        >>> from mpfa_envs import NavigationEnv, generate_world
+        >>> world = generate_world("bars", 7)
+        >>> NavigationEnv(world="bars-7", physics="kinematic").world == world
+        True
+    """
+    generator = _generator(name)
+    if check_count("seed", seed, least=0) >= len(get_args(Split)) * _SPLIT_SIZE:
+        raise ValueError(f"seed must be below {len(get_args(Split)) * _SPLIT_SIZE}, got {seed}")
+    if difficulty is not None:
+        difficulty = check_share("difficulty", difficulty)
+    for attempt in range(_ATTEMPTS):
+        rng = _source(name, int(seed), attempt)
+        # Rooms are as they were before there were others, so that their seeds mean the same.
+        own = 0.5 if name == "rooms" else rng.random()
+        world = generator(rng, own if difficulty is None else difficulty)
+        if _can_be_driven(world):
+            return replace(world, name=_world_name(name, int(seed), difficulty))
+    raise ValueError(
+        f"world {_world_name(name, seed, difficulty)!r} cannot be made: none of {_ATTEMPTS} "
+        "attempts has a start and a goal with a way between them"
+    )
+
+
+def _generator(name: str) -> Generator:
+    """The generator of a name."""
+    if name not in GENERATORS:
+        hint = did_you_mean(name, GENERATORS)
+        raise ValueError(
+            f"generator must be one of {list(GENERATORS)}, got {name!r}{hint and f' ({hint})'}"
+        )
+    return GENERATORS[name]
+
+
+def _source(name: str, seed: int, attempt: int) -> random.Random:
+    """The source of randomness of one attempt; the same in every process and on every machine."""
+    if name == "rooms" and attempt == 0:
+        return random.Random(seed)
+    return random.Random(f"{name}-{seed}-{attempt}")
+
+
+def _world_name(name: str, seed: int, difficulty: float | None) -> str:
+    """What a world is called, and can be asked for by."""
+    split, index = divmod(seed, _SPLIT_SIZE)
+    middle = "" if split == 0 else f"-{get_args(Split)[split]}"
+    return f"{name}{middle}-{index}" + ("" if difficulty is None else f"@{difficulty:g}")
+
+
+def _can_be_driven(world: World) -> bool:
+    """Tell whether there is a task for a TurtleBot2 with something to spare."""
+    return has_task(FreeGrid(world, distance=ROBOT_DISTANCE))
+
+
+def world_of_name(name: str) -> World | None:
+    """Make the world that a name such as ``"bars-test-7"`` stands for.
+
+    Args:
+        name: The name of a generator, ``-validation`` or ``-test`` unless it is a training world,
+            a number, and ``@0.5`` for a difficulty.
+
+    Returns:
+        The world, or None if the name is none of these.
+
+    Examples:
+        >>> from mpfa_envs.generators import world_of_name
+        >>> world_of_name("bars-test-7@0.5").name
+        'bars-test-7@0.5'
+    """
+    found = _NAME.fullmatch(name)
+    if found is None or found[1] not in GENERATORS:
+        return None
+    generator, _, index, difficulty = found.groups()
+    split: Split = "train"
+    if found[2] is not None:
+        split = "validation" if found[2] == "validation" else "test"
+    return generate_world(
+        generator,
+        world_seed(split, int(index)),
+        difficulty=None if difficulty is None else float(difficulty),
+    )
+
+
+def split_worlds(
+    name: str, split: Split, count: int, *, difficulty: float | None = None
+) -> list[World]:
+    """Make the first worlds of a split.
+
+    Args:
+        name: A generator, one of :data:`GENERATORS`.
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        count: How many.
+        difficulty: See :func:`generate_world`.
+
+    Returns:
+        The worlds.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from mpfa_envs import split_worlds
+        >>> [world.name for world in split_worlds("clutter", "test", 2)]
+        ['clutter-test-0', 'clutter-test-1']
+    """
+    check_count("count", count)
+    return [
+        generate_world(name, world_seed(split, index), difficulty=difficulty)
+        for index in range(count)
+    ]
+
+
+def generator_tasks(
+    name: str, split: Split, *, worlds: int = 100, tasks: int = 4
+) -> list[tuple[World, Task]]:
+    """Make the tasks that policies are compared on, fixed for ever.
+
+    Args:
+        name: A generator, one of :data:`GENERATORS`.
+        split: ``"validation"`` or ``"test"``; ``"train"`` is what a policy learned in.
+        worlds: How many worlds; the first ones of more are these.
+        tasks: How many tasks in each.
+
+    Returns:
+        Worlds and tasks, each solved by a way that keeps a TurtleBot2's radius and 0.07 m.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from mpfa_envs import generator_tasks
+        >>> pairs = generator_tasks("bars", "test", worlds=2, tasks=3)
+        >>> [world.name for world, task in pairs]  # doctest: +NORMALIZE_WHITESPACE
+        ['bars-test-0', 'bars-test-0', 'bars-test-0',
+         'bars-test-1', 'bars-test-1', 'bars-test-1']
+    """
+    check_count("tasks", tasks)
+    pairs = []
+    for index, world in enumerate(split_worlds(name, split, worlds)):
+        grid = FreeGrid(world, distance=ROBOT_DISTANCE)
+        # A stream of its own: training with this seed must not meet these tasks.
+        rng = np.random.default_rng((_TASK_STREAM, world_seed(split, index)))
+        pairs += [(world, sample_task_on_grid(grid, rng)[0]) for _ in range(tasks)]
+    return pairs

@@ -1,0 +1,214 @@
+"""What stands in a world: boxes, cylinders and polygons, all upright."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+MOST_VERTICES: Final = 100
+"""No polygon has more vertices: each pair of its edges is looked at."""
+
+
+class Bounds(NamedTuple):
+    """The smallest upright rectangle around a shape [m]."""
+
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
+
+
+@dataclass(frozen=True)
+class Box:
+    """An upright box or a rectangular region, sides parallel to the walls.
+
+    Args:
+        x_min: Left edge [m].
+        y_min: Lower edge [m].
+        x_max: Right edge [m].
+        y_max: Upper edge [m].
+
+    Raises:
+        ValueError: If an edge is not finite or the box has no area.
+    """
+
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (self.x_min, self.y_min, self.x_max, self.y_max))):
+            raise ValueError(f"box must have finite edges, got {self}")
+        if self.x_min >= self.x_max or self.y_min >= self.y_max:
+            raise ValueError(f"box must have x_min < x_max and y_min < y_max, got {self}")
+
+    @property
+    def bounds(self) -> Bounds:
+        """The box itself [m]."""
+        return Bounds(self.x_min, self.y_min, self.x_max, self.y_max)
+
+    @property
+    def area(self) -> float:
+        """Area of the footprint [m²]."""
+        return (self.x_max - self.x_min) * (self.y_max - self.y_min)
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder.
+
+    Args:
+        x: Center [m].
+        y: Center [m].
+        radius: Radius [m].
+
+    Raises:
+        ValueError: If a number is not finite or the radius is not positive.
+    """
+
+    x: float
+    y: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (self.x, self.y, self.radius))):
+            raise ValueError(f"cylinder must have finite numbers, got {self}")
+        if self.radius <= 0:
+            raise ValueError(f"cylinder must have a positive radius, got {self}")
+
+    @property
+    def bounds(self) -> Bounds:
+        """The square around the footprint [m]."""
+        x, y, radius = self.x, self.y, self.radius
+        return Bounds(x - radius, y - radius, x + radius, y + radius)
+
+    @property
+    def area(self) -> float:
+        """Area of the footprint [m²]."""
+        return math.pi * self.radius**2
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """An upright prism; its footprint may have dents, but not cross or touch itself.
+
+    Args:
+        vertices: Corners (x, y) in order [m], 3 to 100 of them; given clockwise, they are
+            kept counter-clockwise.
+
+    Raises:
+        ValueError: If a number is not finite, there are too few or too many vertices, or the
+            outline has no area, or crosses or touches itself.
+
+    Examples:
+        >>> from mpfa_envs import Polygon
+        >>> Polygon(((0, 0), (0, 1), (2, 0)))
+        Polygon(vertices=((2.0, 0.0), (0.0, 1.0), (0.0, 0.0)))
+    """
+
+    vertices: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        if not 3 <= len(self.vertices) <= MOST_VERTICES:
+            raise ValueError(
+                f"polygon must have 3 to {MOST_VERTICES} vertices, got {len(self.vertices)}"
+            )
+        if not all(
+            len(vertex) == 2 and all(map(math.isfinite, vertex)) for vertex in self.vertices
+        ):
+            raise ValueError(f"polygon must have two finite numbers a vertex, got {self.vertices}")
+        vertices = tuple((float(x), float(y)) for x, y in self.vertices)
+        area = _signed_area(vertices)
+        # The dataclass is frozen; this is its only change, before anyone sees it.
+        object.__setattr__(self, "vertices", vertices if area > 0 else vertices[::-1])
+        if area == 0.0 or not (_is_convex(self.vertices) or _is_simple(self.edges)):
+            raise ValueError(
+                "polygon must have an area, and an outline that does not cross or touch itself, "
+                f"got {vertices}"
+            )
+
+    @property
+    def edges(self) -> list[tuple[float, float, float, float]]:
+        """Edges (x0, y0, x1, y1) [m], counter-clockwise: what is left of each is inside."""
+        following = (*self.vertices[1:], self.vertices[0])
+        return [(*one, *other) for one, other in zip(self.vertices, following, strict=True)]
+
+    @property
+    def bounds(self) -> Bounds:
+        """The smallest upright rectangle around the footprint [m]."""
+        xs, ys = zip(*self.vertices, strict=True)
+        return Bounds(min(xs), min(ys), max(xs), max(ys))
+
+    @property
+    def area(self) -> float:
+        """Area of the footprint [m²]."""
+        return _signed_area(self.vertices)
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether the footprint has no dents."""
+        return _is_convex(self.vertices)
+
+
+Shape = Box | Cylinder | Polygon
+"""Anything that can stand in a world."""
+
+
+def _signed_area(vertices: tuple[tuple[float, float], ...]) -> float:
+    """Area [m²]; positive if the vertices run counter-clockwise."""
+    x, y = vertices[0]
+    # From the first vertex, not from the origin: a small polygon far out keeps its digits.
+    rays = [(a - x, b - y) for a, b in vertices[1:]]
+    return sum(a * d - b * c for (a, b), (c, d) in pairwise(rays)) / 2
+
+
+def _is_convex(vertices: tuple[tuple[float, float], ...]) -> bool:
+    """Tell whether counter-clockwise vertices turn left everywhere, once around in all."""
+    count, turned = len(vertices), 0.0
+    for i in range(count):
+        (x0, y0), (x1, y1), (x2, y2) = vertices[i - 2], vertices[i - 1], vertices[i]
+        across = (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1)
+        along = (x1 - x0) * (x2 - x1) + (y1 - y0) * (y2 - y1)
+        if across <= 0.0:
+            return False
+        turned += math.atan2(across, along)
+    return turned < 3 * math.pi
+
+
+def _is_simple(edges: list[tuple[float, float, float, float]]) -> bool:
+    """Tell whether edges meet only where one follows the other."""
+    count = len(edges)
+    for i, (ax, ay, bx, by) in enumerate(edges):
+        if (ax, ay) == (bx, by):
+            return False
+        for j in range(i + 1, count):
+            cx, cy, dx, dy = edges[j]
+            if j == i + 1 or (i == 0 and j == count - 1):
+                # Neighbors share a vertex; they overlap if one turns back on the other.
+                across = (bx - ax) * (dy - cy) - (by - ay) * (dx - cx)
+                if across == 0.0 and (bx - ax) * (dx - cx) + (by - ay) * (dy - cy) < 0.0:
+                    return False
+            elif _meet(edges[i], edges[j]):
+                return False
+    return True
+
+
+def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Tell whether two closed segments have a point in common."""
+    ax, ay, bx, by = one
+    cx, cy, dx, dy = other
+    if (
+        max(ax, bx) < min(cx, dx)
+        or max(cx, dx) < min(ax, bx)
+        or max(ay, by) < min(cy, dy)
+        or max(cy, dy) < min(ay, by)
+    ):
+        return False
+    c_side = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    d_side = (bx - ax) * (dy - ay) - (by - ay) * (dx - ax)
+    a_side = (dx - cx) * (ay - cy) - (dy - cy) * (ax - cx)
+    b_side = (dx - cx) * (by - cy) - (dy - cy) * (bx - cx)
+    return c_side * d_side <= 0.0 and a_side * b_side <= 0.0

@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+import heapq
+import math
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    WORLDS,
+    Box,
+    Cylinder,
+    DistanceField,
+    FreeGrid,
+    PathPlanner,
+    Polygon,
+    World,
+    generate_world,
+    sample_task_on_grid,
+)
+from mpfa_envs.distance import has_task, shortest_way
+
+MIXED = World(
+    name="mixed",
+    size=(7.3, 5.1),
+    boxes=(Box(-3.0, -2.0, -1.0, 0.5), Box(-2.0, -1.0, 0.0, 1.0)),
+    cylinders=(Cylinder(1.5, 1.0, 0.7), Cylinder(2.0, 1.2, 0.5)),
+    polygons=(
+        Polygon(((0.5, -2.0), (2.5, -1.5), (1.2, -1.2), (2.0, -0.5), (0.8, -0.8))),
+        Polygon(((2.0, -1.8), (3.0, -1.8), (2.4, -0.9))),
+    ),
+)
+DOOR = World(name="door", boxes=(Box(-0.2, -5.0, 0.2, -0.4), Box(-0.2, 0.4, 0.2, 5.0)))
+CUT = World(name="cut", boxes=(Box(-0.2, -5.0, 0.2, 5.0),))
+
+
+def points_of(grid: FreeGrid) -> np.ndarray:
+    across, up = np.meshgrid(grid.xs, grid.ys, indexing="ij")
+    return np.stack((across.ravel(), up.ravel()), axis=1)
+
+
+@pytest.mark.parametrize("resolution", [0.1, 0.07])
+def test_clearances_of_the_cells_are_those_of_the_world(resolution: float) -> None:
+    grid = FreeGrid(MIXED, distance=0.2, resolution=resolution)
+    expected = MIXED.clearances(points_of(grid)).reshape(grid.free.shape)
+    np.testing.assert_allclose(grid.clearance, expected, atol=1e-6)
+    clear = np.abs(expected - 0.2) > 1e-6
+    np.testing.assert_array_equal(grid.free[clear], (expected >= 0.2)[clear])
+    assert grid.xs[-1] + resolution / 2 >= 3.65 > grid.xs[-1] - resolution / 2
+    assert grid.center(*grid.index(1.23, -0.71)) == pytest.approx((1.23, -0.71), abs=resolution / 2)
+
+
+def oracle(grid: FreeGrid, goal: tuple[int, int]) -> dict[tuple[int, int], float]:
+    """Dijkstra's algorithm, cell by cell, from a cell."""
+    found: dict[tuple[int, int], float] = {}
+    queue = [(0.0, goal)]
+
+    def free(i: int, j: int) -> bool:
+        return 0 <= i < grid.free.shape[0] and 0 <= j < grid.free.shape[1] and grid.free[i, j]
+
+    while queue:
+        length, (i, j) = heapq.heappop(queue)
+        if (i, j) in found:
+            continue
+        found[i, j] = length
+        for a in range(-2, 3):
+            for b in range(-2, 3):
+                if math.gcd(a, b) != 1 or not free(i + a, j + b):
+                    continue
+                if abs(a) == abs(b):
+                    passed = [(a, 0), (0, b)]
+                elif abs(a) == 2:
+                    passed = [(a // 2, 0), (a // 2, b)]
+                elif abs(b) == 2:
+                    passed = [(0, b // 2), (a, b // 2)]
+                else:
+                    passed = []
+                if all(free(i + c, j + d) for c, d in passed):
+                    step = grid.resolution * math.hypot(a, b)
+                    heapq.heappush(queue, (length + step, (i + a, j + b)))
+    return found
+
+
+@pytest.mark.parametrize("world", [MIXED, CUT, WORLDS["test"]], ids=lambda world: world.name)
+def test_values_are_the_lengths_of_the_shortest_chains_of_moves(world: World) -> None:
+    grid = FreeGrid(world, distance=0.2, resolution=0.15)
+    cell = tuple(grid.cells[len(grid.cells) // 3].tolist())
+    values = DistanceField(grid, grid.center(*cell)).values
+    found = oracle(grid, cell)
+    assert len(found) > 100
+    for index in np.ndindex(values.shape):
+        assert values[index] == pytest.approx(found.get(index, math.inf), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["A", "D", "test"])
+def test_a_field_is_near_to_the_exact_planner(name: str) -> None:
+    world, rng = WORLDS[name], np.random.default_rng(0)
+    grid = FreeGrid(world, distance=0.25)
+    planner = PathPlanner(world, radius=0.25)
+    errors = []
+    for _ in range(15):
+        task, field = sample_task_on_grid(grid, rng)
+        for _ in range(5):
+            x, y = rng.uniform(-4.7, 4.7, 2).tolist()
+            if world.clearance(x, y) < 0.35 or math.dist((x, y), task.goal) < 1.0:
+                continue
+            exact = planner.length((x, y), task.goal)
+            errors.append(field.at(x, y) / exact - 1.0)
+    assert len(errors) > 30
+    assert min(errors) > -0.01 and max(errors) < 0.06 and 0.0 < np.mean(errors) < 0.035
+
+
+def test_a_wall_is_walked_around_and_a_closed_one_is_not() -> None:
+    goal = (3.0, 3.0)
+    field = DistanceField(FreeGrid(DOOR, distance=0.3), goal)
+    exact = PathPlanner(DOOR, radius=0.3).length((-3.0, 3.0), goal)
+    assert field.at(-3.0, 3.0) == pytest.approx(exact, rel=0.03)
+    cut = DistanceField(FreeGrid(CUT, distance=0.3), goal)
+    i, j = cut.grid.index(-3.0, 3.0)
+    assert cut.values[i, j] == math.inf and math.isfinite(cut.at(-3.0, 3.0))
+
+
+def test_cells_without_a_way_take_what_is_nearest() -> None:
+    grid = FreeGrid(MIXED, distance=0.2)
+    field = DistanceField(grid, (-0.5, 2.0))
+    known = np.argwhere(np.isfinite(field.values))
+    for i, j in np.argwhere(np.isinf(field.values))[::7].tolist():
+        gaps = np.hypot(*(known - (i, j)).T)
+        # Of several that are nearly as near, it may take any.
+        near = known[gaps < gaps.min() + 0.5]
+        assert np.isclose(field.values[near[:, 0], near[:, 1]], field.filled[i, j]).any()
+    finite = np.isfinite(field.values)
+    np.testing.assert_array_equal(field.filled[finite], field.values[finite])
+
+
+def test_positions_are_read_bilinearly_one_by_one_or_many_at_once() -> None:
+    field = DistanceField(FreeGrid(MIXED, distance=0.2), (-0.5, 2.0))
+    grid = field.grid
+    assert field.at(*grid.center(30, 40)) == pytest.approx(field.filled[30, 40], abs=1e-6)
+    x, y = grid.center(30, 40)
+    square = field.filled[30:32, 40:42].tolist()
+    expected = 0.7 * 0.6 * square[0][0] + 0.3 * 0.6 * square[1][0]
+    expected += 0.7 * 0.4 * square[0][1] + 0.3 * 0.4 * square[1][1]
+    assert field.at(x + 0.03, y + 0.04) == pytest.approx(expected, abs=1e-6)
+    places = np.random.default_rng(0).uniform(-4.0, 4.0, (2, 50))
+    many = shortest_way(field.filled, grid.origin, grid.resolution, *places)
+    assert many.tolist() == [field.at(a, b) for a, b in places.T.tolist()]
+
+
+def test_a_goal_off_the_free_cells_is_reached_from_the_nearest_one() -> None:
+    field = DistanceField(FreeGrid(WORLDS["B"], distance=0.25), (0.0, 3.75))
+    i, j = field.grid.index(0.0, 3.2)
+    assert field.values[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
+    closet = World(name="closet", size=(0.3, 0.3))
+    with pytest.raises(ValueError, match="grid must have a free cell, and 'closet' has none"):
+        DistanceField(FreeGrid(closet, distance=0.2), (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"distance": 0.0}, "distance must be positive"),
+        ({"distance": 0.25, "resolution": -0.1}, "resolution must be positive"),
+        ({"distance": 0.05}, "resolution must be below twice distance = 0.05 m, got 0.1"),
+        ({"distance": 0.25, "resolution": 0.001}, "at most 4000000 cells"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused(arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FreeGrid(WORLDS["A"], **arguments)
+
+
+def test_tasks_keep_what_they_are_asked_for() -> None:
+    world = World(
+        name="sides",
+        boxes=WORLDS["test"].boxes,
+        start_regions=(Box(-4, -4, -1, 4),),
+        goal_regions=(Box(1, -4, 4, 4), Box(-1, 3, 1, 4)),
+    )
+    rng = np.random.default_rng(0)
+    grid = FreeGrid(world, distance=0.25)
+    planner = PathPlanner(world, radius=0.24)
+    for _ in range(40):
+        task, field = sample_task_on_grid(
+            grid, rng, min_goal_distance=3.0, max_goal_distance=7.0, goal_clearance=0.5
+        )
+        assert task.start[0] <= -0.95 and (task.goal[0] >= 0.95 or task.goal[1] >= 2.95)
+        assert math.dist(task.start[:2], task.goal) >= 3.0
+        assert field.at(*task.start[:2]) <= 7.05
+        assert world.clearance(*task.start[:2]) >= 0.4 - 1e-6
+        assert world.clearance(*task.goal) >= 0.5 - 1e-6
+        assert planner.is_reachable(task.start[:2], task.goal)
+        assert field.goal == task.goal
+
+
+def test_a_detour_is_one() -> None:
+    rng = np.random.default_rng(0)
+    grid = FreeGrid(generate_world("bars", 3, difficulty=0.7), distance=0.25)
+    for chance, low, high in ((1.0, 1.0, 1.0), (0.5, 0.5, 0.95), (0.0, 0.1, 0.8)):
+        around = []
+        for _ in range(60):
+            task, field = sample_task_on_grid(grid, rng, detour_chance=chance)
+            direct = math.dist(task.start[:2], task.goal)
+            around.append(field.at(*task.start[:2]) > 1.05 * direct)
+        assert low <= np.mean(around) <= high
+    open_room = FreeGrid(WORLDS["A"], distance=0.25)
+    sample_task_on_grid(open_room, rng, detour_chance=1.0)
+
+
+def test_a_task_lies_on_one_side_of_a_closed_wall() -> None:
+    rng = np.random.default_rng(0)
+    for chance in (0.0, 1.0):
+        for _ in range(20):
+            task, _ = sample_task_on_grid(CUT, rng, distance=0.25, detour_chance=chance)
+            assert task.start[0] * task.goal[0] > 0.0
+
+
+def test_the_same_generator_gives_the_same_task() -> None:
+    tasks = [
+        sample_task_on_grid(WORLDS["D"], np.random.default_rng(5), distance=0.25)[0]
+        for _ in range(2)
+    ]
+    assert tasks[0] == tasks[1]
+
+
+@pytest.mark.parametrize(
+    ("place", "arguments", "message"),
+    [
+        (WORLDS["A"], {}, "distance must be given for a world, got None"),
+        (FreeGrid(WORLDS["A"], distance=0.3), {"distance": 0.2}, "distance must be None for a"),
+        (WORLDS["A"], {"distance": 0.3, "min_goal_distance": 0}, "min_goal_distance must be pos"),
+        (WORLDS["A"], {"distance": 0.3, "max_goal_distance": 1.0}, "max_goal_distance must be a"),
+        (WORLDS["A"], {"distance": 0.3, "detour_chance": 2}, r"detour_chance must be in \[0, 1\]"),
+        (WORLDS["A"], {"distance": 0.3, "min_goal_distance": 30}, "'A' has no start and goal"),
+        (World(name="closet", size=(0.5, 0.5)), {"distance": 0.3}, "'closet' has no start and"),
+    ],
+)
+def test_a_task_that_cannot_be_is_refused(
+    place: World | FreeGrid, arguments: dict[str, float], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        sample_task_on_grid(place, np.random.default_rng(0), **arguments)
+
+
+def test_a_world_has_a_task_or_none() -> None:
+    assert has_task(FreeGrid(CUT, distance=0.25))
+    assert not has_task(FreeGrid(World(name="closet", size=(2.2, 2.2)), distance=0.25))
+    walls = tuple(Box(x, -1.5, x + 0.1, 1.5) for x in (-1.0, -0.4, 0.2, 0.8))
+    assert has_task(FreeGrid(World(name="lanes", size=(3.0, 3.5), boxes=walls), distance=0.25))

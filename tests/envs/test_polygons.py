@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mpfa_envs import Box, Cylinder, Lidar, Polygon, World
+
+DENTED = Polygon(((-2.0, -1.0), (1.5, -1.5), (0.5, 0.0), (2.0, 1.0), (-1.0, 2.0), (-0.5, 0.5)))
+TRIANGLE = Polygon(((2.0, 2.0), (4.0, 2.5), (3.0, 4.0)))
+OVERLAPPING = Polygon(((0.0, -3.0), (1.0, -3.0), (1.0, 0.5), (0.0, 0.5)))
+
+
+def polygon_world(*polygons: Polygon) -> World:
+    return World(name="polygons", polygons=polygons)
+
+
+def inside(x: float, y: float, polygon: Polygon) -> bool:
+    """Whether the outline winds around a point: the sum of the angles at which it is seen."""
+    angles = [math.atan2(b - y, a - x) for a, b in polygon.vertices]
+    turns = [
+        math.remainder(b - a, math.tau)
+        for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
+    ]
+    return abs(sum(turns)) > 1.0
+
+
+def to_segment(x: float, y: float, edge: tuple[float, float, float, float]) -> float:
+    x0, y0, x1, y1 = edge
+    length = math.dist((x0, y0), (x1, y1))
+    along = ((x - x0) * (x1 - x0) + (y - y0) * (y1 - y0)) / length
+    foot = min(max(along, 0.0), length) / length
+    return math.dist((x, y), (x0 + foot * (x1 - x0), y0 + foot * (y1 - y0)))
+
+
+def distance(x: float, y: float, world: World) -> float:
+    """Signed distance to the nearest polygon or wall, one edge after the other."""
+    found = [world.size[0] / 2 - abs(x), world.size[1] / 2 - abs(y)]
+    for polygon in world.polygons:
+        gap = min(to_segment(x, y, edge) for edge in polygon.edges)
+        found.append(-gap if inside(x, y, polygon) else gap)
+    return min(found)
+
+
+def test_vertices_are_kept_counter_clockwise() -> None:
+    square = ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0))
+    assert Polygon(square).vertices == square
+    assert Polygon(square[::-1]).vertices == square
+    assert Polygon(square).area == Polygon(square[::-1]).area == pytest.approx(1.0)
+    assert Polygon(((0, 0), (0, 1), (2, 0))).area == pytest.approx(1.0)
+
+
+def test_only_a_polygon_without_dents_is_convex() -> None:
+    assert TRIANGLE.is_convex and not DENTED.is_convex
+    assert Polygon(((0, 0), (1, 0), (2, 1), (1, 2), (0, 1))).is_convex
+
+
+@pytest.mark.parametrize(
+    ("vertices", "message"),
+    [
+        (((0, 0), (1, 1)), "3 to 100 vertices, got 2"),
+        (tuple((math.cos(i), math.sin(i)) for i in range(101)), "3 to 100 vertices, got 101"),
+        (((0, 0), (1, 1), (1, math.inf)), "two finite numbers a vertex"),
+        (((0, 0), (1, 1), (1,)), "two finite numbers a vertex"),
+        (((0, 0), (1, 1), (2, 2)), "must have an area"),
+        (((0, 0), (1, 1), (1, 0), (0, 1)), "does not cross"),
+        (((0, 0), (2, 0), (2, 2), (1, 2), (1, -1), (0, 1)), "does not cross"),
+        (((0, 0), (2, 0), (2, 2), (1, 0), (0, 2)), "does not cross or touch itself"),
+        (((0, 0), (2, 0), (2, 0), (0, 2)), "does not cross or touch itself"),
+        (((0, 0), (2, 0), (1, 0), (1, 2)), "does not cross or touch itself"),
+        # A pentagram turns left at each of its points, twice around.
+        (tuple((math.cos(i * 2.513), math.sin(i * 2.513)) for i in range(5)), "does not cross"),
+    ],
+)
+def test_a_shape_that_is_no_polygon_is_refused(vertices: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Polygon(vertices)
+
+
+def test_a_polygon_outside_of_the_room_is_refused() -> None:
+    with pytest.raises(ValueError, match="polygons must lie in the room"):
+        polygon_world(Polygon(((4.0, 0.0), (5.1, 0.0), (4.0, 1.0))))
+
+
+def test_clearances_of_polygons_are_those_of_their_edges() -> None:
+    world = polygon_world(DENTED, TRIANGLE, OVERLAPPING)
+    points = np.random.default_rng(0).uniform(-5.5, 5.5, (600, 2))
+    expected = [distance(x, y, world) for x, y in points.tolist()]
+    assert sum(gap < 0 for gap in expected) > 100
+    np.testing.assert_allclose(world.clearances(points), expected, atol=1e-12)
+    each = [world.clearance(x, y) for x, y in points.tolist()]
+    np.testing.assert_allclose(each, expected, atol=1e-12)
+
+
+def test_the_area_under_obstacles_counts_polygons() -> None:
+    square = Polygon(((0, 0), (1, 1), (0, 2), (-1, 1)))
+    world = World(name="all", boxes=(Box(2, 2, 3, 4),), polygons=(square,))
+    assert world.covered_area == pytest.approx(4.0)
+    assert world.obstacle_count == 2
+
+
+def test_arrays_hold_the_numbers_of_all_obstacles() -> None:
+    world = World(
+        name="all",
+        size=(10.0, 8.0),
+        boxes=(Box(2, 2, 3, 4),),
+        cylinders=(Cylinder(-1, 2, 0.5),),
+        polygons=(TRIANGLE, OVERLAPPING),
+    )
+    half_size, boxes, circles, segments, ends = world.arrays
+    assert half_size.tolist() == [5.0, 4.0]
+    assert boxes.tolist() == [[2, 2, 3, 4]] and circles.tolist() == [[-1, 2, 0.5]]
+    assert ends.tolist() == [3, 7] and ends.dtype == np.int64
+    assert segments.tolist() == [list(edge) for edge in TRIANGLE.edges + OVERLAPPING.edges]
+    empty = World(name="empty").arrays
+    assert [part.shape for part in empty] == [(2,), (0, 4), (0, 3), (0, 4), (0,)]
+    for part in (*world.arrays[:4], *empty[:4]):
+        assert part.dtype == np.float64 and part.flags.c_contiguous
+
+
+def nearest_hit(x: float, y: float, angle: float, world: World, reach: float) -> float:
+    """Where the first step of a millimeter leaves the free space, refined by halving."""
+    low = 0.0
+    while low < reach:
+        high = low + max(0.001, 0.999 * distance(*at(x, y, angle, low), world))
+        if distance(*at(x, y, angle, high), world) <= 0.0:
+            for _ in range(40):
+                middle = (low + high) / 2
+                if distance(*at(x, y, angle, middle), world) <= 0.0:
+                    high = middle
+                else:
+                    low = middle
+            return min(high, reach)
+        low = high
+    return reach
+
+
+def at(x: float, y: float, angle: float, reach: float) -> tuple[float, float]:
+    return x + reach * math.cos(angle), y + reach * math.sin(angle)
+
+
+def test_the_lidar_sees_the_nearest_edge_of_polygons() -> None:
+    world = polygon_world(DENTED, TRIANGLE, OVERLAPPING)
+    lidar = Lidar(world, max_range=6.0)
+    rng = np.random.default_rng(0)
+    scans = 0
+    while scans < 12:
+        x, y, heading = rng.uniform(-5.0, 5.0, 3).tolist()
+        if world.clearance(x, y) < 0.05:
+            continue
+        scans += 1
+        expected = [nearest_hit(x, y, heading + a, world, 6.0) for a in lidar.angles[::3]]
+        np.testing.assert_allclose(lidar.cast(x, y, heading)[::3], expected, atol=2e-3)
+
+
+def test_in_a_polygon_all_ranges_are_zero() -> None:
+    lidar = Lidar(polygon_world(DENTED, OVERLAPPING))
+    for place in ((-0.8, 0.0), (0.5, -2.0), (0.2, 0.2)):
+        np.testing.assert_array_equal(lidar.cast(*place, 0.7), 0.0)
+
+
+def test_a_ray_along_an_edge_of_a_polygon_is_no_number_problem() -> None:
+    world = polygon_world(Polygon(((1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0))))
+    with np.errstate(all="raise", under="ignore"):
+        ranges = Lidar(world, sectors=1, reduction="single").scan(0.0, 0.0, 0.0)
+    assert ranges == pytest.approx(1.0)
