@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import TensorDict
@@ -23,9 +24,12 @@ from benchmarks.timing import (
 from torchrl_mpfa import (
     ACTION_GRADIENT,
     TD_ERROR,
+    Draw,
+    Learner,
     MPFASampler,
     SignalReplayBuffer,
     SignalTensorStorage,
+    run_updates,
 )
 
 BATCH_SIZE = 256
@@ -148,6 +152,47 @@ def measure_sample_16x256(*, quick: bool) -> list[Entry]:
     ours = make_mpfa_update(make_mpfa_buffer(100_000, count), count)
     stock = make_stock_update(make_stock_buffer(100_000, count), count)
     return compare("sample_16x256", ours, stock, quick=quick)
+
+
+class _Signals:
+    """A learner that learns nothing: its signals are the same at each update."""
+
+    def __init__(self) -> None:
+        generator = torch.Generator().manual_seed(1)
+        self._signals = torch.rand(2, BATCH_SIZE, generator=generator).unbind()
+
+    def update(self, draw: Draw) -> dict[str, torch.Tensor]:
+        """Write signals as the loss writes them."""
+        for key, value in zip((TD_ERROR.key, ACTION_GRADIENT.key), self._signals, strict=True):
+            draw.batch.set(key, value)
+        return {}
+
+
+def measure_iteration_4x256(
+    name: str = "iteration_4x256", *, updates: int = 4, capacity: int = 100_000, quick: bool
+) -> list[Entry]:
+    """Four batches and their priorities: ours in one call, TorchRL's one by one.
+
+    Args:
+        name: Name of the entry.
+        updates: Batches of an iteration.
+        capacity: Slots of each buffer, all filled.
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        An entry for each replay; ours has the ratio.
+    """
+    buffer, learner = make_mpfa_buffer(capacity), cast(Learner, _Signals())
+    update = make_stock_update(make_stock_buffer(capacity))
+
+    def ours() -> None:
+        run_updates(buffer, learner, updates=updates)
+
+    def stock() -> None:
+        for _ in range(updates):
+            update()
+
+    return compare(name, ours, stock, quick=quick)
 
 
 def measure_extend_one(

@@ -24,7 +24,10 @@ def check_schema(entries: Sequence[Entry]) -> None:
     assert len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize("measure", [replay.measure_sample_update, replay.measure_extend_one])
+@pytest.mark.parametrize(
+    "measure",
+    [replay.measure_sample_update, replay.measure_extend_one, replay.measure_iteration_4x256],
+)
 def test_replay_is_compared_with_that_of_torchrl(measure) -> None:
     stock, ours = measure("small", capacity=512, quick=True)
     check_schema([stock, ours])

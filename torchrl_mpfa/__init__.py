@@ -31,6 +31,7 @@ from torchrl_mpfa.signals import (
     Signal,
 )
 from torchrl_mpfa.storages import SignalMemmapStorage, SignalTable, SignalTensorStorage
+from torchrl_mpfa.updates import run_updates
 
 __version__ = "0.1.0"
 
@@ -76,6 +77,7 @@ __all__ = [
     "make_stochastic_actor",
     "make_td3_loss",
     "one_batch",
+    "run_updates",
     "save_atomically",
     "write_text_atomically",
 ]

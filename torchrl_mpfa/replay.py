@@ -219,16 +219,19 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
                 "torchrl_mpfa.trainer.PriorityStepper does"
             )
 
-    def update_tensordict_priority(self, data: TensorDictBase) -> None:
+    def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
         """Update signals and priorities of a sampled batch.
 
         Args:
             data: A batch from :meth:`sample` in which the loss wrote the learned signals, each of
                 shape ``[B]`` or ``[B, 1]``, under the keys that the sampler's signals name.
+            batches: How many batches of one size ``data`` is, one after the other: of each, the
+                positions and the mean in Eqs. (23)-(24) are its own.
 
         Raises:
             KeyError: If a signal or the index is missing; nothing is changed.
-            ValueError: If a signal is negative, not finite or out of shape; nothing is changed.
+            ValueError: If a signal is negative, not finite or out of shape, or ``data`` is not so
+                many equal batches; nothing is changed.
         """
         if not self._fuses:
             super().update_tensordict_priority(data)
@@ -247,7 +250,11 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
                 signals[signal.name] = value
         with self._replay_lock, self._write_lock:
             stale = self._sampler.update_signals(
-                index, signals, storage=self._storage, written_at=data.get("written_at", None)
+                index,
+                signals,
+                storage=self._storage,
+                written_at=data.get("written_at", None),
+                batches=batches,
             )
         self.stale_updates += stale
         self._unreturned, self._handed_out = 0, None

@@ -50,6 +50,11 @@ class CappedSampler(SignalSampler):
         self.replay_cap = replay_cap
         super().__init__(*args, **kwargs)
 
+    @property
+    def divisible(self) -> bool:
+        """Never: how a batch is sampled depends on whether enough transitions are left for it."""
+        return False
+
     def _init(self) -> None:
         super()._init()
         self._spent = torch.zeros(self._max_capacity, dtype=torch.bool)

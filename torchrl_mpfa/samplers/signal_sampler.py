@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts
-from torchrl_mpfa.checks import bounds, check_finite, check_index, check_range
+from torchrl_mpfa.checks import bounds, check_counts, check_finite, check_index, check_range
 from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import one_sided
@@ -208,6 +208,7 @@ class SignalSampler(TreeSampler):
         *,
         storage: Storage,
         written_at: Tensor | None = None,
+        batches: int = 1,
     ) -> int:
         """Store new signals of a batch and set its priorities by Eqs. (21)-(24).
 
@@ -218,6 +219,8 @@ class SignalSampler(TreeSampler):
             storage: The storage with the signal table.
             written_at: The entry of that name in the sampled batch, shape ``[B]``: rows whose
                 slot was written since are left out.
+            batches: How many batches of one size these slots are, one after the other; each is
+                adjusted as a batch of its own.
 
         Returns:
             Number of rows left out.
@@ -225,16 +228,56 @@ class SignalSampler(TreeSampler):
         Raises:
             KeyError: If a signal that the sampler fuses is missing.
             IndexError: If a slot is outside the filled part of the buffer.
-            ValueError: If a signal or ``written_at`` has the wrong shape, or a signal is negative
-                or not finite.
+            ValueError: If a signal or ``written_at`` has the wrong shape, a signal is negative or
+                not finite, or the slots are not so many equal batches.
             TypeError: If the storage keeps no signals, or the index holds anything but integers.
         """
         table = self.bind(storage)
         slots = as_slots(index, storage)
         if slots.numel() == 0:
             return 0
+        check_counts(batches=batches)
+        if len(slots) % batches:
+            raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
+        sizes = [len(slots) // batches] * batches
         if len(check_index(slots, table.size)) < len(slots):
             raise IndexError(f"index must be in [0, {table.size}), the filled slots, got -1")
+        rows = self._with_signals(table, slots, signals)
+        stale = 0
+        if written_at is not None:
+            if written_at.numel() != slots.numel():
+                raise ValueError(
+                    "written_at must have one number per transition, got shape "
+                    f"{[*written_at.shape]} for {slots.numel()} slots"
+                )
+            live = rows.select(1, table.time_column) == written_at.reshape(-1)
+            if not live.all():
+                stale = int((~live).sum())
+                sizes = live.reshape(batches, -1).sum(1).tolist()
+                rows, slots = rows[live], slots[live]
+        self._check_signals(rows[:, self._columns])
+        if slots.numel() == 0:
+            return stale
+
+        weighing, fused = self._weighing, []
+        for one, of_one in zip(slots.split(sizes), rows.split(sizes), strict=True):
+            if len(one):
+                weighing = self._weigh(table, one, weighing)
+                fused.append(self._fused(table, of_one, one, weighing))
+        priority = fused[0] if len(fused) == 1 else torch.cat(fused)
+        highest = self._checked(priority, "adjusted priorities")
+        self._weighing = weighing
+        if len(slots) > SERIAL and (last := last_of_each(slots)) is not None:
+            slots, rows, priority = slots[last], rows[last], priority[last]
+            highest = bounds(priority)[1]
+        table.rows.index_copy_(0, slots, rows)
+        self._set(slots, priority, highest)
+        return stale
+
+    def _with_signals(
+        self, table: SignalTable, slots: Tensor, signals: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Rows of the table with the learned signals of a batch in them, shape ``[B, K]``."""
         rows = table.rows.index_select(0, slots)
         for name, priority_of in self._learned.items():
             if name not in signals:
@@ -249,31 +292,7 @@ class SignalSampler(TreeSampler):
             if priority_of is not None:
                 value = priority_of(value)
             rows.select(1, table.column[name]).copy_(value)
-        stale = 0
-        if written_at is not None:
-            if written_at.numel() != slots.numel():
-                raise ValueError(
-                    "written_at must have one number per transition, got shape "
-                    f"{[*written_at.shape]} for {slots.numel()} slots"
-                )
-            live = rows.select(1, table.time_column) == written_at.reshape(-1)
-            if not live.all():
-                stale = int((~live).sum())
-                rows, slots = rows[live], slots[live]
-        self._check_signals(rows[:, self._columns])
-        if slots.numel() == 0:
-            return stale
-
-        weighing = self._weigh(table, slots)
-        priority = self._fused(table, rows, slots, weighing)
-        highest = self._checked(priority, "adjusted priorities")
-        self._weighing = weighing
-        if len(slots) > SERIAL and (last := last_of_each(slots)) is not None:
-            slots, rows, priority = slots[last], rows[last], priority[last]
-            highest = bounds(priority)[1]
-        table.rows.index_copy_(0, slots, rows)
-        self._set(slots, priority, highest)
-        return stale
+        return rows
 
     def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
         """Priorities of Eqs. (21)-(24), eps included, shape ``[B]``."""
@@ -330,9 +349,8 @@ class SignalSampler(TreeSampler):
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
             check_finite(f"signal {name!r}", value)
 
-    def _weigh(self, table: SignalTable, index: Tensor) -> Weighing:
-        """Count the probabilities of Eqs. (16)-(17) anew if enough of the buffer changed."""
-        last = self._weighing
+    def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
+        """Count the probabilities of Eqs. (16)-(17) anew if enough changed since the last count."""
         fresh = table.writes - (0 if last is None else last.writes)
         due = not 0 <= fresh <= self.entropy_refresh * table.size or self.entropy_refresh == 0
         if last is not None and not due and not getattr(self.fusion, "every_batch", False):

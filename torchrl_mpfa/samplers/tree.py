@@ -147,6 +147,11 @@ class TreeSampler(SavedTrees):
         """
         return self._priorities.clone() if index is None else self._priorities[index]
 
+    @property
+    def divisible(self) -> bool:
+        """Whether ``U * B`` slots, sampled at once, are as good as ``U`` batches of ``B``."""
+        return not self.stratified
+
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
         """Draw slots by Eq. (8), with the weights of Eq. (10).
 

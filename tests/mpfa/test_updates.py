@@ -1,0 +1,401 @@
+"""Several updates in one iteration: equal to as many loops of sample, update and write."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler
+
+from torchrl_mpfa import (
+    DDPGLearner,
+    Draw,
+    MPFASampler,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    one_batch,
+    run_updates,
+)
+from torchrl_mpfa.methods import METHODS, loss_options, make_replay
+
+OBSERVATION, ACTION = 5, 2
+MANY, BATCH, UPDATES = 4000, 16, 4
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def make_rows(count, seed=0):
+    def normal(size):
+        return torch.randn(count, size, generator=generator)
+
+    generator = seeded(seed)
+    end = torch.zeros(count, 1, dtype=torch.bool)
+    after = {"observation": normal(OBSERVATION), "reward": normal(1)}
+    return TensorDict(
+        {
+            "observation": normal(OBSERVATION),
+            "action": normal(ACTION).tanh(),
+            "next": {**after, "done": end, "terminated": end.clone()},
+        },
+        [count],
+    )
+
+
+def make_learner(**options):
+    torch.manual_seed(0)
+    actor = make_actor(OBSERVATION, ACTION, width=8)
+    critic = make_critic(OBSERVATION, ACTION, width=8)
+    return DDPGLearner(make_ddpg_loss(actor, critic, **options), actor_lr=1e-2, critic_lr=1e-2)
+
+
+def make_buffer(count=MANY, **options):
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(count),
+        sampler=MPFASampler(count, **options),
+        batch_size=BATCH,
+        generator=seeded(3),
+    )
+    buffer.extend(make_rows(count))
+    return buffer
+
+
+def run_loop(buffer, learner, updates):
+    """The plain loop, but for priorities that wait for the end; gives its batches."""
+    batches = [buffer.sample() for _ in range(updates)]
+    for batch in batches:
+        log = learner.update(batch)
+    for batch in batches:
+        buffer.update_tensordict_priority(batch)
+    return log, batches
+
+
+def has_twins(batches):
+    index = torch.cat([batch["index"] for batch in batches])
+    return len(index.unique()) < len(index)
+
+
+def assert_same(first, second):
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, list | tuple):
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    elif isinstance(first, torch.Tensor):
+        torch.testing.assert_close(first, second, rtol=0, atol=0, equal_nan=True)
+    else:
+        assert first == second
+
+
+class Counting:
+    """A learner that learns nothing: its signals are the number of the update."""
+
+    policy = None
+
+    def __init__(self):
+        self.updates, self.batches = 0, []
+
+    def update(self, draw):
+        self.updates += 1
+        batch = draw.batch
+        value = torch.full((len(batch),), float(self.updates))
+        batch["signals"] = TensorDict({"td_error": value, "action_gradient": value}, [len(batch)])
+        batch["td_error"] = value
+        self.batches.append(batch)
+        return {"loss_value": torch.tensor(float(self.updates))}
+
+
+def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait():
+    ours, theirs = make_buffer(), make_buffer()
+    first, second = make_learner(), make_learner()
+    for _ in range(3):
+        log, batch = run_updates(ours, first, updates=UPDATES)
+        expected, batches = run_loop(theirs, second, UPDATES)
+        assert_same(log, expected)
+        assert_same(batch.to_dict(), batches[-1].to_dict())
+    assert_same(first.state_dict(), second.state_dict())
+    assert_same(ours.state_dict(), theirs.state_dict())
+    assert first.updates == 3 * UPDATES
+
+
+def test_one_call_samples_and_one_writes(monkeypatch):
+    calls = []
+    for name in ("sample", "update_signals"):
+        method = getattr(MPFASampler, name)
+
+        def spy(self, *args, name=name, method=method, **kwargs):
+            calls.append(name)
+            return method(self, *args, **kwargs)
+
+        monkeypatch.setattr(MPFASampler, name, spy)
+    run_updates(make_buffer(), make_learner(), updates=UPDATES)
+    assert calls == ["sample", "update_signals"]
+
+
+@pytest.mark.parametrize("position", ["batch", "rank", "count"])
+def test_each_batch_has_places_and_a_mean_of_its_own(position):
+    ours = make_replay(
+        capacity=MANY, batch_size=BATCH, generator=seeded(1), decay_position=position
+    ).buffer
+    ours.extend(make_rows(MANY))
+    theirs = copy.deepcopy(ours)
+    run_updates(ours, make_learner(), updates=UPDATES)
+    run_loop(theirs, make_learner(), UPDATES)
+    assert_same(ours.sampler.priorities(), theirs.sampler.priorities())
+
+
+def test_of_a_transition_that_was_sampled_twice_the_last_update_counts():
+    few = 12
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(few),
+        sampler=MPFASampler(few),
+        batch_size=8,
+        generator=seeded(0),
+    )
+    buffer.extend(make_rows(few))
+    learner = Counting()
+    run_updates(buffer, learner, updates=UPDATES)
+    last = {}
+    for number, batch in enumerate(learner.batches, start=1):
+        for slot in batch["index"].tolist():
+            last[slot] = float(number)
+    assert has_twins(learner.batches)
+    assert len(set(last.values())) > 2
+    table = buffer.storage.signal_table
+    found = table.rows[:, table.column["td_error"]]
+    assert {slot: found[slot].item() for slot in last} == last
+
+
+def test_rows_that_were_overwritten_meanwhile_are_left_out_of_their_own_batch():
+    ours, theirs = make_buffer(), make_buffer()
+    lost = {}
+
+    def overwrite(buffer, learner):
+        count = 0
+
+        def update(draw):
+            nonlocal count
+            count += 1
+            if count == UPDATES:
+                lost[id(buffer)] = buffer.extend(make_rows(MANY // 2, seed=9))
+            return type(learner).update(learner, draw)
+
+        return update
+
+    first, second = make_learner(), make_learner()
+    first.update = overwrite(ours, first)
+    second.update = overwrite(theirs, second)
+    run_updates(ours, first, updates=UPDATES)
+    run_loop(theirs, second, UPDATES)
+    assert 0 < ours.stale_updates == theirs.stale_updates < UPDATES * BATCH
+    assert_same(ours.sampler.priorities(), theirs.sampler.priorities())
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_makes_as_many_updates_and_gives_log_and_batch(name):
+    learner = make_learner(**loss_options(name))
+    replay = make_replay(
+        name, capacity=200, batch_size=BATCH, generator=seeded(0), policy=learner.policy, sigma=0.2
+    )
+    replay.buffer.extend(make_rows(200))
+    log, batch = run_updates(replay.buffer, learner, replay.select, updates=3)
+    assert learner.updates == 3
+    assert {"loss_value", "loss_actor", "td_error"} <= log.keys()
+    for signal in replay.signals:
+        assert batch["signals", signal].shape == batch.batch_size
+    if name in {"mpfa_per", "per", "lap", "hvper", "rank_per", "mw"}:
+        weight = batch["priority_weight"]
+        assert weight.shape == (BATCH,) and bool((weight > 0).all())
+        assert replay.buffer.sampler.weights
+
+
+def newest_in(batch):
+    return batch["index"][0].item() == 199
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "calls"),
+    [
+        ("mpfa_per", {}, 1),
+        ("ddpg", {}, 1),
+        ("rank_per", {}, 1),
+        ("mpfa_per", {"stratified": True}, 3),
+        ("mw", {}, 3),
+        ("cer", {}, 3),
+        ("la3p", {}, 9),
+        ("klper", {}, 3),
+    ],
+)
+def test_batches_that_are_more_than_their_rows_are_sampled_one_by_one(name, settings, calls):
+    learner = make_learner(**loss_options(name))
+    replay = make_replay(
+        name,
+        capacity=200,
+        batch_size=BATCH,
+        generator=seeded(0),
+        policy=learner.policy,
+        sigma=0.2,
+        **settings,
+    )
+    replay.buffer.extend(make_rows(200))
+    sampled = []
+    sample = replay.buffer.sample
+
+    def spy(*args):
+        sampled.append(sample(*args))
+        return sampled[-1]
+
+    replay.buffer.sample = spy
+    run_updates(replay.buffer, learner, replay.select, updates=3)
+    assert len(sampled) == calls
+    if name == "cer":
+        assert all(map(newest_in, sampled))
+
+
+def test_a_selection_of_ones_own_is_asked_update_by_update_by_the_priorities_before():
+    buffer, seen = make_buffer(), []
+
+    def select(buffer):
+        seen.append(buffer.sampler.priorities())
+        yield from one_batch(buffer)
+
+    learner = Counting()
+    run_updates(buffer, learner, select, updates=3)
+    assert len(seen) == 3
+    for before, after, batch in zip(seen, seen[1:], learner.batches, strict=False):
+        changed = (before != after).nonzero().squeeze(1)
+        assert set(changed.tolist()) <= set(batch["index"].tolist())
+        assert len(changed) > 0
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+def test_what_prepares_a_draw_comes_before_the_learner(updates):
+    learner = Counting()
+
+    def prepare(draw):
+        batch = draw.batch.copy()
+        batch["next", "reward"] = batch["next", "reward"] + 100.0
+        return replace(draw, batch=batch)
+
+    buffer = make_buffer()
+    before = buffer.storage["next", "reward"].clone()
+    _, batch = run_updates(buffer, learner, updates=updates, prepare=prepare)
+    assert all(bool((each["next", "reward"] > 50).all()) for each in learner.batches)
+    assert bool((batch["next", "reward"] > 50).all())
+    assert_same(buffer.storage["next", "reward"], before)
+    found = buffer.storage.signal_table
+    written = found.rows[batch["index"], found.column["td_error"]]
+    assert bool((written == updates).all())
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an accelerator")
+def test_batches_go_to_the_device_of_the_learner_and_signals_come_back(updates):
+    learner, buffer = Counting(), make_buffer()
+    _, batch = run_updates(
+        buffer,
+        learner,
+        updates=updates,
+        prepare=lambda draw: replace(draw, batch=draw.batch.to("cuda")),
+    )
+    assert all(each.device.type == "cuda" for each in learner.batches)
+    assert batch.device.type == "cpu"
+    table = buffer.storage.signal_table
+    assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+def test_batches_of_another_device_come_back_to_that_of_their_rows(updates):
+    # What has no device of its own stands for another one, which not every machine has.
+    learner, buffer = Counting(), make_buffer()
+
+    def prepare(draw):
+        return replace(draw, batch=TensorDict(draw.batch.to_dict(), [BATCH]))
+
+    _, batch = run_updates(buffer, learner, updates=updates, prepare=prepare)
+    assert all(each.device is None for each in learner.batches)
+    assert batch.device == torch.device("cpu")
+    table = buffer.storage.signal_table
+    assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
+
+
+@pytest.mark.parametrize("sampler", [RandomSampler(), PrioritizedSampler(300, 0.6, 0.4)])
+def test_buffers_of_torchrl_are_served_as_they_are(sampler):
+    def make():
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(300),
+            sampler=copy.deepcopy(sampler),
+            batch_size=BATCH,
+            generator=seeded(0),
+            priority_key="td_error",
+        )
+        buffer.extend(make_rows(300))
+        return buffer
+
+    buffer, learner = make(), make_learner()
+    log, batch = run_updates(buffer, learner, updates=3)
+    assert learner.updates == 3
+    assert len(batch) == BATCH
+    assert "loss_value" in log
+    if isinstance(buffer.sampler, PrioritizedSampler):
+        index = batch["index"]
+        found = torch.as_tensor(buffer.sampler._sum_tree[index])
+        expected = (batch["td_error"] + buffer.sampler._eps) ** 0.6
+        torch.testing.assert_close(found.float(), expected.float(), rtol=1e-4, atol=1e-6)
+
+
+def test_a_batch_size_of_several_batches_is_not_warned_of(recwarn):
+    run_updates(make_buffer(), make_learner(), updates=2)
+    assert not [each for each in recwarn if "batch_size" in str(each.message)]
+
+
+@pytest.mark.parametrize("updates", [0, -1, 1.5, True])
+def test_a_number_of_updates_that_is_none_is_refused(updates):
+    with pytest.raises(ValueError, match=r"updates must be a positive integer, got"):
+        run_updates(make_buffer(), make_learner(), updates=updates)
+
+
+def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_refused():
+    learner = make_learner()
+    storage = SignalTensorStorage(MANY)
+    buffer = SignalReplayBuffer(storage=storage, sampler=MPFASampler(MANY))
+    with pytest.raises(ValueError, match="buffer must have a batch_size, got None"):
+        run_updates(buffer, learner)
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(MANY), sampler=MPFASampler(MANY), batch_size=BATCH
+    )
+    buffer.extend(make_rows(BATCH - 1))
+    with pytest.raises(ValueError, match="at least one batch of 16, got 15 transitions"):
+        run_updates(buffer, learner, updates=2)
+    assert learner.updates == 0
+    buffer.extend(make_rows(1))
+    run_updates(buffer, learner, updates=2)
+    assert learner.updates == 2
+
+
+def test_a_selection_without_a_draw_for_the_critic_is_refused():
+    def none(buffer):
+        yield Draw(buffer.sample(), trains="actor")
+
+    with pytest.raises(ValueError, match="select must give the critic a draw"):
+        run_updates(make_buffer(), make_learner(), none)
+
+
+def test_rows_that_are_no_equal_batches_are_refused():
+    buffer = make_buffer()
+    learner = Counting()
+    batch = buffer.sample()
+    learner.update(Draw(batch))
+    before = buffer.sampler.priorities()
+    with pytest.raises(ValueError, match="16 slots cannot make 3 equal batches"):
+        buffer.update_tensordict_priority(batch, batches=3)
+    assert_same(buffer.sampler.priorities(), before)

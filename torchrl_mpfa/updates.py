@@ -1,0 +1,169 @@
+"""The learner's side of one iteration: several updates for what several robots brought.
+
+The batches of all updates are sampled in one call and their priorities written in one, which costs
+a fraction of as many calls; the price is that no batch knows of the updates just before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import RandomSampler, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import PrioritizedSampler
+
+from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.learners.base import Learner
+from torchrl_mpfa.replay import SignalReplayBuffer
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.selection import Draw, Selection, one_batch
+
+Prepare = Callable[[Draw], Draw]
+
+
+def run_updates(
+    buffer: TensorDictReplayBuffer,
+    learner: Learner,
+    select: Selection = one_batch,
+    *,
+    updates: int = 1,
+    prepare: Prepare | None = None,
+) -> tuple[dict[str, Tensor], TensorDictBase]:
+    """Make the updates of one iteration.
+
+    With :func:`~torchrl_mpfa.one_batch` the batches of all updates are sampled in one call, and
+    their priorities are written in one at the end; of a transition that was sampled twice the last
+    update counts. Any other selection, and a sampler whose batches are more than rows drawn one by
+    one (stratified, with the newest transition in each), is asked update by update, and priorities
+    are written after each draw.
+
+    Args:
+        buffer: Where batches of ``B`` are sampled, as its constructor was told.
+        learner: What is trained.
+        select: From the buffer to the draws of an update.
+        updates: Number of updates ``U``.
+        prepare: Applied to each draw before the learner gets it: to move its batch to the learner's
+            device, or to add to its rewards. It keeps the rows of the batch and their order.
+
+    Returns:
+        Detached values for the log, of the last update; and its last batch with signals, where the
+        buffer has its own.
+
+    Raises:
+        ValueError: If ``updates`` is not positive, or the buffer has no batch size or fewer
+            transitions than one batch; nothing is changed.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mpfa import DDPGLearner, make_actor, make_critic, make_ddpg_loss
+        >>> from torchrl_mpfa.methods import make_replay
+        >>> replay = make_replay("mpfa_per", capacity=100, batch_size=8)
+        >>> end = torch.zeros(32, 1, dtype=torch.bool)
+        >>> after = {"observation": torch.rand(32, 24), "reward": torch.rand(32, 1)}
+        >>> rows = {
+        ...     "observation": torch.rand(32, 24),
+        ...     "action": torch.rand(32, 2),
+        ...     "next": {**after, "done": end, "terminated": end},
+        ... }
+        >>> index = replay.buffer.extend(TensorDict(rows, [32]))
+        >>> learner = DDPGLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
+        >>> log, batch = run_updates(replay.buffer, learner, replay.select, updates=4)
+        >>> learner.updates, batch["signals", "td_error"].shape
+        (4, torch.Size([8]))
+    """
+    check_counts(updates=updates)
+    batch_size = buffer.batch_size
+    if batch_size is None:
+        raise ValueError("buffer must have a batch_size, got None")
+    if len(buffer) < batch_size:
+        raise ValueError(
+            f"buffer must hold at least one batch of {batch_size}, got {len(buffer)} transitions"
+        )
+    if updates > 1 and select is one_batch and _divides(buffer):
+        return _together(buffer, learner, prepare, updates, batch_size)
+    for _ in range(updates):
+        log, batch = _one_by_one(buffer, learner, select, prepare)
+    return log, batch
+
+
+def _one_by_one(
+    buffer: TensorDictReplayBuffer, learner: Learner, select: Selection, prepare: Prepare | None
+) -> tuple[dict[str, Tensor], TensorDictBase]:
+    """One update, whose draws may depend on the priorities that the one before it gave."""
+    log: dict[str, Tensor] = {}
+    batch: TensorDictBase | None = None
+    for draw in select(buffer):
+        learned, values = _learn(learner, draw, prepare)
+        log.update(values)
+        if draw.gives_signals:
+            batch = _at(learned, draw.batch.device)
+            buffer.update_tensordict_priority(batch)
+    if batch is None:
+        raise ValueError("select must give the critic a draw in each update, got none")
+    return log, batch
+
+
+def _together(
+    buffer: TensorDictReplayBuffer,
+    learner: Learner,
+    prepare: Prepare | None,
+    updates: int,
+    batch_size: int,
+) -> tuple[dict[str, Tensor], TensorDictBase]:
+    """All updates of an iteration, with one call to sample and one to write priorities."""
+    # TorchRL warns of a batch size that is not the buffer's, which is meant here.
+    buffer._warned_batch_size_conflict = True
+    sampled = buffer.sample(updates * batch_size)
+    home, learned = sampled.device, []
+    for part in sampled.split(batch_size):
+        batch, log = _learn(learner, Draw(part), prepare)
+        learned.append(batch)
+    if isinstance(buffer, SignalReplayBuffer):
+        buffer.update_tensordict_priority(_joined(buffer, learned, home), batches=updates)
+    elif isinstance(buffer.sampler, PrioritizedSampler):
+        buffer.update_tensordict_priority(_joined(buffer, learned, home))
+    return log, _at(learned[-1], home)
+
+
+def _learn(
+    learner: Learner, draw: Draw, prepare: Prepare | None
+) -> tuple[TensorDictBase, dict[str, Tensor]]:
+    """The batch of a draw with its signals, and values for the log."""
+    if prepare is not None:
+        draw = prepare(draw)
+    values = learner.update(draw)
+    return draw.batch, values
+
+
+def _joined(
+    buffer: TensorDictReplayBuffer,
+    batches: Sequence[TensorDictBase],
+    device: torch.device | None,
+) -> TensorDictBase:
+    """What priorities are made from, of several batches, shape ``[U * B]``."""
+    sampler = buffer.sampler
+    keys = ["index", buffer.priority_key]
+    if isinstance(sampler, SignalSampler):
+        learned = [signal.key for signal in sampler.signals if signal.known_at == "update"]
+        keys = ["index", "written_at", *learned]
+    joined = TensorDict({}, [sum(map(len, batches))], device=device)
+    for key in keys:
+        values = [batch.get(key, None) for batch in batches]
+        if all(value is not None for value in values):
+            joined.set(key, torch.cat(values).to(device or "cpu"))
+    return joined
+
+
+def _at(batch: TensorDictBase, device: torch.device | None) -> TensorDictBase:
+    """The batch on the device that its rows came from, of which None is the CPU."""
+    return batch if batch.device == device else batch.to(device or "cpu")
+
+
+def _divides(buffer: TensorDictReplayBuffer) -> bool:
+    """Whether ``U * B`` rows, sampled at once, are ``U`` batches of ``B``."""
+    sampler = buffer.sampler
+    drawn_alone = type(sampler) in (RandomSampler, PrioritizedSampler)
+    alone = drawn_alone or bool(getattr(sampler, "divisible", False))
+    return alone and not getattr(buffer, "_prefetch", False)
