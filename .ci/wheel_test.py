@@ -63,7 +63,7 @@ buffer.update_tensordict_priority(batch)
 print("weights of the signals:", buffer.sampler.weights)
 
 policy = load_policy(sys.argv[3])
-results = evaluate(policy, "random-100", episodes=10, physics="kinematic")
+results = evaluate(policy, "rooms-100", episodes=10, physics="kinematic")
 print("success of the shipped policy:", summarize(results)["success"])
 assert sum(result.success for result in results) >= 8, results
 """

@@ -262,7 +262,7 @@ def describe_world(world: World) -> dict[str, float]:
     lengths = [tight.length(pair.start[:2], pair.goal) for pair in pairs]
     direct = [math.dist(pair.start[:2], pair.goal) for pair in pairs]
     row = {
-        "obstacles": float(len(world.boxes) + len(world.cylinders)),
+        "obstacles": float(world.obstacle_count),
         "covered area [m²]": world.covered_area,
         "mean clearance [m]": statistics.mean(c for c in clearances if c > 0),
         "path / straight line": statistics.mean(

@@ -2,7 +2,7 @@
 
     python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners, too
-    python examples/compare.py --worlds test random:100-109 --episodes 40    eleven worlds
+    python examples/compare.py --worlds test rooms:100-109 --episodes 40    eleven worlds
     python examples/compare.py --seeds 0 --methods per --folder runs/try -- curriculum=A
 
 What follows ``--`` goes to ``train.py``. Stopped at any moment, the same command goes on: finished

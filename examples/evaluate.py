@@ -1,7 +1,7 @@
 """Evaluate a trained policy between fixed starts and goals in one or several worlds.
 
     python examples/evaluate.py runs/demo --worlds A --episodes 100
-    python examples/evaluate.py runs/demo --worlds test random:100-109 --episodes 40
+    python examples/evaluate.py runs/demo --worlds test rooms:100-109 --episodes 40
     python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
 
 Prints a row for each world and their total. Writes to the folder ``evaluation-WORLDS`` in that of
@@ -43,7 +43,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--worlds",
         nargs="+",
         default=["test"],
-        help="names, world files, and spans of random worlds such as random:100-109",
+        help="names, world files, and spans of generated worlds such as rooms:100-109",
     )
     parser.add_argument("--episodes", type=int, default=200, help="in each world (default: 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")

@@ -40,7 +40,7 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
 
     Returns:
         The rows of ``compare.py``; with ``arm`` (learner and method), ``run`` (its name, unique in
-        its arm), ``path`` (its folder) and ``family`` (its worlds: ``random`` for all random ones).
+        its arm), ``path`` (its folder) and ``family`` (``rooms`` for all ``rooms-SEED``).
     """
     tables = []
     for folder in folders:
@@ -52,7 +52,7 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
         found["run"] = seed if len(folders) == 1 else folder.name + "/" + seed
         name = found["learner"] + "-" + found["method"] + "-" + seed
         found["path"] = [str(folder / each) for each in name]
-        found["family"] = found["world"].str.replace(r"^random-\d+$", "random", regex=True)
+        found["family"] = found["world"].str.replace(r"^([a-z-]+)-\d+$", r"\1", regex=True)
         tables.append(found)
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
 from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.evaluation import (
     EpisodeResult,
@@ -22,7 +23,6 @@ from mpfa_envs.navigation import PAPER_TASK, NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
 from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
-from mpfa_envs.random_worlds import random_world
 from mpfa_envs.render import render_trajectories
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
@@ -49,6 +49,7 @@ EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start your own from."""
 
 __all__ = [
+    "BARN_WORLDS",
     "ENV_IDS",
     "EXAMPLE_WORLD",
     "GENERATORS",
@@ -79,6 +80,8 @@ __all__ = [
     "World",
     "WorldArrays",
     "WorldFileError",
+    "barn_task",
+    "barn_world",
     "evaluate",
     "evaluation_pairs",
     "generate_world",
@@ -88,7 +91,6 @@ __all__ = [
     "make_navigation_env",
     "navigation_reward",
     "observation_slices",
-    "random_world",
     "render_trajectories",
     "run_episodes",
     "sample_task",

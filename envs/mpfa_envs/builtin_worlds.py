@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from mpfa_envs.checks import did_you_mean
-from mpfa_envs.random_worlds import random_world
 from mpfa_envs.worlds import Box, World
 
 if TYPE_CHECKING:
@@ -106,8 +105,11 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         return world
     if isinstance(world, str) and world in WORLDS:
         return WORLDS[world]
-    if isinstance(world, str) and (room := re.fullmatch(r"random-([0-9]{1,9})", world)):
-        return random_world(int(room[1]))
+    if isinstance(world, str) and (number := re.fullmatch(r"barn-([0-9]|1[0-9])", world)):
+        # Imported here because it needs tasks, which need this file.
+        from mpfa_envs.barn import barn_world
+
+        return barn_world(int(number[1]))
     if isinstance(world, str) and re.fullmatch(r"[a-z]+-[a-z0-9@.-]*[0-9]", world):
         # Imported here because the generators need Numba, which takes half a second.
         from mpfa_envs.generators import world_of_name
@@ -121,6 +123,6 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         return load_world(world)
     hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
     raise ValueError(
-        f"world must be a World, the path of a .yaml file, 'random-SEED', a generator's "
+        "world must be a World, the path of a .yaml file, 'barn-0' to 'barn-19', a generator's "
         f"'NAME-SEED' or one of {list(WORLDS)}, got {world!r}{hint}"
     )

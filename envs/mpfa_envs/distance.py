@@ -3,8 +3,11 @@
 Where :mod:`~mpfa_envs.path` answers one question exactly, a field answers it for all cells at once,
 and in milliseconds however many obstacles there are: the moves between free cells and their 16
 neighbors make a graph, and SciPy's Dijkstra starts from the goal. Moves have 16 directions, hence
-a way in the open is at most 2.8 % too long. A cell around each corner comes on top of it:
-``docs/worlds.md`` has what was measured.
+a way in the open is up to 1.4 % too long or too short. Around corners and in narrow passages the
+size of the cells adds to it: ``docs/worlds.md`` has what was measured.
+
+Centers of free cells keep the distance d. Between two that are a step L apart a way keeps
+√(d² - L²/4) at least: whatever is nearest to its middle is d away from both ends.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from scipy.sparse.csgraph import dijkstra
 from mpfa_envs.checks import check_number, check_positive, check_share
 from mpfa_envs.kernels.grid import (
     MOVES,
+    STEP_SCALE,
     clearance_grid,
     fill_from_nearest,
     interpolate,
@@ -52,11 +56,11 @@ class FreeGrid:
     Args:
         world: The room and its obstacles.
         distance: What a free cell's center keeps from every obstacle and wall [m].
-        resolution: Side of a cell [m].
+        resolution: Side of a cell [m], no longer than the distance, so that no move steps over a
+            wall. None: 0.1 m, or the distance if that is less.
 
     Raises:
-        ValueError: If a number is not positive, cells are so large that a move could step over
-            a thin wall, or there would be more than four million cells.
+        ValueError: If a number is out of its range, or there would be more than four million cells.
 
     Examples:
         >>> from mpfa_envs import WORLDS, FreeGrid
@@ -67,13 +71,15 @@ class FreeGrid:
         ((50, 87), False)
     """
 
-    def __init__(self, world: World, *, distance: float, resolution: float = RESOLUTION) -> None:
+    def __init__(self, world: World, *, distance: float, resolution: float | None = None) -> None:
         self.world = world
         self.distance = check_positive("distance", distance)
+        if resolution is None:
+            resolution = min(RESOLUTION, self.distance)
         self.resolution = check_positive("resolution", resolution)
-        if self.resolution >= 2 * self.distance:
+        if self.resolution > self.distance:
             raise ValueError(
-                f"resolution must be below twice distance = {distance} m, got {resolution}"
+                f"resolution must be at most the distance, {distance} m, got {resolution}"
             )
         # The grid is as wide as the room or a little wider; what is behind a wall is not free.
         sides = [max(1, math.ceil(round(side / resolution, 6))) for side in world.size]
@@ -104,7 +110,7 @@ class FreeGrid:
     @cached_property
     def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
         """The moves between free cells: starts, neighbors and lengths [m]."""
-        return neighbor_lists(self.free, self._numbers, MOVES, self.resolution)
+        return neighbor_lists(self.free, self._numbers, MOVES, self.resolution * STEP_SCALE)
 
     def index(self, x: float, y: float) -> tuple[int, int]:
         """Find the cell of a position, the nearest one for a position outside.
@@ -190,8 +196,8 @@ class DistanceField:
     Examples:
         >>> from mpfa_envs import WORLDS, DistanceField, FreeGrid
         >>> field = DistanceField(FreeGrid(WORLDS["B"], distance=0.18), (4.0, 0.0))
-        >>> round(field.at(3.9, 0.0), 2), round(field.at(0.0, 0.0), 1)  # [m]; a box is between
-        (0.1, 6.6)
+        >>> round(field.at(3.9, 0.0), 1), round(field.at(0.0, 0.0), 1)  # [m]; a box is between
+        (0.1, 6.4)
     """
 
     def __init__(self, grid: FreeGrid, goal: tuple[float, float]) -> None:

@@ -116,9 +116,9 @@ def evaluate(
     Examples:
         >>> from mpfa_envs import evaluate, summarize
         >>> ahead = lambda observation: np.ones(2)
-        >>> results = evaluate(ahead, ["A", "random-7"], episodes=3, physics="kinematic")
+        >>> results = evaluate(ahead, ["A", "rooms-7"], episodes=3, physics="kinematic")
         >>> [(result.world, result.episode) for result in results[2:4]]
-        [('A', 2), ('random-7', 0)]
+        [('A', 2), ('rooms-7', 0)]
         >>> sorted(summarize(results))[:3]
         ['collision', 'min_clearance', 'path_length']
     """

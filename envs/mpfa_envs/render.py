@@ -97,6 +97,8 @@ class _Canvas:
             )
         for cylinder in world.cylinders:
             self.disc(cylinder.x, cylinder.y, cylinder.radius, fill=OBSTACLE, outline=OBSTACLE_EDGE)
+        for polygon in world.polygons:
+            self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
 
     def rectangle(
         self,
@@ -111,6 +113,11 @@ class _Canvas:
         """Fill a rectangle given by its edges [m]."""
         corners = [self.at(x_min, y_max), self.at(x_max, y_min)]
         self.draw.rectangle(corners, fill=fill, outline=outline, width=_FINE)
+
+    def polygon(self, vertices: Sequence[Point], *, fill: Color, outline: Color) -> None:
+        """Fill a polygon given by its corners [m]."""
+        corners = [self.at(*vertex) for vertex in vertices]
+        self.draw.polygon(corners, fill=fill, outline=outline, width=_FINE)
 
     def disc(
         self,

@@ -78,7 +78,7 @@ def sample_task(
     planner = planner_for(world, collision_distance)
     start_clearance = collision_distance + START_SLACK
     goal_clearance = max(GOAL_CLEARANCE, collision_distance)
-    obstacles = bool(world.boxes or world.cylinders)
+    obstacles = world.obstacle_count > 0
     detour = detour_chance > 0.0 and obstacles and rng.random() < detour_chance
     straight: Task | None = None
     for _ in range(_STARTS):

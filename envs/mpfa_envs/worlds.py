@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -86,6 +87,13 @@ class World:
             for shape in getattr(self, field):
                 if not self.holds(shape):
                     raise ValueError(f"{field} must lie in the room {self.room}, got {shape}")
+
+    def renamed(self, name: str) -> World:
+        """Give the same world another name; what was computed of it is kept."""
+        world = copy.copy(self)
+        # The dataclass is frozen; this is the copy's only change, before anyone sees it.
+        object.__setattr__(world, "name", name)
+        return world
 
     @cached_property
     def room(self) -> Box:

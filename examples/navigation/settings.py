@@ -130,7 +130,7 @@ class Stage:
     """Episodes in one world."""
 
     world: str = "A"
-    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, ``random-SEED``, or the path of a world
+    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, ``rooms-SEED``, or the path of a world
     file."""
     episodes: int = 100
 

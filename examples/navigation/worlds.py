@@ -16,7 +16,7 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
     """The worlds that some words stand for.
 
     Args:
-        words: Names of worlds, paths of world files, and spans of random worlds.
+        words: Names of worlds, paths of world files, and spans of generated ones.
 
     Returns:
         Names and paths, each of which there is.
@@ -25,19 +25,19 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
         ValueError: If there is no such world, or one is named twice.
 
     Examples:
-        >>> parse_worlds(["test", "random:7-9"])
-        ['test', 'random-7', 'random-8', 'random-9']
+        >>> parse_worlds(["test", "rooms:7-9"])
+        ['test', 'rooms-7', 'rooms-8', 'rooms-9']
     """
     worlds: list[str] = []
     for word in words:
-        span = re.fullmatch(r"random:(\d{1,9})-(\d{1,9})", word)
+        span = re.fullmatch(r"([a-z-]+):(\d{1,9})-(\d{1,9})", word)
         if span is None:
             worlds.append(word)
         else:
-            first, last = int(span[1]), int(span[2])
+            first, last = int(span[2]), int(span[3])
             if last < first:
                 raise ValueError(f"{word} ends before it begins")
-            worlds += [f"random-{number}" for number in range(first, last + 1)]
+            worlds += [f"{span[1]}-{number}" for number in range(first, last + 1)]
     for number, world in enumerate(worlds):
         if world in worlds[:number]:
             raise ValueError(f"world {world!r} is named twice")
@@ -60,8 +60,8 @@ def worlds_label(words: Sequence[str]) -> str:
         Part of a file's name; other worlds have another one.
 
     Examples:
-        >>> worlds_label(["test", "random:100-109"])
-        'test+random-100-109'
+        >>> worlds_label(["test", "rooms:100-109"])
+        'test+rooms-100-109'
     """
     label = "+".join(world_name(word.replace(":", "-")) for word in words)
     if len(label) <= _LONGEST and not any(Path(word).suffix for word in words):

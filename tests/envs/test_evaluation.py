@@ -135,11 +135,11 @@ def test_results_do_not_depend_on_how_many_run_at_once(physics: str) -> None:
 
 def test_several_worlds_give_rows_that_name_theirs() -> None:
     policy = steering_policy(max_steps=20)
-    both = evaluate(policy, ["C", "random-100"], episodes=3)
+    both = evaluate(policy, ["C", "rooms-100"], episodes=3)
     assert [(r.world, r.episode) for r in both] == [
-        (world, episode) for world in ("C", "random-100") for episode in range(3)
+        (world, episode) for world in ("C", "rooms-100") for episode in range(3)
     ]
-    assert both[3:] == evaluate(policy, "random-100", episodes=3)
+    assert both[3:] == evaluate(policy, "rooms-100", episodes=3)
     assert list(asdict(both[0]))[-1] == "world"
 
 

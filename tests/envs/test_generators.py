@@ -1,19 +1,25 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import random
 import subprocess
 import sys
+from collections import Counter
+from itertools import combinations
 
+import numpy as np
 import pytest
+from scipy.ndimage import label
 
 from mpfa_envs import (
     GENERATORS,
+    Box,
     FreeGrid,
     PathPlanner,
     World,
     generate_world,
     generator_tasks,
-    random_world,
     split_worlds,
     world_seed,
 )
@@ -21,6 +27,16 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.distance import has_task
 
 NAMES = list(GENERATORS)
+PINNED = {
+    "rooms": ("3e882fba5b92", "792ac77905ff"),
+    "clutter": ("7d517f39f07f", "05f1476961fb"),
+    "bars": ("95bee62eb266", "78103f2b46ff"),
+    "fields": ("050b0f4a3b85", "2ffc4e86d6b2"),
+    "halls": ("937971d5560e", "c893ea64c501"),
+    "mazes": ("5eeb58f9a307", "ad677f95fbf1"),
+    "mixed": ("8b6268b6671e", "9467986caa96"),
+}
+"""World 7 for training, and world 7 of the test at full difficulty."""
 
 
 def fingerprint(world: World) -> str:
@@ -53,20 +69,32 @@ def test_a_seed_is_one_world_and_another_seed_another(name: str) -> None:
     assert [world.name for world in worlds] == [f"{name}-{seed}" for seed in range(20)]
 
 
-def test_rooms_are_what_random_worlds_were() -> None:
-    for seed in (0, 7, 100, 12345):
-        assert generate_world("rooms", seed).boxes == random_world(seed).boxes
+@pytest.mark.parametrize(("name", "expected"), PINNED.items())
+def test_a_seed_is_one_world_for_ever(name: str, expected: tuple[str, str]) -> None:
+    # Results refer to worlds by their names.
+    found = generate_world(name, 7), generate_world(name, world_seed("test", 7), difficulty=1.0)
+    assert tuple(fingerprint(world) for world in found) == expected
+
+
+def test_rooms_are_those_of_earlier_results() -> None:
+    for seed, place, edges in (
+        (7, 0, (4.5, 2.733799, 5.0, 3.380495)),
+        (100, -1, (2.476928, 4.5, 3.871075, 5.0)),
+    ):
+        boxes = generate_world("rooms", seed).boxes
+        assert len(boxes) == 13
+        assert boxes[place].bounds == pytest.approx(edges, abs=2e-6)
 
 
 def test_a_seed_is_the_same_world_in_another_process() -> None:
     code = (
         "from mpfa_envs import generate_world\n"
-        "for name in ('clutter', 'bars'):\n"
+        "for name in ('fields', 'halls', 'mazes', 'mixed'):\n"
         "    print([part.tolist() for part in generate_world(name, 5).arrays])"
     )
     expected = "".join(
         f"{[part.tolist() for part in generate_world(name, 5).arrays]}\n"
-        for name in ("clutter", "bars")
+        for name in ("fields", "halls", "mazes", "mixed")
     )
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
@@ -164,3 +192,94 @@ def test_a_world_that_cannot_be_driven_is_drawn_anew_and_not_for_ever(
     )
     with pytest.raises(ValueError, match="'closets-3' cannot be made: none of 100 attempts"):
         generate_world("closets", 3)
+
+
+def gap(one: Box, other: Box) -> float:
+    across = max(one.x_min - other.x_max, other.x_min - one.x_max, 0.0)
+    up = max(one.y_min - other.y_max, other.y_min - one.y_max, 0.0)
+    return math.hypot(across, up)
+
+
+@pytest.mark.parametrize(("difficulty", "boxes", "passage"), [(0, 8, 1.1), (0.5, 13, 0.9)])
+def test_between_any_two_things_in_rooms_there_is_a_passage_or_none_at_all(
+    difficulty: float, boxes: int, passage: float
+) -> None:
+    touching = [0, 0, 0, 0]
+    for seed in range(20):
+        world = generate_world("rooms", seed, difficulty=difficulty)
+        assert len(world.boxes) == boxes
+        assert all(gap(a, b) >= passage for a, b in combinations(world.boxes, 2))
+        for box in world.boxes:
+            sides = sorted((box.x_max - box.x_min, box.y_max - box.y_min))
+            assert 0.5 - 1e-9 <= sides[0] <= 0.5 + 1e-9 or sides[1] == pytest.approx(0.5)
+            assert sides[1] <= 2.6 + 1e-9
+            ways = [a - b for a, b in zip(box.bounds, world.room.bounds, strict=True)]
+            assert all(way == 0.0 or abs(way) >= passage for way in ways)
+            touching = [n + (way == 0.0) for n, way in zip(touching, ways, strict=True)]
+    # At each wall there are boxes that make dead ends.
+    assert min(touching) > 15
+
+
+@pytest.mark.parametrize("difficulty", [0.0, 0.5, 1.0])
+def test_every_place_of_a_maze_can_be_reached(difficulty: float) -> None:
+    half = (1.5 - 0.8 * difficulty) / 2
+    wider = []
+    for seed in range(15):
+        world = generate_world("mazes", seed, difficulty=difficulty)
+        grid = FreeGrid(world, distance=half - 0.04, resolution=0.05)
+        assert label(grid.free)[1] == 1, world.name
+        wider.append((grid.clearance > half + 0.01).sum() / grid.free.sum())
+    # Only where walls fell there is more room than in a corridor.
+    assert np.mean(wider) < (0.3 if difficulty == 1.0 else 0.75)
+
+
+def test_hard_mazes_have_dead_ends_and_easy_ones_ways_around() -> None:
+    def walls(difficulty: float) -> float:
+        worlds = [generate_world("mazes", seed, difficulty=difficulty) for seed in range(10)]
+        return sum(w.covered_area / (w.size[0] * w.size[1]) for w in worlds)
+
+    assert walls(1.0) > 1.5 * walls(0.0)
+
+
+def test_a_field_has_a_way_from_one_end_to_the_other() -> None:
+    counts = []
+    for seed in range(40):
+        world = generate_world("fields", seed, difficulty=seed / 39)
+        counts.append(len(world.cylinders))
+        grid = FreeGrid(world, distance=0.25)
+        parts, _ = label(grid.free)
+        # The open strips lie along the first and the last row, or column.
+        middle = world.size[0] / 2 - 0.5, world.size[1] / 2 - 0.5
+        ends = (
+            [parts[grid.index(0.0, sign * middle[1])] for sign in (-1, 1)],
+            [parts[grid.index(sign * middle[0], 0.0)] for sign in (-1, 1)],
+        )
+        assert any(first == last != 0 for first, last in ends), world.name
+    assert sum(counts[20:]) > 1.5 * sum(counts[:20])
+    assert 60 < sum(counts) / 40 < 300
+
+
+def test_halls_have_obstacles_at_any_angle_and_are_as_large_as_20_m() -> None:
+    worlds = [generate_world("halls", seed) for seed in range(40)]
+    sides = [side for world in worlds for side in world.size]
+    assert 10.0 <= min(sides) < 11.0 and 19.0 < max(sides) <= 20.0
+    polygons = [polygon for world in worlds for polygon in world.polygons]
+    assert any(not polygon.is_convex for polygon in polygons)
+    assert {len(polygon.vertices) for polygon in polygons} == set(range(3, 8))
+    angles = [math.atan2(y1 - y0, x1 - x0) for x0, y0, x1, y1 in (p.edges[0] for p in polygons)]
+    assert all(sum(low < a <= low + 0.8 for a in angles) > 20 for low in np.arange(-3.1, 2.4, 0.8))
+    assert any(world.cylinders for world in worlds)
+
+
+def test_bars_meet_and_make_pockets() -> None:
+    meeting = 0
+    for seed in range(10):
+        boxes = generate_world("bars", seed, difficulty=0.5).boxes
+        meeting += sum(gap(a, b) == 0.0 for a, b in combinations(boxes, 2))
+    assert meeting > 60
+
+
+def test_mixed_worlds_are_of_all_kinds() -> None:
+    kinds = Counter(GENERATORS["mixed"](random.Random(seed), 0.5).name for seed in range(120))
+    assert set(kinds) == set(NAMES) - {"mixed"}
+    assert min(kinds.values()) > 8

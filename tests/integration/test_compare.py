@@ -31,7 +31,7 @@ def study(
 ) -> list[str]:
     return [
         *("--folder", str(folder), "--methods", *methods, "--seeds", "0"),
-        *("--worlds", "B", "random:7-8", "--episodes", "2", *more),
+        *("--worlds", "B", "rooms:7-8", "--episodes", "2", *more),
         *("--", *OVERRIDES, EPISODES.format(length)),
     ]
 
@@ -73,13 +73,13 @@ def test_a_study_keeps_every_episode_and_refuses_other_settings(
 ) -> None:
     assert compare.main(study(tmp_path)) == 0
     found = read_table(tmp_path / files.EPISODES)
-    worlds = ["B", "B", "random-7", "random-7", "random-8", "random-8"]
+    worlds = ["B", "B", "rooms-7", "rooms-7", "rooms-8", "rooms-8"]
     assert list(found["world"]) == worlds * 2
     assert list(found["method"]) == ["mpfa_per"] * 6 + ["uniform"] * 6
     assert (found["success"] ^ found["collision"] ^ found["timeout"]).all()
     kept = json.loads((tmp_path / files.SETTINGS).read_text())
     assert kept["runs"]["ddpg-uniform-0"]["method"]["name"] == "uniform"
-    assert kept["worlds"] == ["B", "random:7-8"]
+    assert kept["worlds"] == ["B", "rooms:7-8"]
 
     # Again: nothing happens.
     checkpoint = tmp_path / "ddpg-mpfa_per-0" / files.CHECKPOINT

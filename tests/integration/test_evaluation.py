@@ -58,15 +58,15 @@ def test_several_worlds_have_a_row_each_and_a_total(
 ) -> None:
     evaluate.main([str(run), "--worlds", "A", "--episodes", "1", "--no-pictures"])
     before = (run / "evaluation-A" / "episodes.csv").read_bytes()
-    worlds = ["--worlds", "A", "random:5-6"]
+    worlds = ["--worlds", "A", "rooms:5-6"]
     summary = evaluate.main([str(run), *worlds, "--episodes", "2", "--no-pictures"])
-    assert list(summary["world"]) == ["A", "random-5", "random-6", "total"]
+    assert list(summary["world"]) == ["A", "rooms-5", "rooms-6", "total"]
     assert list(summary["episodes"]) == [2, 2, 2, 6]
     assert summary["spl"].iloc[-1] == pytest.approx(summary["spl"].iloc[:-1].mean())
     # Results of other worlds stay what they were.
     assert (run / "evaluation-A" / "episodes.csv").read_bytes() == before
-    assert len(read_table(run / "evaluation-A+random-5-6" / "episodes.csv")) == 6
-    assert "random-6" in capsys.readouterr().out
+    assert len(read_table(run / "evaluation-A+rooms-5-6" / "episodes.csv")) == 6
+    assert "rooms-6" in capsys.readouterr().out
 
 
 def test_the_policy_that_comes_with_the_project_reaches_its_goals(
@@ -83,7 +83,7 @@ def test_the_policy_that_comes_with_the_project_reaches_its_goals(
     ("arguments", "message"),
     [
         (["--worlds", "Q"], "got 'Q'"),
-        (["--worlds", "random:9-3"], "random:9-3 ends before it begins"),
+        (["--worlds", "rooms:9-3"], "rooms:9-3 ends before it begins"),
         (["--worlds", "A", "A"], "world 'A' is named twice"),
         (["--episodes", "0"], "--episodes must be at least 1, got 0"),
         (["--seed", "-1"], "--seed must be at least 0, got -1"),
@@ -110,7 +110,7 @@ def test_a_damaged_policy_is_refused_by_its_name(
 
 
 def test_worlds_and_their_label_agree() -> None:
-    assert parse_worlds(["test", "random:100-101"]) == ["test", "random-100", "random-101"]
+    assert parse_worlds(["test", "rooms:100-101"]) == ["test", "rooms-100", "rooms-101"]
     words = (["test"], ["test", "A"], ["a/w.yaml"], ["b/w.yaml"])
     assert len({worlds_label(each) for each in words}) == 4
     many = [f"random-{number}" for number in range(51)]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import random
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Final, Literal, TypeAlias, get_args
 
@@ -20,6 +19,10 @@ from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.distance import FreeGrid, has_task, sample_task_on_grid
 from mpfa_envs.generators.bars import bars
 from mpfa_envs.generators.clutter import clutter
+from mpfa_envs.generators.fields import fields
+from mpfa_envs.generators.halls import halls
+from mpfa_envs.generators.mazes import mazes
+from mpfa_envs.generators.mixed import mixed
 from mpfa_envs.generators.rooms import rooms
 from mpfa_envs.tasks import Task
 from mpfa_envs.worlds import World
@@ -30,7 +33,15 @@ Split = Literal["train", "validation", "test"]
 """What a seed is for."""
 
 GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(
-    {"rooms": rooms, "clutter": clutter, "bars": bars}
+    {
+        "rooms": rooms,
+        "clutter": clutter,
+        "bars": bars,
+        "fields": fields,
+        "halls": halls,
+        "mazes": mazes,
+        "mixed": mixed,
+    }
 )
 """The generators by name."""
 ROBOT_DISTANCE: Final = 0.25
@@ -102,7 +113,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         own = 0.5 if name == "rooms" else rng.random()
         world = generator(rng, own if difficulty is None else difficulty)
         if _can_be_driven(world):
-            return replace(world, name=_world_name(name, int(seed), difficulty))
+            return world.renamed(_world_name(name, int(seed), difficulty))
     raise ValueError(
         f"world {_world_name(name, seed, difficulty)!r} cannot be made: none of {_ATTEMPTS} "
         "attempts has a start and a goal with a way between them"

@@ -16,14 +16,14 @@ def bars(rng: random.Random, difficulty: float) -> World:
 
     Args:
         rng: Source of randomness.
-        difficulty: 4 pieces in 100 m² at 0, 10 at 1.
+        difficulty: 5 pieces in 100 m² at 0, 12 at 1.
 
     Returns:
         The world.
     """
     size = sample_size(rng, 8.0, 14.0)
     boxes: list[Box | None] = []
-    for _ in range(round(size[0] * size[1] * between(0.04, 0.10, difficulty))):
+    for _ in range(round(size[0] * size[1] * between(0.05, 0.12, difficulty))):
         x, y = (rng.uniform(-side / 2, side / 2) for side in size)
         length, thick = rng.uniform(1.0, 4.0), rng.uniform(0.15, 0.5)
         arm = rng.uniform(0.4, 0.9) * length

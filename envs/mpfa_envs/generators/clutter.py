@@ -16,7 +16,7 @@ def clutter(rng: random.Random, difficulty: float) -> World:
 
     Args:
         rng: Source of randomness.
-        difficulty: 4 obstacles in 100 m² at 0, 15 at 1.
+        difficulty: 5 obstacles in 100 m² at 0, 16 at 1.
 
     Returns:
         The world.
@@ -24,7 +24,7 @@ def clutter(rng: random.Random, difficulty: float) -> World:
     size = sample_size(rng, 8.0, 14.0)
     boxes: list[Box] = []
     cylinders: list[Cylinder] = []
-    for _ in range(round(size[0] * size[1] * between(0.04, 0.15, difficulty))):
+    for _ in range(round(size[0] * size[1] * between(0.05, 0.16, difficulty))):
         x, y = (rng.uniform(-side / 2, side / 2) for side in size)
         if rng.random() < 0.25:
             radius = round(rng.uniform(0.1, 0.6), 3)

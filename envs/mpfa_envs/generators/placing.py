@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from mpfa_envs.worlds import Box, Cylinder
+from mpfa_envs.worlds import Box, Cylinder, Polygon
 
 _LEAST_SIDE = 0.05
 """What is left of a box at a wall is left out if it is thinner than this [m]."""
@@ -39,3 +39,16 @@ def fit_cylinder(x: float, y: float, radius: float, size: tuple[float, float]) -
     return Cylinder(
         round(max(-half_x, min(half_x, x)), 3), round(max(-half_y, min(half_y, y)), 3), radius
     )
+
+
+def fit_polygon(
+    x: float, y: float, outline: list[tuple[float, float]], size: tuple[float, float]
+) -> Polygon:
+    """A polygon as near to a place as the walls allow, in whole millimeters."""
+    # Sines and cosines differ in the last digit between machines; millimeters do not.
+    corners = [(round(across, 3), round(up, 3)) for across, up in outline]
+    place = []
+    for at, side, values in zip((x, y), size, zip(*corners, strict=True), strict=True):
+        low, high = -side / 2 - min(values) + 0.001, side / 2 - max(values) - 0.001
+        place.append(round(max(low, min(high, at)), 3))
+    return Polygon(tuple((round(place[0] + a, 3), round(place[1] + b, 3)) for a, b in corners))
