@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 if TYPE_CHECKING:
     from mpfa_envs.robot import RobotModel
+    from mpfa_envs.simulation import Simulation
     from mpfa_envs.worlds import World
+
+
+SUBSTEP: Final = 1 / 30
+"""Duration of a step of the physics engine [s].
+
+The wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do not.
+"""
 
 
 class Motion(NamedTuple):
@@ -94,8 +102,7 @@ class WheelDrive:
         robot: The robot.
         world: The room it drives in.
         time_step: Duration of a step [s].
-        substep: Duration of a step of the physics engine [s], rounded to divide the time step. The
-            wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do not.
+        substep: Duration of a step of the physics engine [s], rounded to divide the time step.
 
     Examples:
         >>> from mpfa_envs import ROBOTS, WORLDS
@@ -110,16 +117,14 @@ class WheelDrive:
     """
 
     def __init__(
-        self, robot: RobotModel, world: World, *, time_step: float, substep: float = 1 / 30
+        self, robot: RobotModel, world: World, *, time_step: float, substep: float = SUBSTEP
     ) -> None:
         # Imported here so that kinematic environments run without PyBullet, which also greets
         # the terminal whenever it is imported.
         from mpfa_envs.simulation import Simulation
 
         self._wheel_radius = robot.wheel_radius
-        self.simulation = Simulation(
-            time_step=time_step, substeps=max(1, round(time_step / substep))
-        )
+        self.simulation = Simulation(time_step=time_step, substeps=substeps(time_step, substep))
         self.simulation.add_world(world)
         self.simulation.add_robot(robot)
 
@@ -132,10 +137,28 @@ class WheelDrive:
         """Hold the wheel speeds [m/s] for one time step."""
         self.simulation.set_wheel_speeds(left / self._wheel_radius, right / self._wheel_radius)
         self.simulation.step()
-        x, y, heading, speed_x, speed_y, turn = self.simulation.robot_motion()
-        speed = speed_x * math.cos(heading) + speed_y * math.sin(heading)
-        return Motion(x, y, heading, speed, turn)
+        return read_motion(self.simulation)
 
     def close(self) -> None:
         """Shut the physics server down; a second call does nothing."""
         self.simulation.close()
+
+
+def substeps(time_step: float, substep: float = SUBSTEP) -> int:
+    """Count the steps of the physics engine in a time step [s]."""
+    return max(1, round(time_step / substep))
+
+
+def read_motion(simulation: Simulation, name: str = "robot") -> Motion:
+    """Read the motion of a simulated robot.
+
+    Args:
+        simulation: The physics server.
+        name: Name of the body.
+
+    Returns:
+        Its motion.
+    """
+    x, y, heading, speed_x, speed_y, turn = simulation.robot_motion(name)
+    speed = speed_x * math.cos(heading) + speed_y * math.sin(heading)
+    return Motion(x, y, heading, speed, turn)

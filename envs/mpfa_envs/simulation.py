@@ -23,11 +23,15 @@ except ImportError as error:
 from mpfa_envs.checks import check_count, check_positive
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from mpfa_envs.robot import RobotModel
     from mpfa_envs.worlds import World
 
+_ROBOTS = 64
+"""Group of the robots of a server; the engine itself uses the lower bits."""
 _WALL_HEIGHT = 1.0
 _WALL_THICKNESS = 0.2
 _MOTOR_TORQUE = 3.0
@@ -68,7 +72,7 @@ class Simulation:
         self._client: int = pybullet.connect(pybullet.DIRECT)
         # A server takes 34 MB: one whose owner was dropped without close() must go as well.
         self._release = weakref.finalize(self, _disconnect, self._client)
-        self._wheels: list[int] = []
+        self._wheels: dict[str, list[int]] = {}
         self._rest_height = 0.0
         self._configure()
         self._add_plane()
@@ -186,12 +190,18 @@ class Simulation:
                 height=_WALL_HEIGHT,
             )
 
-    def add_robot(self, robot: RobotModel) -> None:
-        """Load a robot from its URDF under the name ``robot``.
+    def add_robot(self, robot: RobotModel, *, name: str = "robot") -> None:
+        """Load a robot from its URDF. Several of them pass through each other.
 
         Args:
             robot: The robot.
+            name: Name of the body.
+
+        Raises:
+            ValueError: If there is a body of that name.
         """
+        if name in self.bodies:
+            raise ValueError(f"name must be new, got {name!r}")
         # The engine reads URDF from files only.
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
@@ -202,7 +212,7 @@ class Simulation:
                 flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
                 physicsClientId=self._client,
             )
-        self.bodies["robot"] = body
+        self.bodies[name] = body
         # The engine's position of a body is its center of mass.
         dynamics = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)
         self._rest_height = dynamics[3][2]
@@ -210,13 +220,15 @@ class Simulation:
         for joint in range(pybullet.getNumJoints(body, physicsClientId=self._client)):
             info = pybullet.getJointInfo(body, joint, physicsClientId=self._client)
             links[info[12].decode()] = joint
-        self._wheels = [links["left_wheel"], links["right_wheel"]]
-        for name, link in links.items():
+        self._wheels[name] = [links["left_wheel"], links["right_wheel"]]
+        if len(self._wheels) > 1:
+            self._part_robots(links.values())
+        for part, link in links.items():
             pybullet.changeDynamics(
                 body,
                 link,
                 # The casters slide; the wheels alone hold the ground.
-                lateralFriction=1.0 if name.endswith("wheel") else 0.0,
+                lateralFriction=1.0 if part.endswith("wheel") else 0.0,
                 linearDamping=0.0,
                 angularDamping=0.0,
                 jointDamping=0.0,
@@ -225,16 +237,25 @@ class Simulation:
                 physicsClientId=self._client,
             )
 
-    def place_robot(self, x: float, y: float, heading: float) -> None:
-        """Put the robot at rest on the floor, as if nothing had happened before.
+    def _part_robots(self, links: Iterable[int]) -> None:
+        """Let robots touch everything but each other."""
+        for robot in self._wheels:
+            for link in links:
+                pybullet.setCollisionFilterGroupMask(
+                    self.bodies[robot], link, _ROBOTS, ~_ROBOTS, physicsClientId=self._client
+                )
+
+    def place_robot(self, x: float, y: float, heading: float, *, name: str = "robot") -> None:
+        """Put a robot at rest on the floor, as if nothing had happened before.
 
         Args:
             x: Position [m].
             y: Position [m].
             heading: Direction of the front [rad].
+            name: Name of the body.
         """
-        body, client = self.bodies["robot"], self._client
-        for wheel in self._wheels:
+        body, client = self.bodies[name], self._client
+        for wheel in self._wheels[name]:
             pybullet.resetJointState(body, wheel, 0.0, 0.0, physicsClientId=client)
         pybullet.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=client)
         half = heading / 2
@@ -244,18 +265,19 @@ class Simulation:
             place = [x, y, height]
             pybullet.resetBasePositionAndOrientation(body, place, turned, physicsClientId=client)
             pybullet.performCollisionDetection(physicsClientId=client)
-        self.set_wheel_speeds(0.0, 0.0)
+        self.set_wheel_speeds(0.0, 0.0, name=name)
 
-    def set_wheel_speeds(self, left: float, right: float) -> None:
+    def set_wheel_speeds(self, left: float, right: float, *, name: str = "robot") -> None:
         """Command the motors.
 
         Args:
             left: Speed of the left wheel, forward is positive [rad/s].
             right: Speed of the right wheel [rad/s].
+            name: Name of the body.
         """
         pybullet.setJointMotorControlArray(
-            self.bodies["robot"],
-            self._wheels,
+            self.bodies[name],
+            self._wheels[name],
             pybullet.VELOCITY_CONTROL,
             targetVelocities=[left, right],
             forces=[_MOTOR_TORQUE, _MOTOR_TORQUE],
@@ -271,13 +293,16 @@ class Simulation:
         for _ in range(count):
             pybullet.stepSimulation(physicsClientId=self._client)
 
-    def robot_motion(self) -> tuple[float, float, float, float, float, float]:
-        """Read where the robot is and how it moves.
+    def robot_motion(self, name: str = "robot") -> tuple[float, float, float, float, float, float]:
+        """Read where a robot is and how it moves.
+
+        Args:
+            name: Name of the body.
 
         Returns:
             ``(x, y, heading, speed in x, speed in y, turning speed)`` [m, m, rad, m/s, m/s, rad/s].
         """
-        body, client = self.bodies["robot"], self._client
+        body, client = self.bodies[name], self._client
         (x, y, _), (qx, qy, qz, qw) = pybullet.getBasePositionAndOrientation(
             body, physicsClientId=client
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import numba
@@ -13,16 +14,19 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def njit(function: _Function) -> _Function:
     """Compile a function of numbers and arrays, and keep the code on disk where that can be.
 
+    Arithmetic is not reordered, and a division by zero gives infinity or NaN as in NumPy.
+
     Args:
         function: A plain loop.
 
     Returns:
         The compiled function; it releases the interpreter's lock.
     """
-    compiled: _Function
+    decorate = partial(numba.njit, nogil=True, error_model="numpy")
+    compiled: Any
     try:
-        compiled = numba.njit(function, cache=True, nogil=True)
+        compiled = decorate(function, cache=True)
     except RuntimeError:
         # No folder can be written to, as in a read-only installation without a home.
-        compiled = numba.njit(function, nogil=True)
+        compiled = decorate(function)
     return compiled

@@ -1,0 +1,72 @@
+"""What many robots sense, as :func:`mpfa_envs.observation.observe` puts it for one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpfa_envs.kernels import njit
+from mpfa_envs.kernels.step import DISTANCE
+from mpfa_envs.observation import DISTANCE_SCALE, GOAL_CLOSENESS_DISTANCE, SPEED_BOUND
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.kernels.step import EpisodeArrays
+
+
+@njit
+def observe_all(
+    episodes: EpisodeArrays,
+    chosen: NDArray[np.bool_],
+    ranges: NDArray[np.float64],
+    median: bool,
+    scales: tuple[float, float, float],
+    observations: NDArray[np.float32],
+) -> None:
+    """Build the observations of the chosen robots.
+
+    Args:
+        episodes: The episodes.
+        chosen: Which robots sense, ``[N]``; the others' observations stay.
+        ranges: Range of each ray [m], ``[N, rays]``.
+        median: Whether a sector reports the median of its rays and not the nearest.
+        scales: Range with closeness one [m]; fastest speed of a wheel [m/s], fastest turn [rad/s].
+        observations: Where the observations go, ``[N, sectors + 6]``.
+    """
+    sectors = observations.shape[1] - 6
+    count = ranges.shape[1] // sectors
+    near, fastest, fastest_turn = scales
+    for robot in range(observations.shape[0]):
+        if not chosen[robot]:
+            continue
+        seen = observations[robot]
+        for sector in range(sectors):
+            rays = ranges[robot, sector * count : (sector + 1) * count]
+            nearest = _middle(rays) if median else rays.min()
+            seen[sector] = near / max(nearest, near)
+        motion = episodes.motions[robot]
+        speed, turn = motion[3] / fastest, motion[4] / fastest_turn
+        distance = episodes.numbers[DISTANCE, robot]
+        # A robot on the goal sees it ahead.
+        bearing, closeness = 0.0, 1.0
+        if distance > 0.0:
+            goal = episodes.goals[robot]
+            bearing = math.atan2(goal[1] - motion[1], goal[0] - motion[0]) - motion[2]
+            closeness = min(GOAL_CLOSENESS_DISTANCE / distance, 1.0)
+        seen[sectors], seen[sectors + 1] = math.cos(bearing), math.sin(bearing)
+        seen[sectors + 2], seen[sectors + 3] = closeness, distance / DISTANCE_SCALE
+        seen[sectors + 4] = min(max(speed, -SPEED_BOUND), SPEED_BOUND)
+        seen[sectors + 5] = min(max(turn, -SPEED_BOUND), SPEED_BOUND)
+
+
+@njit
+def _middle(rays: NDArray[np.float64]) -> float:
+    """Median of a sector's rays."""
+    ordered = np.sort(rays)
+    half = rays.shape[0] // 2
+    if rays.shape[0] % 2 == 1:
+        return ordered[half]
+    return 0.5 * (ordered[half - 1] + ordered[half])

@@ -1,0 +1,162 @@
+"""Two ways to move many robots: exact kinematics, or PyBullet's physics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from mpfa_envs.drives import read_motion, substeps
+from mpfa_envs.kernels.motion import drive_arcs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.arguments import Physics
+    from mpfa_envs.robot import RobotModel
+    from mpfa_envs.simulation import Simulation
+
+_SERVERS: Final = 32
+"""Physics servers at most."""
+
+
+class Drives(Protocol):
+    """What :class:`~mpfa_envs.VectorNavigationEnv` needs of a way to move."""
+
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Put a robot at rest at a pose [m, m, rad]."""
+        ...
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        ...
+
+    def close(self) -> None:
+        """Release what the drives hold."""
+        ...
+
+
+class KinematicDrives:
+    """Moves robots on exact arcs, each as :class:`~mpfa_envs.drives.KinematicDrive` would.
+
+    Args:
+        robot: The robot.
+        time_step: Duration of a step [s].
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import ROBOTS
+        >>> from mpfa_envs.vector_drives import KinematicDrives
+        >>> drives = KinematicDrives(ROBOTS["turtlebot2"], time_step=0.1)
+        >>> motions = np.zeros((2, 5))
+        >>> drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
+        >>> motions[:, 0]
+        array([0.05, 0.  ])
+    """
+
+    def __init__(self, robot: RobotModel, *, time_step: float) -> None:
+        self._wheel_base = robot.wheel_base
+        self._time_step = time_step
+
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Nothing is held: the motions say where the robots are."""
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        drive_arcs(motions, running, speeds, self._wheel_base, self._time_step)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class WheelDrives:
+    """Moves robots by PyBullet, each as :class:`~mpfa_envs.drives.WheelDrive` would.
+
+    Up to 32 robots have a physics server each and drive the same bits as alone. A server takes
+    35 MB; more robots therefore share 32 of them, where they pass through each other. There
+    PyBullet's solver stops at other last digits, and trajectories part slowly.
+
+    Args:
+        robot: The robot.
+        robots: Number of robots.
+        time_step: Duration of a step [s].
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import ROBOTS
+        >>> from mpfa_envs.vector_drives import WheelDrives
+        >>> drives = WheelDrives(ROBOTS["turtlebot2"], 2, time_step=0.1)
+        >>> motions = np.zeros((2, 5))
+        >>> for _ in range(20):
+        ...     drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
+        >>> motions[:, 3].round(2)
+        array([0.5, 0. ])
+        >>> drives.close()
+    """
+
+    def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
+        # Imported here so that kinematic environments run without PyBullet.
+        from mpfa_envs.simulation import Simulation
+
+        self._wheel_radius = robot.wheel_radius
+        self._simulations = [
+            Simulation(time_step=time_step, substeps=substeps(time_step))
+            for _ in range(min(robots, _SERVERS))
+        ]
+        self._names = [f"robot_{index}" for index in range(robots)]
+        for index, name in enumerate(self._names):
+            self._simulation_of(index).add_robot(robot, name=name)
+        for index in range(robots):
+            self.place(index, 0.0, 0.0, 0.0)
+
+    def _simulation_of(self, index: int) -> Simulation:
+        """The server of a robot."""
+        return self._simulations[index % len(self._simulations)]
+
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Put a robot at rest at a pose [m, m, rad]."""
+        self._simulation_of(index).place_robot(x, y, heading, name=self._names[index])
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        turning = np.where(running[:, None], speeds / self._wheel_radius, 0.0).tolist()
+        moving = np.flatnonzero(running).tolist()
+        # In a server of its own, a robot that does not run is not simulated; in a shared one it
+        # stops.
+        shared = len(self._names) > len(self._simulations)
+        for index in range(len(self._names)) if shared else moving:
+            left, right = turning[index]
+            simulation = self._simulation_of(index)
+            simulation.set_wheel_speeds(left, right, name=self._names[index])
+        for number in {index % len(self._simulations) for index in moving}:
+            self._simulations[number].step()
+        for index in moving:
+            motions[index] = read_motion(self._simulation_of(index), self._names[index])
+
+    def close(self) -> None:
+        """Shut the physics servers down; a second call does nothing."""
+        for simulation in self._simulations:
+            simulation.close()
+
+
+def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:
+    """Make the way to move that a name stands for.
+
+    Args:
+        physics: How the robots move.
+        robot: What they are.
+        robots: Number of robots.
+        time_step: Duration of a step [s].
+
+    Returns:
+        The drives.
+    """
+    if physics == "kinematic":
+        return KinematicDrives(robot, time_step=time_step)
+    return WheelDrives(robot, robots, time_step=time_step)

@@ -1,0 +1,98 @@
+"""The worlds of many robots as arrays that compiled loops read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import World
+
+
+class BatchArrays(NamedTuple):
+    """Shapes by robot; of each row only the first few count, and no others are looked at."""
+
+    half_sizes: NDArray[np.float64]
+    """Half the width and the depth of the rooms [m], ``[N, 2]``."""
+    boxes: NDArray[np.float64]
+    """(x_min, y_min, x_max, y_max) [m], ``[N, most boxes, 4]``."""
+    circles: NDArray[np.float64]
+    """(x, y, radius) [m], ``[N, most circles, 3]``."""
+    segments: NDArray[np.float64]
+    """Edges of polygons (x0, y0, x1, y1) [m], ``[N, most edges, 4]``."""
+    polygon_ends: NDArray[np.int64]
+    """Where the edges of each polygon end in segments, ``[N, most polygons]``."""
+    counts: NDArray[np.int64]
+    """Numbers of boxes, circles, segments and polygons, ``[N, 4]``."""
+
+
+class WorldBatch:
+    """A world for each of many robots; setting one copies its shapes and nothing else.
+
+    Args:
+        worlds: The worlds, in the order of the robots.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.world_batch import WorldBatch
+        >>> batch = WorldBatch([WORLDS["A"], WORLDS["B"]])
+        >>> batch.arrays.counts[:, 0]  # boxes
+        array([0, 4])
+        >>> batch[0] = WORLDS["B"]
+        >>> batch.arrays.counts[:, 0]
+        array([4, 4])
+    """
+
+    def __init__(self, worlds: list[World]) -> None:
+        robots = len(worlds)
+        self._worlds = list(worlds)
+        self._rooms = BatchArrays(
+            np.empty((robots, 2)),
+            np.empty((robots, 0, 4)),
+            np.empty((robots, 0, 3)),
+            np.empty((robots, 0, 4)),
+            np.empty((robots, 0), dtype=np.int64),
+            np.zeros((robots, 4), dtype=np.int64),
+        )
+        for robot, world in enumerate(worlds):
+            self[robot] = world
+
+    @property
+    def arrays(self) -> BatchArrays:
+        """What the compiled loops read; setting a larger world may replace the arrays."""
+        return self._rooms
+
+    def __len__(self) -> int:
+        return len(self._worlds)
+
+    def __iter__(self) -> Iterator[World]:
+        return iter(self._worlds)
+
+    def __getitem__(self, robot: int) -> World:
+        return self._worlds[robot]
+
+    def __setitem__(self, robot: int, world: World) -> None:
+        rows = world.arrays
+        self._rooms.half_sizes[robot] = rows.half_size
+        for column, name in enumerate(("boxes", "circles", "segments", "polygon_ends")):
+            count = len(getattr(rows, name))
+            table = getattr(self._rooms, name)
+            if count > table.shape[1]:
+                table = _widened(table, count)
+                self._rooms = self._rooms._replace(**{name: table})  # type: ignore[arg-type]
+            table[robot, :count] = getattr(rows, name)
+            self._rooms.counts[robot, column] = count
+        self._worlds[robot] = world
+
+
+def _widened(table: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """A copy with room for at least so many shapes a robot, and half as many as now to spare."""
+    most = max(count, table.shape[1] * 3 // 2)
+    wider = np.zeros((len(table), most, *table.shape[2:]), dtype=table.dtype)
+    wider[:, : table.shape[1]] = table
+    return wider

@@ -1,0 +1,138 @@
+"""The compiled loops against the plain parts for one robot."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mpfa_envs
+from mpfa_envs import ROBOTS, WORLDS, Box, Lidar, World
+from mpfa_envs.drives import KinematicDrive
+from mpfa_envs.kernels import njit
+from mpfa_envs.kernels.clearance import clearance_at
+from mpfa_envs.kernels.lidar import cast_rays
+from mpfa_envs.vector_drives import KinematicDrives
+from mpfa_envs.world_batch import WorldBatch
+from tests.envs.shapes import random_shapes
+
+MIXES = [
+    {},
+    {"boxes": 12},
+    {"cylinders": 40},
+    {"polygons": 10},
+    {"boxes": 6, "cylinders": 10, "polygons": 5},
+]
+
+
+def somewhere(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Motions at random poses in the room of ``random_shapes``, some of them in shapes."""
+    motions = np.zeros((count, 5))
+    motions[:, 0], motions[:, 1] = rng.uniform(-4.9, 4.9, count), rng.uniform(-3.9, 3.9, count)
+    motions[:, 2] = rng.uniform(-math.pi, math.pi, count)
+    return motions
+
+
+def cast_all(worlds: list[World], motions: np.ndarray, lidar: Lidar) -> np.ndarray:
+    ranges = np.full((len(worlds), lidar.angles.size), np.nan)
+    directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
+    chosen = np.ones(len(worlds), dtype=np.bool_)
+    cast_rays(motions, chosen, WorldBatch(worlds).arrays, directions, lidar.max_range, ranges)
+    return ranges
+
+
+@pytest.mark.parametrize("mix", MIXES, ids=str)
+@pytest.mark.parametrize("max_range", [10.0, 1.5])
+def test_the_rays_are_those_of_the_lidar(mix: dict[str, int], max_range: float) -> None:
+    rng = np.random.default_rng(1)
+    worlds = [random_shapes(rng, **mix) for _ in range(60)]
+    motions = somewhere(rng, 60)
+    lidars = [Lidar(world, max_range=max_range) for world in worlds]
+    expected = [each.cast(*pose) for each, pose in zip(lidars, motions[:, :3], strict=True)]
+    np.testing.assert_allclose(cast_all(worlds, motions, lidars[0]), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi, 0.7])
+@pytest.mark.parametrize(("sectors", "rays"), [(1, 1), (2, 1), (18, 3), (360, 2)])
+def test_any_number_of_rays_sees_boxes_all_around(heading: float, sectors: int, rays: int) -> None:
+    ring = tuple(
+        Box(x - 0.3, y - 0.2, x + 0.3, y + 0.2)
+        for x, y in ((2, 0), (2, 2), (0, 2), (-2, 2), (-2, 0), (-2, -2), (0, -2), (2, -2))
+    )
+    world = World(name="ring", boxes=ring)
+    lidar = Lidar(world, sectors=sectors, rays_per_sector=rays)
+    motions = np.array([[0.01, 0.02, heading, 0.0, 0.0]])
+    np.testing.assert_allclose(
+        cast_all([world], motions, lidar)[0], lidar.cast(0.01, 0.02, heading), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("mix", MIXES, ids=str)
+def test_the_clearance_is_that_of_the_world(mix: dict[str, int]) -> None:
+    rng = np.random.default_rng(2)
+    worlds = [random_shapes(rng, **mix) for _ in range(200)]
+    points = somewhere(rng, 200)[:, :2]
+    arrays = WorldBatch(worlds).arrays
+    measured = [clearance_at(arrays, i, *points[i]) for i in range(200)]
+    expected = [world.clearance(*point) for world, point in zip(worlds, points, strict=True)]
+    np.testing.assert_allclose(measured, expected, atol=1e-12)
+
+
+def test_arcs_are_those_of_the_drive_of_one_robot() -> None:
+    robot, rng = ROBOTS["turtlebot2"], np.random.default_rng(3)
+    motions = somewhere(rng, 8)
+    singles = [KinematicDrive(robot, time_step=0.1) for _ in range(8)]
+    for single, pose in zip(singles, motions[:, :3], strict=True):
+        single.place(*pose)
+    drives = KinematicDrives(robot, time_step=0.1)
+    for step in range(200):
+        speeds = rng.uniform(0.05, 0.5, (8, 2))
+        speeds[step % 8, 1] = speeds[step % 8, 0]  # One of them goes straight.
+        drives.move(motions, np.ones(8, dtype=np.bool_), speeds)
+        expected = [single.move(*pair) for single, pair in zip(singles, speeds, strict=True)]
+        np.testing.assert_allclose(motions, expected, atol=1e-12)
+
+
+def test_a_world_replaces_another_whatever_their_sizes() -> None:
+    rng = np.random.default_rng(4)
+    batch = WorldBatch([WORLDS["A"], WORLDS["D"]])
+    lidar = Lidar(WORLDS["A"])
+    directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
+    for mix in (MIXES[4], MIXES[0], MIXES[2], MIXES[3]):
+        world = random_shapes(rng, **mix)
+        batch[0] = world
+        motions = somewhere(rng, 2)
+        ranges = np.empty((2, lidar.angles.size))
+        cast_rays(motions, np.ones(2, dtype=np.bool_), batch.arrays, directions, 10.0, ranges)
+        for row, each, motion in zip(ranges, (world, WORLDS["D"]), motions, strict=True):
+            np.testing.assert_allclose(row, Lidar(each).cast(*motion[:3]), atol=1e-9)
+    assert batch[0] is world and len(batch) == 2
+
+
+def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
+    root = Path(mpfa_envs.__file__).parents[1]
+    code = (
+        "import numba\n"
+        "real = numba.njit\n"
+        "def refuse(*args, cache=False, **kwargs):\n"
+        "    if cache:\n"
+        "        raise RuntimeError('cannot cache function: no locator available')\n"
+        "    return real(*args, **kwargs)\n"
+        "numba.njit = refuse\n"
+        "from mpfa_envs.kernels import njit\n"
+        "print(njit(lambda x: 2.0 * x)(3.0))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
+    )
+    assert result.stdout == "6.0\n"
+
+
+def test_a_division_by_zero_is_infinite_as_in_numpy() -> None:
+    assert njit(lambda x: 1.0 / x)(0.0) == math.inf
