@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import environment, loss, method_steps, replay, training
+from benchmarks import environment, loss, method_steps, replay, training, vector
 from benchmarks.timing import Entry
 from torchrl_mpfa import write_text_atomically
 
@@ -68,6 +68,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "sb3_step": training.measure_sb3_step,
     "methods": method_steps.measure,
     "environment": measure_environment,
+    "vector": vector.measure,
 }
 
 

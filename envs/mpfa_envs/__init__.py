@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     )
     from mpfa_envs.mirror import Mirror, RandomMirror
     from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
+    from mpfa_envs.vector import VectorNavigationEnv
 
 ENV_IDS = tuple(f"mpfa/Navigation-{name}-v1" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
@@ -77,6 +78,7 @@ __all__ = [
     "RobotModel",
     "StepOutcome",
     "Task",
+    "VectorNavigationEnv",
     "World",
     "WorldArrays",
     "WorldFileError",
@@ -107,7 +109,10 @@ for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
     # A second import, as after a reload, must not warn about an id that is known.
     if _id not in gymnasium.registry:
         gymnasium.register(
-            _id, entry_point="mpfa_envs.navigation:NavigationEnv", kwargs={"world": _name}
+            _id,
+            entry_point="mpfa_envs.navigation:NavigationEnv",
+            vector_entry_point="mpfa_envs.vector:VectorNavigationEnv",
+            kwargs={"world": _name},
         )
 
 
@@ -118,6 +123,7 @@ _LATER = {
     "Mirror": "mirror",
     "NavigationTorchEnv": "torchrl_env",
     "RandomMirror": "mirror",
+    "VectorNavigationEnv": "vector",
     "generate_world": "generators",
     "generator_tasks": "generators",
     "make_navigation_env": "torchrl_env",

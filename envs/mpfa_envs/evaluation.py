@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mpfa_envs.arguments import Physics
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.navigation import NavigationEnv, Physics
+from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.policy import Policy
 from mpfa_envs.tasks import Task, evaluation_pairs
 from mpfa_envs.worlds import World

@@ -5,38 +5,35 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box as BoxSpace
 
+from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
-from mpfa_envs.lidar import Lidar
-from mpfa_envs.observation import observation_bounds, observation_slices, observe
+from mpfa_envs.episodes import distance_field
+from mpfa_envs.observation import observe
 from mpfa_envs.path import planner_for
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
     RewardFunction,
     RewardTerms,
     StepOutcome,
-    navigation_reward,
 )
-from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
+from mpfa_envs.robot import RobotModel
 from mpfa_envs.tasks import Task, check_task, sample_task
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.distance import DistanceField
     from mpfa_envs.worlds import World
 
-Physics = Literal["kinematic", "wheels"]
-"""How the robot moves."""
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "action_repeat": 1,
@@ -52,7 +49,7 @@ The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, 
 """
 
 
-class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
+class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
     """A two-wheeled robot drives to a goal by lidar, without a map.
 
     **Observation**, ``Box`` of shape ``[24]``, float32 (:data:`OBSERVATION` names the slices):
@@ -106,6 +103,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             collision [m]. None: the robot's radius and 0.07 m, 0.25 m for the TurtleBot2.
             ``"contact"``: the robot's radius.
         progress_scale: The paper's ε_p in Eq. (25), reward per meter of approach [1/m].
+        progress: What an approach is measured by: ``"straight_line"``, the distance to the goal as
+            in Eq. (25); ``"shortest_path"``, the way to it that keeps the collision distance
+            (:class:`~mpfa_envs.DistanceField`); or ``"none"``, only goal and collision count.
         reward: Computes the reward in place of Eq. (25), and without progress_scale;
             ``functools.partial(navigation_reward, goal_reward=20.0)``, say.
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``.
@@ -150,6 +150,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         goal_radius: float = 0.5,
         collision_distance: float | Literal["contact"] | None = None,
         progress_scale: float = PROGRESS_SCALE,
+        progress: Progress = "straight_line",
         reward: RewardFunction | None = None,
         lidar: Mapping[str, Any] | None = None,
         closeness_distance: float | None = None,
@@ -158,45 +159,29 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         self.world = resolve_world(world)
-        self.robot = resolve_robot(robot)
-        if physics not in get_args(Physics):
-            raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        if reward is not None and not callable(reward):
-            raise ValueError(f"reward must be callable or None, got {reward!r}")
-        scale = check_number("progress_scale", progress_scale)
-        self._reward = reward or partial(navigation_reward, progress_scale=scale)
-        self.physics = physics
-        self.render_mode = render_mode
-        self.max_steps = check_count("max_steps", max_steps)
-        self.time_step = check_positive("time_step", time_step)
-        self.action_repeat = check_count("action_repeat", action_repeat)
-        self.goal_radius = check_positive("goal_radius", goal_radius)
-        self.min_goal_distance = check_positive("min_goal_distance", min_goal_distance)
-        if not self.min_goal_distance > self.goal_radius:
-            raise ValueError(
-                f"min_goal_distance must be above goal_radius = {goal_radius}, "
-                f"got {min_goal_distance}"
-            )
-        self.detour_chance = check_share("detour_chance", detour_chance)
-        self.collision_distance = resolve_collision_distance(collision_distance, self.robot)
-        self.closeness_distance = (
-            self.robot.collision_distance
-            if closeness_distance is None
-            else check_positive("closeness_distance", closeness_distance)
+        self._set_arguments(
+            robot=robot,
+            physics=physics,
+            max_steps=max_steps,
+            time_step=time_step,
+            action_repeat=action_repeat,
+            goal_radius=goal_radius,
+            collision_distance=collision_distance,
+            progress_scale=progress_scale,
+            progress=progress,
+            reward=reward,
+            lidar=lidar,
+            closeness_distance=closeness_distance,
+            min_goal_distance=min_goal_distance,
+            detour_chance=detour_chance,
+            render_mode=render_mode,
         )
-        try:
-            self.lidar = Lidar(self.world, **(lidar or {}))
-        except TypeError as error:
-            raise ValueError(
-                f"lidar must hold arguments of Lidar, got {lidar!r}: {error}"
-            ) from error
-        self.observation_slices = observation_slices(self.lidar.sectors)
-        low, high = observation_bounds(self.lidar.sectors, self.world.diagonal)
-        self.observation_space = BoxSpace(low, high, dtype=np.float32)
-        self.action_space = BoxSpace(-1.0, 1.0, (2,), np.float32)
+        self.lidar = self._make_lidar(self.world)
+        self.observation_space, self.action_space = self._make_spaces(
+            self.lidar.sectors, self.world.diagonal
+        )
         self._task: Task | None = None
+        self._field: DistanceField | None = None
         self._running = False
         self._trail: list[tuple[float, float]] = []
         self._drive: Drive = (
@@ -252,6 +237,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self._path_length = 0.0
         self._motion = self._drive.place(*task.start)
         self._distance = math.dist(task.start[:2], task.goal)
+        if self.progress == "shortest_path":
+            self._field = distance_field(self.world, self.collision_distance, task.goal)
+        self._way = self._way_from(*task.start[:2])
         clearance = self.world.clearance(*task.start[:2]) - self.robot.radius
         self._min_clearance = clearance
         self._trail = [task.start[:2]]
@@ -296,19 +284,24 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self._path_length += math.dist(motion[:2], self._motion[:2])
         self._motion = motion
         self._trail.append((motion.x, motion.y))
-        previous = self._distance
+        previous = self._way
         self._distance = math.dist(self._goal, motion[:2])
+        self._way = self._way_from(motion.x, motion.y)
         to_obstacle = self.world.clearance(motion.x, motion.y)
         clearance = to_obstacle - self.robot.radius
         self._min_clearance = min(self._min_clearance, clearance)
         success = self._distance <= self.goal_radius
         collision = not success and to_obstacle <= self.collision_distance
         speeds = motion.linear_speed, motion.angular_speed
-        outcome = StepOutcome(previous, self._distance, success, collision, clearance, *speeds)
+        outcome = StepOutcome(previous, self._way, success, collision, clearance, *speeds)
         terms = self._reward(outcome)
         truncated = not (success or collision) and self._steps >= self.max_steps
         self._running = not (success or collision or truncated)
         return success, collision, truncated, terms
+
+    def _way_from(self, x: float, y: float) -> float:
+        """What is left of the way to the goal, as the progress is measured [m]."""
+        return self._distance if self._field is None else self._field.at(x, y)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Render the room from above.

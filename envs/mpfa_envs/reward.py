@@ -20,9 +20,9 @@ class StepOutcome(NamedTuple):
     """What a reward may look at after one step."""
 
     previous_distance: float
-    """Distance to the goal before the step [m]."""
+    """Way to the goal before the step, straight or as ``progress`` measures it [m]."""
     distance: float
-    """Distance to the goal after the step [m]."""
+    """The same after the step [m]."""
     success: bool
     """The goal was reached in this step."""
     collision: bool

@@ -1,0 +1,85 @@
+"""Steps per second of many robots at once.
+
+A step is one time step of one robot: it moves, its lidar casts 54 rays, and its reward is paid. The
+robots drive in small circles, so that an episode lasts for hundreds of steps, as in training; what
+its end costs, a task and the shortest path of the next one, is in the figures.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.timing import Call, Entry, entry, take_turns
+from mpfa_envs import Box, Cylinder, VectorNavigationEnv, World
+
+ROBOTS = 64
+_CIRCLE = (-1.0, 1.0)
+"""Slowest left and fastest right wheel: a circle of 0.3 m."""
+
+
+def cluttered(name: str, seed: int, *, boxes: int = 0, cylinders: int = 0, size: float) -> World:
+    """A square room full of small obstacles that stand where they may."""
+    rng = random.Random(seed)
+    half = size / 2
+    placed_boxes, placed_cylinders = [], []
+    for _ in range(boxes):
+        width, depth = rng.uniform(0.2, 0.8), rng.uniform(0.2, 0.8)
+        x, y = rng.uniform(-half, half - width), rng.uniform(-half, half - depth)
+        placed_boxes.append(Box(x, y, x + width, y + depth))
+    for _ in range(cylinders):
+        radius = rng.uniform(0.05, 0.1)
+        x, y = (rng.uniform(radius - half, half - radius) for _ in range(2))
+        placed_cylinders.append(Cylinder(x, y, radius))
+    return World(
+        name=name,
+        size=(size, size),
+        boxes=tuple(placed_boxes),
+        cylinders=tuple(placed_cylinders),
+    )
+
+
+def _stepper(world: World, *, physics: Any, robots: int = ROBOTS) -> Call:
+    """A call that makes one time step of all robots."""
+    env = VectorNavigationEnv(
+        robots, world=world, physics=physics, action_repeat=1, detour_chance=0.0
+    )
+    env.reset(seed=0)
+    actions = np.tile(np.array(_CIRCLE, dtype=np.float32), (robots, 1))
+    return lambda: env.step(actions)
+
+
+def measure(*, quick: bool) -> list[Entry]:
+    """Measure kinematic robots among 30 obstacles and among 300 cylinders, and wheels.
+
+    Args:
+        quick: Fewer and shorter rounds.
+
+    Returns:
+        Rates; the ratio of ``vector_cylinders`` is its time over that of ``vector_kinematic``.
+    """
+    sparse = cluttered("thirty", 1, boxes=20, cylinders=10, size=14.0)
+    dense = cluttered("three hundred", 2, cylinders=300, size=20.0)
+    calls: dict[str, Callable[[], object]] = {
+        "vector_kinematic": _stepper(sparse, physics="kinematic"),
+        "vector_cylinders": _stepper(dense, physics="kinematic"),
+        "vector_wheels": _stepper(sparse, physics="wheels", robots=16),
+    }
+    timings = take_turns(calls, rounds=3 if quick else 9, seconds=0.1 if quick else 1.0)
+    robots = {"vector_wheels": 16}
+    rates = {name: robots.get(name, ROBOTS) / timing.median for name, timing in timings.items()}
+    return [
+        entry(
+            name,
+            rate,
+            "steps/s",
+            ratio=timings[name].ratio(timings["vector_kinematic"]),
+            baseline="vector_kinematic",
+        )
+        if name == "vector_cylinders"
+        else entry(name, rate, "steps/s")
+        for name, rate in rates.items()
+    ]

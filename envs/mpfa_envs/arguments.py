@@ -1,0 +1,106 @@
+"""The arguments of the navigation task, which one robot's and many robots' environments share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+from gymnasium.spaces import Box as BoxSpace
+
+from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.lidar import Lidar
+from mpfa_envs.observation import observation_bounds, observation_slices
+from mpfa_envs.reward import RewardFunction, navigation_reward
+from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
+from mpfa_envs.worlds import World
+
+if TYPE_CHECKING:
+    from gymnasium.spaces import Space
+
+Physics = Literal["kinematic", "wheels"]
+"""How the robot moves."""
+Progress = Literal["straight_line", "shortest_path", "none"]
+"""What the reward's progress is measured along."""
+
+
+class TaskArguments:
+    """Checks the arguments of :class:`~mpfa_envs.NavigationEnv` and keeps them as attributes."""
+
+    render_mode: str | None
+
+    def _set_arguments(
+        self,
+        *,
+        robot: str | RobotModel,
+        physics: Physics,
+        max_steps: int,
+        time_step: float,
+        action_repeat: int,
+        goal_radius: float,
+        collision_distance: float | Literal["contact"] | None,
+        progress_scale: float,
+        progress: Progress,
+        reward: RewardFunction | None,
+        lidar: Mapping[str, Any] | None,
+        closeness_distance: float | None,
+        min_goal_distance: float,
+        detour_chance: float,
+        render_mode: Literal["rgb_array"] | None,
+    ) -> None:
+        """Check them all; the first that is out of its range is named."""
+        self.robot = resolve_robot(robot)
+        if physics not in get_args(Physics):
+            raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        if reward is not None and not callable(reward):
+            raise ValueError(f"reward must be callable or None, got {reward!r}")
+        if progress not in get_args(Progress):
+            raise ValueError(f"progress must be one of {get_args(Progress)}, got {progress!r}")
+        scale = check_number("progress_scale", progress_scale)
+        self.progress = progress
+        self._reward = reward or partial(
+            navigation_reward, progress_scale=0.0 if progress == "none" else scale
+        )
+        self.physics = physics
+        self.render_mode = render_mode
+        self.max_steps = check_count("max_steps", max_steps)
+        self.time_step = check_positive("time_step", time_step)
+        self.action_repeat = check_count("action_repeat", action_repeat)
+        self.goal_radius = check_positive("goal_radius", goal_radius)
+        self.min_goal_distance = check_positive("min_goal_distance", min_goal_distance)
+        if not self.min_goal_distance > self.goal_radius:
+            raise ValueError(
+                f"min_goal_distance must be above goal_radius = {goal_radius}, "
+                f"got {min_goal_distance}"
+            )
+        self.detour_chance = check_share("detour_chance", detour_chance)
+        self.collision_distance = resolve_collision_distance(collision_distance, self.robot)
+        self.closeness_distance = (
+            self.robot.collision_distance
+            if closeness_distance is None
+            else check_positive("closeness_distance", closeness_distance)
+        )
+        self._lidar_arguments = lidar or {}
+
+    def _make_lidar(self, world: World) -> Lidar:
+        """The lidar in a world."""
+        try:
+            return Lidar(world, **self._lidar_arguments)
+        except TypeError as error:
+            raise ValueError(
+                f"lidar must hold arguments of Lidar, got {self._lidar_arguments!r}: {error}"
+            ) from error
+
+    def _make_spaces(self, sectors: int, diagonal: float) -> tuple[Space[Any], Space[Any]]:
+        """The spaces of one robot's observations and actions.
+
+        Args:
+            sectors: Number of sectors of the lidar.
+            diagonal: Longest distance in a room [m].
+        """
+        self.observation_slices = observation_slices(sectors)
+        low, high = observation_bounds(sectors, diagonal)
+        return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)

@@ -1,0 +1,266 @@
+"""Where the episodes of many robots come from: fixed worlds, or new ones of a generator."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from mpfa_envs.builtin_worlds import WORLDS, resolve_world
+from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.path import planner_for
+from mpfa_envs.tasks import Task, sample_task
+from mpfa_envs.worlds import World
+
+if TYPE_CHECKING:
+    from mpfa_envs.arguments import TaskArguments
+    from mpfa_envs.distance import DistanceField, FreeGrid
+
+WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
+"""What stands for one world."""
+GENERATED_DIAGONAL: Final = 50.0
+"""No room of a generator is longer than this from corner to corner [m]."""
+_WORLDS: Final = 50
+"""Worlds of a generator that are drawn before it is said to have no task."""
+
+
+class Episode(NamedTuple):
+    """A task in its world, and what its robot's progress is measured by."""
+
+    world: World
+    """The room."""
+    task: Task
+    """Start and goal."""
+    shortest_path: float
+    """The shortest path to the goal's center [m]."""
+    field: DistanceField | None
+    """Lengths of the ways to the goal, if the progress is along the shortest path."""
+
+
+@lru_cache(maxsize=64)
+def _grid_of(world: World, distance: float) -> FreeGrid:
+    """Share one grid among the episodes of a world."""
+    from mpfa_envs.distance import FreeGrid
+
+    return FreeGrid(world, distance=distance)
+
+
+def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
+    """Measure the ways to a goal from everywhere in a world.
+
+    Args:
+        world: The room and its obstacles.
+        distance: What the ways keep from obstacles and walls [m].
+        goal: Where they lead (x, y) [m].
+
+    Returns:
+        The field.
+    """
+    from mpfa_envs.distance import DistanceField
+
+    return DistanceField(_grid_of(world, distance), goal)
+
+
+class EpisodeSource:
+    """Draws the episodes of each robot: a task in its world, or in a new world.
+
+    Args:
+        world: What :class:`~mpfa_envs.NavigationEnv` takes, a sequence of it, of which robot i has
+            number ``i % len``, or the name of a generator.
+        robots: Number of robots.
+        rules: The arguments of the task.
+        split: Which worlds of a generator are drawn.
+        difficulty: Difficulty of a generator's worlds; None: each world's own.
+        episodes_per_world: Episodes of a robot in a world of a generator before the next one.
+        max_goal_distance: Longest way between a sampled start and goal [m].
+
+    Raises:
+        ValueError: If an argument is out of its range, or a world has no task.
+    """
+
+    def __init__(
+        self,
+        world: WorldChoice | Sequence[WorldChoice],
+        robots: int,
+        rules: TaskArguments,
+        *,
+        split: Literal["train", "validation"],
+        difficulty: float | None,
+        episodes_per_world: int,
+        max_goal_distance: float,
+    ) -> None:
+        self.refused = 0
+        """Worlds of the generator that were drawn anew, as they had no task."""
+        self._rules = rules
+        self._max_goal_distance = check_goal_distance(rules.min_goal_distance, max_goal_distance)
+        self._episodes_per_world = check_count("episodes_per_world", episodes_per_world)
+        if split not in ("train", "validation"):
+            raise ValueError(f"split must be 'train' or 'validation', got {split!r}")
+        self._split = split
+        self._generator = resolve_generator(world)
+        if difficulty is not None:
+            check_share("difficulty", difficulty)
+            if self._generator is None:
+                raise ValueError(
+                    "difficulty must be None unless world is the name of a generator, got "
+                    f"{difficulty!r}"
+                )
+        self._difficulty = difficulty
+        fixed = [] if self._generator else _resolve_worlds(world)
+        self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
+        self._left = [0] * robots
+        # A task of each world, or the lack of one, shows before anything runs.
+        rng = np.random.default_rng(0)
+        probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
+        self.diagonal = max(self._draw(probe, rng).world.diagonal for probe in probes)
+        """Longest distance in the rooms [m]."""
+        if self._generator:
+            self.diagonal, self.refused = GENERATED_DIAGONAL, 0
+
+    def draw(
+        self,
+        robot: int,
+        rng: np.random.Generator,
+        given: tuple[World, Task | None] | None = None,
+    ) -> Episode:
+        """Draw the next episode of a robot.
+
+        Args:
+            robot: Its number.
+            rng: Its source of randomness.
+            given: A world for this episode alone, and a task or None for any of that world.
+
+        Returns:
+            The episode.
+
+        Raises:
+            ValueError: If no world with a task is found.
+        """
+        if given is not None:
+            world, task = given
+            return self._draw_in(world, rng) if task is None else self.of_task(world, task)
+        kept = self._worlds[robot] if self._generator is None or self._left[robot] else None
+        episode = self._draw(kept, rng)
+        if self._generator:
+            new = episode.world is not kept
+            self._left[robot] = (self._episodes_per_world if new else self._left[robot]) - 1
+            self._worlds[robot] = episode.world
+        return episode
+
+    def forget(self, robot: int) -> None:
+        """Let the next episode of a robot be in a new world, as after a seed."""
+        self._left[robot] = 0
+
+    def fixed(self, robot: int) -> World | None:
+        """The world that a robot always drives in; None with a generator."""
+        return None if self._generator else self._worlds[robot]
+
+    def of_task(self, world: World, task: Task) -> Episode:
+        """Make an episode of a task that is given."""
+        rules = self._rules
+        field = None
+        if rules.progress == "shortest_path":
+            field = distance_field(world, rules.collision_distance, task.goal)
+        planner = planner_for(world, rules.robot.radius)
+        length = planner.length(task.start[:2], task.goal)
+        return Episode(world, task, length, field)
+
+    def _draw(self, world: World | None, rng: np.random.Generator) -> Episode:
+        """Draw an episode in a world, in a new one where it is None or has no task."""
+        if self._generator is None and world is not None:
+            return self._draw_in(world, rng)
+        reason: ValueError | None = None
+        for _ in range(_WORLDS):
+            try:
+                return self._draw_on_grid(world or self._new_world(rng), rng)
+            except ValueError as error:
+                self.refused += 1
+                world, reason = None, error
+        raise ValueError(
+            f"world = {self._generator!r} cannot be driven: {_WORLDS} of its worlds in a row have "
+            f"no task; the last one: {reason}"
+        ) from reason
+
+    def _new_world(self, rng: np.random.Generator) -> World:
+        """The next world of the generator."""
+        from mpfa_envs.generators import generate_world, world_seed
+
+        seed = world_seed(self._split, int(rng.integers(10**9)))
+        return generate_world(str(self._generator), seed, difficulty=self._difficulty)
+
+    def _draw_in(self, world: World, rng: np.random.Generator) -> Episode:
+        """Draw an episode in a fixed world, as :class:`~mpfa_envs.NavigationEnv` does."""
+        if math.isfinite(self._max_goal_distance):
+            return self._draw_on_grid(world, rng)
+        rules = self._rules
+        task = sample_task(
+            world,
+            rng,
+            collision_distance=rules.collision_distance,
+            min_goal_distance=rules.min_goal_distance,
+            detour_chance=rules.detour_chance,
+        )
+        return self.of_task(world, task)
+
+    def _draw_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
+        """Draw an episode over the cells of a grid, in milliseconds however full the world is."""
+        from mpfa_envs.distance import sample_task_on_grid
+
+        rules = self._rules
+        task, field = sample_task_on_grid(
+            _grid_of(world, rules.collision_distance),
+            rng,
+            min_goal_distance=rules.min_goal_distance,
+            max_goal_distance=self._max_goal_distance,
+            detour_chance=rules.detour_chance,
+        )
+        length = field.at(*task.start[:2])
+        return Episode(world, task, length, field if rules.progress == "shortest_path" else None)
+
+
+def resolve_generator(world: object) -> str | None:
+    """The name of a generator, or None for what stands for fixed worlds.
+
+    Raises:
+        ValueError: If it is a word that is neither a generator nor a world.
+    """
+    from mpfa_envs.generators import GENERATORS
+
+    if not isinstance(world, str):
+        return None
+    if world in GENERATORS:
+        return world
+    if world.isidentifier() and world not in WORLDS:
+        known = [*GENERATORS, *WORLDS]
+        hint = f" ({question})" if (question := did_you_mean(world, known)) else ""
+        raise ValueError(
+            "world must be a World, the path of a .yaml file, a sequence of these, or one of "
+            f"{known}, got {world!r}{hint}"
+        )
+    return None
+
+
+def _resolve_worlds(world: WorldChoice | Sequence[WorldChoice]) -> list[World]:
+    """The fixed worlds that are meant."""
+    if isinstance(world, Sequence) and not isinstance(world, str):
+        if not world:
+            raise ValueError("world must hold at least one world, got an empty sequence")
+        return [resolve_world(each) for each in world]
+    return [resolve_world(world)]
+
+
+def check_goal_distance(least: float, most: float) -> float:
+    """A longest way that is above the least distance between start and goal [m].
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
+        raise ValueError(
+            f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"
+        )
+    return float(most)

@@ -1,0 +1,350 @@
+"""Many robots at once against as many environments of one robot, and gymnasium's conventions."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import mpfa_envs
+from mpfa_envs import (
+    ENV_IDS,
+    INFO_TYPES,
+    WORLDS,
+    Box,
+    NavigationEnv,
+    RewardTerms,
+    Task,
+    VectorNavigationEnv,
+    World,
+    navigation_reward,
+)
+from tests.envs.shapes import random_shapes
+
+NAMES = ["A", "B", "D", "test"]
+MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
+
+
+def make(num_envs: int = 4, **kwargs: object) -> VectorNavigationEnv:
+    return VectorNavigationEnv(num_envs, **{"world": NAMES, "physics": "kinematic"} | kwargs)
+
+
+def drive(rng: np.random.Generator, robots: int) -> np.ndarray:
+    """Actions that lead somewhere: mostly forward."""
+    return rng.uniform(-0.3, 1.0, (robots, 2)).astype(np.float32)
+
+
+def assert_alike(ours: tuple, theirs: tuple, atol: float) -> None:
+    """Compare what a step or a reset of two vector environments has given."""
+    *arrays, infos = ours
+    *expected, expected_infos = theirs
+    for array, other in zip(arrays, expected, strict=True):
+        np.testing.assert_allclose(array, other, atol=atol)
+        assert array.dtype == other.dtype
+    assert_infos_alike(infos, expected_infos, atol)
+
+
+def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
+    assert set(infos) == set(expected)
+    for key, value in expected.items():
+        if isinstance(value, dict):
+            assert_infos_alike(infos[key], value, atol)
+        elif value.dtype == object:
+            for row, other in zip(infos[key], value, strict=True):
+                assert (row is None) == (other is None)
+                if other is not None:
+                    np.testing.assert_allclose(row, other, atol=atol)
+        elif f"_{key}" in expected:
+            mask = expected[f"_{key}"]
+            np.testing.assert_allclose(infos[key][mask], value[mask], atol=atol)
+            assert infos[key].dtype == value.dtype, key
+        else:
+            np.testing.assert_array_equal(infos[key], value, key)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"lidar": {"noise": 0.02}, "action_repeat": 1},
+        {"lidar": {"reduction": "median", "sectors": 6, "rays_per_sector": 4}},
+        {"lidar": {"reduction": "single", "max_range": 2.0}, "robot": "burger"},
+        {"reward": partial(navigation_reward, goal_reward=3.0), "max_steps": 40},
+        {"reward": lambda outcome: RewardTerms(other=outcome.clearance), "time_step": 0.2},
+        {"progress": "none", "collision_distance": "contact"},
+        {"progress": "shortest_path", "progress_scale": 7.0},
+    ],
+    ids=str,
+)
+def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments: dict) -> None:
+    ours = make(autoreset_mode=mode, **arguments)
+    singles = [
+        partial(NavigationEnv, world=name, physics="kinematic", **arguments) for name in NAMES
+    ]
+    theirs = SyncVectorEnv(singles, autoreset_mode=mode, observation_mode="different")
+    seeds, rng, episodes = [3, 4, 5, 6], np.random.default_rng(0), 0
+    assert_alike(ours.reset(seed=seeds), theirs.reset(seed=seeds), 1e-9)
+    for _ in range(150):
+        actions = drive(rng, 4)
+        seen = ours.step(actions)
+        assert_alike(seen, theirs.step(actions), 1e-9)
+        episodes += int((seen[2] | seen[3]).sum())
+    assert episodes > 3
+    ours.close()
+    theirs.close()
+
+
+def test_wheels_drive_the_same_trajectories_as_alone() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    ours = make(physics="wheels")
+    theirs = SyncVectorEnv([partial(NavigationEnv, world=name) for name in NAMES])
+    seeds, rng = [3, 4, 5, 6], np.random.default_rng(0)
+    assert_alike(ours.reset(seed=seeds), theirs.reset(seed=seeds), 1e-12)
+    for _ in range(60):
+        actions = drive(rng, 4)
+        assert_alike(ours.step(actions), theirs.step(actions), 1e-12)
+    ours.close()
+    ours.close()
+    theirs.close()
+
+
+def test_robots_that_share_a_server_part_slowly() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    ours, theirs = make(40, physics="wheels"), make(8, physics="wheels")
+    tasks = [Task((0.0, -3.0, 0.3 * i), (0.0, 3.0)) for i in range(8)]
+    ours.reset(seed=0, options={"worlds": ["A"] * 40, "tasks": tasks * 5})
+    theirs.reset(seed=0, options={"worlds": ["A"] * 8, "tasks": tasks})
+    actions = np.tile(np.linspace(0.2, 0.9, 8, dtype=np.float32)[:, None], (1, 2))
+    actions[:, 1] -= 0.2
+    for _ in range(15):  # Three seconds.
+        ours.step(np.tile(actions, (5, 1)))
+        theirs.step(actions)
+    # All 40 are in one place, and none was in another's way.
+    gaps = ours.poses.reshape(5, 8, 3)[..., :2] - theirs.poses[:, :2]
+    assert np.hypot(*gaps.T).max() < 0.05
+    ours.close()
+    theirs.close()
+
+
+def test_a_robot_drives_among_any_shapes_as_alone() -> None:
+    rng, worlds = np.random.default_rng(7), []
+    while len(worlds) < 6:
+        world = random_shapes(rng, boxes=3, cylinders=4, polygons=3)
+        if world.clearance(0.0, 0.0) > 0.5 and world.clearance(3.0, 2.0) > 0.5:
+            worlds.append(world)
+    env = make(6, world=worlds, detour_chance=0.0)
+    env.reset(seed=0)
+    single = [NavigationEnv(world=world, physics="kinematic") for world in worlds]
+    for each, task in zip(single, env.tasks, strict=True):
+        each.reset(options=task._asdict())
+    running = np.ones(6, dtype=np.bool_)
+    for _ in range(60):
+        actions = drive(rng, 6)
+        observations, rewards, terminated, *_ = env.step(actions, only=running)
+        for index in np.flatnonzero(running):
+            seen, reward, over, *_ = single[index].step(actions[index])
+            np.testing.assert_allclose(observations[index], seen, atol=1e-9)
+            assert rewards[index] == pytest.approx(reward, abs=1e-9)
+            assert terminated[index] == over
+        running &= ~terminated
+    for index, each in enumerate(single):
+        np.testing.assert_allclose(env.trail(index), each.trail, atol=1e-9)
+
+
+def test_a_robot_has_the_same_episodes_whatever_their_number() -> None:
+    seen = []
+    for robots in (1, 3, 16):
+        env, rng = make(robots), np.random.default_rng(0)
+        rows = [env.reset(seed=5)[0][0]]
+        for _ in range(80):
+            actions = np.tile(drive(rng, 1), (robots, 1))
+            actions[1:] *= 0.5
+            rows.append(env.step(actions)[0][0])
+        seen.append(np.array(rows))
+    np.testing.assert_array_equal(seen[0], seen[1])
+    np.testing.assert_array_equal(seen[0], seen[2])
+
+
+def hash_of_a_drive(world: object = "D", robots: int = 3, **kwargs: object) -> str:
+    env, rng = make(robots, world=world, **kwargs), np.random.default_rng(1)
+    rows = [env.reset(seed=9)[0].tobytes()]
+    rows += [env.step(drive(rng, robots))[0].tobytes() for _ in range(60)]
+    env.close()
+    return hashlib.sha256(b"".join(rows)).hexdigest()
+
+
+def test_the_same_seed_gives_the_same_bits_in_another_process() -> None:
+    code = "from tests.envs.test_vector import hash_of_a_drive; print(hash_of_a_drive())"
+    root = Path(mpfa_envs.__file__).parents[2]
+    path = f"{root}:{root / 'envs'}"
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        check=True, capture_output=True, text=True, env={"PYTHONPATH": path},
+    )  # fmt: skip
+    assert result.stdout.split()[-1] == hash_of_a_drive()
+
+
+def test_an_ended_robot_waits_for_a_reset_that_names_it() -> None:
+    env = make(2, world="A", autoreset_mode=AutoresetMode.DISABLED, max_steps=4)
+    with pytest.raises(ResetNeeded, match="call reset"):
+        env.step(np.ones((2, 2)))
+    env.reset(seed=0)
+    truncated = [env.step(np.ones((2, 2)))[3].tolist() for _ in range(2)]
+    assert truncated == [[False, False], [True, True]]
+    with pytest.raises(ResetNeeded, match=r"robots \[0, 1\] have ended.*reset_mask"):
+        env.step(np.ones((2, 2)))
+    before = env.poses
+    _, infos = env.reset(options={"reset_mask": np.array([False, True])})
+    assert infos["_x"].tolist() == [False, True]
+    assert (env.poses[0] == before[0]).all() and (env.poses[1] != before[1]).all()
+    with pytest.raises(ResetNeeded, match=r"robots \[0\] have ended"):
+        env.step(np.ones((2, 2)))
+    env.step(np.ones((2, 2)), only=np.array([False, True]))
+
+
+def test_options_fix_the_next_episode_and_no_later_one() -> None:
+    post = World(name="post", boxes=(Box(1.0, -0.5, 2.0, 0.5),))
+    task = Task((0.0, 0.0, 7.0), (3.0, 0.0))
+    env = make(3, world="D")
+    env.reset(seed=1, options={"worlds": [None, post, post], "tasks": [None, task, None]})
+    assert [world.name for world in env.worlds] == ["D", "post", "post"]
+    assert env.tasks[1] == task and env.tasks[2] != task
+    assert env.poses[1].tolist() == pytest.approx([0.0, 0.0, 7.0 - math.tau])
+    env.reset()
+    assert [world.name for world in env.worlds] == ["D"] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"task": []}, "options must have keys among .*got 'task'"),
+        ({"tasks": [None]}, "tasks must have 2 entries, got 1"),
+        ({"tasks": "ab"}, "tasks must be a sequence .*got 'ab'"),
+        ({"worlds": ["tets", None]}, "robot 0: world must be .*did you mean 'test'"),
+        ({"tasks": [None, Task((4.9, 0, 0), (0, 0))]}, "robot 1: start must be farther"),
+        ({"tasks": [None, ((0, 0, 0), (9, 0))]}, "robot 1: goal must be within reach"),
+        ({"reset_mask": np.zeros(2, dtype=np.bool_)}, "reset_mask must name at least one robot"),
+        ({"reset_mask": [True, False]}, "reset_mask must be a NumPy array of 2 bool"),
+        ({"worlds": [World(name="hall", size=(90.0, 9.0)), None]}, "robot 0: world 'hall' .* 14"),
+    ],
+)
+def test_bad_options_are_refused_and_the_episodes_go_on(options: dict, message: str) -> None:
+    env = make(2, world="A")
+    env.reset(seed=0)
+    before = env.step(np.ones((2, 2)))[0]
+    poses = env.poses
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=1, options=options)
+    np.testing.assert_array_equal(env.poses, poses)
+    twin = make(2, world="A")
+    twin.reset(seed=0)
+    np.testing.assert_array_equal(twin.step(np.ones((2, 2)))[0], before)
+    np.testing.assert_array_equal(twin.step(np.ones((2, 2)))[0], env.step(np.ones((2, 2)))[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
+        ({"num_envs": 2.5}, "num_envs must be a positive integer, got 2.5"),
+        ({"world": []}, "world must hold at least one world, got an empty sequence"),
+        ({"world": ["A", "tets"]}, "world must be .*got 'tets' .did you mean 'test'"),
+        ({"world": "barz"}, "world must be .*got 'barz' .did you mean 'bars'"),
+        ({"difficulty": 0.5}, "difficulty must be None unless world is the name of a generator"),
+        ({"world": "rooms", "difficulty": 1.5}, r"difficulty must be in \[0, 1\], got 1.5"),
+        ({"episodes_per_world": 0}, "episodes_per_world must be a positive integer, got 0"),
+        ({"split": "test"}, "split must be 'train' or 'validation', got 'test'"),
+        ({"max_goal_distance": 1.0}, "max_goal_distance must be above min_goal_distance = 2.0"),
+        ({"progress": "path"}, "progress must be one of .*got 'path'"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode must be .*got 'Never'"),
+        ({"physics": "magic"}, "physics must be one of .*got 'magic'"),
+        ({"min_goal_distance": 40.0}, "world 'A' has no start and goal at least"),
+        ({"world": World(name="box", size=(0.9, 0.9))}, "world 'box' has no free goal"),
+        ({"world": "bars", "min_goal_distance": 90.0}, "world = 'bars' cannot be driven: 50 of"),
+    ],
+)
+def test_a_bad_argument_is_named_before_anything_is_built(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        VectorNavigationEnv(**{"num_envs": 2, "world": "A", "physics": "kinematic"} | arguments)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ([[0.0, math.nan], [0.0, 0.0]], r"actions must not hold NaN, got some for robots \[0\]"),
+        ([0.0, 0.0], r"actions must have shape \(2, 2\), got \(2,\)"),
+    ],
+)
+def test_bad_actions_move_nothing(actions: list, message: str) -> None:
+    env = make(2)
+    env.reset(seed=0)
+    poses = env.poses
+    with pytest.raises(ValueError, match=message):
+        env.step(np.array(actions))
+    np.testing.assert_array_equal(env.poses, poses)
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        (-1, "seed must be an integer of at least 0, got -1"),
+        ([1], "seed must have 2 entries, got 1"),
+        ([1, -1], "seed must be an integer of at least 0, got -1"),
+    ],
+)
+def test_a_bad_seed_is_refused(seed: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(2).reset(seed=seed)
+
+
+def test_what_was_given_does_not_change_with_the_next_step() -> None:
+    env = make(2)
+    observations, infos = env.reset(seed=0)
+    kept = observations.copy(), {key: value.copy() for key, value in infos.items()}
+    env.step(np.ones((2, 2)))
+    np.testing.assert_array_equal(observations, kept[0])
+    for key, value in infos.items():
+        np.testing.assert_array_equal(value, kept[1][key])
+    assert set(INFO_TYPES) <= set(infos)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_every_id_makes_a_vector_environment(env_id: str) -> None:
+    env = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")
+    assert isinstance(env.unwrapped, VectorNavigationEnv)
+    assert env.worlds[0] in WORLDS.values()
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    observations, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observations)
+    assert env.single_observation_space.shape == (24,)
+    assert env.action_space.contains(env.action_space.sample())
+    env.close()
+
+
+def test_long_episodes_keep_their_trail() -> None:
+    env = make(1, world="A", max_steps=3000)
+    env.reset(options={"tasks": [Task((0.0, 0.0, 0.0), (4.0, 4.0))]})
+    for _ in range(700):
+        env.step(np.array([[0.2, 0.6]]))
+    trail = env.trail(0)
+    assert len(trail) == 1401 and trail[0] == (0.0, 0.0)
+    assert trail[-1] == tuple(env.poses[0, :2])
+
+
+def test_pictures_show_each_world() -> None:
+    env = make(2, render_mode="rgb_array")
+    with pytest.raises(ResetNeeded, match="render"):
+        env.render()
+    env.reset(seed=0)
+    assert [picture.shape for picture in env.render()] == [(480, 480, 3)] * 2
+    assert make(2).render() is None
