@@ -147,6 +147,21 @@ class FreeGrid:
         around = [number, *neighbors[starts[number] : starts[number + 1]]]
         return [(int(at), math.dist(self.center(*self.cells[at]), goal)) for at in around]
 
+    def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
+        """Measure the way between two positions.
+
+        Args:
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Length [m]; infinite if there is no way.
+        """
+        if not self.free.any():
+            return math.inf
+        ways = self.distances(goal)
+        return min(float(ways[cell]) + gap for cell, gap in self._first_cells(start))
+
     def distances(self, goal: tuple[float, float]) -> NDArray[np.float64]:
         """Measure the way from every free cell to a goal.
 

@@ -18,7 +18,7 @@ from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.episodes import distance_field
 from mpfa_envs.observation import observe
-from mpfa_envs.path import planner_for
+from mpfa_envs.path import shortest_length
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
     RewardFunction,
@@ -231,7 +231,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             )
         self._task = task
         self._goal = task.goal
-        length = planner_for(self.world, self.robot.radius).length(task.start[:2], task.goal)
+        length = shortest_length(self.world, self.robot.radius, task.start[:2], task.goal)
         self._shortest_path = max(length - self.goal_radius, 0.0)
         self._steps = 0
         self._path_length = 0.0

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+Point = tuple[float, float]
+"""A position (x, y) [m]."""
+
 MOST_VERTICES: Final = 100
 """No polygon has more vertices: each pair of its edges is looked at."""
 
@@ -109,7 +112,7 @@ class Polygon:
         Polygon(vertices=((2.0, 0.0), (0.0, 1.0), (0.0, 0.0)))
     """
 
-    vertices: tuple[tuple[float, float], ...]
+    vertices: tuple[Point, ...]
 
     def __post_init__(self) -> None:
         if not 3 <= len(self.vertices) <= MOST_VERTICES:
@@ -137,6 +140,15 @@ class Polygon:
         return [(*one, *other) for one, other in zip(self.vertices, following, strict=True)]
 
     @property
+    def corners(self) -> list[tuple[Point, Point, Point]]:
+        """Each vertex between the one before and the one after it [m]."""
+        count = len(self.vertices)
+        return [
+            (self.vertices[i - 1], vertex, self.vertices[(i + 1) % count])
+            for i, vertex in enumerate(self.vertices)
+        ]
+
+    @property
     def bounds(self) -> Bounds:
         """The smallest upright rectangle around the footprint [m]."""
         xs, ys = zip(*self.vertices, strict=True)
@@ -152,12 +164,28 @@ class Polygon:
         """Whether the footprint has no dents."""
         return _is_convex(self.vertices)
 
+    @property
+    def convex_parts(self) -> list[tuple[Point, ...]]:
+        """The polygon itself, or if it has dents the triangles and the rest that make it up.
+
+        Ears are cut off one by one: corners that bulge, with no other vertex in their triangle.
+        """
+        left = list(self.vertices)
+        parts: list[tuple[Point, ...]] = []
+        while not _is_convex(tuple(left)):
+            ear = next((i for i in range(len(left)) if _is_ear(left, i)), None)
+            if ear is None:  # Vertices in one line are left, which have no area.
+                return parts
+            parts.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
+            del left[ear]
+        return [*parts, tuple(left)]
+
 
 Shape = Box | Cylinder | Polygon
 """Anything that can stand in a world."""
 
 
-def _signed_area(vertices: tuple[tuple[float, float], ...]) -> float:
+def _signed_area(vertices: tuple[Point, ...]) -> float:
     """Area [m²]; positive if the vertices run counter-clockwise."""
     x, y = vertices[0]
     # From the first vertex, not from the origin: a small polygon far out keeps its digits.
@@ -165,7 +193,7 @@ def _signed_area(vertices: tuple[tuple[float, float], ...]) -> float:
     return sum(a * d - b * c for (a, b), (c, d) in pairwise(rays)) / 2
 
 
-def _is_convex(vertices: tuple[tuple[float, float], ...]) -> bool:
+def _is_convex(vertices: tuple[Point, ...]) -> bool:
     """Tell whether counter-clockwise vertices turn left everywhere, once around in all."""
     count, turned = len(vertices), 0.0
     for i in range(count):
@@ -194,6 +222,25 @@ def _is_simple(edges: list[tuple[float, float, float, float]]) -> bool:
             elif _meet(edges[i], edges[j]):
                 return False
     return True
+
+
+def _is_ear(vertices: list[Point], at: int) -> bool:
+    """Tell whether a vertex can be cut off, with the line between its neighbors all inside."""
+    a, b, c = vertices[at - 1], vertices[at], vertices[(at + 1) % len(vertices)]
+    if _turn(a, b, c) <= 0.0:
+        return False
+    return not any(
+        vertex not in (a, b, c)
+        and _turn(a, b, vertex) >= 0.0
+        and _turn(b, c, vertex) >= 0.0
+        and _turn(c, a, vertex) >= 0.0
+        for vertex in vertices
+    )
+
+
+def _turn(a: Point, b: Point, c: Point) -> float:
+    """Positive if c lies to the left of the line from a to b."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:

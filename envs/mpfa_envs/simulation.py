@@ -23,11 +23,12 @@ except ImportError as error:
 from mpfa_envs.checks import check_count, check_positive
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from mpfa_envs.robot import RobotModel
+    from mpfa_envs.shapes import Point
     from mpfa_envs.worlds import World
 
 _ROBOTS = 64
@@ -146,6 +147,21 @@ class Simulation:
         )
         self._add_fixed(name, shape, x, y, height / 2)
 
+    def add_prism(self, name: str, vertices: Sequence[Point], *, height: float) -> None:
+        """Put a fixed upright prism with a convex footprint on the floor.
+
+        Args:
+            name: Name of the body.
+            vertices: Corners of the footprint (x, y) [m].
+            height: Height [m].
+        """
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH,
+            vertices=[[x, y, z] for z in (-height / 2, height / 2) for x, y in vertices],
+            physicsClientId=self._client,
+        )
+        self._add_fixed(name, shape, 0.0, 0.0, height / 2)
+
     def _add_fixed(self, name: str, shape: int, x: float, y: float, z: float) -> None:
         if name in self.bodies:
             raise ValueError(f"name must be new, got {name!r}")
@@ -160,7 +176,8 @@ class Simulation:
         """Build the walls and the obstacles of a world.
 
         Args:
-            world: The room; bodies are named ``wall_0``, ``box_0``, ``cylinder_0`` and so on.
+            world: The room; bodies are named ``wall_0``, ``box_0``, ``cylinder_0``, ``polygon_0``
+                and so on. A polygon with dents is built of the parts ``polygon_0_0`` to the last.
         """
         room, thick = world.room, _WALL_THICKNESS
         low_x, low_y = room.x_min - thick, room.y_min - thick
@@ -189,6 +206,11 @@ class Simulation:
                 radius=cylinder.radius,
                 height=_WALL_HEIGHT,
             )
+        for index, polygon in enumerate(world.polygons):
+            parts = polygon.convex_parts
+            for number, part in enumerate(parts):
+                name = f"polygon_{index}" + (f"_{number}" if len(parts) > 1 else "")
+                self.add_prism(name, part, height=_WALL_HEIGHT)
 
     def add_robot(self, robot: RobotModel, *, name: str = "robot") -> None:
         """Load a robot from its URDF. Several of them pass through each other.

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.path import planner_for
+from mpfa_envs.path import grid_for, is_small, planner_for, shortest_length
 from mpfa_envs.robot import (
     PAPER_CLEARANCE,
     RobotModel,
@@ -53,6 +53,8 @@ def sample_task(
     """Sample a start and a goal uniformly over the free space of their regions.
 
     The two are joined by a path that keeps the collision distance, so every task can be solved.
+    Worlds with many obstacles, and narrow ones in which no point keeps the usual distance of goals,
+    are sampled by :func:`~mpfa_envs.sample_task_on_grid`.
 
     Args:
         world: The room, its obstacles and its regions.
@@ -75,11 +77,48 @@ def sample_task(
         >>> len(task.start), len(task.goal)
         (3, 2)
     """
+    asked = collision_distance, min_goal_distance, detour_chance
+    if not is_small(world):
+        return _sample_cells(world, rng, *asked)
+    try:
+        return _sample_points(world, rng, *asked)
+    except ValueError:
+        try:
+            return _sample_cells(world, rng, *asked)
+        except ValueError:
+            pass
+        raise
+
+
+def _sample_cells(
+    world: World,
+    rng: np.random.Generator,
+    collision_distance: float,
+    min_goal_distance: float,
+    detour_chance: float,
+) -> Task:
+    """Sample a task on a grid, which is quick in any world, and finds the rarest."""
+    # Imported here because it needs Numba, which takes half a second, and many worlds do not.
+    from mpfa_envs.distance import sample_task_on_grid
+
+    grid = grid_for(world, collision_distance)
+    return sample_task_on_grid(
+        grid, rng, min_goal_distance=min_goal_distance, detour_chance=detour_chance
+    )[0]
+
+
+def _sample_points(
+    world: World,
+    rng: np.random.Generator,
+    collision_distance: float,
+    min_goal_distance: float,
+    detour_chance: float,
+) -> Task:
+    """Sample points until two of them make a task."""
     planner = planner_for(world, collision_distance)
     start_clearance = collision_distance + START_SLACK
     goal_clearance = max(GOAL_CLEARANCE, collision_distance)
-    obstacles = world.obstacle_count > 0
-    detour = detour_chance > 0.0 and obstacles and rng.random() < detour_chance
+    detour = detour_chance > 0.0 and world.obstacle_count > 0 and rng.random() < detour_chance
     straight: Task | None = None
     for _ in range(_STARTS):
         start = _sample_point(world, rng, world.start_regions, start_clearance, "start")
@@ -148,7 +187,7 @@ def check_task(
             f"goal must be farther than goal_radius = {goal_radius} m from the start {(x, y)}, "
             f"got {goal}"
         )
-    if planner_for(world, radius).find((x, y), goal) is None:
+    if shortest_length(world, radius, (x, y), goal) == math.inf:
         raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
     return Task((x, y, heading), goal)
 

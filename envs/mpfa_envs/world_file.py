@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 
 from mpfa_envs.checks import did_you_mean
-from mpfa_envs.worlds import Box, Cylinder, World
+from mpfa_envs.shapes import Box, Cylinder, Polygon
+from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,7 +24,7 @@ _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
     "goal": ("x_min", "x_max", "y_min", "y_max"),
 }
 """Keys of a file that hold lists, and the keys of an entry."""
-_KEYS: Final = ("name", "size", *_SHAPES)
+_KEYS: Final = ("name", "size", "polygons", *_SHAPES)
 _REGION_CLEARANCE: Final = 0.5
 """A region must hold a point this far from every obstacle: what the TurtleBot2 asks for [m]."""
 _FINEST: Final = 0.01
@@ -102,12 +103,14 @@ class _Reader:
         room = self.built(entries["size"], name=name, size=size)
         boxes = self.shapes(entries, "boxes", room)
         cylinders = self.shapes(entries, "cylinders", room)
+        polygons = self.polygons(entries, room)
         world = self.built(
             root,
             name=name,
             size=size,
             boxes=tuple(box for box, _ in boxes if isinstance(box, Box)),
             cylinders=tuple(shape for shape, _ in cylinders if isinstance(shape, Cylinder)),
+            polygons=polygons,
         )
         starts = self.regions(entries, "start", world)
         goals = self.regions(entries, "goal", world)
@@ -116,6 +119,7 @@ class _Reader:
             size=size,
             boxes=world.boxes,
             cylinders=world.cylinders,
+            polygons=polygons,
             start_regions=starts,
             goal_regions=goals,
         )
@@ -161,12 +165,17 @@ class _Reader:
             raise self.error(node, f"{what} must be a number in meters, got {got!r}")
         return value
 
+    def pair(self, node: yaml.Node, what: str, form: str) -> tuple[float, float]:
+        """Read a list of two numbers."""
+        values = self.items(node, what)
+        if len(values) != 2:
+            raise self.error(node, f"{what} must be {form}, got {len(values)} entries")
+        first, second = (self.number(value, what) for value in values)
+        return first, second
+
     def size(self, node: yaml.Node) -> tuple[float, float]:
         """Read the size of the room [m]."""
-        sides = self.items(node, "size")
-        if len(sides) != 2:
-            raise self.error(node, f"size must be [width, depth], got {len(sides)} entries")
-        width, depth = (self.number(side, "size") for side in sides)
+        width, depth = self.pair(node, "size", "[width, depth]")
         if width <= 0 or depth <= 0:
             raise self.error(node, f"size must be positive, got {[width, depth]}")
         return width, depth
@@ -193,6 +202,23 @@ class _Reader:
                 raise self.error(node, f"{what} lies outside the room {room.room}, got {shape}")
             shapes.append((shape, node))
         return shapes
+
+    def polygons(self, entries: dict[str, yaml.Node], room: World) -> tuple[Polygon, ...]:
+        """Read a list of polygons, each a list of vertices, that lie in the room."""
+        polygons: list[Polygon] = []
+        for node in self.items(entries["polygons"], "polygons") if "polygons" in entries else ():
+            what = "an entry of polygons"
+            vertices = tuple(
+                self.pair(vertex, "a vertex", "[x, y]") for vertex in self.items(node, what)
+            )
+            try:
+                polygon = Polygon(vertices)
+            except ValueError as error:
+                raise self.error(node, str(error)) from error
+            if not room.holds(polygon):
+                raise self.error(node, f"{what} lies outside the room {room.room}, got {polygon}")
+            polygons.append(polygon)
+        return tuple(polygons)
 
     def regions(self, entries: dict[str, yaml.Node], key: str, world: World) -> tuple[Box, ...]:
         """Read regions in which a robot has room."""
@@ -265,5 +291,9 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
             content[key] = [
                 {name: float(getattr(shape, name)) for name in _SHAPES[key]} for shape in shapes
             ]
+    if world.polygons:
+        content["polygons"] = [
+            [list(vertex) for vertex in polygon.vertices] for polygon in world.polygons
+        ]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
     Path(path).write_text(text, encoding="utf-8")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mpfa_envs import EXAMPLE_WORLD, WORLDS, Box, Cylinder, Lidar, World, load_world
+from mpfa_envs import EXAMPLE_WORLD, WORLDS, Box, Cylinder, Lidar, World, generate_world, load_world
 from mpfa_envs.simulation import Simulation
 
 
@@ -67,7 +67,9 @@ def test_the_reductions_differ_at_the_edge_of_a_box() -> None:
 
 def test_the_lidar_agrees_with_the_ray_test_of_the_engine() -> None:
     rng = np.random.default_rng(0)
-    for world in (WORLDS["test"], load_world(EXAMPLE_WORLD)):
+    hall = generate_world("halls", 5, difficulty=0.6)
+    assert {polygon.is_convex for polygon in hall.polygons} == {True, False}
+    for world in (WORLDS["test"], load_world(EXAMPLE_WORLD), hall):
         lidar = Lidar(world, max_range=9.0)
         simulation = Simulation(time_step=0.02)
         simulation.add_world(world)

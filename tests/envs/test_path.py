@@ -2,11 +2,26 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 
 import numpy as np
 import pytest
 
-from mpfa_envs import WORLDS, Box, Cylinder, PathPlanner, World
+from mpfa_envs import (
+    WORLDS,
+    Box,
+    Cylinder,
+    NavigationEnv,
+    PathPlanner,
+    Polygon,
+    World,
+    barn_task,
+    barn_world,
+    evaluation_pairs,
+    generate_world,
+)
+from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.path import is_small, shortest_length
 
 BLOCK = World(name="block", boxes=(Box(-1.0, -2.0, 1.0, 2.0),))
 
@@ -76,3 +91,95 @@ def test_there_is_no_path_from_within_a_margin() -> None:
 def test_a_bad_radius_is_refused() -> None:
     with pytest.raises(ValueError, match="radius must be positive, got 0"):
         PathPlanner(BLOCK, radius=0)
+
+
+def as_polygon(box: Box, turn: float = 0.0) -> Polygon:
+    """A box turned around the origin."""
+    x0, y0, x1, y1 = box.bounds
+    cosine, sine = math.cos(turn), math.sin(turn)
+    corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+    return Polygon(tuple((cosine * x - sine * y, sine * x + cosine * y) for x, y in corners))
+
+
+def test_a_polygon_in_the_shape_of_a_box_is_passed_as_the_box() -> None:
+    world = World(name="same", polygons=tuple(as_polygon(box) for box in WORLDS["test"].boxes))
+    boxes = PathPlanner(WORLDS["test"], radius=0.3)
+    polygons = PathPlanner(world, radius=0.3)
+    rng = np.random.default_rng(2)
+    for start, goal in rng.uniform(-4.6, 4.6, (40, 2, 2)).tolist():
+        assert polygons.length(start, goal) == pytest.approx(boxes.length(start, goal), rel=1e-6)
+        assert polygons.is_reachable(start, goal) == boxes.is_reachable(start, goal)
+
+
+@pytest.mark.parametrize("turn", [0.4, 1.0, 2.5])
+def test_a_turned_box_is_passed_at_the_same_length(turn: float) -> None:
+    world = World(name="turned", polygons=(as_polygon(BLOCK.boxes[0], turn),))
+    ends = [(3 * s * math.cos(turn), 3 * s * math.sin(turn)) for s in (-1, 1)]
+    length = PathPlanner(world, radius=0.18).length(*ends)
+    optimum = around_a_corner(0.18)
+    assert optimum - 1e-9 <= length <= 1.01 * optimum
+
+
+def test_no_point_of_a_path_around_polygons_comes_nearer_than_the_margin() -> None:
+    rng = np.random.default_rng(1)
+    for seed in (3, 8):
+        world = generate_world("halls", seed, difficulty=0.8)
+        planner = PathPlanner(world, radius=0.25)
+        found = 0
+        while found < 8:
+            start, goal = (rng.uniform(-0.5, 0.5, (2, 2)) * world.size).tolist()
+            path = planner.find(start, goal)
+            assert (path is not None) == planner.is_reachable(start, goal)
+            if path is None or len(path) == 2:
+                continue
+            found += 1
+            for (x0, y0), (x1, y1) in itertools.pairwise(path):
+                points = np.linspace((x0, y0), (x1, y1), 40)
+                assert world.clearances(points).min() >= 0.25 - 1e-6
+
+
+@pytest.mark.parametrize("name", ["halls-4", "bars-test-2", "mazes-3@0.4"])
+def test_a_grid_measures_what_the_planner_finds(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = resolve_world(name)
+    tasks = [evaluation_pairs(world, 4, seed=seed)[3] for seed in range(3)]
+    ends = [(task.start[:2], task.goal) for task in tasks]
+    exact = [shortest_length(world, 0.18, *pair) for pair in ends]
+    assert exact == [PathPlanner(world, radius=0.18).length(*pair) for pair in ends]
+    monkeypatch.setattr("mpfa_envs.path.is_small", lambda world: False)
+    on_grid = [shortest_length(world, 0.18, *pair) for pair in ends]
+    assert on_grid == pytest.approx(exact, rel=0.025)
+    assert on_grid != exact
+
+
+def test_paths_among_hundreds_of_cylinders_take_no_minutes() -> None:
+    world, task = barn_world(9), barn_task()
+    assert not is_small(world) and len(world.cylinders) > 250
+    start = time.process_time()
+    length = shortest_length(world, 0.18, task.start[:2], task.goal)
+    assert 10.0 < length < 14.0
+    assert shortest_length(world, 0.18, task.start[:2], (0.0, 7.4)) == math.inf
+    assert shortest_length(world, 0.18, (4.9, 0.0), task.goal) == math.inf
+    env = NavigationEnv(world=world, physics="kinematic")
+    for seed in range(5):
+        assert env.reset(seed=seed)[1]["shortest_path"] > 5.0
+    assert time.process_time() - start < 10.0
+    with pytest.raises(ValueError, match="goal must be within reach of the start"):
+        env.reset(options={"start": task.start, "goal": (0.0, 7.45)})
+
+
+def test_two_places_that_a_ring_of_cylinders_parts_have_no_path() -> None:
+    angles = np.linspace(0.0, math.tau, 80, endpoint=False)
+    ring = tuple(Cylinder(2 * math.cos(a), 2 * math.sin(a), 0.08) for a in angles)
+    world = World(name="ring", cylinders=ring)
+    assert shortest_length(world, 0.18, (0.0, 0.0), (3.0, 3.0)) == math.inf
+    around = shortest_length(world, 0.18, (-3.0, 0.0), (3.0, 0.0))
+    assert around == pytest.approx(2 * math.sqrt(9 - 2.26**2) + 2.26 * 1.706, rel=0.02)
+
+
+def test_tasks_are_sampled_in_a_corridor_with_no_place_for_the_usual_goal() -> None:
+    world = World(name="corridor", size=(8.0, 0.9))
+    env = NavigationEnv(world=world, physics="kinematic")
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        assert env.task is not None and world.clearance(*env.task.goal) < 0.5
+        assert info["min_clearance"] > 0.07

@@ -93,6 +93,26 @@ def test_clearances_of_polygons_are_those_of_their_edges() -> None:
     np.testing.assert_allclose(each, expected, atol=1e-12)
 
 
+def test_convex_parts_make_up_the_polygon() -> None:
+    assert TRIANGLE.convex_parts == [TRIANGLE.vertices]
+    rng = np.random.default_rng(0)
+    outlines = [DENTED]
+    for count in (5, 8, 13, 20):
+        # A star: corners near to and far from the middle, one after the other.
+        angles = math.tau * np.arange(count) / count
+        reach = np.where(np.arange(count) % 2, 1.0, 0.3) * rng.uniform(0.8, 1.2, count)
+        corners = zip(reach * np.cos(angles), reach * np.sin(angles), strict=True)
+        outlines.append(Polygon(tuple((float(x), float(y)) for x, y in corners)))
+    for polygon in outlines:
+        parts = [Polygon(part) for part in polygon.convex_parts]
+        assert all(part.is_convex for part in parts)
+        assert sum(part.area for part in parts) == pytest.approx(polygon.area)
+        for x, y in rng.uniform(-2.0, 2.0, (200, 2)).tolist():
+            if abs(distance(x, y, polygon_world(*parts))) < 1e-6:
+                continue
+            assert sum(inside(x, y, part) for part in parts) == inside(x, y, polygon)
+
+
 def test_the_area_under_obstacles_counts_polygons() -> None:
     square = Polygon(((0, 0), (1, 1), (0, 2), (-1, 1)))
     world = World(name="all", boxes=(Box(2, 2, 3, 4),), polygons=(square,))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpfa_envs import WORLDS, World, render_trajectories
+from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, render_trajectories
 from mpfa_envs.render import FLOOR, GOAL, OBSTACLE, OUTCOMES, TRAIL, WALL
 from tests.envs.paper import paper_env
 
@@ -71,3 +71,18 @@ def test_bad_lists_are_refused(arguments: tuple[list, ...], message: str) -> Non
 def test_a_bad_size_is_refused() -> None:
     with pytest.raises(ValueError, match="size must be an integer of at least 32, got 3"):
         render_trajectories("A", [], [], [], size=3)
+
+
+def test_a_picture_shows_boxes_cylinders_and_polygons() -> None:
+    dented = Polygon(((0.0, 0.0), (3.0, 0.0), (3.0, 3.0), (1.5, 1.0)))
+    world = World(
+        name="all",
+        boxes=(Box(-3.0, -3.0, -1.0, -1.0),),
+        cylinders=(Cylinder(2.0, -2.0, 0.7),),
+        polygons=(dented,),
+    )
+    picture = render_trajectories(world, [], [], [])
+    for x, y in ((-2.0, -2.0), (2.2, -2.2), (2.6, 1.3), (1.5, 0.4)):
+        assert pixel(picture, x, y) == OBSTACLE[:3]
+    for x, y in ((0.4, 0.7), (2.3, 2.5), (-1.5, 1.5)):
+        assert pixel(picture, x, y) == FLOOR[:3]

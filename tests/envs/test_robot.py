@@ -7,7 +7,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from mpfa_envs import ROBOTS, WORLDS
+from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, World
 from mpfa_envs.drives import WheelDrive
 from mpfa_envs.simulation import Simulation
 
@@ -102,3 +102,42 @@ def test_the_turtlebot2_has_the_measures_of_the_paper() -> None:
     assert (robot.radius, robot.wheel_base, robot.wheel_radius) == (0.18, 0.23, 0.035)
     assert robot.collision_distance == 0.25
     assert robot.max_angular_speed == pytest.approx(1.9565, abs=1e-4)
+
+
+def test_the_engine_feels_obstacles_where_the_world_has_them() -> None:
+    world = World(
+        name="shapes",
+        boxes=(Box(-3.0, 1.0, -1.0, 2.0),),
+        cylinders=(Cylinder(2.5, 2.5, 0.6),),
+        polygons=(
+            Polygon(((1.0, -3.0), (3.0, -2.0), (2.0, -0.5))),
+            Polygon(((-3.0, -3.0), (-0.5, -3.2), (-1.6, -2.4), (-0.8, -0.6), (-2.2, -1.6))),
+        ),
+    )
+    simulation = Simulation(time_step=0.02)
+    simulation.add_world(world)
+    simulation.add_robot(ROBOTS["turtlebot2"])
+    rng = np.random.default_rng(0)
+    compared = 0
+    while compared < 60:
+        x, y = rng.uniform(-4.7, 4.7, 2).tolist()
+        clearance = world.clearance(x, y) - 0.178
+        if not 0.01 < clearance < 0.4:
+            continue
+        compared += 1
+        simulation.place_robot(x, y, 0.0)
+        gaps = [
+            contact[8]
+            for name, body in simulation.bodies.items()
+            if name not in ("floor", "robot")
+            for contact in pybullet.getClosestPoints(
+                simulation.bodies["robot"],
+                body,
+                1.0,
+                linkIndexA=-1,
+                physicsClientId=simulation.client,
+            )
+        ]
+        # The engine rounds edges by millimeters.
+        assert min(gaps) == pytest.approx(clearance, abs=0.006)
+    simulation.close()

@@ -10,12 +10,15 @@ from mpfa_envs import (
     WORLDS,
     NavigationEnv,
     WorldFileError,
+    generate_world,
     load_world,
     save_world,
 )
 
+HALL = generate_world("halls", 1)
 
-@pytest.mark.parametrize("world", [*WORLDS.values(), load_world(EXAMPLE_WORLD)])
+
+@pytest.mark.parametrize("world", [*WORLDS.values(), load_world(EXAMPLE_WORLD), HALL])
 def test_a_saved_world_comes_back_equal(world: object, tmp_path: Path) -> None:
     save_world(world, tmp_path / "world.yaml")
     assert load_world(tmp_path / "world.yaml") == world
@@ -86,6 +89,17 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
             "size: [500, 500]\nboxes:\n" + "  - {x_min: 0, x_max: 1, y_min: 0, y_max: 1}\n" * 1001,
             1,
             "boxes, cylinders and polygons must be at most 1000 in all, got 1001",
+        ),
+        ("size: [4, 4]\npolygons: 3\n", 2, "polygons must be a list"),
+        ("size: [4, 4]\npolygons:\n  - 3\n", 3, "an entry of polygons must be a list"),
+        ("size: [4, 4]\npolygons:\n  - [[0, 0], 1]\n", 3, "a vertex must be a list"),
+        ("size: [4, 4]\npolygons:\n  - [[0, 0], [1]]\n", 3, r"a vertex must be \[x, y\], got 1"),
+        ("size: [4, 4]\npolygons:\n  - [[0, 0], [1, a]]\n", 3, "a vertex must be a number in m"),
+        ("size: [4, 4]\npolygons:\n  - [[0, 0], [1, 0]]\n", 3, "polygon must have 3 to 100 vert"),
+        (
+            "size: [4, 4]\npolygons:\n  - [[0, 0], [1, 0], [0, 1]]\n  - [[0, 0], [3, 0], [0, 1]]\n",
+            4,
+            "an entry of polygons lies outside the room",
         ),
         ("size: [4, 4\nboxes: 1\n", 2, "is not YAML"),
         ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),

@@ -67,7 +67,7 @@ def test_a_run_is_called_after_the_stages_that_it_has(arguments: list[str], name
 def test_two_long_curricula_have_two_short_names() -> None:
     texts = [
         "curriculum.stages=["
-        + ",".join(f"{{world: random-{n}, episodes: {last}}}" for n in range(20))
+        + ",".join(f"{{world: rooms-{n}, episodes: {last}}}" for n in range(20))
         + "]"
         for last in (1, 2)
     ]
