@@ -12,7 +12,7 @@ import numpy as np
 
 from mpfa_envs.builtin_worlds import WORLDS, resolve_world
 from mpfa_envs.checks import check_count, check_share, did_you_mean
-from mpfa_envs.path import planner_for
+from mpfa_envs.path import shortest_length
 from mpfa_envs.tasks import Task, sample_task
 from mpfa_envs.worlds import World
 
@@ -165,8 +165,7 @@ class EpisodeSource:
         field = None
         if rules.progress == "shortest_path":
             field = distance_field(world, rules.collision_distance, task.goal)
-        planner = planner_for(world, rules.robot.radius)
-        length = planner.length(task.start[:2], task.goal)
+        length = shortest_length(world, rules.robot.radius, task.start[:2], task.goal)
         return Episode(world, task, length, field)
 
     def _draw(self, world: World | None, rng: np.random.Generator) -> Episode:

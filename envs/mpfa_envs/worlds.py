@@ -88,6 +88,15 @@ class World:
                 if not self.holds(shape):
                     raise ValueError(f"{field} must lie in the room {self.room}, got {shape}")
 
+    def __hash__(self) -> int:
+        """Worlds are keys of caches, and hundreds of obstacles are hashed once only."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Hash of all numbers; without the name it is the same in every process."""
+        return hash((self.size, self.obstacles, self.start_regions, self.goal_regions))
+
     def renamed(self, name: str) -> World:
         """Give the same world another name; what was computed of it is kept."""
         world = copy.copy(self)

@@ -141,6 +141,15 @@ def test_a_world_without_a_task_is_an_error_and_not_an_endless_search(
         env.reset(seed=0)
 
 
+def test_equal_worlds_are_one_key_and_a_renamed_one_is_another() -> None:
+    one, same = (World(name="x", boxes=(Box(0, 0, 1, 1),)) for _ in range(2))
+    assert one == same and hash(one) == hash(same) and {one: 1}[same] == 1
+    other = one.renamed("y")
+    assert other.name == "y" and one.name == "x" and other != one
+    assert other.boxes == one.boxes and {one: 1}.get(other) is None
+    assert hash(World(name="x")) != hash(one)
+
+
 def test_clearances_of_many_points_are_those_of_each() -> None:
     world = World(
         name="both",
