@@ -52,8 +52,33 @@ def _stepper(world: World, *, physics: Any, robots: int = ROBOTS) -> Call:
     return lambda: env.step(actions)
 
 
+def _torchrl_stepper(world: World) -> Call:
+    """The same through TorchRL: a step, and the reset of the robots whose episode has ended."""
+    import torch
+
+    from mpfa_envs import make_navigation_env
+
+    env = make_navigation_env(
+        world,
+        num_envs=ROBOTS,
+        physics="kinematic",
+        action_repeat=1,
+        detour_chance=0.0,
+        info_keys=("success", "collision", "timeout"),
+        seed=0,
+    )
+    actions = torch.tensor(_CIRCLE).expand(ROBOTS, 2)
+    state = env.reset()
+
+    def step() -> None:
+        nonlocal state
+        _, state = env.step_and_maybe_reset(state.set("action", actions))
+
+    return step
+
+
 def measure(*, quick: bool) -> list[Entry]:
-    """Measure kinematic robots among 30 obstacles and among 300 cylinders, and wheels.
+    """Measure kinematic robots among 30 obstacles, 300 cylinders and in TorchRL, and wheels.
 
     Args:
         quick: Fewer and shorter rounds.
@@ -68,6 +93,7 @@ def measure(*, quick: bool) -> list[Entry]:
         "vector_cylinders": _stepper(dense, physics="kinematic"),
         "vector_wheels": _stepper(sparse, physics="wheels", robots=16),
     }
+    calls["torchrl_vector"] = _torchrl_stepper(sparse)
     timings = take_turns(calls, rounds=3 if quick else 9, seconds=0.1 if quick else 1.0)
     robots = {"vector_wheels": 16}
     rates = {name: robots.get(name, ROBOTS) / timing.median for name, timing in timings.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium.spaces import Box as BoxSpace
@@ -15,9 +15,6 @@ from mpfa_envs.observation import observation_bounds, observation_slices
 from mpfa_envs.reward import RewardFunction, navigation_reward
 from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.worlds import World
-
-if TYPE_CHECKING:
-    from gymnasium.spaces import Space
 
 Physics = Literal["kinematic", "wheels"]
 """How the robot moves."""
@@ -61,7 +58,7 @@ class TaskArguments:
             raise ValueError(f"progress must be one of {get_args(Progress)}, got {progress!r}")
         scale = check_number("progress_scale", progress_scale)
         self.progress = progress
-        self._reward = reward or partial(
+        self.reward: RewardFunction = reward or partial(
             navigation_reward, progress_scale=0.0 if progress == "none" else scale
         )
         self.physics = physics
@@ -94,7 +91,9 @@ class TaskArguments:
                 f"lidar must hold arguments of Lidar, got {self._lidar_arguments!r}: {error}"
             ) from error
 
-    def _make_spaces(self, sectors: int, diagonal: float) -> tuple[Space[Any], Space[Any]]:
+    def _make_spaces(
+        self, sectors: int, diagonal: float
+    ) -> tuple[BoxSpace[np.float32], BoxSpace[np.float32]]:
         """The spaces of one robot's observations and actions.
 
         Args:

@@ -294,7 +294,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         collision = not success and to_obstacle <= self.collision_distance
         speeds = motion.linear_speed, motion.angular_speed
         outcome = StepOutcome(previous, self._way, success, collision, clearance, *speeds)
-        terms = self._reward(outcome)
+        terms = self.reward(outcome)
         truncated = not (success or collision) and self._steps >= self.max_steps
         self._running = not (success or collision or truncated)
         return success, collision, truncated, terms

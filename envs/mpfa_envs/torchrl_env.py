@@ -7,28 +7,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.navigation import NavigationEnv
-from mpfa_envs.observation import INFO_TYPES, observation_bounds
+from mpfa_envs.observation import INFO_TYPES
+from mpfa_envs.robot_batch import FLAGS, NUMBERS
+from mpfa_envs.vector import VectorNavigationEnv
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Iterable, Sequence
 
+    from numpy.typing import NDArray
     from torchrl.data import TensorSpec
 
+    from mpfa_envs.episodes import WorldChoice
+    from mpfa_envs.tasks import Task
     from mpfa_envs.worlds import World
 
 
 class NavigationTorchEnv(EnvBase):
-    """One or several :class:`~mpfa_envs.NavigationEnv` behind TorchRL's interface.
-
-    It speaks TensorDict itself instead of wrapping each environment, so the cost of a TensorDict is
-    paid once a step, not once an environment.
+    """Many robots, or one, behind TorchRL's interface: a :class:`~mpfa_envs.VectorNavigationEnv`.
 
     ============================ ========= =============================================
     key                          shape     meaning
@@ -42,14 +44,15 @@ class NavigationTorchEnv(EnvBase):
                                            :data:`~mpfa_envs.INFO_TYPES`, bool or float32
     ============================ ========= =============================================
 
-    All shapes follow the batch size: ``[]`` for one environment, else ``[num_envs]``.
+    All shapes follow the batch size: ``[]`` for one robot, else ``[num_envs]``.
 
     Args:
-        num_envs: Number of environments in this process; None: one, without a batch dimension.
+        num_envs: Number of robots in this process; None: one, without a batch dimension, which has
+            the episodes of a :class:`~mpfa_envs.NavigationEnv` of the same seed.
         device: Where the tensors live; the simulation runs on the CPU.
         info_keys: Which entries of the info to pass on; None: all. Each costs TorchRL some 20 µs a
             step, which is more than it costs to compute.
-        **kwargs: Arguments of :class:`~mpfa_envs.NavigationEnv`.
+        **kwargs: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Raises:
         ValueError: If num_envs is not a positive integer, or an argument is out of its range.
@@ -80,25 +83,23 @@ class NavigationTorchEnv(EnvBase):
                 raise ValueError(f"info_keys must be among {list(INFO_TYPES)}, got {key!r}")
         batch_size = torch.Size([] if num_envs is None else [num_envs])
         super().__init__(device=device, batch_size=batch_size)
-        self.envs = [NavigationEnv(**kwargs) for _ in range(num_envs or 1)]
-        """The environments, in the order of the batch."""
-        self._seeds: list[int | None] = [None] * len(self.envs)
-        self._tasks: list[dict[str, Any] | None] = [None] * len(self.envs)
-        self._observations = np.zeros(
-            (len(self.envs), self.envs[0].lidar.sectors + 6), dtype=np.float32
+        self.env = VectorNavigationEnv(
+            num_envs or 1, autoreset_mode=AutoresetMode.DISABLED, **kwargs
         )
-        self._number_names = [name for name in keys if INFO_TYPES[name] is float]
-        self._flag_names = [name for name in keys if INFO_TYPES[name] is bool]
-        self._numbers: list[list[float]] = [[] for _ in self.envs]
-        self._flags: list[list[bool]] = [[] for _ in self.envs]
+        """The robots, in the order of the batch."""
+        self._flag_names = [name for name in FLAGS if name in keys]
+        self._number_names = [name for name in NUMBERS if name in keys]
+        self._flag_rows = [FLAGS.index(name) for name in self._flag_names]
+        self._number_rows = [NUMBERS.index(name) for name in self._number_names]
+        self._forget_tasks()
         self._make_specs()
 
     def _make_specs(self) -> None:
-        env = self.envs[0]
         one = (*self.batch_size, 1)
+        space = self.env.single_observation_space
         low, high = (
             torch.as_tensor(bound).expand((*self.batch_size, -1)).contiguous()
-            for bound in observation_bounds(env.lidar.sectors, env.world.diagonal)
+            for bound in (space.low, space.high)
         )
         entries: dict[str, TensorSpec] = {
             name: Binary(shape=one, dtype=torch.bool) for name in self._flag_names
@@ -129,89 +130,87 @@ class NavigationTorchEnv(EnvBase):
         goal: Sequence[float],
         *,
         index: int = 0,
+        world: str | os.PathLike[str] | World | None = None,
     ) -> None:
-        """Fix the start and the goal of the next episode, and of no later one.
+        """Fix the start and the goal of a robot's next episode, and of no later one.
 
         Args:
             start: Pose (x, y, heading) [m, m, rad].
             goal: Position (x, y) [m].
-            index: Which environment of the batch.
+            index: Which robot of the batch.
+            world: The room of that episode; None: the one that the robot always drives in.
 
         Raises:
-            IndexError: If there is no such environment.
+            IndexError: If there is no such robot.
             ValueError: If the task cannot be driven.
         """
-        if not 0 <= index < len(self.envs):
-            raise IndexError(f"index must be in [0, {len(self.envs)}), got {index}")
-        options = {"start": start, "goal": goal}
-        self.envs[index].check_task(options)
-        self._tasks[index] = options
+        if not 0 <= index < self.env.num_envs:
+            raise IndexError(f"index must be in [0, {self.env.num_envs}), got {index}")
+        self._worlds[index], self._tasks[index] = self.env.check_task(index, start, goal, world)
+
+    def _forget_tasks(self) -> None:
+        self._worlds: list[World | None] = [None] * self.env.num_envs
+        self._tasks: list[Task | None] = [None] * self.env.num_envs
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seeds = [None if seed is None else seed + i for i in range(len(self.envs))]
+        # One robot without a batch dimension has the seed itself, as a NavigationEnv.
+        if seed is not None:
+            self.env.set_seed(seed if self.batch_size else [seed])
 
-    def _keep(self, index: int, observation: np.ndarray[Any, Any], info: dict[str, Any]) -> None:
-        self._observations[index] = observation
-        self._numbers[index] = [info[name] for name in self._number_names]
-        self._flags[index] = [info[name] for name in self._flag_names]
+    def _mask(self, tensordict: TensorDictBase | None, key: str) -> NDArray[np.bool_] | None:
+        """Which robots an entry of the input names; None: all."""
+        mask = None if tensordict is None else tensordict.get(key, None)
+        return None if mask is None else mask.reshape(-1).cpu().numpy()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        chosen = [True] * len(self.envs) if mask is None else mask.reshape(-1).tolist()
-        for index, env in enumerate(self.envs):
-            if not chosen[index]:
-                continue
-            seed, task = self._seeds[index], self._tasks[index]
-            self._seeds[index] = self._tasks[index] = None
-            self._keep(index, *env.reset(seed=seed, options=task))
-        return self._pack()
+        mask = self._mask(tensordict, "_reset")
+        chosen = np.ones(self.env.num_envs, dtype=np.bool_) if mask is None else mask
+        if chosen.any():
+            worlds, tasks = (
+                [one if wanted else None for one, wanted in zip(ones, chosen, strict=True)]
+                for ones in (self._worlds, self._tasks)
+            )
+            options = {"reset_mask": chosen, "worlds": worlds, "tasks": tasks}
+            observations, _ = self.env.reset(options=options)
+            for index in np.flatnonzero(chosen).tolist():
+                self._worlds[index] = self._tasks[index] = None
+        else:
+            observations = self.env.observations
+        return self._pack(observations)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = tensordict.get("action").detach().cpu().numpy().reshape(len(self.envs), 2)
+        actions = tensordict.get("action").detach().cpu().numpy()
         # A rollout that waits for the last episode of a batch masks those that are over.
-        mask = tensordict.get("_step", None)
-        chosen = [True] * len(self.envs) if mask is None else mask.reshape(-1).tolist()
-        rewards = [0.0] * len(self.envs)
-        ends = [(False, False)] * len(self.envs)
-        for index, env in enumerate(self.envs):
-            if chosen[index]:
-                observation, rewards[index], terminated, truncated, info = env.step(actions[index])
-                self._keep(index, observation, info)
-                ends[index] = terminated, truncated
-        return self._pack(rewards, ends)
+        observations, rewards, terminated, truncated, _ = self.env.step(
+            actions.reshape(self.env.num_envs, 2), only=self._mask(tensordict, "_step")
+        )
+        entries = self._pack(observations)
+        entries.set("reward", self._tensor(rewards.astype(np.float32)))
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        for name, flags in ends.items():
+            entries.set(name, self._tensor(flags))
+        return entries
 
-    def _pack(
-        self, rewards: list[float] | None = None, ends: list[tuple[bool, bool]] | None = None
-    ) -> TensorDictBase:
-        """Build what a reset gives, or with rewards and (terminated, truncated) what a step gives.
+    def _pack(self, observations: NDArray[np.float32]) -> TensorDictBase:
+        """Build what a reset and a step both give."""
+        shape = (*self.batch_size, observations.shape[1])
+        rows: dict[str, Any] = {
+            "observation": torch.from_numpy(observations).to(self.device).view(shape)
+        }
+        if self._number_rows or self._flag_rows:
+            flags, numbers = self.env.info_tables
+            # Two tensors are made and cut, as making one costs more than all else.
+            numbers = numbers[self._number_rows].astype(np.float32)
+            info = dict(zip(self._number_names, self._tensor(numbers), strict=True))
+            flags = flags[self._flag_rows]
+            info.update(zip(self._flag_names, self._tensor(flags), strict=True))
+            rows["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
+        return TensorDict(rows, batch_size=self.batch_size, device=self.device)
 
-        Few tensors are made and then cut, as making one costs more than all that is done with it.
-        """
-        names, flags = self._number_names, self._flag_names
-        numbers, bits = self._numbers, self._flags
-        if rewards is not None and ends is not None:
-            numbers = [[*row, reward] for row, reward in zip(numbers, rewards, strict=True)]
-            bits = [[*row, *end, any(end)] for row, end in zip(bits, ends, strict=True)]
-        columns = self._columns(numbers, torch.float32)
-        bit_columns = self._columns(bits, torch.bool)
-        # A copy: what a rollout has collected must not change with the next step.
-        observation = torch.tensor(self._observations, device=self.device)
-        entries: dict[str, Any] = {"observation": observation.view(*self.batch_size, -1)}
-        if names or flags:
-            info = dict(zip(names, columns, strict=False))
-            info.update(zip(flags, bit_columns, strict=False))
-            entries["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
-        if rewards is not None:
-            entries["reward"] = columns[-1]
-            entries["terminated"], entries["truncated"], entries["done"] = bit_columns[-3:]
-        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
-
-    def _columns(
-        self, rows: list[list[float]] | list[list[bool]], dtype: torch.dtype
-    ) -> tuple[torch.Tensor, ...]:
-        """Turn one row per environment into tensors of shape ``[*batch, 1]``, one per column."""
-        table = torch.tensor(rows, dtype=dtype, device=self.device)
-        return table.view(*self.batch_size, -1, 1).unbind(-2) if table.numel() else ()
+    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
+        """A tensor of shape ``[..., *batch, 1]`` of an array ``[..., N]``."""
+        shape = (*values.shape[:-1], *self.batch_size, 1)
+        return torch.from_numpy(values).to(self.device).view(shape)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Release the physics servers; a second call does nothing.
@@ -219,14 +218,13 @@ class NavigationTorchEnv(EnvBase):
         Args:
             raise_if_closed: Accepted for TorchRL's sake.
         """
-        for env in self.envs:
-            env.close()
+        self.env.close()
         if not self.is_closed:
             super().close(raise_if_closed=raise_if_closed)
 
 
 def make_navigation_env(
-    world: str | os.PathLike[str] | World = "A",
+    world: WorldChoice | Sequence[WorldChoice] = "A",
     *,
     num_envs: int | None = None,
     parallel: bool = False,
@@ -237,12 +235,13 @@ def make_navigation_env(
     """Build the navigation task for TorchRL.
 
     Args:
-        world: As in :class:`~mpfa_envs.NavigationEnv`.
-        num_envs: Number of environments; None: one, without a batch dimension.
-        parallel: Run each environment in a process of its own.
+        world: As in :class:`~mpfa_envs.VectorNavigationEnv`: a world, several, or the name of a
+            generator.
+        num_envs: Number of robots; None: one, without a batch dimension.
+        parallel: Run each robot in a process of its own, all in the same worlds.
         device: Where the tensors live.
         seed: Seed of the environments; None leaves them to chance.
-        **kwargs: Further arguments of :class:`~mpfa_envs.NavigationEnv`.
+        **kwargs: Further arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Returns:
         A :class:`NavigationTorchEnv`, or a ``ParallelEnv`` of them, of batch size ``[num_envs]`` or

@@ -2,52 +2,35 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box as BoxSpace
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from mpfa_envs.arguments import Physics, Progress, TaskArguments
+from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.episodes import EpisodeSource, WorldChoice
-from mpfa_envs.field_batch import FieldBatch
-from mpfa_envs.kernels.lidar import cast_rays
-from mpfa_envs.kernels.observation import observe_all
-from mpfa_envs.kernels.step import (
-    DISTANCE,
-    MIN_CLEARANCE,
-    POSE,
-    REWARD,
-    SHORTEST_PATH,
-    EpisodeArrays,
-    judge,
-    measure_ways,
-    pay,
-    stop,
-)
+from mpfa_envs.kernels.motion import scale_actions
+from mpfa_envs.kernels.step import outcomes
 from mpfa_envs.observation import INFO_TYPES
-from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction, StepOutcome, navigation_reward
+from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
 from mpfa_envs.robot import RobotModel
+from mpfa_envs.robot_batch import FLAGS, NUMBERS, RobotBatch
 from mpfa_envs.tasks import Task, check_task
-from mpfa_envs.vector_drives import Drives, make_drives
 from mpfa_envs.vector_options import read_mask, read_tasks
-from mpfa_envs.world_batch import WorldBatch
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-FLAGS = tuple(name for name, kind in INFO_TYPES.items() if kind is bool)
-"""Flags of the info dictionary, in the order of the tables."""
-NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
-"""Its numbers, likewise."""
 _MASKS = tuple(f"_{name}" for name in INFO_TYPES)
+_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 _EMPTY = World(name="empty")
 
 
@@ -114,6 +97,8 @@ class VectorNavigationEnv(
         ['A', 'D', 'A', 'D']
         >>> env.close()
     """
+
+    single_observation_space: BoxSpace[np.float32]
 
     def __init__(
         self,
@@ -184,49 +169,16 @@ class VectorNavigationEnv(
         )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._make_tables()
-        self._drives: Drives = make_drives(
-            self.physics, self.robot, self.num_envs, time_step=self.time_step
+        self._batch = RobotBatch(
+            self, self.lidar, [self._source.fixed(i) or _EMPTY for i in range(self.num_envs)]
         )
-
-    def _make_tables(self) -> None:
-        """Allocate what is known of each robot."""
-        count = self.num_envs
-        self._tasks: list[Task | None] = [None] * count
         self._rngs: list[np.random.Generator] = []
-        self._episodes = EpisodeArrays(
-            motions=np.zeros((count, 5)),
-            goals=np.zeros((count, 2)),
-            numbers=np.zeros((len(NUMBERS), count)),
-            flags=np.zeros((len(FLAGS), count), dtype=np.bool_),
-            steps=np.zeros(count, dtype=np.int64),
-            clearances=np.zeros(count),
-            ways=np.zeros((2, count)),
-        )
-        self._worlds = WorldBatch([self._source.fixed(i) or _EMPTY for i in range(count)])
-        self._fields = FieldBatch(count) if self.progress == "shortest_path" else None
-        self._running = np.zeros(count, dtype=np.bool_)
-        self._trails = np.zeros((count, min(self.max_steps, 500) + 1, 2))
-        self._ranges = np.zeros((count, self.lidar.angles.size))
-        self._directions = np.stack((np.cos(self.lidar.angles), np.sin(self.lidar.angles)))
-        self._observations = np.zeros((count, self.lidar.sectors + 6), dtype=np.float32)
-        self._rules = (
-            self.robot.radius,
-            self.collision_distance,
-            self.goal_radius,
-            self.time_step,
-        )
-        self._scales = (
-            self.closeness_distance,
-            self.robot.max_wheel_speed,
-            self.robot.max_angular_speed,
-        )
-        self._reward_scales = _scales_of(self._reward)
+        self._begun = False
 
     @property
     def worlds(self) -> list[World]:
         """The world that each robot is in."""
-        return list(self._worlds)
+        return list(self._batch.worlds)
 
     @property
     def worlds_refused(self) -> int:
@@ -236,12 +188,22 @@ class VectorNavigationEnv(
     @property
     def tasks(self) -> list[Task | None]:
         """Start and goal of each robot's episode; None before the first."""
-        return list(self._tasks)
+        return list(self._batch.tasks)
 
     @property
     def poses(self) -> NDArray[np.float64]:
         """Poses (x, y, heading) [m, m, rad], ``[N, 3]``."""
-        return self._episodes.motions[:, :3].copy()
+        return self._batch.episodes.motions[:, :3].copy()
+
+    @property
+    def observations(self) -> NDArray[np.float32]:
+        """The last observations, ``[N, 24]``."""
+        return self._batch.observations.copy()
+
+    @property
+    def info_tables(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """The infos as two tables, ``[3, N]`` and ``[12, N]``: the rows are flags and numbers."""
+        return self._batch.episodes.flags.copy(), self._batch.episodes.numbers.copy()
 
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m].
@@ -249,8 +211,30 @@ class VectorNavigationEnv(
         Args:
             index: Number of the robot.
         """
-        rows = self._trails[index, : self._episodes.steps[index] + 1]
+        rows = self._batch.trails[index, : self._batch.episodes.steps[index] + 1]
         return [(x, y) for x, y in rows.tolist()]
+
+    def set_seed(self, seed: int | Sequence[int | None]) -> None:
+        """Seed the episodes that begin from now on, without beginning any.
+
+        Args:
+            seed: As in :meth:`reset`.
+
+        Raises:
+            ValueError: If a seed is negative, or there are not as many as robots.
+        """
+        self._take_generators(self._generators_of(seed), range(self.num_envs))
+
+    def _take_generators(
+        self, rngs: Sequence[np.random.Generator | None], robots: Iterable[int]
+    ) -> None:
+        """Let some robots draw from new sources of randomness, where they are given."""
+        if not self._rngs:
+            self._rngs = _generators(np.random.SeedSequence(), self.num_envs)
+        for index in robots:
+            if (rng := rngs[index]) is not None:
+                self._rngs[index] = rng
+                self._source.forget(index)
 
     def reset(
         self,
@@ -274,20 +258,18 @@ class VectorNavigationEnv(
             ValueError: If a seed is negative, or the options are not tasks that can be driven; the
                 episodes go on then.
         """
-        seeded = self._read_seed(seed)
+        seeded = self._generators_of(seed)
         chosen = read_mask(options, self.num_envs)
         given = read_tasks(options, self.num_envs, self._source.fixed, self._check)
-        if not self._rngs and not chosen.all():
+        if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
-        if not self._rngs:
-            self._rngs = _generators(np.random.SeedSequence(), self.num_envs)
-        for index in np.flatnonzero(chosen).tolist():
-            if (rng := seeded[index]) is not None:
-                self._rngs[index] = rng
-                self._source.forget(index)
+        robots = np.flatnonzero(chosen).tolist()
+        self._take_generators(seeded, robots)
+        for index in robots:
             self._begin(index, given[index])
-        self._sense(chosen)
-        return self._observations.copy(), self._infos(chosen)
+        self._begun = True
+        self._batch.sense(chosen, self._rngs)
+        return self._batch.observations.copy(), self._infos(chosen)
 
     def step(
         self, actions: NDArray[np.float32], *, only: NDArray[np.bool_] | None = None
@@ -313,127 +295,47 @@ class VectorNavigationEnv(
             ResetNeeded: If there was no reset yet, or a robot's episode has ended and
                 autoreset_mode is ``DISABLED``.
         """
-        if not self._rngs:
+        if not self._begun:
             raise ResetNeeded("no episode is running: call reset() before step()")
         speeds = self._wheel_speeds(actions)
         chosen = np.ones(self.num_envs, dtype=np.bool_) if only is None else only
-        waiting = chosen & ~self._running
+        waiting = chosen & ~self._batch.running
         if waiting.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise ResetNeeded(
                 f"the episodes of robots {np.flatnonzero(waiting).tolist()} have ended: call "
                 "reset(options={'reset_mask': ...}) before step()"
             )
-        moving = chosen & self._running
+        moving = chosen & self._batch.running
         for index in np.flatnonzero(waiting).tolist():
             self._begin(index, None)
-        self._advance(speeds, moving)
-        self._sense(chosen)
-        flags, numbers = self._episodes.flags, self._episodes.numbers
-        rewards = np.where(moving, numbers[REWARD : REWARD + 4].sum(axis=0), 0.0)
-        terminated, truncated = moving & (flags[0] | flags[1]), moving & flags[2]
+        self._batch.advance(speeds, moving)
+        self._batch.sense(chosen, self._rngs)
+        rewards, terminated, truncated = outcomes(self._batch.episodes, moving)
         infos: dict[str, Any] = {}
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             infos = self._final(ended)
             for index in np.flatnonzero(ended).tolist():
                 self._begin(index, None)
-            self._sense(ended)
-        return self._observations.copy(), rewards, terminated, truncated, self._infos(None) | infos
-
-    def _advance(self, speeds: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:
-        """Hold the wheel speeds ``[N, 2]`` [m/s] until the next action is due."""
-        episodes, worlds, running = self._episodes, self._worlds.arrays, moving.copy()
-        episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
-        self._lengthen_trails(int(episodes.steps.max()) + self.action_repeat)
-        for _ in range(self.action_repeat):
-            self._drives.move(episodes.motions, running, speeds)
-            judge(episodes, worlds, running, self._trails, self._rules, self.max_steps)
-            if self._fields is not None:
-                measure_ways(episodes, running, self._fields.arrays)
-            if self._reward_scales is None:
-                self._pay_by_function(running)
-            else:
-                pay(episodes, running, self._reward_scales)
-            if not stop(episodes.flags, running):
-                break
-        self._running[moving] = running[moving]
-
-    def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
-        """Add what a reward of the user's gives, robot by robot."""
-        episodes = self._episodes
-        for index in np.flatnonzero(running).tolist():
-            outcome = StepOutcome(
-                float(episodes.ways[1, index]),
-                float(episodes.ways[0, index]),
-                bool(episodes.flags[0, index]),
-                bool(episodes.flags[1, index]),
-                float(episodes.clearances[index]),
-                *episodes.motions[index, 3:].tolist(),
-            )
-            episodes.numbers[REWARD : REWARD + 4, index] += self._reward(outcome)
+            self._batch.sense(ended, self._rngs)
+        infos = self._infos(None) | infos
+        return self.observations, rewards, terminated, truncated, infos
 
     def _begin(self, index: int, given: tuple[World, Task | None] | None) -> None:
         """Start the next episode of a robot, the given one or one that is drawn."""
-        episode = self._source.draw(index, self._rngs[index], given)
-        task, episodes = episode.task, self._episodes
-        if self._worlds[index] is not episode.world:
-            self._worlds[index] = episode.world
-        x, y, heading = task.start
-        heading = math.remainder(heading, math.tau)
-        distance = math.dist((x, y), task.goal)
-        way = distance
-        if self._fields is not None and episode.field is not None:
-            self._fields[index] = episode.field
-            way = episode.field.at(x, y)
-        clearance = episode.world.clearance(x, y) - self.robot.radius
-        self._drives.place(index, x, y, heading)
-        self._tasks[index] = task
-        episodes.motions[index] = x, y, heading, 0.0, 0.0
-        episodes.goals[index] = task.goal
-        episodes.flags[:, index] = False
-        episodes.steps[index] = 0
-        episodes.clearances[index] = clearance
-        episodes.ways[:, index] = way
-        numbers = episodes.numbers[:, index]
-        numbers[:] = 0.0
-        numbers[SHORTEST_PATH] = max(episode.shortest_path - self.goal_radius, 0.0)
-        numbers[MIN_CLEARANCE] = clearance
-        numbers[DISTANCE] = distance
-        numbers[POSE : POSE + 3] = x, y, heading
-        self._trails[index, 0] = x, y
-        self._running[index] = True
-
-    def _sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Sense the worlds and build the observations of some robots."""
-        lidar, ranges = self.lidar, self._ranges
-        cast_rays(
-            self._episodes.motions,
-            chosen,
-            self._worlds.arrays,
-            self._directions,
-            lidar.max_range,
-            ranges,
-        )
-        if lidar.noise > 0.0:
-            for index in np.flatnonzero(chosen).tolist():
-                ranges[index] += lidar.noise * self._rngs[index].standard_normal(ranges.shape[1])
-            np.clip(ranges, 0.0, lidar.max_range, out=ranges)
-        median = lidar.reduction == "median"
-        observe_all(self._episodes, chosen, ranges, median, self._scales, self._observations)
+        self._batch.begin(index, self._source.draw(index, self._rngs[index], given))
 
     def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
         """An array for each key of the info, and a mask of the chosen robots, or of all."""
         mask = np.ones(self.num_envs, dtype=np.bool_) if chosen is None else chosen
-        infos: dict[str, Any] = dict(zip(FLAGS, self._episodes.flags.copy(), strict=True))
-        infos.update(zip(NUMBERS, self._episodes.numbers.copy(), strict=True))
-        infos.update(dict.fromkeys(_MASKS, mask))
-        return infos
+        flags, numbers = self.info_tables
+        return dict(zip(_KEYS, (*flags, *numbers, *(mask,) * len(_MASKS)), strict=True))
 
     def _final(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
         """What the last step of episodes has shown, before new ones begin."""
         seen = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(ended).tolist():
-            seen[index] = self._observations[index].copy()
+            seen[index] = self._batch.observations[index].copy()
         return {
             "final_obs": seen,
             "_final_obs": ended,
@@ -452,20 +354,20 @@ class VectorNavigationEnv(
         """
         if self.render_mode is None:
             return None
-        if not self._rngs:
+        if not self._begun:
             raise ResetNeeded("there is nothing to render: call reset() before render()")
         # Imported here because training does not render.
         from mpfa_envs.render import render_scene
 
         return tuple(
             render_scene(
-                self._worlds[index],
+                self._batch.worlds[index],
                 robot=self.robot,
                 pose=(x, y, heading),
-                goal=tuple(self._episodes.goals[index].tolist()),
+                goal=tuple(self._batch.episodes.goals[index].tolist()),
                 goal_radius=self.goal_radius,
                 trail=self.trail(index),
-                rays=(self.lidar.angles, self._ranges[index]),
+                rays=(self.lidar.angles, self._batch.ranges[index]),
             )
             for index, (x, y, heading) in enumerate(self.poses.tolist())
         )
@@ -476,20 +378,22 @@ class VectorNavigationEnv(
         Args:
             **kwargs: None are used.
         """
-        self._drives.close()
+        self._batch.drives.close()
 
     def _wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
         """Read actions, as :meth:`~mpfa_envs.RobotModel.wheel_speeds` reads one."""
-        values = np.asarray(actions, dtype=np.float64)
+        values = np.ascontiguousarray(actions, dtype=np.float64)
         if values.shape != (self.num_envs, 2):
             raise ValueError(f"actions must have shape ({self.num_envs}, 2), got {values.shape}")
-        if np.isnan(values).any():
+        speeds = np.empty_like(values)
+        if not scale_actions(
+            values, self.robot.min_wheel_speed, self.robot.max_wheel_speed, speeds
+        ):
             rows = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
             raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
-        slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
-        return (fast + slow) / 2 + (fast - slow) / 2 * np.clip(values, -1.0, 1.0)
+        return speeds
 
-    def _read_seed(
+    def _generators_of(
         self, seed: int | Sequence[int | None] | None
     ) -> Sequence[np.random.Generator | None]:
         """Make each robot's source of randomness; None where the old one goes on."""
@@ -503,16 +407,40 @@ class VectorNavigationEnv(
         sequence = np.random.SeedSequence(check_count("seed", seed, least=0))
         return _generators(sequence, self.num_envs)
 
+    def check_task(
+        self,
+        index: int,
+        start: Sequence[float],
+        goal: Sequence[float],
+        world: WorldChoice | None = None,
+    ) -> tuple[World, Task]:
+        """Read a task of a robot.
+
+        Args:
+            index: Number of the robot.
+            start: Pose (x, y, heading) [m, m, rad].
+            goal: Position (x, y) [m].
+            world: The room; None: the one that the robot always drives in.
+
+        Returns:
+            The room and the task.
+
+        Raises:
+            ValueError: If it cannot be driven.
+        """
+        room = self._source.fixed(index) if world is None else resolve_world(world)
+        if room is None:
+            raise ValueError(f"world must be given where it is a generator's, got {world}")
+        self._check_size(room)
+        return room, self._task_in(room, start, goal)
+
     def _check(self, world: World, task: Task | None) -> Task | None:
         """Refuse a world that is too large, or a task that cannot be driven."""
-        if world.diagonal > self._source.diagonal:
-            raise ValueError(
-                f"world {world.name!r} must be at most {self._source.diagonal:.4g} m from corner "
-                f"to corner, as the observations are bounded, got {world.diagonal:.4g} m"
-            )
-        if task is None:
-            return None
-        start, goal = task
+        self._check_size(world)
+        return None if task is None else self._task_in(world, *task)
+
+    def _task_in(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
+        """Read a task in a world."""
         return check_task(
             world,
             {"start": start, "goal": goal},
@@ -521,31 +449,15 @@ class VectorNavigationEnv(
             radius=self.robot.radius,
         )
 
-    def _lengthen_trails(self, steps: int) -> None:
-        """Make room for so many time steps."""
-        if steps >= self._trails.shape[1]:
-            longer = np.zeros((self.num_envs, 2 * steps + 1, 2))
-            longer[:, : self._trails.shape[1]] = self._trails
-            self._trails = longer
+    def _check_size(self, world: World) -> None:
+        """Refuse a world in which observations would leave their bounds."""
+        if world.diagonal > self._source.diagonal:
+            raise ValueError(
+                f"world {world.name!r} must be at most {self._source.diagonal:.4g} m from corner "
+                f"to corner, as the observations are bounded, got {world.diagonal:.4g} m"
+            )
 
 
 def _generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:
     """A source of randomness for each robot, which does not depend on how many there are."""
     return [np.random.default_rng(child) for child in sequence.spawn(robots)]
-
-
-def _scales_of(reward: RewardFunction) -> tuple[float, float, float] | None:
-    """Rewards for goal, collision and approach if Eq. (25) pays; None for any other reward."""
-    function = reward.func if isinstance(reward, partial) else reward
-    if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
-        return None
-    given = inspect.signature(navigation_reward).bind_partial(
-        **(reward.keywords if isinstance(reward, partial) else {})
-    )
-    given.apply_defaults()
-    scales = given.arguments
-    return (
-        float(scales["goal_reward"]),
-        float(scales["collision_reward"]),
-        float(scales["progress_scale"]),
-    )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -48,7 +48,7 @@ class WorldBatch:
         array([4, 4])
     """
 
-    def __init__(self, worlds: list[World]) -> None:
+    def __init__(self, worlds: Sequence[World]) -> None:
         robots = len(worlds)
         self._worlds = list(worlds)
         self._rooms = BatchArrays(

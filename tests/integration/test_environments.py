@@ -18,7 +18,7 @@ def test_a_robot_learns_with_a_clearance(robot: str, radius: float) -> None:
         robot=robot, physics="kinematic", clearance=0.1, progress_scale=3.0
     )
     training = make_training_env("C", settings)
-    assert training.envs[0].collision_distance == pytest.approx(radius + 0.1)
+    assert training.env.collision_distance == pytest.approx(radius + 0.1)
     assert env_arguments(settings)["closeness_distance"] == pytest.approx(radius + 0.1)
     training.close()
 
@@ -31,10 +31,10 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     judging = NavigationEnv(world="D", collision_distance="contact", **env_arguments(settings))
     training.set_seed(1)
     seen = training.reset()["observation"].numpy()
-    task = training.envs[0].task
+    task = training.env.tasks[0]
     assert judging.reset(options=task._asdict())[0] == pytest.approx(seen)
     for name in ("max_steps", "action_repeat", "closeness_distance", "physics"):
-        assert getattr(judging, name) == getattr(training.envs[0], name)
+        assert getattr(judging, name) == getattr(training.env, name)
     assert judging.closeness_distance == pytest.approx(0.28)
     training.close()
     judging.close()
@@ -43,13 +43,17 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
 def test_the_defaults_are_those_of_the_environment_itself() -> None:
     training = make_training_env("B", EnvironmentSettings(physics="kinematic"))
     plain = NavigationEnv(world="B", physics="kinematic", render_mode=None)
-    ours = vars(training.envs[0])
+    ours = vars(training.env)
     values = (bool, int, float, str, type(None))
-    same = {name: each for name, each in vars(plain).items() if isinstance(each, values)}
+    same = {
+        name: each
+        for name, each in vars(plain).items()
+        if isinstance(each, values) and not name.startswith("_")
+    }
     assert {"max_steps", "action_repeat", "collision_distance"} <= set(same)
     assert {name: ours[name] for name in same} == same
     assert ours["robot"] == plain.robot
-    assert ours["_reward"].keywords == vars(plain)["_reward"].keywords
+    assert ours["reward"].keywords == plain.reward.keywords
     defaults = inspect.signature(NavigationEnv).parameters
     for name in ("robot", "physics", "max_steps", "action_repeat", "detour_chance"):
         assert getattr(EnvironmentSettings(), name) == defaults[name].default
@@ -59,7 +63,7 @@ def test_the_defaults_are_those_of_the_environment_itself() -> None:
 
 def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> None:
     settings = EnvironmentSettings(physics="kinematic")
-    trained, plain = make_training_env("D", settings).envs[0], NavigationEnv(physics="kinematic")
+    trained, plain = make_training_env("D", settings).env, NavigationEnv(physics="kinematic")
     for name in (
         "max_steps", "time_step", "action_repeat", "goal_radius", "collision_distance",
         "closeness_distance", "min_goal_distance", "detour_chance", "robot",

@@ -13,6 +13,31 @@ if TYPE_CHECKING:
 
 
 @njit
+def scale_actions(
+    actions: NDArray[np.float64], slow: float, fast: float, speeds: NDArray[np.float64]
+) -> bool:
+    """Turn actions into speeds, as :meth:`mpfa_envs.RobotModel.wheel_speeds` does for one robot.
+
+    Args:
+        actions: Left and right wheel, ``[N, 2]``; what is beyond [-1, 1] is clipped.
+        slow: Speed for -1 [m/s].
+        fast: Speed for 1 [m/s].
+        speeds: Where the speeds go [m/s], ``[N, 2]``.
+
+    Returns:
+        Whether all actions are numbers.
+    """
+    middle, span = 0.5 * (fast + slow), 0.5 * (fast - slow)
+    numbers = True
+    for robot in range(actions.shape[0]):
+        for wheel in range(2):
+            action = actions[robot, wheel]
+            numbers &= action == action  # NaN is not.
+            speeds[robot, wheel] = middle + span * min(max(action, -1.0), 1.0)
+    return numbers
+
+
+@njit
 def drive_arcs(
     motions: NDArray[np.float64],
     running: NDArray[np.bool_],

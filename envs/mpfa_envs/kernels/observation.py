@@ -44,8 +44,13 @@ def observe_all(
             continue
         seen = observations[robot]
         for sector in range(sectors):
-            rays = ranges[robot, sector * count : (sector + 1) * count]
-            nearest = _middle(rays) if median else rays.min()
+            first = sector * count
+            if median:
+                nearest = _middle(ranges[robot, first : first + count])
+            else:
+                nearest = ranges[robot, first]
+                for ray in range(first + 1, first + count):
+                    nearest = min(nearest, ranges[robot, ray])
             seen[sector] = near / max(nearest, near)
         motion = episodes.motions[robot]
         speed, turn = motion[3] / fastest, motion[4] / fastest_turn

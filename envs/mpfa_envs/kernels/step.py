@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from mpfa_envs.kernels import njit
 from mpfa_envs.kernels.clearance import clearance_at
 from mpfa_envs.kernels.grid import interpolate
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from mpfa_envs.field_batch import FieldArrays
@@ -98,45 +99,61 @@ def judge(
 
 
 @njit
-def pay(
-    episodes: EpisodeArrays, running: NDArray[np.bool_], scales: tuple[float, float, float]
-) -> None:
-    """Add the terms of Eq. (25), as :func:`mpfa_envs.navigation_reward` gives them.
+def settle(
+    episodes: EpisodeArrays, running: NDArray[np.bool_], payments: tuple[float, float, float]
+) -> bool:
+    """Add the terms of Eq. (25), as :func:`mpfa_envs.navigation_reward` gives them, and stop.
 
     Args:
         episodes: The episodes; the first rows of their numbers are added to.
-        running: Which robots have moved, ``[N]``.
-        scales: Reward for the goal, for a collision, and per meter of approach.
+        running: Which robots have moved, ``[N]``; those whose episode has ended are taken out.
+        payments: Rewards for the goal, for a collision, and per meter of approach.
+
+    Returns:
+        Whether any robot still runs.
     """
+    numbers, flags = episodes.numbers, episodes.flags
+    left = False
     for robot in range(running.shape[0]):
         if not running[robot]:
             continue
-        if episodes.flags[SUCCESS, robot]:
-            episodes.numbers[REWARD, robot] += scales[0]
-        elif episodes.flags[COLLISION, robot]:
-            episodes.numbers[REWARD + 1, robot] += scales[1]
+        if flags[SUCCESS, robot]:
+            numbers[REWARD, robot] += payments[0]
+        elif flags[COLLISION, robot]:
+            numbers[REWARD + 1, robot] += payments[1]
         else:
             approach = episodes.ways[1, robot] - episodes.ways[0, robot]
-            episodes.numbers[REWARD + 2, robot] += scales[2] * approach
+            numbers[REWARD + 2, robot] += payments[2] * approach
+        ended = flags[SUCCESS, robot] or flags[COLLISION, robot] or flags[TIMEOUT, robot]
+        running[robot] = not ended
+        left |= not ended
+    return left
 
 
 @njit
-def stop(flags: NDArray[np.bool_], running: NDArray[np.bool_]) -> bool:
-    """Take robots whose episode has ended out of those that run.
+def outcomes(
+    episodes: EpisodeArrays, moving: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Read what a step has given.
 
     Args:
-        flags: Success, collision and timeout, ``[3, N]``.
-        running: Which robots run, ``[N]``.
+        episodes: The episodes.
+        moving: Which robots took part, ``[N]``.
 
     Returns:
-        Whether any is left.
+        Rewards, terminations and truncations, ``[N]``; zero and false for the others.
     """
-    left = False
-    for robot in range(running.shape[0]):
-        if flags[SUCCESS, robot] or flags[COLLISION, robot] or flags[TIMEOUT, robot]:
-            running[robot] = False
-        left |= running[robot]
-    return left
+    robots = moving.shape[0]
+    rewards = np.zeros(robots)
+    terminated, truncated = np.zeros(robots, np.bool_), np.zeros(robots, np.bool_)
+    for robot in range(robots):
+        if moving[robot]:
+            for term in range(REWARD, REWARD + 4):
+                rewards[robot] += episodes.numbers[term, robot]
+            flags = episodes.flags
+            terminated[robot] = flags[SUCCESS, robot] or flags[COLLISION, robot]
+            truncated[robot] = flags[TIMEOUT, robot]
+    return rewards, terminated, truncated
 
 
 @njit

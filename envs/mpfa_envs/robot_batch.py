@@ -1,0 +1,217 @@
+"""Many robots in their worlds: moved, sensed and rewarded together by compiled loops."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpfa_envs.field_batch import FieldBatch
+from mpfa_envs.kernels.lidar import cast_rays
+from mpfa_envs.kernels.observation import observe_all
+from mpfa_envs.kernels.step import (
+    DISTANCE,
+    MIN_CLEARANCE,
+    POSE,
+    REWARD,
+    SHORTEST_PATH,
+    EpisodeArrays,
+    judge,
+    measure_ways,
+    settle,
+)
+from mpfa_envs.observation import INFO_TYPES
+from mpfa_envs.reward import RewardFunction, StepOutcome, navigation_reward
+from mpfa_envs.vector_drives import make_drives
+from mpfa_envs.world_batch import WorldBatch
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.arguments import TaskArguments
+    from mpfa_envs.episodes import Episode
+    from mpfa_envs.lidar import Lidar
+    from mpfa_envs.tasks import Task
+    from mpfa_envs.worlds import World
+
+FLAGS = tuple(name for name, kind in INFO_TYPES.items() if kind is bool)
+"""Flags of the info dictionary, in the order of the tables."""
+NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
+"""Its numbers, likewise."""
+_TRAIL = 500
+"""Time steps that there is room for at first."""
+
+
+class RobotBatch:
+    """What is known of each of many robots, and what happens to them.
+
+    Args:
+        rules: The arguments of the task.
+        lidar: What the robots see by.
+        worlds: The world of each robot before its first episode.
+    """
+
+    def __init__(self, rules: TaskArguments, lidar: Lidar, worlds: Sequence[World]) -> None:
+        count = len(worlds)
+        self._rules = rules
+        self._lidar = lidar
+        self.tasks: list[Task | None] = [None] * count
+        """Start and goal of each robot's episode; None before the first."""
+        self.worlds = WorldBatch(worlds)
+        """The world that each robot is in."""
+        self._fields = FieldBatch(count) if rules.progress == "shortest_path" else None
+        self.episodes = EpisodeArrays(
+            motions=np.zeros((count, 5)),
+            goals=np.zeros((count, 2)),
+            numbers=np.zeros((len(NUMBERS), count)),
+            flags=np.zeros((len(FLAGS), count), dtype=np.bool_),
+            steps=np.zeros(count, dtype=np.int64),
+            clearances=np.zeros(count),
+            ways=np.zeros((2, count)),
+        )
+        """Their episodes so far."""
+        self.running = np.zeros(count, dtype=np.bool_)
+        """Whose episode has begun and not ended, ``[N]``."""
+        self.trails = np.zeros((count, min(rules.max_steps, _TRAIL) + 1, 2))
+        """Positions since the start of the episode [m], ``[N, steps, 2]``."""
+        self.ranges = np.zeros((count, lidar.angles.size))
+        """Range of each ray [m], ``[N, rays]``."""
+        self.observations = np.zeros((count, lidar.sectors + 6), dtype=np.float32)
+        """What they sense, ``[N, 24]``."""
+        self.drives = make_drives(rules.physics, rules.robot, count, time_step=rules.time_step)
+        """How they move."""
+        self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
+        robot = rules.robot
+        self._lengths = robot.radius, rules.collision_distance, rules.goal_radius, rules.time_step
+        self._scales = rules.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed
+        self._payments = payments_of(rules.reward)
+
+    def begin(self, index: int, episode: Episode) -> None:
+        """Start an episode of a robot.
+
+        Args:
+            index: Number of the robot.
+            episode: What it is to drive.
+        """
+        task, episodes = episode.task, self.episodes
+        if self.worlds[index] is not episode.world:
+            self.worlds[index] = episode.world
+        x, y, heading = task.start
+        heading = math.remainder(heading, math.tau)
+        distance = math.dist((x, y), task.goal)
+        way = distance
+        if self._fields is not None and episode.field is not None:
+            self._fields[index] = episode.field
+            way = episode.field.at(x, y)
+        clearance = episode.world.clearance(x, y) - self._rules.robot.radius
+        self.drives.place(index, x, y, heading)
+        self.tasks[index] = task
+        episodes.motions[index] = x, y, heading, 0.0, 0.0
+        episodes.goals[index] = task.goal
+        episodes.flags[:, index] = False
+        episodes.steps[index] = 0
+        episodes.clearances[index] = clearance
+        episodes.ways[:, index] = way
+        numbers = episodes.numbers[:, index]
+        numbers[:] = 0.0
+        numbers[SHORTEST_PATH] = max(episode.shortest_path - self._rules.goal_radius, 0.0)
+        numbers[MIN_CLEARANCE] = clearance
+        numbers[DISTANCE] = distance
+        numbers[POSE : POSE + 3] = x, y, heading
+        self.trails[index, 0] = x, y
+        self.running[index] = True
+
+    def advance(self, speeds: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:
+        """Hold the wheel speeds until the next actions are due.
+
+        Args:
+            speeds: Of the left and the right wheel [m/s], ``[N, 2]``.
+            moving: Which robots move, ``[N]``; the others' rows stay.
+        """
+        episodes, worlds, running = self.episodes, self.worlds.arrays, moving.copy()
+        episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
+        self._lengthen_trails(int(episodes.steps.max()) + self._rules.action_repeat)
+        for _ in range(self._rules.action_repeat):
+            self.drives.move(episodes.motions, running, speeds)
+            judge(episodes, worlds, running, self.trails, self._lengths, self._rules.max_steps)
+            if self._fields is not None:
+                measure_ways(episodes, running, self._fields.arrays)
+            if self._payments is None:
+                self._pay_by_function(running)
+            if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0)):
+                break
+        self.running[moving] = running[moving]
+
+    def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
+        """Add what a reward of the user's gives, robot by robot."""
+        episodes = self.episodes
+        for index in np.flatnonzero(running).tolist():
+            outcome = StepOutcome(
+                float(episodes.ways[1, index]),
+                float(episodes.ways[0, index]),
+                bool(episodes.flags[0, index]),
+                bool(episodes.flags[1, index]),
+                float(episodes.clearances[index]),
+                *episodes.motions[index, 3:].tolist(),
+            )
+            episodes.numbers[REWARD : REWARD + 4, index] += self._rules.reward(outcome)
+
+    def sense(self, chosen: NDArray[np.bool_], rngs: Sequence[np.random.Generator]) -> None:
+        """Sense the worlds and build the observations.
+
+        Args:
+            chosen: Which robots sense, ``[N]``; the others' rows stay.
+            rngs: Source of each robot's noise.
+        """
+        lidar, ranges = self._lidar, self.ranges
+        cast_rays(
+            self.episodes.motions,
+            chosen,
+            self.worlds.arrays,
+            self._directions,
+            lidar.max_range,
+            ranges,
+        )
+        if lidar.noise > 0.0:
+            for index in np.flatnonzero(chosen).tolist():
+                ranges[index] += lidar.noise * rngs[index].standard_normal(ranges.shape[1])
+            np.clip(ranges, 0.0, lidar.max_range, out=ranges)
+        median = lidar.reduction == "median"
+        observe_all(self.episodes, chosen, ranges, median, self._scales, self.observations)
+
+    def _lengthen_trails(self, steps: int) -> None:
+        """Make room for so many time steps."""
+        if steps >= self.trails.shape[1]:
+            longer = np.zeros((len(self.trails), 2 * steps + 1, 2))
+            longer[:, : self.trails.shape[1]] = self.trails
+            self.trails = longer
+
+
+def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
+    """Read what Eq. (25) pays.
+
+    Args:
+        reward: A reward function.
+
+    Returns:
+        Rewards for the goal, for a collision and per meter of approach; None if the function is
+        neither :func:`~mpfa_envs.navigation_reward` nor a ``functools.partial`` of it by keywords.
+    """
+    function = reward.func if isinstance(reward, partial) else reward
+    if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
+        return None
+    given = inspect.signature(navigation_reward).bind_partial(
+        **(reward.keywords if isinstance(reward, partial) else {})
+    )
+    given.apply_defaults()
+    scales = given.arguments
+    return (
+        float(scales["goal_reward"]),
+        float(scales["collision_reward"]),
+        float(scales["progress_scale"]),
+    )
