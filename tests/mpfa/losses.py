@@ -5,6 +5,7 @@ from tensordict import TensorDict
 
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
+from torchrl_mpfa.learners.gradients import Gradients
 
 GAMMA = 0.9
 BOUNDS = (-1.0, 1.0)
@@ -49,3 +50,20 @@ def make_batch(count=6, *, seed=0, weighted=False):
 def parameter_gradients(loss):
     """Gradients by parameter name, of those parameters that have one."""
     return {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}
+
+
+def differentiate_at_once(loss, batch, *, trains="both", loss_function=None):
+    """Set gradients and write signals by the function that a compiled update is made of."""
+    gradients = Gradients(loss)
+    parts = gradients.parts
+    actor = dict(parts.actor.module.named_parameters())
+    given = gradients.inputs(batch, trains, loss_function)
+    found = gradients(actor, parts.critic_parameters, *parts.target_parameters, given)
+    for parameters, of in (
+        (actor, found.of_actor),
+        (parts.critic_parameters, found.of_critic),
+    ):
+        for name, value in parameters.items():
+            value.grad = of.get(name)
+    gradients.write_signals(batch, found.signals)
+    return found.log

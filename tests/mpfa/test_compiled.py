@@ -1,12 +1,21 @@
 """An update as one program: the same numbers as the losses give, whatever their options."""
 
+import copy
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks
-from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
-from torchrl_mpfa.learners.compiled import CompiledGradients
+from tests.mpfa.losses import BOUNDS, GAMMA, differentiate_at_once, make_batch, make_networks
+from torchrl_mpfa import (
+    DDPGLearner,
+    Draw,
+    TD3Learner,
+    load_safely,
+    make_ddpg_loss,
+    make_td3_loss,
+    save_atomically,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -14,6 +23,8 @@ MAKE = {"ddpg": make_ddpg_loss, "td3": make_td3_loss}
 LEARNERS = {"ddpg": DDPGLearner, "td3": TD3Learner}
 # Python stands in for the C++ compiler: what is traced is the same.
 TRACED = {"backend": "eager"}
+# The function itself, where tracing takes most of the time.
+UNTRACED = {"disable": True}
 
 
 def make_loss(name, **options):
@@ -65,7 +76,7 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
     torch.manual_seed(5)  # TD3 has noise in its targets.
     gradients, log = by_losses(name, loss, expected)
     torch.manual_seed(5)
-    found = CompiledGradients(whole, compile=None)(batch)
+    found = differentiate_at_once(whole, batch)
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
@@ -85,7 +96,7 @@ def test_the_critic_may_learn_by_another_distance(name):
     torch.manual_seed(5)
     gradients, _ = by_losses(name, loss, expected, loss_function="smooth_l1")
     torch.manual_seed(5)
-    CompiledGradients(whole, compile=None)(batch, loss_function="smooth_l1")
+    differentiate_at_once(whole, batch, loss_function="smooth_l1")
     again = {n: p.grad for n, p in whole.named_parameters() if p.grad is not None}
     assert again.keys() == gradients.keys()
     for key, value in gradients.items():
@@ -99,11 +110,12 @@ def test_critic_or_actor_alone_get_the_gradients_of_their_loss(name, trains):
     loss, whole = make_loss(name, **options), make_loss(name, **options)
     torch.manual_seed(5)
     gradients, log = by_losses(name, loss, make_batch(), trains)
-    gradients_of = CompiledGradients(whole, compile=None)
-    gradients_of(make_batch())  # Gradients of an earlier batch must not move the other again.
+    differentiate_at_once(
+        whole, make_batch()
+    )  # Gradients of an earlier batch must not move the other again.
     torch.manual_seed(5)
     batch = make_batch()
-    found = gradients_of(batch, trains=trains)
+    found = differentiate_at_once(whole, batch, trains=trains)
     assert ("signals" in batch.keys()) == (trains == "critic")  # noqa: SIM118
     assert {key for key in found if key.startswith("loss")} == {
         "loss_value" if trains == "critic" else "loss_actor"
@@ -116,29 +128,198 @@ def test_critic_or_actor_alone_get_the_gradients_of_their_loss(name, trains):
         torch.testing.assert_close(again[key], value, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_a_traced_learner_takes_the_same_steps(name):
-    plain, traced = (
-        LEARNERS[name](make_loss(name), actor_lr=1e-3, critic_lr=1e-3, compile=compile)
-        for compile in (False, TRACED)
+def make_pair(name, compile=UNTRACED, *, loss=None, **options):
+    """An eager learner and a compiled one, with networks of the same weights."""
+    options = {"actor_lr": 1e-3, "critic_lr": 1e-3, **options}
+    return [
+        LEARNERS[name](make_loss(name, **(loss or {})), compile=each, **options)
+        for each in (False, compile)
+    ]
+
+
+def update_both(learners, seed, **draw):
+    """One update each by the same batch; their values for the log and their batches."""
+    logs, batches = [], []
+    for learner in learners:
+        torch.manual_seed(seed)  # TD3 has noise in its targets.
+        batches.append(make_batch(seed=seed, weighted=True))
+        logs.append(learner.update(Draw(batches[-1], **draw)))
+    return logs, batches
+
+
+def tensors_of(state, name="state"):
+    """All that a state holds, by where it lies."""
+    if isinstance(state, dict):
+        return {k: v for key in state for k, v in tensors_of(state[key], f"{name}.{key}").items()}
+    if isinstance(state, list):
+        return tensors_of(dict(enumerate(state)), name)
+    return (
+        {name: torch.as_tensor(state)} if not isinstance(state, tuple) and state is not None else {}
     )
-    for seed in range(6):
-        one, other = (make_batch(seed=seed, weighted=True) for _ in range(2))
-        torch.manual_seed(seed)
-        plain.update(one)
-        torch.manual_seed(seed)
-        traced.update(other)
-        torch.testing.assert_close(other["signals"].to_dict(), one["signals"].to_dict())
-    expected = dict(plain.loss.named_parameters()) | dict(plain.loss.named_buffers())
-    found = dict(traced.loss.named_parameters()) | dict(traced.loss.named_buffers())
-    for key, value in expected.items():
-        torch.testing.assert_close(found[key], value, rtol=1e-4, atol=1e-5)
+
+
+def assert_alike(one, other, *, rtol=1e-4, atol=1e-5):
+    one, other = tensors_of(one.state_dict()), tensors_of(other.state_dict())
+    assert one.keys() == other.keys()
+    for key, value in one.items():
+        assert other[key].shape == value.shape
+        assert other[key].dtype == value.dtype
+        torch.testing.assert_close(other[key], value, rtol=rtol, atol=atol)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_traced_learner_goes_on_from_a_state_that_is_loaded(name):
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"optimizer": "radam", "tau": 0.2},
+        {"critic_weight_decay": 0.1, "loss": {"target_average": 2}},
+        {"loss": {"delay_actor": False}},
+    ],
+    ids=str,
+)
+def test_a_program_takes_the_same_hundred_steps(name, options):
+    learners = make_pair(name, **options)
+    assert_alike(*learners)
+    for seed in range(100):
+        for learner in learners:
+            learner.anneal(1.0 - seed / 200)
+        logs, batches = update_both(learners, seed)
+        assert logs[0].keys() >= logs[1].keys() >= {"loss_value"}
+        torch.testing.assert_close(logs[1]["loss_value"], logs[0]["loss_value"])
+        torch.testing.assert_close(
+            batches[1]["signals"].to_dict(), batches[0]["signals"].to_dict(), rtol=1e-3, atol=1e-5
+        )
+        if seed % 40 == 39:
+            for learner in learners:
+                learner.end_episode()
+    assert_alike(*learners)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_traced_program_does_so_too(name):
+    learners = make_pair(name, TRACED, loss={"target_average": 2} if name == "ddpg" else {})
+    for seed in range(4):
+        update_both(learners, seed)
+        update_both(learners, seed + 50, trains="critic", loss_function="pal", new_step=False)
+    assert_alike(*learners)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_draws_for_one_of_both_move_that_one_alone(name):
+    learners = make_pair(name)
+    for seed in range(6):
+        update_both(learners, seed, loss_function="pal")
+        update_both(learners, seed + 50, trains="critic", loss_function="smooth_l1", new_step=False)
+        update_both(learners, seed + 90, trains="actor", new_step=False)
+    assert_alike(*learners)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_rates_that_fall_at_each_update_make_no_program_anew(name):
+    made = []
+
+    def backend(module, inputs):
+        made.append(module)
+        return module.forward
+
+    learner = make_pair(name, {"backend": backend})[1]
+    for seed in range(12):
+        learner.anneal(1.0 - seed / 12)
+        learner.update(make_batch(seed=seed))
+    assert len(made) == {"ddpg": 1, "td3": 2}[name]
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+@pytest.mark.parametrize("before", [0, 3])
+def test_losses_that_are_not_finite_are_refused_before_anything_changes(name, number, before):
+    learner = make_pair(name)[1]
+    for seed in range(before):
+        learner.update(make_batch(seed=seed))
+    kept = copy.deepcopy(learner.state_dict())
+    for key in ("observation", ("next", "reward")):
+        batch = make_batch(seed=7)
+        batch[key][3] = number
+        with pytest.raises(ValueError, match="batch must be finite, got"):
+            learner.update(batch)
+    found, expected = tensors_of(learner.state_dict()), tensors_of(kept)
+    assert found.keys() == expected.keys()
+    assert all(found[key].equal(expected[key]) for key in expected)
+    learner.update(make_batch(seed=8))
+    assert learner.updates == before + 1
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("through_file", [False, True])
+@pytest.mark.parametrize("to_compiled", [False, True])
+@pytest.mark.parametrize("updates", [0, 4])
+def test_a_checkpoint_of_either_goes_on_in_the_other(
+    name, through_file, to_compiled, updates, tmp_path
+):
+    first, second = make_pair(name)[:: -1 if not to_compiled else 1]
+    third = make_pair(name)[1 if not to_compiled else 0]
+    second.update(make_batch(seed=9))
+    for seed in range(updates):
+        update_both([first], seed)
+    state = first.state_dict()
+    if through_file:
+        save_atomically(state, tmp_path / "state.pt")
+        state = load_safely(tmp_path / "state.pt")
+    second.load_state_dict(state)
+    third.load_state_dict(state)
+    assert_alike(first, second, rtol=0, atol=0)
+    for seed in range(20, 26):
+        update_both([third, second], seed)
+    assert_alike(third, second)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_policy_and_losses_see_what_the_program_learned(name):
+    plain, traced = make_pair(name)
+    before = make_batch()["observation"]
+    start = traced.policy.outputs({"observation": before})["action"].clone()
+    for seed in range(4):
+        update_both([plain, traced], seed)
+    seen = [each.policy.outputs({"observation": before})["action"] for each in (plain, traced)]
+    torch.testing.assert_close(seen[1], seen[0])
+    assert not torch.allclose(seen[1], start, atol=1e-6)
+    values = []
+    for learner in (plain, traced):
+        torch.manual_seed(0)
+        values.append(by_losses(name, learner.loss, make_batch(seed=5))[1]["loss_value"])
+    torch.testing.assert_close(values[1], values[0])
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_parameters_that_are_laid_elsewhere_are_still_those_that_learn(name):
+    plain, traced = make_pair(name)
+    for learner in (plain, traced):
+        learner.loss.load_state_dict(copy.deepcopy(learner.loss.state_dict()))
+    update_both([plain, traced], 0)
+    for value in traced.loss.parameters():
+        value.data = value.data.clone()
+    for seed in range(1, 5):
+        update_both([plain, traced], seed)
+    assert_alike(plain, traced)
+
+
+def test_parameters_that_are_fixed_stay_as_they_are():
+    learners = []
+    for compile in (False, UNTRACED):
+        actor, critic = make_networks()
+        critic.module.first[0].weight.requires_grad_(False)
+        loss = make_ddpg_loss(actor, critic, gamma=GAMMA)
+        learners.append(DDPGLearner(loss, critic_lr=1e-2, compile=compile))
+    for seed in range(5):
+        update_both(learners, seed)
+    assert_alike(*learners)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_compiled_learner_goes_on_from_a_state_that_is_loaded(name):
     first, second = (
-        LEARNERS[name](make_loss(name), critic_lr=1e-2, compile=TRACED) for _ in range(2)
+        LEARNERS[name](make_loss(name), critic_lr=1e-2, compile=UNTRACED) for _ in range(2)
     )
     second.update(make_batch(seed=9))
     for seed in range(3):

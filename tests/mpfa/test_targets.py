@@ -10,9 +10,8 @@ from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
 
 from tests.mpfa import sac_networks
-from tests.mpfa.losses import BOUNDS, make_batch, make_networks
+from tests.mpfa.losses import BOUNDS, differentiate_at_once, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, SignalDDPGLoss, SignalSACLoss, SignalTD3Loss, TD3Learner
-from torchrl_mpfa.learners.compiled import CompiledGradients
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -111,7 +110,7 @@ def test_a_compiled_update_has_the_targets_of_several_steps_too(name, column):
     loss.importance = "critic"
     expected = targets_of(loss, batch.clone())
     torch.manual_seed(3)
-    log = CompiledGradients(loss, compile=None)(batch, trains="critic")
+    log = differentiate_at_once(loss, batch, trains="critic")
     torch.testing.assert_close(log["target_value"], expected)
 
 
@@ -179,9 +178,9 @@ def test_what_a_compiled_update_cannot_estimate_is_refused_by_name(name, kind):
 def test_a_discount_that_is_set_later_reaches_the_compiled_update():
     _, loss = make_pair("ddpg")
     loss.importance = "critic"
-    gradients, batch = CompiledGradients(loss, compile=None), make_batch()
+    batch = make_batch()
     for gamma in (0.5, 0.0):
         loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-        log = gradients(batch, trains="critic")
+        log = differentiate_at_once(loss, batch, trains="critic")
         torch.testing.assert_close(log["target_value"], loss(batch.clone())["target_value"])
     torch.testing.assert_close(log["target_value"], batch["next", "reward"].squeeze(1))

@@ -6,6 +6,7 @@ learner has the same methods and takes its place.
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
@@ -151,13 +152,32 @@ class ActorCriticLearner:
         if trains == "both" and not due:
             trains = "critic"
         if trains == "critic" or due:
-            log = self._differentiate(draw.batch, trains, draw.loss_function)
-            refuse_unfinished(log, draw.batch)
-            self.optimizer.step()
-            if trains != "critic":
-                self.targets.step()
+            log = self._step(draw.batch, trains, draw.loss_function)
         self.updates = updates
         return {key: value.detach() for key, value in log.items()}
+
+    def _step(
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
+    ) -> dict[str, Tensor]:
+        """One step of the optimizer, and of the target networks with the actor.
+
+        Args:
+            batch: What is learned from, batch size ``[B]``.
+            trains: Who moves.
+            loss_function: Distance of the critics' loss; None: the loss's own.
+
+        Returns:
+            Losses and other values for the log.
+
+        Raises:
+            ValueError: If a loss is not finite; nothing is changed then.
+        """
+        log = self._differentiate(batch, trains, loss_function)
+        refuse_unfinished(log, batch)
+        self.optimizer.step()
+        if trains != "critic":
+            self.targets.step()
+        return log
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
@@ -216,7 +236,8 @@ class ActorCriticLearner:
         """
         check_state(state_dict, self.state_dict(), self.optimizer)
         self.loss.load_state_dict(state_dict["loss"])
-        self.optimizer.load_state_dict(state_dict["optimizer"])
+        # PyTorch would share the tensors with whoever gave the state.
+        self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
         self.updates = state_dict["updates"]
 
 

@@ -1,39 +1,26 @@
-"""All gradients of an update as one function of tensors, which ``torch.compile`` makes one program.
+"""An update as one program: gradients, optimizer, target networks, and the check before them.
 
-With networks of a hundred units an update is mostly the cost of calling some four hundred small
-operations; as one program it takes a third of the time. What it computes is what the losses do,
-by the same functions (:mod:`torchrl_mpfa.losses.functional`).
+With networks of a hundred units an update is mostly the cost of calling some five hundred small
+operations; ``torch.compile`` makes one program of them. All parameters of a network lie in one
+vector, so that optimizer and target step are a few lines of it whatever the network.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
-from torch import Tensor, nn
-from torch.func import functional_call, grad, grad_and_value
+from torch import Tensor
 
 from torchrl_mpfa.learners.base import ActorCriticLearner
+from torchrl_mpfa.learners.flat import FlatParameters
+from torchrl_mpfa.learners.gradients import Gradients, Inputs
+from torchrl_mpfa.learners.states import refuse_unfinished
+from torchrl_mpfa.learners.steps import Step, move
 from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.calling import Parts
-from torchrl_mpfa.losses.functional import (
-    bootstrap_target,
-    critic_loss,
-    least_value,
-    saturation,
-    smoothed_action,
-)
-from torchrl_mpfa.losses.writing import VALUE
-from torchrl_mpfa.networks import DirectModule
-from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.selection import Trains
-from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
-
-Parameters = dict[str, Tensor]
-State = Mapping[NestedKey, Tensor]
 
 
 class CompilableLearner(ActorCriticLearner):
@@ -42,8 +29,8 @@ class CompilableLearner(ActorCriticLearner):
     Args:
         loss: The loss with its networks in it.
         compile: Whether ``torch.compile`` makes one program of an update, or the arguments for it.
-            It needs a C++ compiler and half a minute, and takes a third of the time for networks of
-            64 units. The networks must stay on their device.
+            It needs a C++ compiler and half a minute once (the program is kept on disk), and takes
+            a third of the time for networks of 64 units. The networks must stay on their device.
         **kwargs: Options of :class:`~torchrl_mpfa.learners.ActorCriticLearner`: ``actor_lr``,
             ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``.
 
@@ -56,65 +43,69 @@ class CompilableLearner(ActorCriticLearner):
         self, loss: SignalLoss, *, compile: bool | dict[str, Any] = False, **kwargs: Any
     ) -> None:
         super().__init__(loss, **kwargs)
-        self._compiled: CompiledGradients | None = None
+        self._compiled: CompiledUpdate | None = None
         if compile:
             arguments = compile if isinstance(compile, dict) else {}
-            self._compiled = CompiledGradients(loss, compile=arguments)
+            self._compiled = CompiledUpdate(
+                loss, self.optimizer, tau=self.targets.share, compile=arguments
+            )
 
-    def _differentiate(
+    def _step(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
         if self._compiled is None:
-            return super()._differentiate(batch, trains, loss_function)
+            return super()._step(batch, trains, loss_function)
         return self._compiled(batch, trains=trains, loss_function=loss_function)
 
 
-class Transitions(NamedTuple):
-    """What the critics' loss is computed from, rows first."""
-
-    state: State
-    action: Tensor
-    after: State
-    reward: Tensor
-    terminated: Tensor
-    gamma: Tensor
-    steps: Tensor | None
-    weight: Tensor | None
-    noise: Tensor | None
+_NO_STEP = Step(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class CompiledGradients:
-    """Sets the gradients of all parameters and writes the signals, in one call.
+class Vectors(NamedTuple):
+    """All that an update changes of a network, each of shape ``[P]``."""
+
+    weights: Tensor
+    targets: Tensor
+    mean: Tensor
+    square: Tensor
+
+
+class CompiledUpdate:
+    """Takes one step of networks, optimizer and target networks, in one call.
+
+    The program writes new values only where all losses are finite.
 
     Args:
         loss: The loss; its networks must not move to another device later.
-        compile: Arguments of ``torch.compile``; None: not compiled, which only a test wants.
+        optimizer: Adam or RAdam over its parameters, whose state is kept up to date.
+        tau: Share of the networks in the target networks' step.
+        compile: Arguments of ``torch.compile``.
 
     Raises:
         ValueError: If the loss does what this cannot.
     """
 
-    def __init__(self, loss: Any, *, compile: dict[str, Any] | None) -> None:
-        _check(loss)
-        self._loss = loss
-        self._parts: Parts = loss.parts()
-        self._actor_parameters = dict(self._parts.actor.module.named_parameters())
-        self._scale, self._pal_alpha = loss.reward_scale, loss.pal_alpha
-        self._order, self._with_slope = loss.gradient_order, ACTION_GRADIENT.name in loss.signals
-        self._penalty, self._limit = loss.saturation_penalty, loss.saturation_limit
-        keys = loss.tensor_keys
-        self._action, self._value = keys.action, keys.state_action_value
-        self._preactivation = keys.preactivation
-        self._call: Callable[..., Any] = self._gradients
-        if compile is not None:
-            # Apart from other learners, whose recompilations would count against this one's limit.
-            self._call = torch.compile(
-                self._gradients,
-                fullgraph=True,
-                dynamic=False,
-                **{"isolate_recompiles": True, **compile},
-            )
+    def __init__(
+        self, loss: Any, optimizer: torch.optim.Optimizer, *, tau: float, compile: dict[str, Any]
+    ) -> None:
+        self._gradients = Gradients(loss)
+        self._loss, self._tau = loss, tau
+        self._own_target_actor = loss.delay_actor
+        parts = self._gradients.parts
+        of_actor, of_critics = parts.target_parameters
+        actor = dict(parts.actor.module.named_parameters())
+        self._actor = FlatParameters(actor, of_actor if self._own_target_actor else None, optimizer)
+        self._critics = FlatParameters(parts.critic_parameters, of_critics, optimizer)
+        loss.forget_networks()
+        # Apart from other learners, whose recompilations would count against this one's limit.
+        self._call: Callable[..., Any] = torch.compile(
+            self._program,
+            fullgraph=True,
+            dynamic=False,
+            **{"isolate_recompiles": True, **compile},
+        )
 
+    @torch.no_grad()
     def __call__(
         self,
         batch: TensorDictBase,
@@ -122,12 +113,12 @@ class CompiledGradients:
         trains: Trains = "both",
         loss_function: str | None = None,
     ) -> dict[str, Tensor]:
-        """Differentiate.
+        """Take the step.
 
         Args:
             batch: Transitions, batch size ``[B]``; gets its signals, unless ``trains`` is
                 ``"actor"``.
-            trains: Whose losses are differentiated; the other's parameters get no gradients.
+            trains: Who moves. The target networks move with the actor.
             loss_function: Distance of the critics' loss; None: the loss's own.
 
         Returns:
@@ -135,194 +126,59 @@ class CompiledGradients:
 
         Raises:
             KeyError: If the batch lacks an entry.
-            ValueError: If the loss has got a value estimator of several steps meanwhile.
+            ValueError: If a loss is not finite, or the loss has got a value estimator of several
+                steps meanwhile; nothing is changed then.
         """
-        loss, parts, keys = self._loss, self._parts, self._loss.tensor_keys
-        _check_estimator(loss)
-        of_critic, of_actor, signals, log = self._call(
-            self._actor_parameters,
-            parts.critic_parameters,
-            transitions=None if trains == "actor" else self._transitions(batch),
-            actor_state=None if trains == "critic" else self._state(batch),
-            loss_function=loss_function or loss.loss_function,
-        )
-        for parameters, gradients in (
-            (parts.critic_parameters, of_critic),
-            (self._actor_parameters, of_actor),
-        ):
-            for name, parameter in parameters.items():
-                parameter.grad = gradients.get(name)
-        for name, key in (
-            (TD_ERROR.name, keys.td_error_signal),
-            (ACTION_GRADIENT.name, keys.action_gradient_signal),
-            (VALUE, keys.value_signal),
-        ):
-            if name in loss.signals and trains != "actor":
-                batch.set(key, signals[name])
+        given = self._gradients.inputs(batch, trains, loss_function)
+        both = self._actor, self._critics
+        if any([each.hold() for each in both]):
+            self._loss.forget_networks()
+        learns = trains != "critic", trains != "actor"
+        steps = [
+            each.next_step() if on else _NO_STEP for each, on in zip(both, learns, strict=True)
+        ]
+        actor, critics = (Vectors(e.weights, e.targets, e.mean, e.square) for e in both)
+        numbers = torch.tensor(steps, dtype=actor.weights.dtype).to(actor.weights.device)
+        signals, log = self._call(actor, critics, numbers, given)
+        self._gradients.write_signals(batch, signals)
+        refuse_unfinished(log, batch)
+        for each, on in zip(both, learns, strict=True):
+            if on:
+                each.count_step()
         return dict(log)
 
-    def _state(self, source: TensorDictBase) -> State:
-        """What actor and critics read beside the action."""
-        parts = self._parts
-        inputs = {*parts.actor.in_keys, *parts.critic.in_keys} - {self._action}
-        return {key: source[key] for key in inputs}
-
-    def _transitions(self, batch: TensorDictBase) -> Transitions:
-        loss, keys, noise = self._loss, self._loss.tensor_keys, self._parts.target_noise
-        after, action = batch["next"], batch[self._action]
-        steps = batch.get(loss.value_estimator.tensor_keys.steps_to_next_obs, None)
-        weight = batch.get(keys.priority_weight, None) if loss.importance == "critic" else None
-        return Transitions(
-            state=self._state(batch),
-            action=action,
-            after=self._state(after),
-            reward=after[keys.reward].reshape(-1),
-            terminated=after[keys.terminated].reshape(-1),
-            gamma=loss.value_estimator.gamma,
-            steps=None if steps is None else steps.reshape(-1),
-            weight=None if weight is None else weight.reshape(-1),
-            noise=None if noise is None else noise(action),
+    def _program(
+        self, actor: Vectors, critics: Vectors, numbers: Tensor, given: Inputs
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Signals and values for the log; changes the vectors where all losses are finite."""
+        found = self._gradients(
+            self._actor.views(actor.weights),
+            self._critics.views(critics.weights),
+            self._actor.views(actor.targets),
+            self._critics.views(critics.targets),
+            given,
         )
-
-    @torch.no_grad()
-    def _gradients(
-        self,
-        actor_parameters: Parameters,
-        critic_parameters: Parameters,
-        *,
-        transitions: Transitions | None,
-        actor_state: State | None,
-        loss_function: str,
-    ) -> tuple[Parameters, Parameters, Parameters, Parameters]:
-        """Gradients of critics and actor, signals, and values for the log; a pure function."""
-        of_critic: Parameters = {}
-        of_actor: Parameters = {}
-        signals: Parameters = {}
-        log: Parameters = {}
-        if transitions is not None:
-            of_critic, signals, log = self._critics_part(
-                critic_parameters, transitions, loss_function
-            )
-        if actor_state is not None:
-            of_actor, more = self._actors_part(actor_parameters, critic_parameters, actor_state)
-            log = {**log, **more}
-        return of_critic, of_actor, signals, log
-
-    def _critics_part(
-        self, critic_parameters: Parameters, given: Transitions, loss_function: str
-    ) -> tuple[Parameters, Parameters, Parameters]:
-        """Gradients of the critics (Eq. 11), signals (Eqs. 13-14), and values for the log."""
-        parts, module = self._parts, self._parts.critic.module
-        state, action, weight = given.state, given.action, given.weight
-        target = bootstrap_target(
-            given.reward * self._scale,
-            self._next_value(given.after, given.noise),
-            given.terminated,
-            gamma=given.gamma,
-            steps=given.steps,
-        )
-
-        def of_critics(parameters: Parameters) -> tuple[Tensor, Tensor]:
-            each = [self._q(_with(module, p), state, action) for p in parts.split(parameters)]
-            value = torch.stack(each)
-            loss = critic_loss(
-                value, target, loss_function, unit=self._scale, pal_alpha=self._pal_alpha
-            )
-            return (loss if weight is None else loss * weight).mean(), value
-
-        of_critic, (loss_value, value) = grad_and_value(of_critics, has_aux=True)(critic_parameters)
-        td_error = target - value
-        signals = {
-            TD_ERROR.name: td_error_priority(td_error).amax(0) / self._scale,
-            VALUE: value[0] / self._scale,
-        }
-        log = {
-            "loss_value": loss_value,
-            "td_error": td_error.square(),
-            "pred_value": value,
-            "target_value": target,
-        }
-        if self._with_slope:
-            first = self._first(critic_parameters)
-            slope = grad(lambda a: self._q(first, state, a).sum())(action)
-            size = action_gradient_priority(slope, order=self._order)
-            signals[ACTION_GRADIENT.name] = size / self._scale
-        return of_critic, signals, log
-
-    def _actors_part(
-        self, actor_parameters: Parameters, critic_parameters: Parameters, state: State
-    ) -> tuple[Parameters, Parameters]:
-        """Gradients of the actor, by the first critic, and values for the log."""
-        actor, first = self._parts.actor.module, self._first(critic_parameters)
-
-        def of_policy(parameters: Parameters) -> tuple[Tensor, Parameters]:
-            chosen = self._chosen(_with(actor, parameters), state)
-            loss = -self._q(first, state, chosen[self._action]).mean()
-            before = chosen.get(self._preactivation)
-            if before is None:
-                return loss, {}
-            if self._penalty > 0:
-                loss = loss + self._penalty * saturation(before, limit=self._limit)
-            return loss, {"preactivation": before.abs()}
-
-        of_actor, (loss, more) = grad_and_value(of_policy, has_aux=True)(actor_parameters)
-        return of_actor, {"loss_actor": loss, **more}
-
-    def _first(self, critic_parameters: Parameters) -> Callable[..., Any]:
-        """The first critic, whose slope counts."""
-        parts = self._parts
-        return _with(parts.critic.module, parts.split(critic_parameters)[0])
-
-    def _next_value(self, after: State, noise: Tensor | None) -> Tensor:
-        """Value of the next states in the targets, of the least critic, shape ``[B]``."""
-        parts = self._parts
-        chosen = self._chosen(parts.target_actor.module, after)[self._action]
-        if noise is not None and parts.action_bounds is not None:
-            low, high = parts.action_bounds
-            chosen = smoothed_action(chosen, noise, low=low, high=high)
-        each = [self._q(critic.module, after, chosen) for critic in parts.target_critics]
-        return least_value(torch.stack(each))
-
-    def _q(self, critic: Callable[..., Any], state: State, action: Tensor) -> Tensor:
-        """Q of a critic, shape ``[B]``."""
-        given, critics = {**state, self._action: action}, self._parts.critic
-        found = critics.by_key(critic(*[given[key] for key in critics.in_keys]))
-        return found[self._value].squeeze(-1)
-
-    def _chosen(self, actor: Callable[..., Any], state: State) -> dict[NestedKey, Tensor]:
-        """What a policy gives."""
-        actors = self._parts.actor
-        return actors.by_key(actor(*[state[key] for key in actors.in_keys]))
+        losses = [value for name, value in found.log.items() if name.startswith("loss")]
+        finite = torch.stack(losses).isfinite().all()
+        with_targets = given.actor_state is not None
+        for of, flat, gradients, row, own_targets in (
+            (actor, self._actor, found.of_actor, 0, self._own_target_actor),
+            (critics, self._critics, found.of_critic, 1, True),
+        ):
+            weights = of.weights
+            if gradients:
+                step = Step(*numbers[row].unbind())
+                moved = move(weights, flat.joined(gradients), of.mean, of.square, step)
+                weights = moved.weights
+            if with_targets and own_targets:
+                targets = of.targets + self._tau * (weights - of.targets)
+                _write(finite, [of.targets], [targets])
+            if gradients:
+                _write(finite, [of.weights, of.mean, of.square], moved)
+        return found.signals, found.log
 
 
-def _with(module: nn.Module, parameters: Parameters) -> Callable[..., Any]:
-    """The module with other parameters, as a function of its inputs."""
-    return lambda *inputs: functional_call(module, parameters, inputs)
-
-
-def _check(loss: Any) -> None:
-    for name in ("actor_network", loss._critic_name):
-        network = getattr(loss, name)
-        if not isinstance(network, DirectModule):
-            raise ValueError(
-                f"compile needs a DirectModule as {name}, got {type(network).__name__}"
-            )
-    _check_estimator(loss)
-    if loss.reduction != "mean":
-        raise ValueError(f"compile needs reduction = 'mean' in the loss, got {loss.reduction!r}")
-    if loss.importance == "torchrl":
-        raise ValueError("compile needs importance = 'critic' or 'none', got 'torchrl'")
-    if loss.saturation_penalty > 0:
-        key, written = loss.tensor_keys.preactivation, loss.actor_network.out_keys
-        if key not in written:
-            raise ValueError(
-                f"saturation_penalty is {loss.saturation_penalty}, but the actor writes no {key!r}"
-            )
-
-
-def _check_estimator(loss: Any) -> None:
-    if not loss.bootstraps_once:
-        raise ValueError(
-            "compile needs the value estimator TD0 without average_rewards in the loss, got "
-            f"{type(loss.value_estimator).__name__}"
-        )
+def _write(finite: Tensor, old: Sequence[Tensor], new: Sequence[Tensor]) -> None:
+    """Put new values in the place of old ones, if that is finite which they were made of."""
+    for before, after in zip(old, new, strict=True):
+        before.copy_(torch.where(finite, after, before))

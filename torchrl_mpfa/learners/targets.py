@@ -28,6 +28,7 @@ class MultiTensorSoftUpdate(SoftUpdate):
         buffers = {**params, **dict(loss.named_buffers())}
         pairs = [(p, buffers.get(f"target_{name}")) for name, p in params.items()]
         self._pairs = [(online, target) for online, target in pairs if target is not None]
+        self.share = tau
         self._move = get_ema_multi_avg_fn(1.0 - tau)
 
     def step(self) -> None:

@@ -304,6 +304,10 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             loss = loss + self.saturation_penalty * penalty
         return loss, {"preactivation": preactivation.detach().abs()}
 
+    def forget_networks(self) -> None:
+        """Have the networks that hold the parameters made anew: those lie elsewhere now."""
+        self._bound = None
+
     # The networks hold the parameters of the loss; these may put others in their place.
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:

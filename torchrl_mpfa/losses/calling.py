@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from torchrl_mpfa.losses.averaging import AveragedNetwork
 from torchrl_mpfa.networks import DirectModule
 
 Tensors = Mapping[NestedKey, Tensor]
@@ -67,6 +68,14 @@ def call(network: TensorDictModule, inputs: dict[NestedKey, Tensor]) -> dict[Nes
     return {key: value for key in network.out_keys if (value := found.get(key)) is not None}
 
 
+def bare(params: TensorDictBase) -> dict[str, Tensor]:
+    """Parameters by the names that the module in a :class:`DirectModule` has for them."""
+    flat = params.flatten_keys(".").items()
+    return {
+        name.removeprefix("module."): value for name, value in flat if isinstance(value, Tensor)
+    }
+
+
 class StackedNetworks:
     """Networks of one structure whose parameters are stacked, called one after the other.
 
@@ -81,8 +90,7 @@ class StackedNetworks:
         self.network = deepcopy(network)
         flat = params.flatten_keys(".").items()
         self._params = {name: value for name, value in flat if isinstance(value, Tensor)}
-        self.bare = {name.removeprefix("module."): value for name, value in self._params.items()}
-        """The parameters by the names that the module in a :class:`DirectModule` has for them."""
+        self.bare = bare(params)
 
     def call(self, inputs: Sequence[dict[NestedKey, Tensor]]) -> list[dict[NestedKey, Tensor]]:
         """Compute what each network gives for inputs of its own, as :func:`call` does for one."""
@@ -123,6 +131,9 @@ class Parts:
     """Policy that holds the target parameters."""
     target_critics: Sequence[DirectModule]
     """``C`` critics that hold the target parameters."""
+    target_parameters: tuple[dict[str, Tensor], dict[str, Tensor]]
+    """Parameters of target actor and target critics, by the same names; those of an actor that has
+    no target of its own are the current ones."""
     action_bounds: tuple[Any, Any] | None = None
     """Least and greatest action of a smoothed target; None: targets are not smoothed."""
     target_noise: Callable[[Tensor], Tensor] | None = None
@@ -134,3 +145,14 @@ class Parts:
         if count == 1:
             return [parameters]
         return [{name: value[i] for name, value in parameters.items()} for i in range(count)]
+
+    def of_targets(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:
+        """Parameters of each target critic, by the names that its module has for them."""
+        return [
+            {f"{_prefix(critic)}{name}": value for name, value in own.items()}
+            for critic, own in zip(self.target_critics, self.split(parameters), strict=True)
+        ]
+
+
+def _prefix(critic: DirectModule) -> str:
+    return "network." if isinstance(critic.module, AveragedNetwork) else ""

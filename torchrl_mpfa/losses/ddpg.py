@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.calling import Parts, bind, call, read_inputs
+from torchrl_mpfa.losses.calling import Parts, bare, bind, call, read_inputs
 from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.losses.writing import SignalKeys
 
@@ -171,6 +171,10 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
             critic_parameters=dict(critic.module.named_parameters()),
             target_actor=networks.target_actor,
             target_critics=[networks.target_critic],
+            target_parameters=(
+                bare(self.target_actor_network_params),
+                bare(self.target_value_network_params),
+            ),
         )
 
 

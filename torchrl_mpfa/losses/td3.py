@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 
 from torchrl_mpfa.checks import check_range
-from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bind, call, read_inputs
+from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bare, bind, call, read_inputs
 from torchrl_mpfa.losses.functional import least_value, smoothed_action, smoothing_noise
 from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.losses.twin import TwinCritics
@@ -135,6 +135,10 @@ class SignalTD3Loss(TwinCritics, TD3Loss):
             critic_parameters=networks.critics.bare,
             target_actor=networks.target_actor,
             target_critics=networks.target_critics,
+            target_parameters=(
+                bare(self.target_actor_network_params),
+                bare(self.target_qvalue_network_params),
+            ),
             action_bounds=(self.min_action, self.max_action),
             target_noise=self.target_noise,
         )
