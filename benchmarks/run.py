@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import environment, loss, method_steps, replay, training, vector
+from benchmarks import environment, loss, method_steps, replay, training, vector, worlds
 from benchmarks.timing import Entry
 from torchrl_mpfa import write_text_atomically
 
@@ -69,6 +69,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "methods": method_steps.measure,
     "environment": measure_environment,
     "vector": vector.measure,
+    "worlds": worlds.measure,
 }
 
 

@@ -2,7 +2,7 @@
 
 BARN, Benchmark for Autonomous Robot Navigation (Perille et al. 2020,
 https://arxiv.org/abs/2008.13315), has three hundred fields of cylinders. These are every fifteenth
-of the published ones, from open to narrow; ``data/barn/LICENSE.txt`` is their license. The
+of the published ones, which grow denser; ``data/barn/LICENSE.txt`` is their license. The
 benchmark's robot is a Jackal of 0.51 x 0.43 m with up to 2 m/s, ours a disc of 0.18 m radius with
 up to 0.5 m/s: rates of success are of another task than those of the benchmark's table.
 """
@@ -55,7 +55,7 @@ def barn_world(index: int) -> World:
     and 1.5 m behind the goal. Sampled tasks lead from the corridor through the field.
 
     Args:
-        index: From 0, the most open, to 19; the benchmark calls it ``BARN_WORLDS[index]``.
+        index: From 0 to 19, denser on average; the benchmark calls it ``BARN_WORLDS[index]``.
 
     Returns:
         The world, called ``"barn-INDEX"``.

@@ -48,6 +48,8 @@ _ROOMY: Final = 0.1
 """Share of the free cells with the usual clearance that a world must have to be asked for it."""
 _GOALS: Final = 30
 """Goals that are tried before a world is said to have no task."""
+_DETOURS: Final = 5
+"""Goals that are tried for a detour before a straight way will do."""
 
 
 class FreeGrid:
@@ -300,7 +302,9 @@ def sample_task_on_grid(
     goals = np.flatnonzero((room >= np.float32(goal_room)) & _in_regions(world.goal_regions, x, y))
     detour = detour_chance > 0.0 and rng.random() < detour_chance
     straight: tuple[Task, DistanceField] | None = None
-    for _ in range(_GOALS if len(goals) and may_start.any() else 0):
+    for attempt in range(_GOALS if len(goals) and may_start.any() else 0):
+        if straight is not None and attempt >= _DETOURS:
+            break
         goal_cell = goals[rng.integers(len(goals))]
         goal = _within_cell(grid, rng, x[goal_cell], y[goal_cell], goal_room)
         field = DistanceField(grid, goal)

@@ -1,0 +1,192 @@
+"""What a new world costs, how far its field is off, and what the worlds look like.
+
+python -m benchmarks.worlds                         # a table of the generators
+python -m benchmarks.worlds --pictures docs/images  # twelve worlds of each, from easy to hard
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.timing import Call, Entry, entry, take_turns
+from mpfa_envs import (
+    GENERATORS,
+    DistanceField,
+    FreeGrid,
+    PathPlanner,
+    World,
+    barn_world,
+    generate_world,
+    render_trajectories,
+    sample_task_on_grid,
+)
+
+DISTANCE = 0.25
+"""What ways keep from obstacles: a TurtleBot2's radius and 0.07 m [m]."""
+WORLDS = 60
+"""Worlds of a generator that are measured in turn."""
+_MILLISECONDS = 1e3
+_FEW_CORNERS = 60
+"""The exact planner is asked in worlds with so many obstacles at most."""
+
+
+def _new_world(name: str) -> Call:
+    """A call that makes the next world."""
+    seeds = count()
+    return lambda: generate_world(name, next(seeds) % WORLDS)
+
+
+def _new_task(name: str) -> Call:
+    """A call that makes grid, goal, field and start in the next world."""
+    worlds = [generate_world(name, seed) for seed in range(WORLDS)]
+    turns, rng = count(), np.random.default_rng(0)
+
+    def sample() -> object:
+        grid = FreeGrid(worlds[next(turns) % WORLDS], distance=DISTANCE)
+        return sample_task_on_grid(grid, rng, detour_chance=0.8)[1].filled
+
+    return sample
+
+
+def measure(*, quick: bool, names: Sequence[str] = ("mixed",)) -> list[Entry]:
+    """Measure a new world, and grid, task and field in it.
+
+    Args:
+        quick: Fewer and shorter rounds.
+        names: Generators.
+
+    Returns:
+        ``world_NAME`` and ``field_NAME``; and for the first generator ``world_and_field``, the sum.
+    """
+    calls: dict[str, Call] = {}
+    for name in names:
+        calls |= {f"world_{name}": _new_world(name), f"field_{name}": _new_task(name)}
+    timings = take_turns(calls, rounds=3 if quick else 9, seconds=0.1 if quick else 0.5)
+    medians = {name: timing.median * _MILLISECONDS for name, timing in timings.items()}
+    total = medians[f"world_{names[0]}"] + medians[f"field_{names[0]}"]
+    return [
+        entry("world_and_field", total, "ms"),
+        *(entry(name, median, "ms") for name, median in medians.items()),
+    ]
+
+
+def errors_of_fields(name: str, *, worlds: int = 20) -> Iterator[float]:
+    """Compare lengths of a field with those of the exact planner.
+
+    Args:
+        name: A generator.
+        worlds: How many of its worlds; those with more than 60 obstacles are left out.
+
+    Yields:
+        What a field says over what the planner says, less one, at places 1 m and more from the goal
+        that keep 0.1 m more than they need.
+    """
+    rng = np.random.default_rng(1)
+    for seed in range(worlds):
+        world = generate_world(name, seed)
+        if world.obstacle_count > _FEW_CORNERS:
+            continue
+        grid, planner = FreeGrid(world, distance=DISTANCE), PathPlanner(world, radius=DISTANCE)
+        field = DistanceField(grid, sample_task_on_grid(grid, rng)[0].goal)
+        for x, y in (rng.uniform(-0.5, 0.5, (20, 2)) * world.size).tolist():
+            i, j = grid.index(x, y)
+            near = math.dist((x, y), field.goal) < 1.0
+            if near or grid.clearance[i, j] < DISTANCE + 0.1 or math.isinf(field.values[i, j]):
+                continue
+            exact = planner.length((x, y), field.goal)
+            if math.isfinite(exact):
+                yield field.at(x, y) / exact - 1.0
+
+
+def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
+    """Figures of a generator.
+
+    Args:
+        name: Its name.
+        milliseconds: What :func:`measure` found, by name.
+
+    Returns:
+        Figures by the heading of their column.
+    """
+    worlds = [generate_world(name, seed) for seed in range(WORLDS)]
+    errors = [abs(error) for error in errors_of_fields(name)]
+    obstacles = [world.obstacle_count for world in worlds]
+    sides = [side for world in worlds for side in world.size]
+    free = [FreeGrid(world, distance=DISTANCE).free.mean() for world in worlds]
+    return {
+        "generator": f"`{name}`",
+        "sides [m]": f"{min(sides):.0f} to {max(sides):.0f}",
+        "obstacles": f"{min(obstacles)} to {max(obstacles)}",
+        "free": f"{statistics.mean(free):.0%}",
+        "world [ms]": f"{milliseconds[f'world_{name}']:.1f}",
+        "task and field [ms]": f"{milliseconds[f'field_{name}']:.1f}",
+        "error of the field": f"{statistics.mean(errors):.1%}",
+        "of 95 %": f"{np.quantile(errors, 0.95):.1%}",
+    }
+
+
+def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any, Any]:
+    """Render worlds, four in a row.
+
+    Args:
+        worlds: The worlds.
+        side: Longer side of each [px].
+
+    Returns:
+        Picture of shape ``[height, width, 3]``.
+    """
+    tiles = []
+    for world in worlds:
+        picture = render_trajectories(world, [], [], [], title=world.name, size=side)
+        tile = np.full((side + 40, side + 12, 3), 255, dtype=np.uint8)
+        left = (tile.shape[1] - picture.shape[1]) // 2
+        tile[: picture.shape[0], left : left + picture.shape[1]] = picture
+        tiles.append(tile)
+    rows = [np.concatenate(tiles[i : i + 4], axis=1) for i in range(0, len(tiles), 4)]
+    return np.concatenate(rows)
+
+
+def save_pictures(folder: Path) -> None:
+    """Write ``generator-NAME.png`` for each generator, and ``barn.png``.
+
+    Args:
+        folder: Where to.
+    """
+    from PIL import Image
+
+    for name in GENERATORS:
+        steps = [round(step / 11, 2) for step in range(12)]
+        worlds = [generate_world(name, seed, difficulty=step) for seed, step in enumerate(steps)]
+        Image.fromarray(render_twelve(worlds)).quantize(64).save(folder / f"generator-{name}.png")
+    worlds = [barn_world(index) for index in range(8, 20)]
+    Image.fromarray(render_twelve(worlds)).quantize(64).save(folder / "barn.png")
+
+
+def main() -> None:
+    """Print the table, or write the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--pictures", type=Path, help="render the worlds into this folder instead")
+    arguments = parser.parse_args()
+    if arguments.pictures:
+        save_pictures(arguments.pictures)
+        return
+    milliseconds = {
+        found["name"]: found["value"] for found in measure(quick=False, names=list(GENERATORS))
+    }
+    for number, name in enumerate(GENERATORS):
+        row = describe(name, milliseconds)
+        if number == 0:
+            print("| " + " | ".join(row) + " |\n|---" + "|---" * (len(row) - 1) + "|")
+        print("| " + " | ".join(row.values()) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
