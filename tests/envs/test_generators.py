@@ -21,11 +21,11 @@ from mpfa_envs import (
     World,
     generate_world,
     generator_tasks,
+    sample_task_on_grid,
     split_worlds,
     world_seed,
 )
 from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.distance import has_task
 
 NAMES = list(GENERATORS)
 PINNED = {
@@ -47,10 +47,17 @@ def fingerprint(world: World) -> str:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_seed_has_a_task(name: str) -> None:
-    for seed in range(60):
-        world = generate_world(name, seed)
-        assert has_task(FreeGrid(world, distance=0.25)), world.name
+def test_a_task_is_found_in_each_of_hundreds_of_worlds(name: str) -> None:
+    rng = np.random.default_rng(0)
+    for split in ("train", "validation", "test"):
+        for index in range(50):
+            world = generate_world(name, world_seed(split, 100 + index))
+            grid = FreeGrid(world, distance=0.25)
+            task, field = sample_task_on_grid(grid, rng, detour_chance=0.8)
+            assert math.dist(task.start[:2], task.goal) >= 2.0
+            # A way over free cells, and 0.07 m to spare for a robot of 0.18 m.
+            assert math.isfinite(field.values[grid.index(*task.start[:2])]), world.name
+            assert min(world.clearance(*task.start[:2]), world.clearance(*task.goal)) > 0.2499
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -75,6 +82,24 @@ def test_a_seed_is_one_world_for_ever(name: str, expected: tuple[str, str]) -> N
     # Results refer to worlds by their names.
     found = generate_world(name, 7), generate_world(name, world_seed("test", 7), difficulty=1.0)
     assert tuple(fingerprint(world) for world in found) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("rooms", (-0.7066, 3.2507, -1.4663, 3.8691, -0.4614)),
+        ("fields", (1.2038, -2.0168, 2.3047, -0.9531, -2.3814)),
+        ("halls", (2.45, 4.8494, 2.2954, 2.6136, -6.0002)),
+        ("mazes", (3.0271, 0.04, -0.3046, 3.7575, -3.4064)),
+    ],
+)
+def test_the_tasks_of_the_tables_are_the_same_for_ever(
+    name: str, expected: tuple[float, ...]
+) -> None:
+    pairs = generator_tasks(name, "test", worlds=2, tasks=2)
+    assert pairs[:2] == generator_tasks(name, "test", worlds=1, tasks=2)
+    start, goal = pairs[1][1]
+    assert (*start, *goal) == pytest.approx(expected, abs=1e-4)
 
 
 def test_rooms_are_those_of_earlier_results() -> None:

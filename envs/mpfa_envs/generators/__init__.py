@@ -236,6 +236,7 @@ def generator_tasks(
     for index, world in enumerate(split_worlds(name, split, worlds)):
         grid = FreeGrid(world, distance=ROBOT_DISTANCE)
         # A stream of its own: training with this seed must not meet these tasks.
-        rng = np.random.default_rng((_TASK_STREAM, world_seed(split, index)))
+        kind = int.from_bytes(name.encode(), "big")
+        rng = np.random.default_rng((_TASK_STREAM, kind, world_seed(split, index)))
         pairs += [(world, sample_task_on_grid(grid, rng)[0]) for _ in range(tasks)]
     return pairs
