@@ -108,6 +108,10 @@ class SignalDDPGLossConfig(SignalLossConfig):
     value_network: Any = None
     delay_actor: bool = True
     delay_value: bool = True
+    action_spec: Any = None
+    bounds: list[float] | None = None
+    policy_noise: float = 0.0
+    noise_clip: float = 0.5
     _target_: str = "torchrl_mpfa.configs.learning._make_ddpg_loss"
 
 

@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.learners.base import ActorCriticLearner
 from torchrl_mpfa.learners.flat import FlatParameters
 from torchrl_mpfa.learners.gradients import Gradients, Inputs
@@ -31,6 +32,7 @@ class CompilableLearner(ActorCriticLearner):
         compile: Whether ``torch.compile`` makes one program of an update, or the arguments for it.
             It needs a C++ compiler and half a minute once (the program is kept on disk), and takes
             a third of the time for networks of 64 units. The networks must stay on their device.
+        policy_delay: Updates of the critics for one of the actor and of the targets.
         **kwargs: Options of :class:`~torchrl_mpfa.learners.ActorCriticLearner`: ``actor_lr``,
             ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``.
 
@@ -40,9 +42,16 @@ class CompilableLearner(ActorCriticLearner):
     """
 
     def __init__(
-        self, loss: SignalLoss, *, compile: bool | dict[str, Any] = False, **kwargs: Any
+        self,
+        loss: SignalLoss,
+        *,
+        compile: bool | dict[str, Any] = False,
+        policy_delay: int = 1,
+        **kwargs: Any,
     ) -> None:
+        check_counts(policy_delay=policy_delay)
         super().__init__(loss, **kwargs)
+        self.policy_delay = policy_delay
         self._compiled: CompiledUpdate | None = None
         if compile:
             arguments = compile if isinstance(compile, dict) else {}

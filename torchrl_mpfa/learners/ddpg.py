@@ -1,4 +1,4 @@
-"""DDPG: actor and critic move at every update."""
+"""DDPG: actor and critic move at every update, or the actor less often."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ class DDPGLearner(CompilableLearner):
     Args:
         loss: A :class:`~torchrl_mpfa.SignalDDPGLoss` with both networks in it.
         compile: Whether an update is one compiled program, or the arguments of ``torch.compile``.
+        policy_delay: Updates of the critic for one of the actor and of the targets. Eqs. (4)-(7)
+            have 1; 2 is TD3's (Fujimoto et al. 2018), and steadies a single critic.
         **kwargs: ``actor_lr``, ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``.
 
     Raises:

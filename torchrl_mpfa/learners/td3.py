@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.learners.compiled import CompilableLearner
 from torchrl_mpfa.losses import SignalTD3Loss
 
@@ -36,6 +35,4 @@ class TD3Learner(CompilableLearner):
     loss_type = SignalTD3Loss
 
     def __init__(self, loss: SignalTD3Loss, *, policy_delay: int = 2, **kwargs: Any) -> None:
-        check_counts(policy_delay=policy_delay)
-        super().__init__(loss, **kwargs)
-        self.policy_delay = policy_delay
+        super().__init__(loss, policy_delay=policy_delay, **kwargs)

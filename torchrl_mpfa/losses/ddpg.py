@@ -13,10 +13,11 @@ from torchrl.objectives import DDPGLoss, ValueEstimators
 from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import Parts, bare, bind, call, read_inputs
 from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.losses.smoothing import TargetSmoothing, bounds_of, check_noise
 from torchrl_mpfa.losses.writing import SignalKeys
 
 
-class SignalDDPGLoss(SignalLoss, DDPGLoss):
+class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
     r""":class:`~torchrl.objectives.DDPGLoss` that also writes the signals of Eqs. (13)-(14).
 
     The critic's loss is Eq. (11), :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2` with the
@@ -33,6 +34,12 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         value_network: Critic; reads observations and action, writes ``"state_action_value"``.
         delay_actor: Whether the target has a target actor, as Eq. (5) has; TorchRL's default is
             not to.
+        policy_noise: Standard deviation of noise on the target action, in units of the action, as
+            TD3 has it; 0 is Eq. (5).
+        noise_clip: Limit of that noise.
+        action_spec: Bounded spec of the actions, such as ``env.action_spec``; noise needs it, or
+            ``bounds``.
+        bounds: Least and greatest action, numbers or tensors of shape ``[A]``, in its place.
         **kwargs: Options of :class:`~torchrl_mpfa.losses.SignalLoss`: ``signals``,
             ``gradient_order``, ``importance``, ``reward_scale``, ``saturation_penalty``,
             ``saturation_limit``, ``target_average``, ``pal_alpha``; and of TorchRL's loss.
@@ -77,9 +84,20 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         value_network: TensorDictModule,
         *,
         delay_actor: bool = True,
+        policy_noise: float = 0.0,
+        noise_clip: float = 0.5,
+        action_spec: Any = None,
+        bounds: Any = None,
         **kwargs: Any,
     ) -> None:
+        check_noise(policy_noise, noise_clip)
+        within = bounds_of(action_spec, bounds) if policy_noise > 0 else None
         super().__init__(actor_network, value_network, delay_actor=delay_actor, **kwargs)
+        self.policy_noise, self.noise_clip = policy_noise, noise_clip
+        if within is not None:
+            # Arguments, hence not part of a state.
+            for name, value in zip(("min_action", "max_action"), within, strict=True):
+                self.register_buffer(name, value, persistent=False)
 
     def loss_value(
         self,
@@ -141,6 +159,9 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
     def _next_value(self, after: TensorDictBase) -> Tensor:
         networks = self._networks()
         chosen = call(networks.target_actor, read_inputs(networks.target_actor, after))
+        if self.policy_noise > 0:
+            key = self.tensor_keys.action
+            chosen = {**chosen, key: self._smoothed(chosen[key])}
         return self._value(networks.target_critic, after, chosen)
 
     def _networks(self) -> _Networks:
@@ -164,7 +185,7 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
     def parts(self) -> Parts:
         """The networks as functions of tensors."""
         networks = self._networks()
-        critic = networks.critic
+        critic, smooths = networks.critic, self.policy_noise > 0
         return Parts(
             actor=networks.actor,
             critic=critic,
@@ -175,6 +196,8 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
                 bare(self.target_actor_network_params),
                 bare(self.target_value_network_params),
             ),
+            action_bounds=(self.min_action, self.max_action) if smooths else None,
+            target_noise=self.target_noise if smooths else None,
         )
 
 

@@ -5,22 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 
-from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bare, bind, call, read_inputs
-from torchrl_mpfa.losses.functional import least_value, smoothed_action, smoothing_noise
+from torchrl_mpfa.losses.functional import least_value
 from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.losses.smoothing import TargetSmoothing, bounds_of, check_noise
 from torchrl_mpfa.losses.twin import TwinCritics
 from torchrl_mpfa.losses.writing import SignalKeys
-from torchrl_mpfa.networks import action_bounds
 
 
-class SignalTD3Loss(TwinCritics, TD3Loss):
+class SignalTD3Loss(TwinCritics, TargetSmoothing, TD3Loss):
     r""":class:`~torchrl.objectives.TD3Loss` that also writes the signals of Eqs. (13)-(14).
 
     Of its two critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; the
@@ -70,18 +68,8 @@ class SignalTD3Loss(TwinCritics, TD3Loss):
         bounds: Any = None,
         **kwargs: Any,
     ) -> None:
-        if (action_spec is None) == (bounds is None):
-            raise ValueError(
-                "one of action_spec and bounds must be given, got "
-                f"action_spec={action_spec} and bounds={bounds}"
-            )
-        if action_spec is not None:
-            bounds = action_bounds(action_spec)
-        low, high = map(torch.as_tensor, bounds)
-        if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
-            raise ValueError(f"bounds must be finite, low < high, got {bounds}")
-        check_range("policy_noise", kwargs.get("policy_noise", 0.0), low=0.0)
-        check_range("noise_clip", kwargs.get("noise_clip", 0.0), low=0.0)
+        low, high = bounds_of(action_spec, bounds)
+        check_noise(kwargs.get("policy_noise", 0.0), kwargs.get("noise_clip", 0.0))
         super().__init__(actor_network, qvalue_network, bounds=(low, high), **kwargs)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -100,16 +88,10 @@ class SignalTD3Loss(TwinCritics, TD3Loss):
         loss, log = self.actor_loss(batch)
         return {"loss_actor": loss}, log
 
-    def target_noise(self, action: Tensor) -> Tensor:
-        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
-        return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
-
     def _next_value(self, after: TensorDictBase) -> Tensor:
         actor, key = self._networks().target_actor, self.tensor_keys.action
         action = call(actor, read_inputs(actor, after))[key]
-        action = smoothed_action(
-            action, self.target_noise(action), low=self.min_action, high=self.max_action
-        )
+        action = self._smoothed(action)
         return least_value(self._target_values(after, {key: action}))
 
     def _networks(self) -> _Networks:
