@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mpfa_envs.builtin_worlds import WORLDS, resolve_world
 from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.path import shortest_length
-from mpfa_envs.tasks import Task, sample_task
+from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs.tasks import Task, check_task, sample_task
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
@@ -41,12 +42,16 @@ class Episode(NamedTuple):
     """Lengths of the ways to the goal, if the progress is along the shortest path."""
 
 
-@lru_cache(maxsize=64)
 def _grid_of(world: World, distance: float) -> FreeGrid:
-    """Share one grid among the episodes of a world."""
+    """Make the grid of a world."""
+    # Imported here because it needs Numba, which takes half a second.
     from mpfa_envs.distance import FreeGrid
 
     return FreeGrid(world, distance=distance)
+
+
+_kept_grid_of = lru_cache(maxsize=4)(_grid_of)
+"""The same for worlds that stay; a grid takes some megabytes."""
 
 
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
@@ -62,7 +67,7 @@ def distance_field(world: World, distance: float, goal: tuple[float, float]) -> 
     """
     from mpfa_envs.distance import DistanceField
 
-    return DistanceField(_grid_of(world, distance), goal)
+    return DistanceField(_kept_grid_of(world, distance), goal)
 
 
 class EpisodeSource:
@@ -159,6 +164,48 @@ class EpisodeSource:
         """The world that a robot always drives in; None with a generator."""
         return None if self._generator else self._worlds[robot]
 
+    def state_dict(self) -> dict[str, Any]:
+        """Where each robot is among the worlds of a generator."""
+        kept = zip(self._worlds, self._left, strict=True)
+        return {
+            "refused": self.refused,
+            "left": list(self._left),
+            "worlds": [world_to_plain(world) if left and world else None for world, left in kept],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what :meth:`state_dict` gave."""
+        self.refused = int(state["refused"])
+        self._left = [int(left) for left in state["left"]]
+        if self._generator:
+            self._worlds = [
+                None if values is None else world_from_plain(values) for values in state["worlds"]
+            ]
+
+    def check(self, world: World, task: Task | None) -> Task | None:
+        """Refuse a world that is too large, or a task that cannot be driven."""
+        if world.diagonal > self.diagonal:
+            raise ValueError(
+                f"world {world.name!r} must be at most {self.diagonal:.4g} m from corner to "
+                f"corner, as the observations are bounded, got {world.diagonal:.4g} m"
+            )
+        return None if task is None else self._read_task(world, *task)
+
+    def check_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
+        """Read a task in a world, and refuse it likewise."""
+        self.check(world, None)
+        return self._read_task(world, start, goal)
+
+    def _read_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
+        rules = self._rules
+        return check_task(
+            world,
+            {"start": start, "goal": goal},
+            collision_distance=rules.collision_distance,
+            goal_radius=rules.goal_radius,
+            radius=rules.robot.radius,
+        )
+
     def of_task(self, world: World, task: Task) -> Episode:
         """Make an episode of a task that is given."""
         rules = self._rules
@@ -211,7 +258,7 @@ class EpisodeSource:
 
         rules = self._rules
         task, field = sample_task_on_grid(
-            _grid_of(world, rules.collision_distance),
+            (_grid_of if self._generator else _kept_grid_of)(world, rules.collision_distance),
             rng,
             min_goal_distance=rules.min_goal_distance,
             max_goal_distance=self._max_goal_distance,

@@ -5,12 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mpfa_envs.episodes import distance_field
 from mpfa_envs.field_batch import FieldBatch
 from mpfa_envs.kernels.lidar import cast_rays
+from mpfa_envs.kernels.motion import scale_actions
 from mpfa_envs.kernels.observation import observe_all
 from mpfa_envs.kernels.step import (
     DISTANCE,
@@ -24,12 +26,15 @@ from mpfa_envs.kernels.step import (
     settle,
 )
 from mpfa_envs.observation import INFO_TYPES
+from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
 from mpfa_envs.reward import RewardFunction, StepOutcome, navigation_reward
+from mpfa_envs.tasks import read_task
 from mpfa_envs.vector_drives import make_drives
+from mpfa_envs.vector_state import read_array
 from mpfa_envs.world_batch import WorldBatch
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -126,6 +131,28 @@ class RobotBatch:
         self.trails[index, 0] = x, y
         self.running[index] = True
 
+    def wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Read actions, as :meth:`~mpfa_envs.RobotModel.wheel_speeds` reads one.
+
+        Args:
+            actions: Left and right wheel, ``[N, 2]``.
+
+        Returns:
+            Speeds [m/s], ``[N, 2]``.
+
+        Raises:
+            ValueError: If they are not two numbers for each robot.
+        """
+        values = np.ascontiguousarray(actions, dtype=np.float64)
+        if values.shape != (len(self.tasks), 2):
+            raise ValueError(f"actions must have shape ({len(self.tasks)}, 2), got {values.shape}")
+        speeds = np.empty_like(values)
+        robot = self._rules.robot
+        if not scale_actions(values, robot.min_wheel_speed, robot.max_wheel_speed, speeds):
+            rows = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
+            raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
+        return speeds
+
     def advance(self, speeds: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:
         """Hold the wheel speeds until the next actions are due.
 
@@ -146,6 +173,61 @@ class RobotBatch:
             if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0)):
                 break
         self.running[moving] = running[moving]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is known of the robots, as plain values and arrays."""
+        last = int(self.episodes.steps.max())
+        return {
+            "worlds": [world_to_plain(world) for world in self.worlds],
+            "tasks": [task and (task.start, task.goal) for task in self.tasks],
+            "trails": self.trails[:, : last + 1].copy(),
+            "drives": self.drives.state_dict(),
+            **{name: array.copy() for name, array in self._arrays().items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what :meth:`state_dict` gave.
+
+        Args:
+            state: What it gave.
+
+        Raises:
+            ValueError: If something is missing or of another shape; nothing has changed then.
+        """
+        arrays = self._arrays()
+        values = {name: read_array(state, name, like) for name, like in arrays.items()}
+        for name in ("worlds", "tasks"):
+            if len(state.get(name, ())) != len(self.tasks):
+                raise ValueError(f"{name} of the state must have {len(self.tasks)} entries")
+        worlds = [world_from_plain(plain) for plain in state["worlds"]]
+        tasks = [None if task is None else read_task(task) for task in state["tasks"]]
+        last = int(values["steps"].max())
+        trails = read_array(state, "trails", np.zeros((len(tasks), last + 1, 2)))
+        self._lengthen_trails(last)
+        self.trails[:, : last + 1] = trails
+        for name, array in arrays.items():
+            array[...] = values[name]
+        self.tasks = tasks
+        starts = np.zeros((len(tasks), 3))
+        for index, (world, task) in enumerate(zip(worlds, tasks, strict=True)):
+            self.worlds[index] = world
+            if task is None:
+                continue
+            x, y, heading = task.start
+            starts[index] = x, y, math.remainder(heading, math.tau)
+            if self._fields is not None:
+                distance = self._rules.collision_distance
+                self._fields[index] = distance_field(world, distance, task.goal)
+        self.drives.load_state_dict(state["drives"], starts, self.episodes.motions.copy())
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays that a robot's episode is in, by name."""
+        return {
+            **self.episodes._asdict(),
+            "running": self.running,
+            "observations": self.observations,
+            "ranges": self.ranges,
+        }
 
     def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
         """Add what a reward of the user's gives, robot by robot."""

@@ -42,6 +42,19 @@ class Task(NamedTuple):
     """Position (x, y) [m]."""
 
 
+def read_task(values: Any) -> Task:
+    """Make a task of a start and a goal.
+
+    Raises:
+        ValueError: If they are not three and two numbers.
+    """
+    try:
+        (x, y, heading), (goal_x, goal_y) = values
+        return Task((float(x), float(y), float(heading)), (float(goal_x), float(goal_y)))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"task must be a start and a goal, got {values!r}") from error
+
+
 def sample_task(
     world: World,
     rng: np.random.Generator,

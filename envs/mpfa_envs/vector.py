@@ -16,14 +16,14 @@ from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.episodes import EpisodeSource, WorldChoice
-from mpfa_envs.kernels.motion import scale_actions
 from mpfa_envs.kernels.step import outcomes
 from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
 from mpfa_envs.robot import RobotModel
 from mpfa_envs.robot_batch import FLAGS, NUMBERS, RobotBatch
-from mpfa_envs.tasks import Task, check_task
-from mpfa_envs.vector_options import read_mask, read_tasks
+from mpfa_envs.tasks import Task
+from mpfa_envs.vector_options import read_mask, read_seed, read_tasks, spawn_generators
+from mpfa_envs.vector_state import check_alike, describe, read_generators
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
@@ -205,6 +205,32 @@ class VectorNavigationEnv(
         """The infos as two tables, ``[3, N]`` and ``[12, N]``: the rows are flags and numbers."""
         return self._batch.episodes.flags.copy(), self._batch.episodes.numbers.copy()
 
+    def check_task(
+        self,
+        index: int,
+        start: Sequence[float],
+        goal: Sequence[float],
+        world: WorldChoice | None = None,
+    ) -> tuple[World, Task]:
+        """Read a task of a robot.
+
+        Args:
+            index: Number of the robot.
+            start: Pose (x, y, heading) [m, m, rad].
+            goal: Position (x, y) [m].
+            world: The room; None: the one that the robot always drives in.
+
+        Returns:
+            The room and the task.
+
+        Raises:
+            ValueError: If it cannot be driven.
+        """
+        room = self._source.fixed(index) if world is None else resolve_world(world)
+        if room is None:
+            raise ValueError("world must be given where the worlds are a generator's, got None")
+        return room, self._source.check_task(room, start, goal)
+
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m].
 
@@ -223,14 +249,14 @@ class VectorNavigationEnv(
         Raises:
             ValueError: If a seed is negative, or there are not as many as robots.
         """
-        self._take_generators(self._generators_of(seed), range(self.num_envs))
+        self._take_generators(read_seed(seed, self.num_envs), range(self.num_envs))
 
     def _take_generators(
         self, rngs: Sequence[np.random.Generator | None], robots: Iterable[int]
     ) -> None:
         """Let some robots draw from new sources of randomness, where they are given."""
         if not self._rngs:
-            self._rngs = _generators(np.random.SeedSequence(), self.num_envs)
+            self._rngs = spawn_generators(np.random.SeedSequence(), self.num_envs)
         for index in robots:
             if (rng := rngs[index]) is not None:
                 self._rngs[index] = rng
@@ -258,9 +284,9 @@ class VectorNavigationEnv(
             ValueError: If a seed is negative, or the options are not tasks that can be driven; the
                 episodes go on then.
         """
-        seeded = self._generators_of(seed)
+        seeded = read_seed(seed, self.num_envs)
         chosen = read_mask(options, self.num_envs)
-        given = read_tasks(options, self.num_envs, self._source.fixed, self._check)
+        given = read_tasks(options, self.num_envs, self._source.fixed, self._source.check)
         if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
         robots = np.flatnonzero(chosen).tolist()
@@ -297,7 +323,7 @@ class VectorNavigationEnv(
         """
         if not self._begun:
             raise ResetNeeded("no episode is running: call reset() before step()")
-        speeds = self._wheel_speeds(actions)
+        speeds = self._batch.wheel_speeds(actions)
         chosen = np.ones(self.num_envs, dtype=np.bool_) if only is None else only
         waiting = chosen & ~self._batch.running
         if waiting.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
@@ -343,6 +369,40 @@ class VectorNavigationEnv(
             "_final_info": ended,
         }
 
+    def state_dict(self) -> dict[str, Any]:
+        """Give all that the environment needs to go on elsewhere in the middle of episodes.
+
+        Returns:
+            Plain values and arrays. Worlds, tasks and motions are in it, sources of randomness too;
+            on wheels also what was driven in each episode.
+        """
+        return {
+            "arguments": describe(self, self.lidar, self.num_envs),
+            "rngs": [rng.bit_generator.state for rng in self._rngs],
+            "begun": self._begun,
+            "source": self._source.state_dict(),
+            "batch": self._batch.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where another environment with the same arguments was.
+
+        What follows is the same to the bit. On wheels the episodes so far are driven again from
+        their starts, which takes a moment and is as exact for up to 32 robots.
+
+        Args:
+            state: What :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: If it is of an environment with other arguments, or no state; nothing has
+                changed then.
+        """
+        state = check_alike(state, describe(self, self.lidar, self.num_envs))
+        rngs = read_generators(state.get("rngs"), self.num_envs)
+        self._batch.load_state_dict(state["batch"])
+        self._source.load_state_dict(state["source"])
+        self._rngs, self._begun = rngs, bool(state["begun"])
+
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Render each robot's room from above.
 
@@ -379,85 +439,3 @@ class VectorNavigationEnv(
             **kwargs: None are used.
         """
         self._batch.drives.close()
-
-    def _wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Read actions, as :meth:`~mpfa_envs.RobotModel.wheel_speeds` reads one."""
-        values = np.ascontiguousarray(actions, dtype=np.float64)
-        if values.shape != (self.num_envs, 2):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 2), got {values.shape}")
-        speeds = np.empty_like(values)
-        if not scale_actions(
-            values, self.robot.min_wheel_speed, self.robot.max_wheel_speed, speeds
-        ):
-            rows = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
-            raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
-        return speeds
-
-    def _generators_of(
-        self, seed: int | Sequence[int | None] | None
-    ) -> Sequence[np.random.Generator | None]:
-        """Make each robot's source of randomness; None where the old one goes on."""
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
-            if len(seed) != self.num_envs:
-                raise ValueError(f"seed must have {self.num_envs} entries, got {len(seed)}")
-            checked = [None if one is None else check_count("seed", one, least=0) for one in seed]
-            return [None if one is None else np.random.default_rng(one) for one in checked]
-        sequence = np.random.SeedSequence(check_count("seed", seed, least=0))
-        return _generators(sequence, self.num_envs)
-
-    def check_task(
-        self,
-        index: int,
-        start: Sequence[float],
-        goal: Sequence[float],
-        world: WorldChoice | None = None,
-    ) -> tuple[World, Task]:
-        """Read a task of a robot.
-
-        Args:
-            index: Number of the robot.
-            start: Pose (x, y, heading) [m, m, rad].
-            goal: Position (x, y) [m].
-            world: The room; None: the one that the robot always drives in.
-
-        Returns:
-            The room and the task.
-
-        Raises:
-            ValueError: If it cannot be driven.
-        """
-        room = self._source.fixed(index) if world is None else resolve_world(world)
-        if room is None:
-            raise ValueError(f"world must be given where it is a generator's, got {world}")
-        self._check_size(room)
-        return room, self._task_in(room, start, goal)
-
-    def _check(self, world: World, task: Task | None) -> Task | None:
-        """Refuse a world that is too large, or a task that cannot be driven."""
-        self._check_size(world)
-        return None if task is None else self._task_in(world, *task)
-
-    def _task_in(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
-        """Read a task in a world."""
-        return check_task(
-            world,
-            {"start": start, "goal": goal},
-            collision_distance=self.collision_distance,
-            goal_radius=self.goal_radius,
-            radius=self.robot.radius,
-        )
-
-    def _check_size(self, world: World) -> None:
-        """Refuse a world in which observations would leave their bounds."""
-        if world.diagonal > self._source.diagonal:
-            raise ValueError(
-                f"world {world.name!r} must be at most {self._source.diagonal:.4g} m from corner "
-                f"to corner, as the observations are bounded, got {world.diagonal:.4g} m"
-            )
-
-
-def _generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:
-    """A source of randomness for each robot, which does not depend on how many there are."""
-    return [np.random.default_rng(child) for child in sequence.spawn(robots)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from mpfa_envs.drives import read_motion, substeps
 from mpfa_envs.kernels.motion import drive_arcs
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from mpfa_envs.arguments import Physics
@@ -31,6 +33,19 @@ class Drives(Protocol):
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What brings the robots where they are in their episodes."""
+        ...
+
+    def load_state_dict(
+        self,
+        state: Mapping[str, Any],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Bring them there from their starts ``[N, 3]``."""
         ...
 
     def close(self) -> None:
@@ -68,6 +83,18 @@ class KinematicDrives:
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
         drive_arcs(motions, running, speeds, self._wheel_base, self._time_step)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing is held."""
+        return {}
+
+    def load_state_dict(
+        self,
+        state: Mapping[str, Any],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Nothing is held."""
 
     def close(self) -> None:
         """Nothing is held."""
@@ -108,6 +135,9 @@ class WheelDrives:
             for _ in range(min(robots, _SERVERS))
         ]
         self._names = [f"robot_{index}" for index in range(robots)]
+        # Speeds of each robot in its episode so far, and their number.
+        self._driven = np.zeros((robots, 64, 2))
+        self._counts = np.zeros(robots, dtype=np.int64)
         for index, name in enumerate(self._names):
             self._simulation_of(index).add_robot(robot, name=name)
         for index in range(robots):
@@ -120,11 +150,13 @@ class WheelDrives:
     def place(self, index: int, x: float, y: float, heading: float) -> None:
         """Put a robot at rest at a pose [m, m, rad]."""
         self._simulation_of(index).place_robot(x, y, heading, name=self._names[index])
+        self._counts[index] = 0
 
     def move(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        self._remember(running, speeds)
         turning = np.where(running[:, None], speeds / self._wheel_radius, 0.0).tolist()
         moving = np.flatnonzero(running).tolist()
         # In a server of its own, a robot that does not run is not simulated; in a shared one it
@@ -138,6 +170,42 @@ class WheelDrives:
             self._simulations[number].step()
         for index in moving:
             motions[index] = read_motion(self._simulation_of(index), self._names[index])
+
+    def _remember(self, running: NDArray[np.bool_], speeds: NDArray[np.float64]) -> None:
+        """Keep what the robots have driven since the start of their episodes."""
+        if self._counts.max() == self._driven.shape[1]:
+            self._driven = np.concatenate((self._driven, np.zeros_like(self._driven)), axis=1)
+        self._driven[running, self._counts[running]] = speeds[running]
+        self._counts[running] += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """The wheel speeds of the episodes so far: the engine cannot save all that it knows."""
+        counts = self._counts.copy()
+        return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
+
+    def load_state_dict(
+        self,
+        state: Mapping[str, Any],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Drive the episodes again from their starts.
+
+        Args:
+            state: What :meth:`state_dict` gave.
+            starts: Poses at the start (x, y, heading) [m, m, rad], ``[N, 3]``.
+            motions: Poses and speeds, ``[N, 5]``, changed on the way.
+        """
+        counts = np.array(state["counts"], dtype=np.int64)
+        speeds = np.array(state["speeds"], dtype=np.float64)
+        last = int(counts.max())
+        # All end at once. A robot has its last contacts with the floor from where it was placed.
+        for index, start in enumerate(starts.tolist()):
+            self.place(index, *start)
+        for step in range(last):
+            running = step >= last - counts
+            now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
+            self.move(motions, running, now)
 
     def close(self) -> None:
         """Shut the physics servers down; a second call does nothing."""

@@ -1,4 +1,4 @@
-"""What the options of a vector environment's reset ask for, checked before anything changes."""
+"""What the reset of a vector environment asks for, checked before anything changes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.checks import check_count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -92,3 +93,34 @@ def _read_list(options: Mapping[str, Any] | None, key: str, robots: int) -> Sequ
     if len(values) != robots:
         raise ValueError(f"{key} must have {robots} entries, got {len(values)}")
     return values
+
+
+def read_seed(
+    seed: int | Sequence[int | None] | None, robots: int
+) -> Sequence[np.random.Generator | None]:
+    """Make a source of randomness for each robot.
+
+    Args:
+        seed: One for all, from which each robot's is made with its number; one for each robot; or
+            None.
+        robots: Number of robots.
+
+    Returns:
+        The sources; None where the old one goes on.
+
+    Raises:
+        ValueError: If a seed is negative, or there are not as many as robots.
+    """
+    if seed is None:
+        return [None] * robots
+    if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
+        if len(seed) != robots:
+            raise ValueError(f"seed must have {robots} entries, got {len(seed)}")
+        checked = [None if one is None else check_count("seed", one, least=0) for one in seed]
+        return [None if one is None else np.random.default_rng(one) for one in checked]
+    return spawn_generators(np.random.SeedSequence(check_count("seed", seed, least=0)), robots)
+
+
+def spawn_generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:
+    """Make a source of randomness for each robot that does not depend on how many there are."""
+    return [np.random.default_rng(child) for child in sequence.spawn(robots)]

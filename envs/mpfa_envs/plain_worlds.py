@@ -1,0 +1,66 @@
+"""Worlds as plain values, to be saved and read back exactly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpfa_envs.shapes import Box, Cylinder, Polygon
+from mpfa_envs.worlds import World
+
+
+def world_to_plain(world: World) -> dict[str, Any]:
+    """Turn a world into strings, numbers and lists.
+
+    Args:
+        world: The world.
+
+    Returns:
+        Its fields by name.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+        >>> world_from_plain(world_to_plain(WORLDS["B"])) == WORLDS["B"]
+        True
+    """
+    return {
+        "name": world.name,
+        "size": list(world.size),
+        "boxes": [_edges(box) for box in world.boxes],
+        "cylinders": [[c.x, c.y, c.radius] for c in world.cylinders],
+        "polygons": [[list(vertex) for vertex in polygon.vertices] for polygon in world.polygons],
+        "start_regions": [_edges(box) for box in world.start_regions],
+        "goal_regions": [_edges(box) for box in world.goal_regions],
+    }
+
+
+def world_from_plain(values: dict[str, Any]) -> World:
+    """Make a world of what :func:`world_to_plain` gave.
+
+    Args:
+        values: Its fields by name.
+
+    Returns:
+        The world.
+
+    Raises:
+        ValueError: If a shape is none, or the fields are not those of a world.
+    """
+    try:
+        return World(
+            name=values["name"],
+            size=(values["size"][0], values["size"][1]),
+            boxes=tuple(Box(*edges) for edges in values["boxes"]),
+            cylinders=tuple(Cylinder(*numbers) for numbers in values["cylinders"]),
+            polygons=tuple(
+                Polygon(tuple((x, y) for x, y in vertices)) for vertices in values["polygons"]
+            ),
+            start_regions=tuple(Box(*edges) for edges in values["start_regions"]),
+            goal_regions=tuple(Box(*edges) for edges in values["goal_regions"]),
+        )
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"worlds must hold the fields of a World, got {values!r}") from error
+
+
+def _edges(box: Box) -> list[float]:
+    return [box.x_min, box.y_min, box.x_max, box.y_max]
