@@ -46,6 +46,11 @@ if TYPE_CHECKING:
 
 ENV_IDS = tuple(f"mpfa/Navigation-{name}-v1" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
+VECTOR_ENV_IDS = tuple(
+    f"mpfa/Navigation-{name}-v1"
+    for name in ("Rooms", "Clutter", "Bars", "Fields", "Halls", "Mazes", "Mixed")
+)
+"""The ids of the generators' worlds, which only ``gymnasium.make_vec`` knows."""
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start your own from."""
 
@@ -58,6 +63,7 @@ __all__ = [
     "OBSERVATION",
     "PAPER_TASK",
     "ROBOTS",
+    "VECTOR_ENV_IDS",
     "WORLDS",
     "Box",
     "Cylinder",
@@ -113,6 +119,13 @@ for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
             entry_point="mpfa_envs.navigation:NavigationEnv",
             vector_entry_point="mpfa_envs.vector:VectorNavigationEnv",
             kwargs={"world": _name},
+        )
+for _id in VECTOR_ENV_IDS:
+    if _id not in gymnasium.registry:
+        gymnasium.register(
+            _id,
+            vector_entry_point="mpfa_envs.vector:VectorNavigationEnv",
+            kwargs={"world": _id.split("-")[1].lower()},
         )
 
 

@@ -1,0 +1,149 @@
+"""Many robots in the worlds of a generator."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mpfa_envs.generators
+from mpfa_envs import (
+    GENERATORS,
+    VECTOR_ENV_IDS,
+    Box,
+    DistanceField,
+    FreeGrid,
+    NavigationEnv,
+    Task,
+    VectorNavigationEnv,
+    World,
+)
+from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.generators import generate_world
+
+
+def make(num_envs: int, world: str, **kwargs: object) -> VectorNavigationEnv:
+    return VectorNavigationEnv(num_envs, **{"world": world, "physics": "kinematic"} | kwargs)
+
+
+def names(env: VectorNavigationEnv, resets: int) -> list[list[str]]:
+    return [[world.name for world in env.worlds] for _ in range(resets) if env.reset()]
+
+
+@pytest.mark.parametrize("env_id", VECTOR_ENV_IDS)
+def test_every_generator_has_an_id(env_id: str) -> None:
+    env = gymnasium.make_vec(env_id, num_envs=3, physics="kinematic")
+    observations, _ = env.reset(seed=0)
+    kind = env_id.split("-")[1].lower()
+    assert kind in GENERATORS
+    assert len({world.name for world in env.worlds}) == 3
+    for world in env.worlds:
+        assert world == resolve_world(world.name)
+    for _ in range(20):
+        assert env.observation_space.contains(observations)
+        observations, *_ = env.step(np.full((3, 2), 0.4, dtype=np.float32))
+    env.close()
+
+
+def test_there_is_an_id_for_each_generator() -> None:
+    assert {env_id.split("-")[1].lower() for env_id in VECTOR_ENV_IDS} == set(GENERATORS)
+
+
+def test_each_episode_is_in_a_new_world() -> None:
+    env = make(2, "bars")
+    env.reset(seed=3)
+    seen = [world for row in names(env, 5) for world in row]
+    assert len(set(seen)) == 10
+    assert all(name.startswith("bars-") for name in seen)
+
+
+def test_a_world_can_be_kept_for_some_episodes() -> None:
+    env = make(1, "clutter", episodes_per_world=3)
+    env.reset(seed=3)
+    rows = [env.worlds[0].name] + [row[0] for row in names(env, 6)]
+    assert rows[0] == rows[1] == rows[2] != rows[3] == rows[4] == rows[5] != rows[6]
+    tasks = []
+    env.reset(seed=3)
+    assert env.worlds[0].name == rows[0]  # A seed starts anew.
+    tasks.append(env.tasks[0])
+    env.reset()
+    assert env.tasks[0] not in tasks
+
+
+def test_a_robot_has_the_same_worlds_whatever_their_number() -> None:
+    rows = []
+    for robots in (1, 5):
+        env = make(robots, "mixed")
+        env.reset(seed=7)
+        rows.append([(row[0], env.tasks[0]) for row in names(env, 4)])
+    assert rows[0] == rows[1]
+
+
+def test_validation_worlds_are_others_than_those_of_training() -> None:
+    env = make(4, "mazes", split="validation", difficulty=0.3)
+    env.reset(seed=0)
+    for world in env.worlds:
+        assert world.name.startswith("mazes-validation-") and world.name.endswith("@0.3")
+
+
+@pytest.mark.parametrize("kind", GENERATORS)
+def test_every_task_can_be_solved_at_the_collision_distance(kind: str) -> None:
+    env = make(6, kind, max_goal_distance=6.0)
+    env.reset(seed=1)
+    for world, task in zip(env.worlds, env.tasks, strict=True):
+        field = DistanceField(FreeGrid(world, distance=env.collision_distance), task.goal)
+        assert 1.9 <= field.at(*task.start[:2]) <= 6.1
+        assert world.clearance(*task.start[:2]) > env.collision_distance
+
+
+def test_a_robot_drives_a_generated_world_as_alone() -> None:
+    env = make(3, "halls", progress="shortest_path")
+    env.reset(seed=2)
+    singles = [
+        NavigationEnv(world=world, physics="kinematic", progress="shortest_path")
+        for world in env.worlds
+    ]
+    for single, task in zip(singles, env.tasks, strict=True):
+        single.reset(options=task._asdict())
+    running = np.ones(3, dtype=np.bool_)
+    for step in range(60):
+        actions = np.random.default_rng(step).uniform(-0.2, 1.0, (3, 2))
+        observations, rewards, terminated, *_ = env.step(actions, only=running)
+        for index in np.flatnonzero(running):
+            seen, reward, over, *_ = singles[index].step(actions[index])
+            # The bounds of the observation differ, the observation does not.
+            np.testing.assert_allclose(observations[index], seen, atol=1e-9)
+            assert rewards[index] == pytest.approx(reward, abs=1e-9)
+            assert terminated[index] == over
+        running &= ~terminated
+
+
+def test_a_world_without_a_task_is_drawn_anew_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = World(name="full", size=(4.0, 4.0), boxes=(Box(-1.9, -1.9, 1.9, 1.9),))
+    asked = []
+
+    def sometimes(name: str, seed: int, *, difficulty: float | None = None) -> World:
+        asked.append(seed)
+        if len(asked) % 3:
+            return full
+        return generate_world(name, seed, difficulty=difficulty)
+
+    monkeypatch.setattr(mpfa_envs.generators, "generate_world", sometimes)
+    env = make(2, "bars")
+    assert env.worlds_refused == 0
+    env.reset(seed=0)
+    env.reset()
+    assert env.worlds_refused == 2 * 4
+    assert len(asked) == 3 * 5
+    assert all(world.name != "full" for world in env.worlds)
+
+
+def test_a_task_needs_its_world_where_worlds_come_and_go() -> None:
+    env = make(2, "bars")
+    task = Task((0.0, 0.0, 0.0), (3.0, 0.0))
+    with pytest.raises(ValueError, match="robot 0: a task must come with a world"):
+        env.reset(options={"tasks": [task, None]})
+    env.reset(seed=0, options={"worlds": ["A", None], "tasks": [task, None]})
+    assert env.worlds[0].name == "A" and env.worlds[1].name.startswith("bars-")
+    env.reset()
+    assert env.worlds[0].name.startswith("bars-")
