@@ -25,13 +25,13 @@ def mazes(rng: random.Random, difficulty: float) -> World:
 
     Args:
         rng: Source of randomness.
-        difficulty: Corridors are 1.5 m wide at 0, 1.1 m at 0.5 and 0.7 m at 1. Of the walls that
+        difficulty: Corridors are 1.5 m wide at 0, 1.15 m at 0.5 and 0.8 m at 1. Of the walls that
             are left between cells, a third falls at 0, and one in twenty at 1.
 
     Returns:
         The world; its walls are 0.1 to 0.3 m thick.
     """
-    passage, thick = round(between(1.5, 0.7, difficulty), 3), round(rng.uniform(0.1, 0.3), 3)
+    passage, thick = round(between(1.5, 0.8, difficulty), 3), round(rng.uniform(0.1, 0.3), 3)
     pitch = passage + thick
     columns, rows = (max(3, round(rng.uniform(*_SIDES) / pitch)) for _ in range(2))
     walls = _carve(rng, columns, rows)
