@@ -310,8 +310,8 @@ def shortest_length(world: World, radius: float, start: Point, goal: Point) -> f
     """Measure the shortest path of a disc.
 
     In a world with few corners it is that of the :class:`PathPlanner`. In others it comes from a
-    grid of 0.05 m, or 0.1 m in a room of more than 250 m²: within 2 % of the planner's where it was
-    measured, and infinite for passages that are wider than the disc by less than a cell.
+    grid of 0.05 m, or 0.1 m in a room of more than 250 m²: within 2.5 % of the planner's where that
+    was measured, and infinite for passages that are wider than the disc by less than a cell.
 
     Args:
         world: The room and its obstacles.
