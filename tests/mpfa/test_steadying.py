@@ -136,3 +136,66 @@ def test_a_delayed_smoothed_ddpg_is_the_same_compiled():
 def test_a_delay_that_is_no_count_is_refused():
     with pytest.raises(ValueError, match="policy_delay must be a positive integer, got 0"):
         make_learner("ddpg", make_loss(), policy_delay=0)
+
+
+# Weights of unit length --------------------------------------------------------------------------
+
+UNIT = {"normalize_weights": True}
+
+
+def hidden_weights(loss, critic):
+    """The weights of all hidden layers, by name; of two critics they are stacked."""
+    actor = loss.actor_network_params.flatten_keys(".")
+    critics = getattr(loss, f"{critic}_params").flatten_keys(".")
+    return {
+        **{f"actor {i}": actor[f"module.body.{i}.weight"] for i in (0, 3)},
+        "critic first": critics["module.first.0.weight"],
+        "critic rest": critics["module.rest.0.weight"],
+    }
+
+
+CRITICS = {"ddpg": "value_network", "td3": "qvalue_network"}
+
+
+@pytest.mark.parametrize("name", CRITICS)
+@pytest.mark.parametrize("compile", [False, UNTRACED])
+def test_rows_of_hidden_weights_keep_length_one_and_the_last_layer_is_free(name, compile):
+    loss = make_loss(name, networks=UNIT)
+    learner = make_learner(name, loss, compile=compile)
+    start = copied(loss.actor_network_params)
+    for number in range(5):
+        for key, weight in hidden_weights(loss, CRITICS[name]).items():
+            length = weight.detach().square().sum(-1).sqrt()
+            torch.testing.assert_close(length, torch.ones_like(length), msg=key)
+        learner.update(make_batch(seed=number))
+    end = copied(loss.actor_network_params)
+    assert not end["module.body.0.weight"].equal(start["module.body.0.weight"])
+    lengths = end["module.head.weight"].norm(dim=-1)
+    assert bool(((lengths - 1.0).abs() > 1e-2).all())
+
+
+@pytest.mark.parametrize("name", CRITICS)
+@pytest.mark.parametrize("compile", [False, UNTRACED])
+def test_a_step_is_the_optimizers_and_then_each_row_by_its_length(name, compile):
+    free = make_learner(name, make_loss(name))
+    unit = make_learner(name, make_loss(name, networks=UNIT), compile=compile)
+    unit.update(make_batch(seed=1))
+    free.load_state_dict(unit.state_dict())
+    for learner in (free, unit):
+        torch.manual_seed(2)
+        learner.update(make_batch(seed=2))
+    stepped, found = (hidden_weights(each.loss, CRITICS[name]) for each in (free, unit))
+    for key, weight in stepped.items():
+        rows = weight.detach().reshape(-1, weight.shape[-1])
+        expected = torch.stack([row / row.square().sum().sqrt() for row in rows])
+        got = found[key].detach().reshape(-1, weight.shape[-1])
+        torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_unit_weights_are_the_same_compiled(name):
+    learners = [
+        make_learner(name, make_loss(name, networks=UNIT), compile=compile)
+        for compile in (False, UNTRACED)
+    ]
+    assert_same_steps(learners)

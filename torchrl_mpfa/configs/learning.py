@@ -30,6 +30,7 @@ class PerceptronConfig(NetworkConfig):
     layers: int = 2
     layer_norm: bool = True
     final_init: float | None = 3e-3
+    normalize_weights: bool = False
 
 
 @dataclass

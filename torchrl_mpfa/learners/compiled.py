@@ -103,8 +103,11 @@ class CompiledUpdate:
         parts = self._gradients.parts
         of_actor, of_critics = parts.target_parameters
         actor = dict(parts.actor.module.named_parameters())
-        self._actor = FlatParameters(actor, of_actor if self._own_target_actor else None, optimizer)
-        self._critics = FlatParameters(parts.critic_parameters, of_critics, optimizer)
+        unit = loss.unit_parameters()
+        self._actor = FlatParameters(
+            actor, of_actor if self._own_target_actor else None, optimizer, unit
+        )
+        self._critics = FlatParameters(parts.critic_parameters, of_critics, optimizer, unit)
         loss.forget_networks()
         # Apart from other learners, whose recompilations would count against this one's limit.
         self._call: Callable[..., Any] = torch.compile(
@@ -178,12 +181,14 @@ class CompiledUpdate:
             if gradients:
                 step = Step(*numbers[row].unbind())
                 moved = move(weights, flat.joined(gradients), of.mean, of.square, step)
-                weights = moved.weights
+                weights = flat.projected(moved.weights)
             if with_targets and own_targets:
                 targets = of.targets + self._tau * (weights - of.targets)
                 _write(finite, [of.targets], [targets])
             if gradients:
-                _write(finite, [of.weights, of.mean, of.square], moved)
+                _write(
+                    finite, [of.weights, of.mean, of.square], [weights, moved.mean, moved.square]
+                )
         return found.signals, found.log
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.learners.steps import STEPS, Step
+from torchrl_mpfa.networks.unit import unit_rows
 
 Tensors = dict[str, Tensor]
 
@@ -24,13 +25,18 @@ class FlatParameters:
         parameters: Parameters by name.
         targets: Target parameters by the same names; None: they have none of their own.
         optimizer: The optimizer that keeps the moments; it takes no step itself any more.
+        unit: Parameters, of these or others, whose rows are set to length one after each step.
 
     Raises:
         ValueError: If the parameters are not all of one type.
     """
 
     def __init__(
-        self, parameters: Tensors, targets: Tensors | None, optimizer: torch.optim.Optimizer
+        self,
+        parameters: Tensors,
+        targets: Tensors | None,
+        optimizer: torch.optim.Optimizer,
+        unit: Sequence[Tensor] = (),
     ) -> None:
         learned = {name: value for name, value in parameters.items() if value.requires_grad}
         kinds = sorted({str(value.dtype) for value in learned.values()})
@@ -40,6 +46,7 @@ class FlatParameters:
         self._fixed = {name: value for name, value in parameters.items() if name not in learned}
         self._parameters = list(learned.values())
         self._targets = None if targets is None else [targets[name] for name in learned]
+        self._unit = [name for name, value in learned.items() if any(value is u for u in unit)]
         self._optimizer = optimizer
         self._group: Mapping[str, Any] = next(
             group
@@ -77,6 +84,13 @@ class FlatParameters:
     def joined(self, tensors: Tensors) -> Tensor:
         """Tensors of the names of the parameters, as one vector."""
         return torch.cat([tensors[name].reshape(-1) for name in self._shapes])
+
+    def projected(self, vector: Tensor) -> Tensor:
+        """Parameters with those rows set to length one that are to have it."""
+        if not self._unit:
+            return vector
+        tensors = self.views(vector)
+        return self.joined({**tensors, **{name: unit_rows(tensors[name]) for name in self._unit}})
 
     def next_step(self) -> Step:
         """Numbers of the step that comes next."""

@@ -18,7 +18,7 @@ from torchrl_mpfa.losses.functional import DISTANCES, action_gradient, critic_lo
 from torchrl_mpfa.losses.refusals import check_networks
 from torchrl_mpfa.losses.targets import EstimatedTargets
 from torchrl_mpfa.losses.writing import DEFAULT_SIGNALS, WRITTEN, SignalWriting
-from torchrl_mpfa.networks import DirectModule
+from torchrl_mpfa.networks import DirectModule, UnitLinear
 from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import ACTION_GRADIENT
 
@@ -212,6 +212,16 @@ class SignalLoss(SignalWriting, EstimatedTargets):
     def critic_parameters(self) -> list[nn.Parameter]:
         """What the critics' loss moves."""
         return self._parameters_of(self._critic_name)
+
+    def unit_parameters(self) -> list[nn.Parameter]:
+        """Weights whose rows are to have length one after each step."""
+        found = []
+        for name in ("actor_network", self._critic_name):
+            held = getattr(self, f"{name}_params").flatten_keys(".")
+            for path, module in getattr(self, name).named_modules():
+                if isinstance(module, UnitLinear):
+                    found.append(held[f"{path}.weight"])
+        return found
 
     def _parameters_of(self, name: str) -> list[nn.Parameter]:
         flat = getattr(self, f"{name}_params").flatten_keys().values()

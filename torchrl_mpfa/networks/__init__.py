@@ -9,6 +9,7 @@ from torchrl_mpfa.networks.stochastic import (
     make_stochastic_actor,
     sample_tanh_normal,
 )
+from torchrl_mpfa.networks.unit import UnitLinear
 
 __all__ = [
     "ActionScale",
@@ -17,6 +18,7 @@ __all__ = [
     "DirectModule",
     "StochasticActor",
     "StochasticNetwork",
+    "UnitLinear",
     "action_bounds",
     "make_actor",
     "make_critic",

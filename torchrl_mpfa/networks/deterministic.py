@@ -29,11 +29,17 @@ class Actor(nn.Module):
         layers: int,
         layer_norm: bool,
         final_init: float | None,
+        normalize_weights: bool = False,
         scale: ActionScale | None = None,
     ) -> None:
         super().__init__()
         # One flat sequence: in small networks each nested call is felt.
-        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
+        hidden = hidden_layers(
+            observation_size,
+            *[width] * layers,
+            layer_norm=layer_norm,
+            normalize_weights=normalize_weights,
+        )
         self.body = nn.Sequential(*hidden)
         self.head = last_layer(width, action_size, final_init)
         self.scale = scale
@@ -62,15 +68,17 @@ class Critic(nn.Module):
         layers: int,
         layer_norm: bool,
         final_init: float | None,
+        normalize_weights: bool = False,
         late_action: bool,
     ) -> None:
         super().__init__()
         self.late_action = late_action
         first = observation_size if late_action else observation_size + action_size
         second = width + action_size if late_action else width
-        self.first = nn.Sequential(*hidden_layers(first, width, layer_norm=layer_norm))
+        options = {"layer_norm": layer_norm, "normalize_weights": normalize_weights}
+        self.first = nn.Sequential(*hidden_layers(first, width, **options))
         sizes = [second, *[width] * (layers - 1)]
-        rest = hidden_layers(*sizes, layer_norm=layer_norm)
+        rest = hidden_layers(*sizes, **options)
         self.rest = nn.Sequential(*rest, last_layer(sizes[-1], 1, final_init))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
@@ -92,6 +100,7 @@ def make_actor(
     layers: int = 2,
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
+    normalize_weights: bool = False,
 ) -> DirectModule:
     """Policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
 
@@ -105,6 +114,8 @@ def make_actor(
         layer_norm: Normalize each hidden layer, so that no feature grows without bound.
         final_init: The last layer starts uniformly within this, hence near the middle of the
             tanh; None leaves PyTorch's start.
+        normalize_weights: Whether a learner keeps the rows of the hidden layers' weights at length
+            one, see :mod:`torchrl_mpfa.networks.unit`.
 
     Returns:
         A module for TorchRL's losses and collectors.
@@ -129,6 +140,7 @@ def make_actor(
         layers=layers,
         layer_norm=layer_norm,
         final_init=final_init,
+        normalize_weights=normalize_weights,
         scale=action_scale(action_spec, action_size),
     )
     return DirectModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
@@ -142,6 +154,7 @@ def make_critic(
     layers: int = 2,
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
+    normalize_weights: bool = False,
     late_action: bool = True,
 ) -> DirectModule:
     """Critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
@@ -153,6 +166,7 @@ def make_critic(
         layers: Number of hidden layers; with ``late_action`` at least two.
         layer_norm: As in :func:`make_actor`.
         final_init: As in :func:`make_actor`.
+        normalize_weights: As in :func:`make_actor`.
         late_action: Whether the action joins at the second layer in place of the first.
 
     Returns:
@@ -177,6 +191,7 @@ def make_critic(
         layers=layers,
         layer_norm=layer_norm,
         final_init=final_init,
+        normalize_weights=normalize_weights,
         late_action=late_action,
     )
     return DirectModule(critic, in_keys=["observation", "action"], out_keys=["state_action_value"])

@@ -10,6 +10,8 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_mpfa.networks.unit import UnitLinear
+
 
 class DirectModule(TensorDictModule):
     """A :class:`~tensordict.nn.TensorDictModule` that is a plain function of its inputs as well.
@@ -55,7 +57,9 @@ class DirectModule(TensorDictModule):
         )
 
 
-def hidden_layers(*sizes: int, layer_norm: bool) -> list[nn.Module]:
+def hidden_layers(
+    *sizes: int, layer_norm: bool, normalize_weights: bool = False
+) -> list[nn.Module]:
     """Layers from the first size to the last, each followed by LayerNorm (if asked) and ReLU.
 
     Examples:
@@ -63,9 +67,10 @@ def hidden_layers(*sizes: int, layer_norm: bool) -> list[nn.Module]:
         ['Linear', 'LayerNorm', 'ReLU']
     """
     layers: list[nn.Module] = []
+    linear = UnitLinear if normalize_weights else nn.Linear
     for inputs, outputs in pairwise(sizes):
         norm = [nn.LayerNorm(outputs)] if layer_norm else []
-        layers += [nn.Linear(inputs, outputs), *norm, nn.ReLU()]
+        layers += [linear(inputs, outputs), *norm, nn.ReLU()]
     return layers
 
 
