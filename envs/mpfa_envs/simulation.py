@@ -89,6 +89,8 @@ class Simulation:
             solverResidualThreshold=1e-4,
             # The order of contacts, and so the last bits, must not depend on earlier episodes.
             deterministicOverlappingPairs=1,
+            # Robots that do not touch are solved apart, so that none depends on what others do.
+            minimumSolverIslandSize=1,
             physicsClientId=self._client,
         )
 

@@ -184,33 +184,35 @@ class NavigationTorchEnv(EnvBase):
         observations, rewards, terminated, truncated, _ = self.env.step(
             actions.reshape(self.env.num_envs, 2), only=self._mask(tensordict, "_step")
         )
-        entries = self._pack(observations)
-        entries.set("reward", self._tensor(rewards.astype(np.float32)))
-        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        for name, flags in ends.items():
-            entries.set(name, self._tensor(flags))
-        return entries
+        return self._pack(
+            observations,
+            reward=self._tensor(rewards.astype(np.float32)),
+            terminated=self._tensor(terminated),
+            truncated=self._tensor(truncated),
+            done=self._tensor(terminated | truncated),
+        )
 
-    def _pack(self, observations: NDArray[np.float32]) -> TensorDictBase:
-        """Build what a reset and a step both give."""
+    def _pack(self, observations: NDArray[np.float32], **entries: torch.Tensor) -> TensorDictBase:
+        """Build what a reset gives, and with further entries what a step gives."""
         shape = (*self.batch_size, observations.shape[1])
-        rows: dict[str, Any] = {
-            "observation": torch.from_numpy(observations).to(self.device).view(shape)
-        }
+        rows: dict[str, Any] = {"observation": self._to_device(observations).view(shape), **entries}
         if self._number_rows or self._flag_rows:
             flags, numbers = self.env.info_tables
             # Two tensors are made and cut, as making one costs more than all else.
             numbers = numbers[self._number_rows].astype(np.float32)
-            info = dict(zip(self._number_names, self._tensor(numbers), strict=True))
+            info = dict(zip(self._number_names, self._tensor(numbers).unbind(), strict=True))
             flags = flags[self._flag_rows]
-            info.update(zip(self._flag_names, self._tensor(flags), strict=True))
+            info.update(zip(self._flag_names, self._tensor(flags).unbind(), strict=True))
             rows["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
         return TensorDict(rows, batch_size=self.batch_size, device=self.device)
 
     def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
         """A tensor of shape ``[..., *batch, 1]`` of an array ``[..., N]``."""
-        shape = (*values.shape[:-1], *self.batch_size, 1)
-        return torch.from_numpy(values).to(self.device).view(shape)
+        return self._to_device(values).view(*values.shape[:-1], *self.batch_size, 1)
+
+    def _to_device(self, values: NDArray[Any]) -> torch.Tensor:
+        tensor = torch.from_numpy(values)
+        return tensor if self.device is None else tensor.to(self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Release the physics servers; a second call does nothing.

@@ -199,10 +199,12 @@ class WheelDrives:
         counts = np.array(state["counts"], dtype=np.int64)
         speeds = np.array(state["speeds"], dtype=np.float64)
         last = int(counts.max())
-        # All end at once. A robot has its last contacts with the floor from where it was placed.
-        for index, start in enumerate(starts.tolist()):
-            self.place(index, *start)
-        for step in range(last):
+        # All end at once; who has driven for a shorter time is placed later.
+        for step in range(last + 1):
+            for index in np.flatnonzero(counts == last - step).tolist():
+                self.place(index, *starts[index].tolist())
+            if step == last:
+                return
             running = step >= last - counts
             now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
             self.move(motions, running, now)

@@ -1,12 +1,20 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from mpfa_envs import INFO_TYPES, evaluation_pairs, make_navigation_env
+from mpfa_envs import (
+    INFO_TYPES,
+    NavigationEnv,
+    NavigationTorchEnv,
+    evaluation_pairs,
+    make_navigation_env,
+)
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])
@@ -129,3 +137,53 @@ def test_info_keys_choose_what_is_handed_on() -> None:
 def test_a_bad_argument_is_named(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_navigation_env("A", physics="kinematic", **arguments)
+
+
+def test_the_specs_hold_in_the_worlds_of_a_generator() -> None:
+    env = make_navigation_env(
+        "mixed", num_envs=3, physics="kinematic", progress="shortest_path", max_steps=20, seed=0
+    )
+    check_env_specs(env)
+    rollout = env.rollout(30, break_when_any_done=False)
+    assert rollout["next", "done"].sum() >= 6
+    assert len({world.name for world in env.env.worlds}) == 3
+
+
+def test_one_robot_has_the_episodes_of_the_environment_for_one() -> None:
+    env = make_navigation_env("D", physics="kinematic", seed=5)
+    single = NavigationEnv(world="D", physics="kinematic")
+    for seed in (5, None):
+        seen, _ = single.reset(seed=seed)
+        np.testing.assert_array_equal(env.reset()["observation"].numpy(), seen)
+
+
+def test_a_task_can_come_with_its_world() -> None:
+    env = make_navigation_env("bars", num_envs=2, physics="kinematic", seed=0)
+    pair = evaluation_pairs("test", 1, seed=0)[0]
+    env.set_task(*pair, index=1, world="test")
+    with pytest.raises(ValueError, match="world must be given"):
+        env.set_task(*pair, index=0)
+    env.reset(TensorDict({"_reset": torch.tensor([[True], [True]])}, [2]))
+    assert [world.name == "test" for world in env.env.worlds] == [False, True]
+    assert env.env.tasks[1] == pair
+
+
+def test_a_mask_resets_the_robots_that_it_names() -> None:
+    env = make_navigation_env("A", num_envs=3, physics="kinematic", seed=0)
+    env.reset()
+    before = env.env.poses
+    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    assert (env.env.poses == before).all(axis=1).tolist() == [True, False, True]
+
+
+def test_batches_of_robots_can_be_collected_and_put_in_a_row() -> None:
+    def make() -> NavigationTorchEnv:
+        return NavigationTorchEnv(num_envs=2, world="A", physics="kinematic", max_steps=8)
+
+    collector = Collector(make, None, frames_per_batch=40, total_frames=80)
+    shapes = [tuple(batch.shape) for batch in collector]
+    collector.shutdown()
+    assert shapes == [(2, 20), (2, 20)]
+    serial = SerialEnv(2, make)
+    assert serial.rollout(10, break_when_any_done=False).shape == (2, 2, 10)
+    serial.close()
