@@ -1,10 +1,21 @@
 """Options that steady a single critic: what each of them computes, eager and compiled."""
 
+import math
+
 import pytest
 import torch
 
 from tests.mpfa.losses import BOUNDS, GAMMA, differentiate_at_once, make_batch, make_networks
-from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
+from torchrl_mpfa import (
+    DDPGLearner,
+    Draw,
+    TD3Learner,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_td3_loss,
+)
+from torchrl_mpfa.categorical import bin_edges, gaussian_histogram, hl_gauss_loss, mean_value
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -199,3 +210,123 @@ def test_unit_weights_are_the_same_compiled(name):
         for compile in (False, UNTRACED)
     ]
     assert_same_steps(learners)
+
+
+# A categorical critic ----------------------------------------------------------------------------
+
+RANGE = (-2.0, 3.0)
+BINS = {"bins": 11, "value_range": RANGE}
+
+
+def make_categorical(name, **options):
+    torch.manual_seed(0)
+    sizes = {"width": 16, "final_init": 0.5}
+    actor, critic = make_actor(5, 2, **sizes), make_critic(5, 2, **sizes, **BINS)
+    more = {"bounds": BOUNDS, **options} if name == "td3" else options
+    make = {"ddpg": make_ddpg_loss, "td3": make_td3_loss}[name]
+    return make(actor, critic, gamma=GAMMA, **{"loss_function": "hl_gauss", **more})
+
+
+def by_loops(logits, target, low, high):
+    """Cross-entropy of one histogram with a Gaussian, bin by bin; and the histogram's mean."""
+    count = len(logits)
+    width = (high - low) / count
+    deviation = 0.75 * width
+    target = min(max(target, low), high)
+
+    def below(x):
+        return 0.5 * (1.0 + math.erf((x - target) / (math.sqrt(2.0) * deviation)))
+
+    whole = below(high) - below(low)
+    total = sum(math.exp(each) for each in logits)
+    loss = value = 0.0
+    for k, each in enumerate(logits):
+        share = (below(low + (k + 1) * width) - below(low + k * width)) / whole
+        loss -= share * math.log(math.exp(each) / total)
+        value += math.exp(each) / total * (low + (k + 0.5) * width)
+    return loss, value
+
+
+def test_loss_and_mean_of_histograms_are_those_of_a_loop_over_bins():
+    logits = torch.randn(6, 11, generator=torch.Generator().manual_seed(0), dtype=torch.double)
+    target = torch.tensor([-5.0, -2.0, -0.1, 1.3, 3.0, 99.0], dtype=torch.double)
+    losses, values = hl_gauss_loss(logits, target, RANGE), mean_value(logits, RANGE)
+    rows = zip(logits.tolist(), target.tolist(), losses, values, strict=True)
+    for row, wanted, loss, value in rows:
+        expected = by_loops(row, wanted, *RANGE)
+        assert (loss.item(), value.item()) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("target", [-1.9, 0.0, 2.2])
+def test_the_mean_of_the_histogram_that_is_learned_is_the_target_but_near_the_ends(target):
+    edges = bin_edges(torch.zeros(51), RANGE)
+    shares = gaussian_histogram(torch.tensor(target), edges)
+    assert shares.sum().item() == pytest.approx(1.0, abs=1e-5)
+    assert mean_value(shares.log(), RANGE).item() == pytest.approx(target, abs=0.02)
+
+
+@pytest.mark.parametrize("name", CRITICS)
+def test_the_loss_of_a_categorical_critic_is_the_cross_entropy_with_its_targets(name):
+    loss, batch = make_categorical(name), make_batch(weighted=True)
+    torch.manual_seed(1)
+    values, log = loss._critics_part(batch)
+    critics = loss._held_critics("")
+    logits = [each.module(batch["observation"], batch["action"])[1] for each in critics]
+    expected = 0.0
+    for row in range(len(batch)):
+        for each in logits:
+            found, _ = by_loops(each[row].tolist(), log["target_value"][row].item(), *RANGE)
+            expected += found * batch["priority_weight"][row].item() / len(batch)
+    assert values.item() == pytest.approx(expected, rel=1e-4)
+    _, value = by_loops(logits[0][0].tolist(), 0.0, *RANGE)
+    assert log["pred_value"].reshape(-1)[0].item() == pytest.approx(value, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", CRITICS)
+@pytest.mark.parametrize("defer", [False, True])
+def test_signals_of_a_categorical_critic_are_those_of_its_mean(name, defer):
+    loss, batch = make_categorical(name, reward_scale=0.5), make_batch()
+    value, log = loss._critics_part(batch, defer_gradient=defer)
+    value.backward()
+    loss.write_action_gradient(batch)
+    critic = loss._held_critics("")[0].module
+    action = batch["action"].clone().requires_grad_(True)
+    found = critic(batch["observation"], action)[0].squeeze(-1)
+    (slope,) = torch.autograd.grad(found.sum(), action)
+    torch.testing.assert_close(batch["signals", "action_gradient"], slope.norm(dim=-1) / 0.5)
+    error = (log["target_value"] - log["pred_value"].reshape(-1, len(batch))).abs().amax(0)
+    torch.testing.assert_close(batch["signals", "td_error"], error / 0.5)
+
+
+@pytest.mark.parametrize("name", CRITICS)
+@pytest.mark.parametrize("loss_function", ["hl_gauss", "smooth_l1"])
+def test_a_categorical_critic_is_the_same_compiled(name, loss_function):
+    learners = [
+        make_learner(name, make_categorical(name, loss_function=loss_function), compile=compile)
+        for compile in (False, UNTRACED)
+    ]
+    assert_same_steps(learners)
+
+
+def test_a_traced_categorical_critic_is_the_same():
+    learners = [
+        make_learner("ddpg", make_categorical("ddpg"), compile=compile)
+        for compile in (False, {"backend": "eager"})
+    ]
+    assert_same_steps(learners, updates=3)
+
+
+def test_bins_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="'hl_gauss' needs a critic with bins"):
+        make_loss(loss_function="hl_gauss")
+    with pytest.raises(ValueError, match="bins and value_range must both be given, got bins=5"):
+        make_critic(5, 2, bins=5)
+    with pytest.raises(ValueError, match="bins must be at least 2 and value_range finite"):
+        make_critic(5, 2, bins=1, value_range=RANGE)
+    with pytest.raises(ValueError, match=r"low < high, got 5 and \(3.0, -2.0\)"):
+        make_critic(5, 2, bins=5, value_range=RANGE[::-1])
+    with pytest.raises(ValueError, match="target_average must be 1 with bins, got 2"):
+        make_categorical("ddpg", target_average=2)
+    learner = make_learner("ddpg", make_loss())
+    with pytest.raises(ValueError, match="'hl_gauss' needs a critic with bins"):
+        learner.update(Draw(make_batch(), loss_function="hl_gauss"))

@@ -58,6 +58,8 @@ class CriticConfig(PerceptronConfig):
     """
 
     late_action: bool = True
+    bins: int | None = None
+    value_range: Any = None
     _target_: str = "torchrl_mpfa.make_critic"
 
 

@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import functional_call, grad, grad_and_value
 
+from torchrl_mpfa.categorical import LOGITS
 from torchrl_mpfa.losses.calling import Parts
 from torchrl_mpfa.losses.functional import (
     bootstrap_target,
@@ -80,6 +81,7 @@ class Gradients:
         self.parts: Parts = loss.parts()
         self._scale, self._pal_alpha = loss.reward_scale, loss.pal_alpha
         self._order, self._with_slope = loss.gradient_order, ACTION_GRADIENT.name in loss.signals
+        self._value_range = loss.value_range
         self._penalty, self._limit = loss.saturation_penalty, loss.saturation_limit
         keys = loss.tensor_keys
         self._action, self._value = keys.action, keys.state_action_value
@@ -196,10 +198,17 @@ class Gradients:
         )
 
         def of_critics(parameters: Parameters) -> tuple[Tensor, Tensor]:
-            each = [self._q(_with(module, p), state, action) for p in parts.split(parameters)]
-            value = torch.stack(each)
+            each = [self._outputs(_with(module, p), state, action) for p in parts.split(parameters)]
+            value = torch.stack([out[self._value].squeeze(-1) for out in each])
+            with_bins = LOGITS in each[0]
             loss = critic_loss(
-                value, target, loss_function, unit=self._scale, pal_alpha=self._pal_alpha
+                value,
+                target,
+                loss_function,
+                unit=self._scale,
+                pal_alpha=self._pal_alpha,
+                logits=torch.stack([out[LOGITS] for out in each]) if with_bins else None,
+                value_range=self._value_range,
             )
             return (loss if weight is None else loss * weight).mean(), value
 
@@ -263,9 +272,14 @@ class Gradients:
 
     def _q(self, critic: Callable[..., Any], state: State, action: Tensor) -> Tensor:
         """Q of a critic, shape ``[B]``."""
+        return self._outputs(critic, state, action)[self._value].squeeze(-1)
+
+    def _outputs(
+        self, critic: Callable[..., Any], state: State, action: Tensor
+    ) -> dict[NestedKey, Tensor]:
+        """What a critic gives."""
         given, critics = {**state, self._action: action}, self.parts.critic
-        found = critics.by_key(critic(*[given[key] for key in critics.in_keys]))
-        return found[self._value].squeeze(-1)
+        return critics.by_key(critic(*[given[key] for key in critics.in_keys]))
 
     def _chosen(self, actor: Callable[..., Any], state: State) -> dict[NestedKey, Tensor]:
         """What a policy gives."""

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from torchrl_mpfa.categorical import LOGITS
 from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import Tensors, bind, read_inputs
 
@@ -55,11 +56,13 @@ class TwinCritics(SignalLoss):
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
         return self.value_loss(batch, **options)
 
-    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
+    def _values(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor | None]:
         critics, key = self._networks().critics, self.tensor_keys.action
         actions = [action] + [action.detach()] * (self.num_qvalue_nets - 1)
         found = critics.call([read_inputs(critics.network, tensordict, {key: a}) for a in actions])
-        return torch.stack([out[self.tensor_keys.state_action_value].squeeze(-1) for out in found])
+        key, with_bins = self.tensor_keys.state_action_value, LOGITS in found[0]
+        logits = torch.stack([out[LOGITS] for out in found]) if with_bins else None
+        return torch.stack([out[key].squeeze(-1) for out in found]), logits
 
     def _target_values(self, after: TensorDictBase, chosen: Tensors) -> Tensor:
         """Q of the target critics at the next state, shape ``[C, B]``."""

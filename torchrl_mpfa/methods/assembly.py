@@ -62,7 +62,7 @@ WORDS: dict[str, set[str]] = {
     "decay_position": {"batch", "rank", "count"},
     "population": {"buffer", "batch"},
     "importance": {"critic", "torchrl", "none"},
-    "loss_function": {"l2", "smooth_l1", "pal"},
+    "loss_function": {"l2", "smooth_l1", "pal", "hl_gauss"},
     "optimizer": {"adam", "radam"},
 }
 """What the settings of a method that are words may be."""
