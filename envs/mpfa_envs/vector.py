@@ -22,7 +22,13 @@ from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
 from mpfa_envs.robot import RobotModel
 from mpfa_envs.robot_batch import FLAGS, NUMBERS, RobotBatch
 from mpfa_envs.tasks import Task
-from mpfa_envs.vector_options import read_mask, read_seed, read_tasks, spawn_generators
+from mpfa_envs.vector_options import (
+    read_mask,
+    read_reset_mask,
+    read_seed,
+    read_tasks,
+    spawn_generators,
+)
 from mpfa_envs.vector_state import check_alike, describe, read_generators
 from mpfa_envs.worlds import World
 
@@ -285,7 +291,7 @@ class VectorNavigationEnv(
                 episodes go on then.
         """
         seeded = read_seed(seed, self.num_envs)
-        chosen = read_mask(options, self.num_envs)
+        chosen = read_reset_mask(options, self.num_envs)
         given = read_tasks(options, self.num_envs, self._source.fixed, self._source.check)
         if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
@@ -317,14 +323,15 @@ class VectorNavigationEnv(
             Observations ``[N, 24]``, rewards, terminations and truncations ``[N]``, and infos.
 
         Raises:
-            ValueError: If the actions are not two numbers for each robot; nothing has moved then.
+            ValueError: If the actions are not two numbers for each robot, or only is no mask of
+                them; nothing has moved then.
             ResetNeeded: If there was no reset yet, or a robot's episode has ended and
                 autoreset_mode is ``DISABLED``.
         """
         if not self._begun:
             raise ResetNeeded("no episode is running: call reset() before step()")
         speeds = self._batch.wheel_speeds(actions)
-        chosen = np.ones(self.num_envs, dtype=np.bool_) if only is None else only
+        chosen = read_mask("only", only, self.num_envs)
         waiting = chosen & ~self._batch.running
         if waiting.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise ResetNeeded(

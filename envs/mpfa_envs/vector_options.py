@@ -19,7 +19,28 @@ if TYPE_CHECKING:
 _KEYS: Final = ("reset_mask", "tasks", "worlds")
 
 
-def read_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[np.bool_]:
+def read_mask(name: str, mask: NDArray[np.bool_] | None, robots: int) -> NDArray[np.bool_]:
+    """Read which robots are meant.
+
+    Args:
+        name: What messages call it.
+        mask: ``[N]``; None: all.
+        robots: Number of robots.
+
+    Returns:
+        A mask of its own.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if mask is None:
+        return np.ones(robots, dtype=np.bool_)
+    if not isinstance(mask, np.ndarray) or mask.shape != (robots,) or mask.dtype != np.bool_:
+        raise ValueError(f"{name} must be a NumPy array of {robots} bool, got {mask!r}")
+    return mask.copy()
+
+
+def read_reset_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[np.bool_]:
     """Read which robots start.
 
     Args:
@@ -30,19 +51,15 @@ def read_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[np.bool
         All, or those of ``"reset_mask"``, ``[N]``.
 
     Raises:
-        ValueError: If there is a key that no option has, or the mask is none.
+        ValueError: If there is a key that no option has, or the mask is none or empty.
     """
     for key in options or ():
         if key not in _KEYS:
             raise ValueError(f"options must have keys among {list(_KEYS)}, got {key!r}")
-    mask = (options or {}).get("reset_mask")
-    if mask is None:
-        return np.ones(robots, dtype=np.bool_)
-    if not isinstance(mask, np.ndarray) or mask.shape != (robots,) or mask.dtype != np.bool_:
-        raise ValueError(f"reset_mask must be a NumPy array of {robots} bool, got {mask!r}")
+    mask = read_mask("reset_mask", (options or {}).get("reset_mask"), robots)
     if not mask.any():
         raise ValueError("reset_mask must name at least one robot, got none")
-    return mask.copy()
+    return mask
 
 
 def read_tasks(

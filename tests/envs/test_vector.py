@@ -294,6 +294,16 @@ def test_bad_actions_move_nothing(actions: list, message: str) -> None:
     np.testing.assert_array_equal(env.poses, poses)
 
 
+@pytest.mark.parametrize("only", [[True, False], np.ones(3, dtype=np.bool_), np.ones(2)], ids=str)
+def test_a_mask_of_other_robots_moves_nothing(only: object) -> None:
+    env = make(2)
+    env.reset(seed=0)
+    poses = env.poses
+    with pytest.raises(ValueError, match="only must be a NumPy array of 2 bool"):
+        env.step(np.ones((2, 2)), only=only)
+    np.testing.assert_array_equal(env.poses, poses)
+
+
 @pytest.mark.parametrize(
     ("seed", "message"),
     [
