@@ -64,6 +64,21 @@ def test_what_follows_is_the_same_to_the_bit(case: dict[str, Any]) -> None:
     other.close()
 
 
+def test_wheels_are_restored_at_the_start_of_an_episode_too() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    env, other = (VectorNavigationEnv(2, world="A", physics="wheels") for _ in range(2))
+    env.reset(seed=1)
+    drive(env, 0, 10)
+    env.reset(options={"reset_mask": np.array([False, True])})
+    state = env.state_dict()
+    other.reset(seed=2)
+    drive(other, 0, 7)
+    other.load_state_dict(state)
+    assert drive(other, 10, 30) == drive(env, 10, 30)
+    env.close()
+    other.close()
+
+
 def test_a_state_is_plain_values_and_arrays() -> None:
     env = VectorNavigationEnv(2, world="clutter", physics="kinematic")
     env.load_state_dict(env.state_dict())  # Before the first reset there is little in it.
