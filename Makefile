@@ -8,7 +8,9 @@
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   COMPILE=false                  train: no compiled updates; by default if a C++ compiler is found
-#   EPISODES=100                   episodes that demo trains for and evaluates on
+#   REGIME=paper                   train: the paper's task and numbers; by default today's, rooms
+#   DEMO_ACTIONS=80000             actions that demo trains for
+#   EPISODES=100                   episodes that demo drives in the worlds of each generator
 #   SLOW=1                         test: the slow tests as well
 #   WORKERS=4                      test: processes, 2 by default; 0: one, with its output as it comes
 
@@ -20,6 +22,8 @@ SHELL := /bin/sh
 PYTHON ?=
 TORCH_INSTALL_ARGS ?=
 ARGS ?=
+REGIME ?= rooms
+DEMO_ACTIONS ?= 80000
 EPISODES ?= 100
 COMPILE ?= $(if $(shell command -v "$${CXX:-g++}" 2>/dev/null),true,false)
 SLOW ?=
@@ -40,22 +44,25 @@ HOME_OF := import sys; print(sys.base_prefix)
 WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
 NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simulated wheels; demo and train use physics=kinematic
 # What the scripts get there, evaluated when they are called: before, there may be no .venv.
+WHEELS = `$(BIN)/python -c "import sys; print('--physics ' + ('kinematic' if sys.version_info >= (3, 12) else 'wheels'))"`
 PHYSICS = `$(BIN)/python -c "import sys; print('environment.physics=kinematic' * (sys.version_info >= (3, 12)))"`
 
 help: ## Print this list
 	@echo "usage: make TARGET"
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' Makefile | \
 	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
-	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, EPISODES, SLOW, WORKERS; see the top of the Makefile"
+	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, REGIME, DEMO_ACTIONS, EPISODES, SLOW, WORKERS; see the top of the Makefile"
 
-demo: $(STAMP) ## Train MPFA-PER in world A for 100 episodes and evaluate it (minutes)
-	@echo "== training in world A, $(EPISODES) episodes; Ctrl-C stops after the current one"
-	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: A, episodes: $(EPISODES)}]' $(PHYSICS) $(ARGS)
-	@echo "== evaluating on $(EPISODES) fixed pairs of start and goal"
-	$(BIN)/python examples/evaluate.py runs/demo --worlds A --episodes $(EPISODES)
+demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute and drive through rooms that no training saw
+	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
+	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true learner.compile=$(COMPILE) 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
+	@echo "== driving through test worlds of every generator"
+	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) $(WHEELS)
+	@cp runs/demo/evaluation-all/evaluation.json runs/demo/evaluation-all/trajectories.png runs/demo/evaluation-all/episode.gif runs/demo/
+	@echo "written: runs/demo/evaluation.json, trajectories.png, episode.gif"
 
-train: $(STAMP) ## Train on the paper's curriculum, worlds A to D (tens of minutes); ARGS='method=per seed=1'
-	$(BIN)/python examples/train.py curriculum=paper learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
+train: $(STAMP) ## Train in rooms that are new each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
+	$(BIN)/python examples/train.py regime=$(REGIME) learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)

@@ -2,7 +2,7 @@
 
     python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners, too
-    python examples/compare.py --worlds test rooms:100-109 --episodes 40    eleven worlds
+    python examples/compare.py --worlds test mazes:test --episodes 40    a world, a generator's
     python examples/compare.py --seeds 0 --methods per --folder runs/try -- curriculum=A
 
 What follows ``--`` goes to ``train.py``. Stopped at any moment, the same command goes on: finished
@@ -49,7 +49,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--folder", type=Path, default=Path("runs/compare"))
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     parser.add_argument("--worlds", nargs="+", default=["test"], help="(default: test)")
-    parser.add_argument("--episodes", type=int, default=200, help="in each world (default: 200)")
+    parser.add_argument("--episodes", type=int, default=200, help="for each (default: 200)")
     parser.add_argument("--anew", action="store_true", help="train runs of other settings again")
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
@@ -94,7 +94,8 @@ class Running:
     def ended(self) -> int | None:
         """Exit status of the last command, or of one that failed; None while it runs."""
         status = self.job.status()
-        self._bar.total, self._bar.n = status.get("episodes"), status.get("episode", 0)
+        self._bar.total, self._bar.n = status.get("total"), status.get("done", 0)
+        self._bar.unit = status.get("unit", "it")
         self._bar.set_postfix_str(status.get("summary", "") if self._commands else "evaluation")
         exit_status = self._child.ended()
         if exit_status == 0 and self._commands:

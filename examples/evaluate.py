@@ -1,34 +1,44 @@
-"""Evaluate a trained policy between fixed starts and goals in one or several worlds.
+"""Evaluate a trained policy between fixed starts and goals, in worlds or those of generators.
 
     python examples/evaluate.py runs/demo --worlds A --episodes 100
-    python examples/evaluate.py runs/demo --worlds test rooms:100-109 --episodes 40
+    python examples/evaluate.py runs/demo --worlds test mazes:test bars:test
+    python examples/evaluate.py runs/demo --worlds all        every generator's test worlds
     python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
 
-Prints a row for each world and their total. Writes to the folder ``evaluation-WORLDS`` in that of
-the run, for another file to runs/evaluation-NAME, or to --output: summary.csv (the rows with their
-intervals), episodes.csv (a row an episode), settings.json (what was asked for, and the policy's
-card), and for each world trajectories-WORLD.png (every way) and episode-WORLD.gif (one from above).
+Prints a row for each world or generator and their total. Writes to the folder
+``evaluation-WORLDS`` in that of the run, for another file to runs/evaluation-NAME, or to --output:
+summary.csv (the rows with their intervals), evaluation.json (the same numbers), episodes.csv (a
+row an episode), settings.json (what was asked for, and the policy's card), trajectories.png (the
+ways in up to nine worlds) and episode.gif (the longest one from above).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from PIL import Image
 
-from mpfa_envs import EpisodeResult, Policy, load_policy, render_trajectories
+from mpfa_envs import GENERATORS, EpisodeResult, Policy, World, load_policy, render_trajectories
 from navigation import files
 from navigation.evaluating import Drives, drive, film, summary_row
-from navigation.figures import write_animation
+from navigation.figures import tiled, write_animation
 from navigation.records import as_table, write_table
 from navigation.stopping import end_with_parent
 from navigation.worlds import parse_worlds, world_name, worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
+EVALUATION = "evaluation.json"
+_PICTURED = 9
+"""Worlds in a picture at most."""
+_DOCUMENTED = ("success", "collision", "timeout", "spl", "time_s")
 _COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
 _SECONDS = {"time_s": "{:.1f}", "min_clearance": "{:.3f}"}
 
@@ -43,19 +53,23 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--worlds",
         nargs="+",
         default=["test"],
-        help="names, world files, and spans of generated worlds such as rooms:100-109",
+        help="names, world files, spans such as rooms:100-109, splits such as bars:test, or all",
     )
-    parser.add_argument("--episodes", type=int, default=200, help="in each world (default: 200)")
+    parser.add_argument(
+        "--episodes", type=int, help="for each (default: 200 in a world, 400 of a generator)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
     parser.add_argument("--output", type=Path, help="folder (default: in that of the run)")
     parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
     parser.add_argument("--no-pictures", action="store_true", help="write tables alone")
     options = parser.parse_args(arguments)
     for name, least in (("episodes", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} must be at least {least}, got {getattr(options, name)}")
+        value = getattr(options, name)
+        if value is not None and value < least:
+            parser.error(f"--{name} must be at least {least}, got {value}")
+    every = [f"{name}:test" for name in GENERATORS if name != "mixed"]
     try:
-        options.names = parse_worlds(options.worlds)
+        options.names = every if options.worlds == ["all"] else parse_worlds(options.worlds)
         options.loaded = load_policy(options.policy)
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -82,25 +96,67 @@ def printed(summary: pd.DataFrame) -> str:
     return table.to_string(index=False)
 
 
-def write_pictures(
-    policy: Policy, world: str, drives: Drives, options: argparse.Namespace, folder: Path
-) -> None:
-    """Every way in one picture, and one episode as an animation."""
-    results, name = drives.results, world_name(world)
-    ends = ["success" if r.success else "collision" if r.collision else "timeout" for r in results]
-    picture = render_trajectories(
-        world,
-        drives.trails,
-        drives.goals,
-        ends,  # type: ignore[arg-type]
-        title=f"world {name}",
-        size=640,
-    )
-    Image.fromarray(picture).save(folder / f"trajectories-{name}.png")
+def write_pictures(policy: Policy, driven: Sequence[Drives], folder: Path, **how: Any) -> None:
+    """Nine worlds with the ways in them, and one episode as an animation.
+
+    Args:
+        policy: The policy.
+        driven: What it did, one for each row of the table.
+        folder: Where the pictures go.
+        **how: Passed to :func:`navigation.evaluating.film`.
+    """
+    # One world of each row, then a second one of each, and so on.
+    in_turn = zip_longest(*map(worlds_in, driven))
+    worlds = [each for nth in in_turn for each in nth if each is not None]
+    size = 640 if len(worlds) == 1 else 360
+    pictures = [picture_of(world, drives, size=size) for world, drives in worlds[:_PICTURED]]
+    Image.fromarray(tiled(pictures)).save(folder / "trajectories.png")
     # The success with the longest way shows most; any episode if there is none.
-    shown = max([r for r in results if r.success] or results, key=lambda r: r.path_length)
-    frames = film(policy, world, episode=shown.episode, seed=options.seed, physics=options.physics)
-    write_animation(frames, folder / f"episode-{name}.gif")
+    episodes = [pair for each in driven for pair in zip(each.results, each.tasks, strict=True)]
+    reached = [pair for pair in episodes if pair[0].success]
+    _, shown = max(reached or episodes, key=lambda pair: pair[0].path_length)
+    write_animation(film(policy, shown, **how), folder / "episode.gif")
+
+
+def worlds_in(drives: Drives) -> list[tuple[World, Drives]]:
+    """Each world of some drives, with the drives."""
+    return [(world, drives) for world in {e.world.name: e.world for e in drives.tasks}.values()]
+
+
+def picture_of(world: World, drives: Drives, *, size: int) -> NDArray[np.uint8]:
+    """The ways in one world, shape ``[size, size, 3]``."""
+    numbers = drives.of_world(world.name)
+    return render_trajectories(
+        world,
+        [drives.trails[n] for n in numbers],
+        [drives.tasks[n].task.goal for n in numbers],
+        [end_of(drives.results[n]) for n in numbers],
+        title=f"world {world.name}",
+        size=size,
+    )
+
+
+def end_of(result: EpisodeResult) -> Literal["success", "collision", "timeout"]:
+    """How an episode ended, in a word."""
+    if result.success:
+        return "success"
+    return "collision" if result.collision else "timeout"
+
+
+def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The rows as one document: the total, and each generator and each world under its name."""
+
+    def entries(row: Mapping[str, Any]) -> dict[str, Any]:
+        kept = {name: float(row[name]) for name in _DOCUMENTED}
+        return {"episodes": int(row["episodes"]), **kept}
+
+    document: dict[str, Any] = {**entries(rows[-1]), "generators": {}, "worlds": {}}
+    for row in rows:
+        generator = str(row["world"]).removesuffix("-test").removesuffix("-validation")
+        if row["world"] != "total":
+            kind = "generators" if generator in GENERATORS else "worlds"
+            document[kind][generator if kind == "generators" else row["world"]] = entries(row)
+    return document
 
 
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
@@ -118,22 +174,25 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     folder = options.output or output_folder(options.policy, options.worlds)
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": options.physics}
     results: list[EpisodeResult] = []
+    driven: list[Drives] = []
     rows = []
     with files.lock(folder):
         for world in options.names:
             drives = drive(policy, world, progress=not options.no_pictures, **asked)
             results += drives.results
+            driven.append(drives)
             rows.append({"world": world_name(world), **summary_row(drives.results)})
-            if not options.no_pictures:
-                write_pictures(policy, world, drives, options, folder)
+        if not options.no_pictures:
+            write_pictures(policy, driven, folder, physics=options.physics)
         if len(rows) > 1:
             rows.append({"world": "total", **summary_row(results)})
         summary = pd.DataFrame(rows)
         write_table(summary, folder / "summary.csv")
         write_table(as_table(results, EpisodeResult), folder / files.EPISODES)
+        write_text_atomically(json.dumps(as_document(rows), indent=2) + "\n", folder / EVALUATION)
         document = {"words": options.worlds, **asked, "card": policy.card}
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
-    print(f"\n{options.policy}, {options.episodes} pairs in each world\n{printed(summary)}")
+    print(f"\n{options.policy}\n{printed(summary)}")
     print(f"written: {folder}")
     return summary
 

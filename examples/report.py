@@ -31,6 +31,8 @@ from navigation.tables import (
 )
 from torchrl_mpfa.saving import write_text_atomically
 
+_OF_A_GENERATOR = r"^([a-z]+)(?:-validation|-test)?-\d+(?:@.*)?$"
+
 
 def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
     """The evaluation episodes of studies.
@@ -40,7 +42,7 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
 
     Returns:
         The rows of ``compare.py``; with ``arm`` (learner and method), ``run`` (its name, unique in
-        its arm), ``path`` (its folder) and ``family`` (``rooms`` for all ``rooms-SEED``).
+        its arm), ``path`` (its folder) and ``family``: the generator of its world, or the world.
     """
     tables = []
     for folder in folders:
@@ -52,7 +54,8 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
         found["run"] = seed if len(folders) == 1 else folder.name + "/" + seed
         name = found["learner"] + "-" + found["method"] + "-" + seed
         found["path"] = [str(folder / each) for each in name]
-        found["family"] = found["world"].str.replace(r"^([a-z-]+)-\d+$", r"\1", regex=True)
+        generator = found["world"].str.extract(_OF_A_GENERATOR, expand=False)
+        found["family"] = generator.fillna(found["world"])
         tables.append(found)
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 

@@ -85,15 +85,19 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["demo"],
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
-                "[{world: A, episodes: 100}]",
-                "python examples/evaluate.py runs/demo --worlds A --episodes 100",
+                "[{world: mixed, actions: 80000}]",
+                "python examples/evaluate.py runs/demo --worlds all --episodes 100",
+                "cp runs/demo/evaluation-all/evaluation.json",
             ],
         ),
-        (["demo", "EPISODES=2"], ["[{world: A, episodes: 2}]", "--worlds A --episodes 2"]),
+        (
+            ["demo", "EPISODES=2", "DEMO_ACTIONS=900"],
+            ["[{world: mixed, actions: 900}]", "--worlds all --episodes 2"],
+        ),
         (
             ["train", "COMPILE=false", "ARGS=method=per seed=1"],
             [
-                "python examples/train.py curriculum=paper learner.compile=false",
+                "python examples/train.py regime=rooms learner.compile=false",
                 "method=per seed=1",
             ],
         ),

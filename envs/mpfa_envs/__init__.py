@@ -10,20 +10,13 @@ import gymnasium
 
 from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
 from mpfa_envs.builtin_worlds import WORLDS
-from mpfa_envs.evaluation import (
-    EpisodeResult,
-    Interval,
-    evaluate,
-    run_episodes,
-    spl,
-    summarize,
-)
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.navigation import PAPER_TASK, NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
 from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
 from mpfa_envs.render import render_trajectories
+from mpfa_envs.results import EpisodeResult, Interval, spl, summarize
 from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
 from mpfa_envs.shapes import Box, Cylinder, Polygon
@@ -33,6 +26,7 @@ from mpfa_envs.worlds import World, WorldArrays
 
 if TYPE_CHECKING:
     from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
+    from mpfa_envs.evaluation import evaluate, run_tasks
     from mpfa_envs.generators import (
         GENERATORS,
         generate_world,
@@ -41,6 +35,7 @@ if TYPE_CHECKING:
         world_seed,
     )
     from mpfa_envs.mirror import Mirror, RandomMirror
+    from mpfa_envs.task_sets import WorldTask, world_tasks
     from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
     from mpfa_envs.vector import VectorNavigationEnv
 
@@ -88,6 +83,7 @@ __all__ = [
     "World",
     "WorldArrays",
     "WorldFileError",
+    "WorldTask",
     "barn_task",
     "barn_world",
     "evaluate",
@@ -100,7 +96,7 @@ __all__ = [
     "navigation_reward",
     "observation_slices",
     "render_trajectories",
-    "run_episodes",
+    "run_tasks",
     "sample_task",
     "sample_task_on_grid",
     "save_policy",
@@ -109,6 +105,7 @@ __all__ = [
     "split_worlds",
     "summarize",
     "world_seed",
+    "world_tasks",
 ]
 
 for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
@@ -137,12 +134,16 @@ _LATER = {
     "NavigationTorchEnv": "torchrl_env",
     "RandomMirror": "mirror",
     "VectorNavigationEnv": "vector",
+    "WorldTask": "task_sets",
+    "evaluate": "evaluation",
     "generate_world": "generators",
     "generator_tasks": "generators",
     "make_navigation_env": "torchrl_env",
+    "run_tasks": "evaluation",
     "sample_task_on_grid": "distance",
     "split_worlds": "generators",
     "world_seed": "generators",
+    "world_tasks": "task_sets",
 }
 """Names whose modules need torch, or Numba, which takes half a second to import."""
 

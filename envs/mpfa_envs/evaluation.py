@@ -1,23 +1,22 @@
-"""Greedy episodes of a policy between fixed starts and goals, and their statistics."""
+"""Greedy episodes of a policy between fixed starts and goals, many at once."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from mpfa_envs.arguments import Physics
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.policy import Policy
-from mpfa_envs.tasks import Task, evaluation_pairs
+from mpfa_envs.results import EpisodeResult, spl
+from mpfa_envs.task_sets import WorldTask, world_tasks
+from mpfa_envs.vector import VectorNavigationEnv
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
@@ -26,67 +25,15 @@ if TYPE_CHECKING:
     Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]
     """All that a policy must be: a function from observation to action."""
 
-ENVS_AT_ONCE = 8
+ENVS_AT_ONCE = 64
 """How many episodes of a :class:`~mpfa_envs.Policy` run together by default."""
-_LEVEL = 0.95
-_RESAMPLES = 2000
-
-
-@dataclass(frozen=True)
-class EpisodeResult:
-    """One evaluation episode."""
-
-    episode: int
-    """Number of the task."""
-    success: bool
-    collision: bool
-    timeout: bool
-    time_s: float
-    """Simulated time [s]."""
-    path_length: float
-    """Distance driven [m]."""
-    shortest_path: float
-    """Shortest path of the task [m]."""
-    min_clearance: float
-    """Least distance between the robot's rim and an obstacle or wall [m]."""
-    spl: float
-    """Success weighted by path length, see :func:`spl`."""
-    world: str = ""
-    """Where it was."""
-
-
-@dataclass(frozen=True)
-class Interval:
-    """An estimate with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-
-def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
-    """Success weighted by path length, of one episode (https://arxiv.org/abs/1807.06757).
-
-    Args:
-        success: Whether the goal was reached.
-        path_length: Distance driven [m].
-        shortest_path: Shortest path of the task [m].
-
-    Returns:
-        0 for a failure, 1 for a success on the shortest path.
-
-    Examples:
-        >>> spl(True, path_length=4.0, shortest_path=3.0)
-        0.75
-    """
-    return success * shortest_path / max(path_length, shortest_path)
 
 
 def evaluate(
     policy: Action,
     world: str | os.PathLike[str] | World | Sequence[str | os.PathLike[str] | World] = "test",
     *,
-    episodes: int = 200,
+    episodes: int | None = None,
     seed: int = 0,
     physics: Physics | None = None,
     envs_at_once: int | None = None,
@@ -97,15 +44,15 @@ def evaluate(
 
     Args:
         policy: A :class:`~mpfa_envs.Policy` or any function from observation to action, see
-            :func:`run_episodes`.
-        world: A world as in :class:`~mpfa_envs.NavigationEnv`, or several.
-        episodes: Number of tasks in each world, those of :func:`~mpfa_envs.evaluation_pairs`.
-        seed: Seed of the tasks.
+            :func:`run_tasks`.
+        world: What :func:`~mpfa_envs.world_tasks` takes: a world, or ``"bars:test"``, the test
+            worlds of a generator; or several of these.
+        episodes: Number of tasks in each; None: 200 in a world, 400 in the worlds of a generator.
+        seed: Seed of the tasks in a world.
         physics: ``"wheels"`` or ``"kinematic"``; None: that of the policy.
-        envs_at_once: How many episodes run together, which changes no result of a
-            :class:`~mpfa_envs.Policy`; None: eight for one, else one at a time.
+        envs_at_once: As in :func:`run_tasks`.
         progress: Whether to show a bar.
-        **env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv` in place of
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv` in place of
             ``policy.env_arguments``.
 
     Returns:
@@ -123,208 +70,169 @@ def evaluate(
         >>> sorted(summarize(results))[:3]
         ['collision', 'min_clearance', 'path_length']
     """
-    if envs_at_once is None:
-        envs_at_once = ENVS_AT_ONCE if isinstance(policy, Policy) else 1
-    check_count("episodes", episodes)
-    check_count("envs_at_once", envs_at_once)
     arguments = {**getattr(policy, "env_arguments", {}), **env_arguments}
     if physics is not None:
         arguments["physics"] = physics
     robot = arguments.get("robot", "turtlebot2")
     several = [world] if isinstance(world, (str, os.PathLike, World)) else world
-    worlds = [resolve_world(each) for each in several]
-    tasks = [evaluation_pairs(each, episodes, seed, robot=robot) for each in worlds]
-    results: list[EpisodeResult] = []
-    with _progress_bar(len(worlds) * episodes if progress else None) as advance:
-        for each, chosen in zip(worlds, tasks, strict=True):
-            with _make_envs(min(envs_at_once, episodes), each, arguments) as envs:
-                results += run_episodes(envs, policy, chosen, on_end=lambda *_: advance())
-    return results
+    tasks = [
+        task
+        for each in several
+        for task in world_tasks(each, episodes=episodes, seed=seed, robot=robot)
+    ]
+    return run_tasks(policy, tasks, envs_at_once=envs_at_once, progress=progress, **arguments)
 
 
-def run_episodes(
-    envs: NavigationEnv | Sequence[NavigationEnv],
+def run_tasks(
     policy: Action,
-    tasks: Sequence[Task],
+    tasks: Sequence[WorldTask],
     *,
-    on_step: Callable[[NavigationEnv], object] | None = None,
-    on_end: Callable[[NavigationEnv, EpisodeResult], object] | None = None,
+    envs_at_once: int | None = None,
+    progress: bool = False,
+    on_end: Callable[[VectorNavigationEnv, int, int], object] | None = None,
+    **env_arguments: Any,
 ) -> list[EpisodeResult]:
     """Drive every task once.
 
     Args:
-        envs: One environment, for one episode after the other, or several with equal arguments, for
-            as many at once.
-        policy: From one observation, ``[O]``, to one action, ``[A]``. With a list of environments
-            from ``[N, O]`` to ``[N, A]`` for the N episodes that are under way.
-        tasks: Starts and goals.
-        on_step: Called after every reset and step, to render a picture, say.
-        on_end: Called at the end of every episode; ``env.trail`` is its trajectory.
+        policy: From observations, ``[N, O]``, to actions, ``[N, A]``, for the N episodes that are
+            under way; with ``envs_at_once=1`` from one observation, ``[O]``, to one action.
+        tasks: Tasks with their worlds.
+        envs_at_once: How many episodes run together, which changes no result of a
+            :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
+            wheels; None: 64 for one, else one at a time.
+        progress: Whether to show a bar.
+        on_end: Called at the end of every episode with the environment, the number of the robot,
+            whose ``env.trail(robot)`` is the way that it took, and that of the task.
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Returns:
         One result a task, in the order of the tasks.
 
     Raises:
-        ValueError: If there is no environment, or the policy gives no action for each observation.
+        ValueError: If an argument is out of its range, or the policy gives no action for each
+            observation.
     """
-    several = not isinstance(envs, NavigationEnv)
-    waiting = deque(enumerate(tasks))
+    if envs_at_once is None:
+        envs_at_once = ENVS_AT_ONCE if isinstance(policy, Policy) else 1
+    check_count("envs_at_once", envs_at_once)
     results: dict[int, EpisodeResult] = {}
-    idle: list[NavigationEnv] = list(envs) if several else [envs]  # type: ignore[arg-type, list-item]
-    if not idle:
-        raise ValueError("envs must hold at least one environment")
-    running: list[tuple[NavigationEnv, int, NDArray[np.float32]]] = []
-    while waiting or running:
-        while idle and waiting:
-            env = idle.pop()
-            number, task = waiting.popleft()
-            # The seed is that of a noisy lidar: each episode has its own, whichever env it is in.
-            observation, _ = env.reset(seed=number, options=task._asdict())
-            running.append((env, number, observation))
-            if on_step:
-                on_step(env)
-        observations = [observation for *_, observation in running]
-        actions = _choose(policy, observations) if several else [policy(observations[0])]
-        episodes, running = running, []
-        for (env, number, _), action in zip(episodes, actions, strict=True):
-            observation, _, terminated, truncated, info = env.step(action)
-            if on_step:
-                on_step(env)
-            if not (terminated or truncated):
-                running.append((env, number, observation))
-                continue
-            results[number] = _result(number, env, info)
-            idle.append(env)
-            if on_end:
-                on_end(env, results[number])
+    arguments = {"collision_distance": "contact", **env_arguments}
+    arguments["autoreset_mode"] = AutoresetMode.DISABLED
+    with _progress_bar(len(tasks) if progress else None) as advance:
+        for max_steps, numbers in _by_time_limit(tasks).items():
+            if max_steps is not None:
+                arguments["max_steps"] = max_steps
+            robots = min(envs_at_once, len(numbers))
+            arguments["world"] = _room_for([tasks[number].world for number in numbers])
+            with closing(VectorNavigationEnv(robots, **arguments)) as env:
+                for robot, number, info in _drive(
+                    env, policy, tasks, deque(numbers), alone=envs_at_once == 1
+                ):
+                    results[number] = _result(tasks, number, info, robot)
+                    advance()
+                    if on_end:
+                        on_end(env, robot, number)
     return [results[number] for number in range(len(tasks))]
 
 
-def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, Interval]:
-    """Rates and means with 95 % intervals; time and path count successes only.
-
-    Rates have Wilson's interval, which stays right near 0 and 1, means that of the percentile
-    bootstrap; NaN where there are no two values to tell a spread from.
-
-    Args:
-        results: The episodes.
-        seed: Seed of the bootstrap.
-
-    Returns:
-        Estimates by name; success, collision and timeout sum to one.
-
-    Raises:
-        ValueError: If there are no results.
-    """
-    if not results:
-        raise ValueError("results must hold at least one episode")
-    rng = np.random.default_rng(seed)
-    reached = [result for result in results if result.success]
-    return {
-        "success": wilson([result.success for result in results]),
-        "collision": wilson([result.collision for result in results]),
-        "timeout": wilson([result.timeout for result in results]),
-        "spl": bootstrap([result.spl for result in results], rng),
-        "time_s": bootstrap([result.time_s for result in reached], rng),
-        "path_length": bootstrap([result.path_length for result in reached], rng),
-        "min_clearance": bootstrap([result.min_clearance for result in results], rng),
-    }
+def _by_time_limit(tasks: Sequence[WorldTask]) -> dict[int | None, list[int]]:
+    """Numbers of the tasks that have the same time limit."""
+    found: dict[int | None, list[int]] = {}
+    for number, each in enumerate(tasks):
+        found.setdefault(each.max_steps, []).append(number)
+    return found
 
 
-def wilson(outcomes: Sequence[bool]) -> Interval:
-    """A rate with Wilson's 95 % interval.
-
-    Args:
-        outcomes: Of each trial; at least one.
-
-    Returns:
-        The rate and its interval.
-
-    Examples:
-        >>> interval = wilson([True] * 181 + [False] * 19)
-        >>> round(interval.low, 3), round(interval.high, 3)
-        (0.856, 0.938)
-    """
-    from scipy.stats import binomtest
-
-    test = binomtest(sum(outcomes), len(outcomes))
-    found = test.proportion_ci(_LEVEL, method="wilson")
-    return Interval(float(test.statistic), float(found.low), float(found.high))
+def _room_for(worlds: Sequence[World]) -> World:
+    """An empty room as long and as wide as the largest: what bounds the observations."""
+    sides = zip(*(world.size for world in worlds), strict=True)
+    width, depth = (max(each) for each in sides)
+    return World(name="empty", size=(max(width, 10.0), max(depth, 10.0)))
 
 
-def bootstrap(values: Sequence[float], rng: np.random.Generator) -> Interval:
-    """A mean with its 95 % percentile bootstrap interval.
-
-    Args:
-        values: The sample; without values all is NaN, with one its interval is.
-        rng: Source of the resamples.
-
-    Returns:
-        The mean and its interval.
-
-    Examples:
-        >>> interval = bootstrap([3.0, 4.0, 5.0, 6.0], np.random.default_rng(0))
-        >>> interval.value, 3.0 <= interval.low < 4.5 < interval.high <= 6.0
-        (4.5, True)
-    """
-    from scipy import stats
-
-    if len(values) < 2:
-        return Interval(float(values[0]) if values else math.nan, math.nan, math.nan)
-    found = stats.bootstrap(
-        (np.asarray(values, dtype=np.float64),),
-        np.mean,
-        n_resamples=_RESAMPLES,
-        batch=100,
-        confidence_level=_LEVEL,
-        method="percentile",
-        rng=rng,
-    ).confidence_interval
-    return Interval(float(np.mean(values)), float(found.low), float(found.high))
+def _drive(
+    env: VectorNavigationEnv,
+    policy: Action,
+    tasks: Sequence[WorldTask],
+    waiting: deque[int],
+    *,
+    alone: bool,
+) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Drive the tasks that wait; robot, number of the task and infos at the end of each."""
+    at_work = np.full(env.num_envs, -1)
+    observations = np.empty(env.observation_space.shape or (), np.float32)
+    while waiting or (at_work >= 0).any():
+        begun = np.zeros(env.num_envs, dtype=np.bool_)
+        for robot in np.flatnonzero(at_work < 0)[: len(waiting)]:
+            at_work[robot], begun[robot] = waiting.popleft(), True
+        if begun.any():
+            observations = _begin(env, tasks, at_work, begun)
+        running = at_work >= 0
+        actions = np.zeros((env.num_envs, 2), np.float32)
+        actions[running] = _choose(policy, observations[running], alone=alone)
+        observations, _, terminated, truncated, info = env.step(actions, only=running)
+        for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
+            number, at_work[robot] = int(at_work[robot]), -1
+            yield robot, number, info
 
 
-def _choose(policy: Action, observations: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+def _begin(
+    env: VectorNavigationEnv,
+    tasks: Sequence[WorldTask],
+    at_work: NDArray[np.int64],
+    begun: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Put robots at the start of their tasks; observations of all robots, ``[N, O]``."""
+    chosen = [
+        int(number) if begins else None for number, begins in zip(at_work, begun, strict=True)
+    ]
+    observations, _ = env.reset(
+        # The seed is that of a noisy lidar: each episode has its own, whichever robot drives it.
+        seed=chosen,
+        options={
+            "reset_mask": begun,
+            "worlds": [None if number is None else tasks[number].world for number in chosen],
+            "tasks": [None if number is None else tasks[number].task for number in chosen],
+        },
+    )
+    return observations
+
+
+def _choose(
+    policy: Action, observations: NDArray[np.float32], *, alone: bool
+) -> NDArray[np.float32]:
     """One action for each observation."""
-    actions = np.asarray(policy(np.stack(observations)))
+    if alone:
+        return np.asarray(policy(observations[0]), dtype=np.float32)[None]
+    actions = np.asarray(policy(observations), dtype=np.float32)
     if actions.shape != (len(observations), 2):
         raise ValueError(
             f"policy must give actions of shape {(len(observations), 2)} for observations of shape "
-            f"{(len(observations), *observations[0].shape)}, got {actions.shape}; one that takes "
-            "a single observation runs with envs_at_once=1"
+            f"{observations.shape}, got {actions.shape}; one that takes a single observation runs "
+            "with envs_at_once=1"
         )
     return actions
 
 
-def _result(number: int, env: NavigationEnv, info: dict[str, Any]) -> EpisodeResult:
-    driven, shortest = info["path_length"], info["shortest_path"]
+def _result(
+    tasks: Sequence[WorldTask], number: int, info: dict[str, NDArray[Any]], robot: int
+) -> EpisodeResult:
+    world = tasks[number].world
+    driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
+    success = bool(info["success"][robot])
     return EpisodeResult(
-        episode=number,
-        success=info["success"],
-        collision=info["collision"],
-        timeout=info["timeout"],
-        time_s=info["sim_time"],
+        episode=sum(each.world is world for each in tasks[:number]),
+        success=success,
+        collision=bool(info["collision"][robot]),
+        timeout=bool(info["timeout"][robot]),
+        time_s=float(info["sim_time"][robot]),
         path_length=driven,
         shortest_path=shortest,
-        min_clearance=info["min_clearance"],
-        spl=spl(info["success"], path_length=driven, shortest_path=shortest),
-        world=env.world.name,
+        min_clearance=float(info["min_clearance"][robot]),
+        spl=spl(success, path_length=driven, shortest_path=shortest),
+        world=world.name,
     )
-
-
-@contextmanager
-def _make_envs(
-    count: int, world: World, arguments: dict[str, Any]
-) -> Iterator[NavigationEnv | list[NavigationEnv]]:
-    """One environment, or a list of several, which are closed in the end."""
-    arguments = {"collision_distance": "contact", **arguments, "world": world}
-    envs: list[NavigationEnv] = []
-    try:
-        while len(envs) < count:
-            envs.append(NavigationEnv(**arguments))
-        yield envs if count > 1 else envs[0]
-    finally:
-        for env in envs:
-            env.close()
 
 
 @contextmanager

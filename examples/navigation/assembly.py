@@ -82,8 +82,9 @@ def _ddpg(
     of_loss: Options,
     of_learner: Options,
 ) -> Learner:
-    loss = make_ddpg_loss(actor, critic, **of_loss)
-    return DDPGLearner(loss, compile=settings.compile, **of_learner)
+    loss = make_ddpg_loss(actor, critic, **_smoothing(settings), **of_loss)
+    delay = settings.policy_delay
+    return DDPGLearner(loss, policy_delay=delay, compile=settings.compile, **of_learner)
 
 
 def _td3(
@@ -93,17 +94,18 @@ def _td3(
     of_loss: Options,
     of_learner: Options,
 ) -> Learner:
-    loss = make_td3_loss(
-        actor,
-        critic,
-        # Wheel speeds are scaled to it by the environment.
-        bounds=(-1.0, 1.0),
-        policy_noise=settings.policy_noise,
-        noise_clip=settings.noise_clip,
-        **of_loss,
-    )
+    loss = make_td3_loss(actor, critic, **_smoothing(settings), **of_loss)
     delay = settings.policy_delay
     return TD3Learner(loss, policy_delay=delay, compile=settings.compile, **of_learner)
+
+
+def _smoothing(settings: LearnerSettings) -> Options:
+    return {
+        # Wheel speeds are scaled to it by the environment.
+        "bounds": (-1.0, 1.0),
+        "policy_noise": settings.policy_noise,
+        "noise_clip": settings.noise_clip,
+    }
 
 
 def _sac(

@@ -1,16 +1,20 @@
-"""The checkpoint of a run: everything that its next episode depends on."""
+"""The checkpoint of a run: everything that its next iteration depends on."""
 
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import torch
 
 from navigation.files import CHECKPOINT
 from torchrl_mpfa import load_safely
 
-FORMAT = 4
-"""4: settings of one process; a wandb run's id; ``timeout`` and ``evaluations``."""
+FORMAT = 5
+"""5: many robots, in the middle of their episodes."""
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any]:
@@ -37,3 +41,30 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
     if found != FORMAT:
         raise ValueError(f"{file} has format {found}, this version reads {FORMAT}")
     return dict(state)
+
+
+def as_tensors(value: Any) -> Any:
+    """A state with tensors in place of NumPy's arrays, which a safe loader takes for code.
+
+    Args:
+        value: Plain values, arrays, and lists, tuples and dictionaries of these.
+
+    Returns:
+        The same with tensors.
+    """
+    return _replaced(value, np.ndarray, torch.from_numpy)
+
+
+def as_arrays(value: Any) -> Any:
+    """What :func:`as_tensors` was given."""
+    return _replaced(value, torch.Tensor, torch.Tensor.numpy)
+
+
+def _replaced(value: Any, kind: type[Any], convert: Callable[[Any], Any]) -> Any:
+    if isinstance(value, kind):
+        return convert(value)
+    if isinstance(value, dict):
+        return {name: _replaced(each, kind, convert) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replaced(each, kind, convert) for each in value]
+    return value

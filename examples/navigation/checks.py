@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import torch
 
-from mpfa_envs import NavigationEnv
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.robot import resolve_robot
-from navigation.environments import collision_distance
-from navigation.settings import EnvironmentSettings, TrainSettings
+from navigation.environments import make_training_env
+from navigation.settings import TrainSettings
+from navigation.worlds import parse_worlds
 from torchrl_mpfa.methods.assembly import WORDS
 
 Rule = tuple[Callable[[Any], bool], str]
@@ -51,6 +50,8 @@ RULES: dict[str, Rule] = {
     "seed": at_least(0),
     "threads": at_least(1),
     "checkpoint_every": at_least(1),
+    "robots": at_least(1),
+    "updates": at_least(1),
     "method.name": NAME,
     **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
     "method.positive_above": LEVEL,
@@ -70,7 +71,6 @@ RULES: dict[str, Rule] = {
     "method.curiosity_scale": POSITIVE,
     "learner.name": NAME,
     "learner.algorithm": choice("ddpg", "td3", "sac"),
-    "learner.update_every": at_least(1),
     "learner.actor_lr": POSITIVE,
     "learner.critic_lr": POSITIVE,
     "learner.lr_end_factor": SHARE,
@@ -100,6 +100,9 @@ RULES: dict[str, Rule] = {
     "environment.progress_scale": NOT_NEGATIVE,
     "environment.clearance": NOT_NEGATIVE,
     "environment.detour_chance": SHARE,
+    "environment.progress": choice("straight_line", "shortest_path", "none"),
+    "environment.max_goal_distance": POSITIVE,
+    "environment.episodes_per_world": at_least(1),
     "evaluation.every": at_least(0),
     "evaluation.episodes": at_least(1),
     "tracking.mode": choice("offline", "online", "off"),
@@ -145,22 +148,34 @@ def check_settings(settings: TrainSettings) -> None:
             if not allowed(value):
                 raise ValueError(f"{name} must be {wanted}, got {value!r}")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
-    for number, stage in enumerate(settings.curriculum.stages):
-        where = f"curriculum.stages[{number}]"
-        if stage.episodes < 1:
-            raise ValueError(f"{where}.episodes must be at least 1, got {stage.episodes}")
-        _resolve(f"{where}.world", resolve_world, stage.world)
-        _check_room(f"{where}.world", stage.world, settings.environment)
-    _resolve("evaluation.world", resolve_world, settings.evaluation.world)
+    _check_stages(settings)
+    _resolve("evaluation.world", lambda word: parse_worlds([word]), settings.evaluation.world)
     method = settings.method
     if method.capacity < method.batch_size * method.candidates:
         raise ValueError(
             f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "
             f"got {method.capacity}: it would never learn"
         )
+    if settings.evaluation.choose and not settings.evaluation.every:
+        raise ValueError("evaluation.choose needs evaluations: set evaluation.every, got 0")
     if settings.learner.compile and settings.learner.algorithm == "sac":
         raise ValueError("learner.compile must be false with SAC, got True")
     _check_device(settings.device)
+
+
+def _check_stages(settings: TrainSettings) -> None:
+    """Refuse stages that count nothing or different things, and worlds without a task."""
+    stages = settings.curriculum.stages
+    for number, stage in enumerate(stages):
+        where = f"curriculum.stages[{number}]"
+        if min(stage.episodes, stage.actions) != 0 or stage.length < 1:
+            raise ValueError(
+                f"{where} must have episodes or actions, at least 1, got episodes="
+                f"{stage.episodes}, actions={stage.actions}"
+            )
+        if bool(stage.actions) != bool(stages[0].actions):
+            raise ValueError(f"{where} must count what the others count, episodes or actions")
+        _check_world(f"{where}.world", stage.world, settings)
 
 
 def _resolve(name: str, resolve: Callable[[str], Any], value: str) -> None:
@@ -171,20 +186,17 @@ def _resolve(name: str, resolve: Callable[[str], Any], value: str) -> None:
         raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
 
 
-def _check_room(name: str, world: str, settings: EnvironmentSettings) -> None:
-    """Refuse a world in which no episode can begin, as the robot has to keep too far away."""
-    env = NavigationEnv(
-        world=world,
-        robot=settings.robot,
-        physics="kinematic",
-        collision_distance=collision_distance(settings),
-    )
+def _check_world(name: str, world: str, settings: TrainSettings) -> None:
+    """Refuse a world that there is not, or in which no episode can begin."""
     try:
-        env.reset(seed=0)
-    except ValueError as error:
-        raise ValueError(f"{name}, environment.clearance={settings.clearance}: {error}") from error
-    finally:
-        env.close()
+        env = make_training_env(world, replace(settings.environment, physics="kinematic"))
+        env.set_seed(0)
+        env.reset()
+    except (ValueError, OSError) as error:
+        text = " ".join(str(error).split())
+        clearance = f"environment.clearance={settings.environment.clearance}"
+        raise ValueError(f"{name}, {clearance}: {text}") from error
+    env.close()
 
 
 def _check_device(device: str) -> None:

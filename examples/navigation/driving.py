@@ -1,16 +1,19 @@
-"""The robot in its training episodes, action by action."""
+"""The robots of a run in their training episodes, one action of each at a time."""
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import step_mdp
+from torch import Tensor
 
+from mpfa_envs import NavigationTorchEnv
+from navigation.checkpoints import as_arrays, as_tensors
 from navigation.environments import INFO, make_training_env
 from navigation.exploration import Explorer
+from navigation.records import EpisodeRecord
 from navigation.settings import TrainSettings
 
 TRANSITION = (
@@ -24,8 +27,8 @@ TRANSITION = (
 """What a buffer keeps of a step."""
 
 
-class Driver:
-    """Drives the robot of a run, at random in its first steps and by an explorer after them.
+class Robots:
+    """Robots that act at random in the first steps of a run and by an explorer after them.
 
     Args:
         settings: Of the run.
@@ -33,55 +36,125 @@ class Driver:
 
     def __init__(self, settings: TrainSettings) -> None:
         self.settings = settings
-        self._env: EnvBase | None = None
-        self._world = ""
+        self.count = settings.robots
+        self.seconds = 0.0
+        """Wall-clock time of the run before this process [s]."""
+        self._started = time.perf_counter()
+        self._env: NavigationTorchEnv | None = None
+        self._world: str | None = None
+        self._state: TensorDictBase | None = None
+        self._rewards = torch.zeros(self.count, dtype=torch.double)
+        self._steps = torch.zeros(self.count, dtype=torch.long)
 
-    def environment(self, world: str) -> EnvBase:
-        """The environment of a world, kept for as long as the world stays the same."""
+    def environment(self, world: str) -> NavigationTorchEnv:
+        """The environment of a stage, kept for as long as its world stays the same."""
         if self._env is None or world != self._world:
             self.close()
-            self._env = make_training_env(world, self.settings.environment)
+            self._env = make_training_env(world, self.settings.environment, robots=self.count)
             self._world = world
         return self._env
 
-    def begin(self, world: str, explorer: Explorer, *, seed: int, step: int) -> None:
-        """Begin an episode.
+    def begin(self, world: str, explorer: Explorer, *, seed: int) -> None:
+        """Begin an episode with each robot; those that were on their way are given up.
 
         Args:
-            world: Name of a world, or a world file.
+            world: Of the stage, as in the settings.
             explorer: What acts.
-            seed: Seed of the environment and of the noise.
-            step: Actions of the run before this episode.
+            seed: Seed of the environment.
         """
         env = self.environment(world)
         env.set_seed(seed)
-        torch.manual_seed(seed)
-        explorer.begin_episode()
-        self._explorer, self._step = explorer, step
+        explorer.begin_episodes(torch.ones(self.count, dtype=torch.bool))
         self._state = env.reset()
+        self._rewards.zero_()
+        self._steps.zero_()
 
-    def drive(self) -> TensorDictBase:
-        """Choose an action and take it.
+    def drive(
+        self, explorer: Explorer, *, actions: int, episode: int
+    ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
+        """Take one action with each robot.
+
+        Args:
+            explorer: What acts.
+            actions: Of the run before these.
+            episode: Episodes of the run that have ended.
 
         Returns:
-            The entries of :data:`TRANSITION`, batch size ``[1]``.
+            The entries of :data:`TRANSITION`, batch size ``[robots]``, and the records of the
+            episodes that ended.
         """
-        assert self._env is not None
-        state = self._env.step(self._act(self._env, self._state))
-        self._step += 1
-        self._last, self._state = state["next"], step_mdp(state)
-        return state.select(*TRANSITION).unsqueeze(0)
+        assert self._env is not None and self._state is not None
+        state, self._state = self._env.step_and_maybe_reset(
+            self._act(explorer, self._state, actions)
+        )
+        after = state["next"]
+        self._rewards += after["reward"].squeeze(-1)
+        self._steps += 1
+        done = after["done"].squeeze(-1)
+        records: list[EpisodeRecord] = []
+        if done.any():
+            for robot in done.nonzero().squeeze(-1).tolist():
+                number, total = episode + len(records), actions + self.count
+                records.append(self._record(after, robot, episode=number, total_steps=total))
+            explorer.begin_episodes(done)
+            self._rewards[done] = 0.0
+            self._steps[done] = 0
+        return state.select(*TRANSITION), records
 
     @torch.no_grad()
-    def _act(self, env: EnvBase, state: TensorDictBase) -> TensorDictBase:
-        if self._step < self.settings.exploration.random_steps:
-            return env.rand_action(state)
+    def _act(self, explorer: Explorer, state: TensorDictBase, actions: int) -> TensorDictBase:
+        assert self._env is not None
+        if actions < self.settings.exploration.random_steps:
+            return self._env.rand_action(state)
         observation = state.get("observation").to(self.settings.device)
-        return state.set("action", self._explorer.act(observation).cpu())
+        return state.set("action", explorer.act(observation).cpu())
 
-    def info(self) -> dict[str, Any]:
-        """Entries of the environment's info after the last action."""
-        return {name: self._last["info", name].item() for name in INFO}
+    def _record(
+        self, after: TensorDictBase, robot: int, *, episode: int, total_steps: int
+    ) -> EpisodeRecord:
+        reward, steps = self._rewards[robot].item(), int(self._steps[robot])
+        info: dict[str, Any] = {name: after["info", name][robot].item() for name in INFO}
+        return EpisodeRecord(
+            episode=episode,
+            world=self._world or "",
+            steps=steps,
+            total_steps=total_steps,
+            reward=reward,
+            average_reward=reward / steps,
+            seconds=self.elapsed(),
+            **info,
+        )
+
+    def elapsed(self) -> float:
+        """Wall-clock time of the run so far [s]."""
+        return self.seconds + time.perf_counter() - self._started
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where every robot is, and what its next observation and record depend on."""
+        assert self._env is not None and self._state is not None
+        observation: Tensor = self._state["observation"]
+        return {
+            "environment": as_tensors(self._env.env.state_dict()),
+            "observation": observation.clone(),
+            "rewards": self._rewards.clone(),
+            "steps": self._steps.clone(),
+            "seconds": self.elapsed(),
+        }
+
+    def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state_dict` was called.
+
+        Args:
+            world: Of the stage.
+            state: The state.
+        """
+        env = self.environment(world)
+        # A reset makes the entries that a step wants; what is in them is replaced.
+        self._state = env.reset()
+        env.env.load_state_dict(as_arrays(state["environment"]))
+        self._state["observation"] = state["observation"].clone()
+        self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
+        self.seconds = state["seconds"]
 
     def close(self) -> None:
         """Release the environment."""

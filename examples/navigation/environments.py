@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-from torchrl.envs import EnvBase
-
-from mpfa_envs import make_navigation_env
+from mpfa_envs import NavigationTorchEnv
 from mpfa_envs.robot import resolve_robot
 from navigation.settings import EnvironmentSettings
 
@@ -37,21 +36,28 @@ def collision_distance(settings: EnvironmentSettings) -> float:
     return resolve_robot(settings.robot).radius + settings.clearance
 
 
-def make_training_env(world: str, settings: EnvironmentSettings) -> EnvBase:
+def make_training_env(
+    world: str, settings: EnvironmentSettings, *, robots: int = 1
+) -> NavigationTorchEnv:
     """The environment to learn in.
 
     Args:
-        world: Name of a world, or a world file.
+        world: Of a stage.
         settings: The environment's settings.
+        robots: Number of robots.
 
     Returns:
-        The environment, with the entries of ``info`` that a run records.
+        The environment of batch size ``[robots]``, with the entries of ``info`` that a run records.
     """
-    return make_navigation_env(
-        world,
+    return NavigationTorchEnv(
+        world=world,
+        num_envs=robots,
         info_keys=INFO,
         collision_distance=collision_distance(settings),
+        progress=settings.progress,
         progress_scale=settings.progress_scale,
         detour_chance=settings.detour_chance,
+        max_goal_distance=settings.max_goal_distance or math.inf,
+        episodes_per_world=settings.episodes_per_world,
         **env_arguments(settings),
     )

@@ -4,93 +4,99 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tensordict.nn import TensorDictModule
-from tqdm import tqdm
 
 from mpfa_envs import (
     EpisodeResult,
     NavigationEnv,
     Policy,
+    VectorNavigationEnv,
+    WorldTask,
     evaluate,
-    evaluation_pairs,
-    run_episodes,
+    run_tasks,
     summarize,
+    world_tasks,
 )
 from navigation.assembly import policy_layers
 from navigation.environments import env_arguments
 from navigation.records import EpisodeRecord, EvaluationRecord
 from navigation.settings import TrainSettings
 
-_AT_ONCE = 8
 _SEED = 1
 """Of the pairs of start and goal: others than those of ``evaluate.py``."""
 
 
 @dataclass(frozen=True)
 class Drives:
-    """What a policy did in one world."""
+    """What a policy did in one world, or in the worlds of a generator."""
 
+    tasks: list[WorldTask]
     results: list[EpisodeResult]
     trails: list[list[tuple[float, float]]]
     """Positions of the robot in each episode [m]."""
-    goals: list[tuple[float, float]]
-    """Of each episode [m]."""
+
+    def of_world(self, name: str) -> list[int]:
+        """Numbers of the episodes in one world."""
+        return [n for n, each in enumerate(self.tasks) if each.world.name == name]
 
 
 def drive(
-    policy: Policy, world: str, *, episodes: int, seed: int, physics: str | None, progress: bool
+    policy: Policy,
+    world: str,
+    *,
+    episodes: int | None,
+    seed: int,
+    physics: str | None,
+    progress: bool,
 ) -> Drives:
-    """Drive a policy between fixed pairs of start and goal, contact being the only collision.
+    """Drive a policy through fixed tasks, contact being the only collision.
 
     As :func:`mpfa_envs.evaluate`, and the ways are kept.
 
     Args:
         policy: The policy.
-        world: Name of a world, or a world file.
-        episodes: Number of pairs.
-        seed: Seed of the pairs.
+        world: What :func:`mpfa_envs.world_tasks` takes.
+        episodes: Number of tasks; None: as many as there usually are.
+        seed: Seed of the tasks in a world.
         physics: ``wheels`` or ``kinematic``; None: as trained.
         progress: Whether to show a bar.
 
     Returns:
-        Results and ways.
+        Tasks, results and ways.
     """
-    arguments = {**policy.env_arguments, "collision_distance": "contact", "world": world}
+    arguments = dict(policy.env_arguments)
     if physics is not None:
         arguments["physics"] = physics
-    tasks = evaluation_pairs(world, episodes, seed, robot=arguments["robot"])
-    trails: dict[int, list[tuple[float, float]]] = {}
-    with ExitStack() as opened, tqdm(total=episodes, desc=world, disable=not progress) as bar:
+    tasks = world_tasks(world, episodes=episodes, seed=seed, robot=arguments["robot"])
+    trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
 
-        def keep(env: NavigationEnv, result: EpisodeResult) -> None:
-            trails[result.episode] = env.trail
-            bar.update()
+    def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
+        trails[number] = env.trail(robot)
 
-        envs = [
-            opened.enter_context(closing(NavigationEnv(**arguments)))
-            for _ in range(min(_AT_ONCE, episodes))
-        ]
-        results = run_episodes(envs, policy, tasks, on_end=keep)
-    return Drives(results, [trails[n] for n in range(episodes)], [task.goal for task in tasks])
+    results = run_tasks(policy, tasks, progress=progress, on_end=keep, **arguments)
+    return Drives(tasks, results, trails)
 
 
-def film(
-    policy: Policy, world: str, *, episode: int, seed: int, physics: str | None
-) -> list[NDArray[np.uint8]]:
-    """Pictures of one of the episodes of :func:`drive`, each of shape ``[height, width, 3]``."""
-    arguments = {**policy.env_arguments, "collision_distance": "contact", "world": world}
+def film(policy: Policy, episode: WorldTask, *, physics: str | None) -> list[NDArray[np.uint8]]:
+    """Pictures of an episode, each of shape ``[height, width, 3]``."""
+    arguments = {**policy.env_arguments, "collision_distance": "contact", "world": episode.world}
     if physics is not None:
         arguments["physics"] = physics
-    task = evaluation_pairs(world, episode + 1, seed, robot=arguments["robot"])[episode]
     frames: list[Any] = []
     with closing(NavigationEnv(**arguments, render_mode="rgb_array")) as env:
-        run_episodes(env, policy, [task], on_step=lambda env: frames.append(env.render()))
+        observation, _ = env.reset(seed=0, options=episode.task._asdict())
+        ended = False
+        while not ended:
+            frames.append(env.render())
+            observation, _, terminated, truncated, _ = env.step(policy(observation))
+            ended = terminated or truncated
+        frames.append(env.render())
     return frames
 
 
@@ -130,15 +136,21 @@ def exported_policy(
 
 
 def evaluate_policy(
-    settings: TrainSettings, policy: TensorDictModule, *, total_steps: int, episode: int
+    settings: TrainSettings,
+    policy: TensorDictModule,
+    *,
+    total_steps: int,
+    episode: int,
+    trained_for: float,
 ) -> EvaluationRecord:
-    """Drive the fixed pairs of the validation world, or of another one that the settings name.
+    """Drive the fixed tasks of the validation world, or of others that the settings name.
 
     Args:
         settings: Of the run.
         policy: The policy as it is now.
         total_steps: Actions so far.
         episode: Episodes so far.
+        trained_for: Wall-clock time of the training so far [s].
 
     Returns:
         Rates of success, collision and timeout, and the mean SPL.
@@ -154,5 +166,6 @@ def evaluate_policy(
         episode=episode,
         world=wanted.world,
         seconds=time.perf_counter() - start,
+        trained_for=trained_for,
         **{name: sum(getattr(r, name) for r in results) / len(results) for name in names},
     )

@@ -25,15 +25,15 @@ class Explorer(Protocol):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the actions around the policy's, in the present episode."""
+        """Standard deviation of the actions around the policy's, the mean of the robots."""
         ...
 
-    def begin_episode(self) -> None:
-        """Take note that an episode begins."""
+    def begin_episodes(self, begun: Tensor) -> None:
+        """Take note which robots begin an episode, bool of shape ``[N]``."""
         ...
 
     def act(self, observation: Tensor) -> Tensor:
-        """From an observation, shape ``[O]``, to an action, shape ``[A]``."""
+        """From observations, shape ``[N, O]``, to actions, shape ``[N, A]``."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class NoisyPolicy:
     Args:
         policy: The deterministic policy.
         settings: The noise.
-        action_spec: Range of actions.
+        action_spec: Range of actions, shape ``[N, A]``.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class NoisyPolicy:
     ) -> None:
         self.policy = policy
         self.varied = settings.varied
-        self.share = 1.0
+        self.shares = torch.ones(action_spec.shape[0], 1)
         self.noise = AdditiveGaussianModule(
             action_spec,
             sigma_init=settings.sigma,
@@ -72,30 +72,31 @@ class NoisyPolicy:
 
     @property
     def sigma(self) -> float:
-        """Present standard deviation of the noise: the episode's share of it."""
-        return self.share * float(self.noise.sigma)
+        """Present standard deviation of the noise, the mean of what the episodes have of it."""
+        return float(self.shares.mean()) * float(self.noise.sigma)
 
-    def begin_episode(self) -> None:
-        """Sample the share of the noise that the episode has."""
+    def begin_episodes(self, begun: Tensor) -> None:
+        """Sample the share of the noise that each of these episodes has."""
         if self.varied:
-            self.share = float(torch.rand(()))
+            self.shares[begun] = torch.rand(int(begun.sum()), 1)
 
     def act(self, observation: Tensor) -> Tensor:
-        """The policy's action and noise."""
+        """The policy's actions and noise."""
         chosen = self.policy.outputs({"observation": observation})["action"]
         with set_exploration_type(ExplorationType.RANDOM):
             noisy = self.noise(TensorDict({"action": chosen})).get("action")
-        self.noise.step(1)
-        action: Tensor = noisy if self.share == 1.0 else chosen.lerp(noisy, self.share)
+        self.noise.step(len(observation))
+        action: Tensor = chosen.lerp(noisy, self.shares.to(chosen.device))
         return action
 
     def state_dict(self) -> dict[str, Any]:
-        """The state of the noise."""
-        return dict(self.noise.state_dict())
+        """The state of the noise, and the shares of it."""
+        return {"noise": dict(self.noise.state_dict()), "shares": self.shares.clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave."""
-        self.noise.load_state_dict(state_dict)
+        self.noise.load_state_dict(state_dict["noise"])
+        self.shares.copy_(state_dict["shares"])
 
 
 class RandomPolicy:
@@ -111,11 +112,11 @@ class RandomPolicy:
         self.policy = policy
         self.sigma = settings.sigma_end
 
-    def begin_episode(self) -> None:
+    def begin_episodes(self, begun: Tensor) -> None:
         """Nothing changes."""
 
     def act(self, observation: Tensor) -> Tensor:
-        """An action sampled from the policy."""
+        """Actions sampled from the policy."""
         with set_exploration_type(ExplorationType.RANDOM):
             found = self.policy.outputs({"observation": observation})
         action: Tensor = found["action"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,25 @@ def write_animation(frames: Sequence[NDArray[np.uint8]], path: Path) -> None:
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=50 * step, loop=0, optimize=True
     )
+
+
+def tiled(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Pictures side by side, as many in a row as there are rows.
+
+    Args:
+        pictures: Each of shape ``[height, width, 3]``; smaller ones are filled up with white.
+
+    Returns:
+        One picture.
+    """
+    columns = math.ceil(math.sqrt(len(pictures)))
+    height, width = (max(each.shape[axis] for each in pictures) for axis in (0, 1))
+    lines = math.ceil(len(pictures) / columns)
+    whole = np.full((lines * height, columns * width, 3), 255, dtype=np.uint8)
+    for number, each in enumerate(pictures):
+        top, left = number // columns * height, number % columns * width
+        whole[top : top + each.shape[0], left : left + each.shape[1]] = each
+    return whole
 
 
 def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:

@@ -18,14 +18,17 @@ class EpisodeRecord:
 
     episode: int
     world: str
+    """Of the stage; of a generator its name."""
     steps: int
+    """Actions of this episode."""
     total_steps: int
+    """Actions of all robots when it ended."""
     reward: float
     """Total reward."""
     average_reward: float
     """Total reward over steps, the paper's curve."""
     seconds: float
-    """Wall-clock time [s]."""
+    """Wall-clock time of the run when it ended [s]."""
     success: bool
     collision: bool
     timeout: bool
@@ -50,6 +53,13 @@ class EvaluationRecord:
     spl: float
     seconds: float
     """Wall-clock time that it took [s]."""
+    trained_for: float
+    """Wall-clock time of the run before it, less that of evaluations [s]."""
+
+    def is_best(self, others: Sequence[EvaluationRecord]) -> bool:
+        """Whether none of the others had a higher success, or the same and a higher SPL."""
+        mine = (self.success, self.spl)
+        return all(mine >= (other.success, other.spl) for other in others)
 
 
 def as_table(rows: Sequence[Any], kind: type[Any]) -> pd.DataFrame:

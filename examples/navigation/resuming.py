@@ -44,7 +44,7 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
         key, value = override.key_or_group, override.value()
         if key in OF_THE_CALL:
             continue
-        if key in GROUPS:
+        if key in GROUPS and key != "regime":
             node = GROUPS[key][str(value)]
             config[key] = OmegaConf.structured(node)
         else:
@@ -80,14 +80,15 @@ def check_lawful(before: TrainSettings, after: TrainSettings, folder: Path) -> N
 
 
 def extends(before: list[Stage], after: list[Stage]) -> bool:
-    """Whether stages begin with others, the last one of these perhaps with more episodes."""
+    """Whether stages begin with others, the last one of these perhaps with more of its unit."""
     *fixed, last = before
     count = len(fixed)
     if len(after) <= count or after[:count] != fixed:
         return False
-    return after[count].world == last.world and after[count].episodes >= last.episodes
+    same = after[count].world == last.world and bool(after[count].episodes) == bool(last.episodes)
+    return same and after[count].length >= last.length
 
 
 def _short(settings: TrainSettings) -> str:
     stages = settings.curriculum.stages
-    return "[" + ", ".join(f"{stage.world}: {stage.episodes}" for stage in stages) + "]"
+    return "[" + ", ".join(f"{stage.world}: {stage.length}" for stage in stages) + "]"

@@ -111,7 +111,7 @@ def _train(training: TrainingRun) -> int:
     if finished:
         print(f"policy: {folder / files.POLICY}   curve: {curve}")
         return 0
-    print(f"stopped after episode {training.episode}; continue with: train.py resume={folder}")
+    print(f"stopped after {training.actions} actions; continue with: train.py resume={folder}")
     return training.stop.exit_status
 
 

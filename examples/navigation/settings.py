@@ -27,8 +27,6 @@ class LearnerSettings:
     name: str = "ddpg"
     algorithm: str = "ddpg"
     """``ddpg``, ``td3`` or ``sac``; ``learner=td3`` chooses it with what goes with it."""
-    update_every: int = 1
-    """Actions for each update, which the paper does not give."""
     actor_lr: float = 1e-4
     """Table 1."""
     critic_lr: float = 1e-4
@@ -64,12 +62,12 @@ class LearnerSettings:
     compile: bool = False
     """Make one program of an update with ``torch.compile``, which halves the time of a run. Needs a
     C++ compiler, and half a minute at the start, a few seconds the next time."""
-    policy_delay: int = 2
-    """TD3: updates of the critics for one of the actor and the targets."""
-    policy_noise: float = 0.2
-    """TD3: standard deviation of the noise that smooths the target."""
+    policy_delay: int = 1
+    """DDPG and TD3: updates of the critics for one of the actor and the targets."""
+    policy_noise: float = 0.0
+    """DDPG and TD3: standard deviation of the noise that smooths the target."""
     noise_clip: float = 0.5
-    """TD3: bound of that noise."""
+    """DDPG and TD3: bound of that noise."""
     alpha_init: float = 0.01
     """SAC: temperature of the entropy at the start, of rewards that are scaled."""
     alpha_lr: float = 3e-4
@@ -82,6 +80,8 @@ class TD3Settings(LearnerSettings):
 
     name: str = "td3"
     algorithm: str = "td3"
+    policy_delay: int = 2
+    policy_noise: float = 0.2
 
 
 @dataclass
@@ -127,12 +127,20 @@ class ExplorationSettings:
 
 @dataclass
 class Stage:
-    """Episodes in one world."""
+    """A number of episodes, or of actions, in one world or in the worlds of a generator."""
 
     world: str = "A"
-    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, ``rooms-SEED``, or the path of a world
-    file."""
-    episodes: int = 100
+    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, the path of a world file, one world of
+    a generator, as ``bars-7``, or a generator, as ``mixed``: a new world in each episode."""
+    episodes: int = 0
+    """Episodes; 0: the stage counts actions."""
+    actions: int = 0
+    """Actions of all robots together; 0: the stage counts episodes."""
+
+    @property
+    def length(self) -> int:
+        """Episodes or actions, whichever it counts."""
+        return self.episodes or self.actions
 
 
 @dataclass
@@ -141,19 +149,21 @@ class CurriculumSettings:
 
     name: str | None = None
     """Part of the run's folder and of its group in wandb; null: named after the stages."""
-    stages: list[Stage] = field(default_factory=lambda: [Stage("A", 100)])
+    stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
+    """All of them count episodes, or all of them count actions."""
     carry: bool = True
     """Whether networks and buffer carry on from world to world, or start anew."""
 
 
 CURRICULA = {
-    "A": [Stage("A", 100)],
-    "B": [Stage("B", 200)],
-    "C": [Stage("C", 300)],
-    "D": [Stage("D", 400)],
+    "A": [Stage("A", episodes=100)],
+    "B": [Stage("B", episodes=200)],
+    "C": [Stage("C", episodes=300)],
+    "D": [Stage("D", episodes=400)],
     "paper": [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)],
+    "rooms": [Stage("mixed", actions=100_000)],
 }
-"""The paper's episodes in each of its worlds, and all of them one after the other."""
+"""The paper's episodes in each of its worlds, all of them one after the other, and new worlds."""
 _LONGEST_NAME = 60
 
 
@@ -173,7 +183,7 @@ def curriculum_name(stages: Sequence[Stage]) -> str:
     for name, known in CURRICULA.items():
         if list(stages) == known:
             return name
-    parts = [re.sub(r"[^\w.-]", "_", Path(s.world).stem) + str(s.episodes) for s in stages]
+    parts = [re.sub(r"[^\w.-]", "_", Path(s.world).stem) + str(s.length) for s in stages]
     whole = "+".join(parts)
     if len(whole) <= _LONGEST_NAME:
         return whole
@@ -203,6 +213,13 @@ class EnvironmentSettings:
     detour_chance: float = 0.8
     """Chance that start and goal of an episode must have something between them. As they come, up
     to a half of the goals can be driven at blindly."""
+    progress: str = "straight_line"
+    """What Eq. 25 measures approach by: ``straight_line`` (the paper), ``shortest_path``, or
+    ``none``, the goal and the collision alone."""
+    max_goal_distance: float | None = None
+    """Longest way of a sampled task [m]; null: as it comes."""
+    episodes_per_world: int = 1
+    """Episodes of a robot in a world of a generator before it gets another one."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""
 
@@ -212,11 +229,14 @@ class EvaluationSettings:
     """Greedy episodes during training, which show how fast it learns and change nothing in it."""
 
     every: int = 0
-    """Steps between two evaluations; 0: none."""
+    """Actions between two evaluations; 0: none."""
     world: str = "validation"
-    """Never the test world, by which nothing may be chosen."""
+    """A world, or ``mixed:validation``: the validation worlds of a generator. Never those of a
+    test, by which nothing may be chosen."""
     episodes: int = 20
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
+    choose: bool = False
+    """Whether the policy of the run is the one that did best there, not the last one."""
 
 
 @dataclass
@@ -227,7 +247,7 @@ class TrackingSettings:
     """wandb: ``offline`` (no account), ``online`` or ``off``."""
     project: str = "torchrl-mpfa"
     log_every: int = 200
-    """Steps between two entries of losses, weights and priorities."""
+    """Actions between two entries of losses, weights and priorities."""
 
 
 @dataclass
@@ -241,6 +261,8 @@ class TrainSettings:
             {"learner": "ddpg"},
             {"curriculum": "A"},
             {"tracking": "offline"},
+            # After the learner: it has its values for all learners.
+            {"regime": "rooms"},
             {"override hydra/job_logging": "none"},
         ]
     )
@@ -260,6 +282,8 @@ class TrainSettings:
         "-${method.name}-${learner.name}-${seed}"
     )
     """Folder of checkpoints, logs and pictures."""
+    regime: str = "paper"
+    """``regime=rooms``: many robots in new worlds; ``regime=paper``: Table 1, one robot, A to D."""
     seed: int = 0
     device: str = "cpu"
     """Where the networks are; the buffer stays in main memory."""
@@ -270,8 +294,12 @@ class TrainSettings:
     resume: str | None = None
     """Folder of a run to continue, with its own settings. More episodes, tracking, threads and
     how often to evaluate and to save may be changed; anything else is refused."""
-    checkpoint_every: int = 25
-    """Episodes between two checkpoints."""
+    checkpoint_every: int = 10_000
+    """Actions between two checkpoints."""
+    robots: int = 1
+    """Robots that drive at once, each in a world of its own."""
+    updates: int = 1
+    """Updates for one action of each robot."""
     method: Method = field(default_factory=Method)
     learner: LearnerSettings = field(default_factory=LearnerSettings)
     curriculum: CurriculumSettings = field(default_factory=CurriculumSettings)
@@ -280,6 +308,32 @@ class TrainSettings:
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
 
+
+REGIMES: dict[str, dict[str, Any]] = {
+    "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
+    "rooms": {
+        "regime": "rooms",
+        "defaults": [{"override /curriculum": "rooms"}],
+        "robots": 16,
+        "updates": 4,
+        "learner": {
+            "actor_lr": 3e-4,
+            "critic_lr": 3e-4,
+            "tau": 0.002,
+            # Without both a single critic's targets run ahead, and the robot circles.
+            "policy_delay": 2,
+            "policy_noise": 0.2,
+        },
+        "exploration": {"random_steps": 2_000, "annealing_steps": 20_000},
+        "environment": {
+            "physics": "kinematic",
+            "progress": "shortest_path",
+            "max_goal_distance": 20.0,
+        },
+        "evaluation": {"world": "mixed:validation", "episodes": 100},
+    },
+}
+"""The paper's task and numbers, and what one would do today."""
 
 GROUPS: dict[str, dict[str, Any]] = {
     "method": METHODS,
@@ -295,6 +349,7 @@ GROUPS: dict[str, dict[str, Any]] = {
         "online": TrackingSettings(mode="online"),
         "off": TrackingSettings(mode="off"),
     },
+    "regime": REGIMES,
 }
 
 
@@ -304,12 +359,13 @@ def register() -> None:
     store = ConfigStore.instance()
     store.store(name="train", node=TrainSettings)
     for group, choices in GROUPS.items():
+        package = "_global_" if group == "regime" else None
         for name, node in choices.items():
-            store.store(group=group, name=name, node=node)
+            store.store(group=group, name=name, node=node, package=package)
 
 
 def _resolve_name(name: str | None, stages: Sequence[Any]) -> str:
-    return name or curriculum_name([Stage(stage.world, stage.episodes) for stage in stages])
+    return name or curriculum_name([Stage(s.world, s.episodes, s.actions) for s in stages])
 
 
 def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:

@@ -24,7 +24,7 @@ class Stop:
         answer: What it says to the first one.
     """
 
-    def __init__(self, answer: str = "stopping after this episode") -> None:
+    def __init__(self, answer: str = "stopping and saving") -> None:
         self.answer = answer
         self.signal: int | None = None
 

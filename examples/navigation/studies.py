@@ -21,7 +21,7 @@ from navigation.worlds import worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
 SCRIPTS = Path(__file__).resolve().parents[1]
-DEFAULTS = ("curriculum=paper", "tracking=off", "evaluation.every=5000")
+DEFAULTS = ("tracking=off", "evaluation.every=5000")
 """What a study has unless its command line says otherwise."""
 
 

@@ -57,7 +57,7 @@ class Tracker:
         entries["train/steps"] = record.steps
         entries["train/path_length"] = record.path_length
         entries["train/episode"] = record.episode
-        entries["time/steps_per_second"] = record.steps / max(record.seconds, 1e-9)
+        entries["time/steps_per_second"] = record.total_steps / max(record.seconds, 1e-9)
         self._run.log(entries, step=record.total_steps)
 
     def log_evaluation(self, record: EvaluationRecord) -> None:

@@ -1,4 +1,4 @@
-"""The training run: episodes of the curriculum, one update a step, checkpoints between episodes."""
+"""The training run: iterations of many robots at once, with checkpoints at any of them."""
 
 from __future__ import annotations
 
@@ -8,51 +8,43 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from itertools import accumulate
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor
 from tqdm import tqdm
 
 from mpfa_envs import RandomMirror, save_policy
 from navigation import files
 from navigation.assembly import make_curiosity, make_learner
 from navigation.checkpoints import FORMAT
-from navigation.driving import Driver
+from navigation.driving import Robots
 from navigation.evaluating import evaluate_policy, exported_policy
 from navigation.exploration import make_explorer
 from navigation.records import EpisodeRecord, EvaluationRecord, as_table, write_table
-from navigation.settings import Stage, TrainSettings
+from navigation.schedule import Schedule
+from navigation.settings import TrainSettings
 from navigation.stopping import Stop
 from navigation.tracking import Tracker
-from torchrl_mpfa import SignalSampler, save_atomically
+from torchrl_mpfa import Draw, SignalSampler, run_updates, save_atomically
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.saving import write_text_atomically
 
-_RECENT = 20
+_RECENT = 100
+"""Episodes whose success is shown."""
 _MANY_EPISODES = 500
 """From here on the learning rates fall linearly unless the settings say otherwise."""
-
-
-@dataclass(frozen=True)
-class Moment:
-    """A run between two episodes: what the next one depends on."""
-
-    episode: int
-    step: int
-    parts: dict[str, Any]
-    policy: TensorDictModule
+_TELL_EVERY = 1.0
+"""Between two words on how far the run is [s]."""
 
 
 class TrainingRun:
     """Everything that a run is: its parts, how far it is, and its records.
 
-    Randomness starts anew with each episode, from the seed of the run and the number of the
-    episode, so that a run which was stopped between two episodes goes on as if it had not been.
+    An iteration is one action of each robot, and the updates that are due for them.
 
     Args:
         settings: The settings.
@@ -65,25 +57,26 @@ class TrainingRun:
     ) -> None:
         self.settings = settings
         self.folder = folder
-        self.stages: list[Stage] = list(settings.curriculum.stages)
-        self.total_episodes = sum(stage.episodes for stage in self.stages)
+        self.schedule = Schedule(settings.curriculum.stages)
         self.stop = Stop()
         torch.manual_seed(settings.seed)
-        self.driver = Driver(settings)
-        env = self.driver.environment(self.stages[0].world)
+        self.robots = Robots(settings)
+        env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
         self._build()
-        self._waiting: list[TensorDictBase] = []
-        self.episode = 0
-        self.step = 0
+        self.updates = 0
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
-        if state is not None:
+        self._bonus: dict[str, Tensor] = {}
+        self._best: TensorDictModule | None = None
+        """The policy that did best in the evaluations."""
+        self._told = 0.0
+        if state is None:
+            self._begin_stage()
+        else:
             self._load(state)
         self.tracker = Tracker(settings, folder, run_id=None if state is None else state["wandb"])
-        # Should an episode fail, its networks and its buffer are not to be saved.
-        self._kept = copy.deepcopy(self._moment())
 
     def _build(self) -> None:
         """Make the parts that learn, and the buffer."""
@@ -104,216 +97,215 @@ class TrainingRun:
         if settings.environment.mirror:
             self.buffer.append_transform(RandomMirror())
 
-    # Episodes --------------------------------------------------------------------------------
+    def _begin_stage(self) -> None:
+        seed = self.settings.seed * 1_000_003 + self.schedule.stage
+        # However many random numbers the parts were made of, the robots explore alike.
+        torch.manual_seed(seed)
+        self.robots.begin(self.schedule.world, self.explorer, seed=seed)
 
-    def train(self, on_episode: Callable[[EpisodeRecord], None] | None = None) -> bool:
+    # Iterations ------------------------------------------------------------------------------
+
+    @property
+    def actions(self) -> int:
+        """Actions of all robots so far."""
+        return self.schedule.actions
+
+    def train(self, on_iteration: Callable[[], object] | None = None) -> bool:
         """Run to the end of the curriculum, or until asked to stop.
 
-        Whatever ends it, the last finished episode is saved.
+        Whatever ends it, the run is saved as it is then, unless an error broke its parts.
 
         Args:
-            on_episode: Called with the record of each finished episode.
+            on_iteration: Called after each iteration.
 
         Returns:
             Whether the curriculum was finished.
         """
-        bar = tqdm(total=self.total_episodes, initial=self.episode, unit="episode", smoothing=0.05)
+        bar = tqdm(
+            total=self.schedule.total,
+            initial=self.schedule.done,
+            unit=self.schedule.unit,
+            smoothing=0.05,
+        )
         with self.stop.listening(), bar:
             try:
-                while self.episode < self.total_episodes and not self.stop:
-                    self._finish(self._run_episode())
-                    bar.update()
-                    bar.set_postfix_str(self._summary())
-                    if self.episode % self.settings.checkpoint_every == 0:
+                while not self.schedule.finished and not self.stop:
+                    before = self.actions
+                    self._iterate()
+                    bar.update(self.schedule.done - bar.n)
+                    if time.monotonic() - self._told > _TELL_EVERY:
+                        bar.set_postfix_str(self._tell())
+                    if self._crossed(self.settings.checkpoint_every, before):
                         self.save()
-                    if on_episode is not None:
-                        on_episode(self.records[-1])
-            except BaseException:
-                self._write(self._kept)
+                    if on_iteration is not None:
+                        on_iteration()
+            except Exception:
+                if self._is_sound():
+                    self.save()
                 raise
-            self.save()
-        finished = self.episode == self.total_episodes
-        self._tell(finished=finished)
-        return finished
+            bar.set_postfix_str(self._tell())
+        self.save()
+        return self.schedule.finished
 
-    def _finish(self, record: EpisodeRecord) -> None:
-        """Count an episode, log it, and evaluate if that fell due."""
-        self.records.append(record)
-        self.episode += 1
-        self.tracker.log_episode(record)
-        every = self.settings.evaluation.every
-        if every > 0 and self.step // every != (self.step - record.steps) // every:
-            found = evaluate_policy(
-                self.settings, self.learner.policy, total_steps=self.step, episode=self.episode
-            )
-            self.evaluations.append(found)
-            self.tracker.log_evaluation(found)
-        self._kept = copy.deepcopy(self._moment())
-        self._tell()
-
-    def _summary(self) -> str:
-        recent = self.records[-_RECENT:]
-        if not recent:
-            return "no episode yet"
-        success = sum(r.success for r in recent) / len(recent)
-        return f"world {recent[-1].world}, success {success:.0%} of last {len(recent)}"
-
-    def _tell(self, *, finished: bool = False) -> None:
-        """Say how far the run is, to whoever reads its folder."""
-        status = {
-            "episode": self.episode,
-            "episodes": self.total_episodes,
-            "steps": self.step,
-            "summary": self._summary(),
-            "finished": finished,
-        }
-        write_text_atomically(json.dumps(status), self.folder / files.STATUS)
-
-    def _stage(self, episode: int) -> Stage:
-        for stage in self.stages:
-            if episode < stage.episodes:
-                return stage
-            episode -= stage.episodes
-        return self.stages[-1]
-
-    def _begins_stage(self) -> bool:
-        """Whether the next episode is the first one in a world, but for the first world."""
-        lengths = [stage.episodes for stage in self.stages]
-        return self.episode in list(accumulate(lengths))[:-1]
-
-    def _run_episode(self) -> EpisodeRecord:
-        seed = episode_seed(self.settings.seed, self.episode)
-        torch.manual_seed(seed)
-        if not self.settings.curriculum.carry and self._begins_stage():
-            self._build()
-        self._anneal()
-        world = self._stage(self.episode).world
-        start, total_reward, steps = time.perf_counter(), 0.0, 0
-        self.driver.begin(world, self.explorer, seed=seed, step=self.step)
-        done = False
-        while not done:
-            transition = self.driver.drive()
-            self.step += 1
-            steps += 1
-            after = transition["next"]
-            total_reward += after["reward"].item()
-            done = after["done"].item()
-            self._store(transition, flush=done)
-            if self.step % self.settings.learner.update_every == 0:
-                self._update()
-        self.learner.end_episode()
-        return EpisodeRecord(
-            episode=self.episode,
-            world=world,
-            steps=steps,
-            total_steps=self.step,
-            reward=total_reward,
-            average_reward=total_reward / steps,
-            seconds=time.perf_counter() - start,
-            **self.driver.info(),
+    def _iterate(self) -> None:
+        """One action of each robot, and the updates for them."""
+        before = self.actions
+        rows, records = self.robots.drive(
+            self.explorer, actions=before, episode=self.schedule.episodes
         )
+        self.buffer.extend(rows)
+        self.records += records
+        begins = self.schedule.count(actions=len(rows), episodes=len(records))
+        if len(self.buffer) >= (self.buffer.batch_size or 0):
+            self._update(before)
+        for record in records:
+            self.learner.end_episode()
+            self.tracker.log_episode(record)
+        if self._crossed(self.settings.evaluation.every, before):
+            self._evaluate()
+        if begins:
+            if not self.settings.curriculum.carry:
+                self._build()
+            self._begin_stage()
+        self._anneal()
 
-    def _store(self, transition: TensorDictBase, *, flush: bool) -> None:
-        """Keep a step; those between two updates are written together, at the price of one."""
-        self._waiting.append(transition)
-        if flush or self.step % self.settings.learner.update_every == 0:
-            first, *more = self._waiting
-            # Most often there is one alone.
-            self.buffer.extend(torch.cat(self._waiting) if more else first)
-            self._waiting.clear()
+    def _crossed(self, every: int, before: int) -> bool:
+        """Whether a multiple of so many actions lies between those before and those now."""
+        return every > 0 and before // every != self.actions // every
 
-    def _update(self) -> None:
-        if len(self.buffer) < self.settings.method.batch_size:
-            return
+    def _update(self, before: int) -> None:
+        losses, batch = run_updates(
+            self.buffer,
+            self.learner,
+            self.select,
+            updates=self.settings.updates,
+            prepare=self._prepared,
+        )
+        self.updates += self.settings.updates
+        if self._crossed(self.settings.tracking.log_every, before):
+            self.tracker.log_update(self.actions, {**losses, **self._bonus}, self.buffer, batch)
+
+    def _prepared(self, draw: Draw) -> Draw:
+        """A draw where the networks are, with the bonus of curiosity in its rewards."""
         device = self.settings.device
-        values: dict[str, torch.Tensor] = {}
-        for draw in self.select(self.buffer):
-            if device != "cpu":
-                draw = replace(draw, batch=draw.batch.to(device))
-            # Rewards are the critic's business.
-            if self.curiosity is not None and draw.gives_signals:
-                values.update(self.curiosity(draw.batch))
-            values.update(self.learner.update(draw))
-            if draw.gives_signals:
-                batch = draw.batch if device == "cpu" else draw.batch.to("cpu")
-                self.buffer.update_tensordict_priority(batch)
-        if self.step % self.settings.tracking.log_every == 0:
-            self.tracker.log_update(self.step, values, self.buffer, batch)
+        if device != "cpu":
+            draw = replace(draw, batch=draw.batch.to(device))
+        if self.curiosity is not None and draw.gives_signals:
+            self._bonus = self.curiosity(draw.batch)
+        return draw
+
+    def _evaluate(self) -> None:
+        found = evaluate_policy(
+            self.settings,
+            self.learner.policy,
+            total_steps=self.actions,
+            episode=self.schedule.episodes,
+            trained_for=self.robots.elapsed(),
+        )
+        # The clock of the run shows how long it trains.
+        self.robots.seconds -= found.seconds
+        if found.is_best(self.evaluations):
+            self._best = copy.deepcopy(self.learner.policy)
+        self.evaluations.append(found)
+        self.tracker.log_evaluation(found)
 
     def _anneal(self) -> None:
-        """Move what changes with the episodes: beta of Eq. (10), fusion and learning rates."""
-        settings = self.settings
+        """Move what changes with the run: beta of Eq. (10), fusion and learning rates."""
+        settings, done = self.settings, self.schedule.fraction
         if isinstance(self.buffer.sampler, SignalSampler):
-            done = self.episode / max(self.total_episodes - 1, 1)
             start, end = settings.method.beta, settings.method.beta_end
             self.buffer.sampler.beta = start + (end - start) * done
             self.buffer.sampler.anneal(done)
-        # Counted so that the last episode still learns.
-        left = 1.0 - self.episode / self.total_episodes
         lowest, power = settings.learner.lr_end_factor, settings.learner.lr_power
         if power is None:
-            power = 1.0 if self.total_episodes >= _MANY_EPISODES else 3.0
-        self.learner.anneal(lowest + (1.0 - lowest) * left**power)
+            few = self.schedule.unit == "episode" and self.schedule.total < _MANY_EPISODES
+            power = 3.0 if few else 1.0
+        self.learner.anneal(lowest + (1.0 - lowest) * (1.0 - done) ** power)
+
+    def _summary(self) -> str:
+        """How it goes, in a few words."""
+        speed = f"{self.updates / max(self.robots.elapsed(), 1e-9):.0f} updates/s"
+        recent = self.records[-_RECENT:]
+        if not recent:
+            return f"no episode yet, {speed}"
+        success = sum(record.success for record in recent) / len(recent)
+        return f"{recent[-1].world}: success {success:.0%} of last {len(recent)}, {speed}"
+
+    def _tell(self) -> str:
+        """Say how far the run is, to whoever reads its folder, and in a few words."""
+        self._told, summary = time.monotonic(), self._summary()
+        status = {
+            "unit": self.schedule.unit,
+            "done": self.schedule.done,
+            "total": self.schedule.total,
+            "episodes": self.schedule.episodes,
+            "steps": self.actions,
+            "summary": summary,
+            "finished": self.schedule.finished,
+        }
+        write_text_atomically(json.dumps(status), self.folder / files.STATUS)
+        return summary
 
     # Saving ----------------------------------------------------------------------------------
 
-    def _moment(self) -> Moment:
-        """The run as it is now, between two episodes; its tensors are those that will change."""
-        parts = {
-            "learner": self.learner.state_dict(),
-            "buffer": self.buffer.state_dict(),
-            "explorer": self.explorer.state_dict(),
-            "curiosity": None if self.curiosity is None else self.curiosity.checkpoint(),
-        }
-        return Moment(self.episode, self.step, parts, self.learner.policy)
+    def _is_sound(self) -> bool:
+        """Whether an error has left the networks as numbers."""
+        weights = self.learner.state_dict()["loss"].values()
+        return all(bool(value.isfinite().all()) for value in weights)
 
     def save(self) -> None:
         """Write checkpoint, policy and records, each of them whole or not at all."""
-        self._write(self._moment())
-
-    def _write(self, moment: Moment) -> None:
-        if moment.episode == 0:
-            return
-        records = self.records[: moment.episode]
-        evaluations = [each for each in self.evaluations if each.episode <= moment.episode]
         state = {
             "format": FORMAT,
             "settings": asdict(self.settings),
             "wandb": self.tracker.run_id,
-            "episode": moment.episode,
-            "step": moment.step,
-            **moment.parts,
-            "records": [asdict(record) for record in records],
-            "evaluations": [asdict(record) for record in evaluations],
+            "schedule": self.schedule.state_dict(),
+            "updates": self.updates,
+            "random": torch.get_rng_state(),
+            "robots": self.robots.state_dict(),
+            "learner": self.learner.state_dict(),
+            "buffer": self.buffer.state_dict(),
+            "explorer": self.explorer.state_dict(),
+            "curiosity": None if self.curiosity is None else self.curiosity.checkpoint(),
+            "best": None if self._best is None else dict(self._best.state_dict()),
+            "records": [asdict(record) for record in self.records],
+            "evaluations": [asdict(record) for record in self.evaluations],
         }
         save_atomically(state, self.folder / files.CHECKPOINT)
-        policy = exported_policy(moment.policy, self.settings, records)
+        chosen = self._best if self.settings.evaluation.choose else None
+        policy = exported_policy(chosen or self.learner.policy, self.settings, self.records)
         save_policy(policy, self.folder / files.POLICY)
-        write_table(as_table(records, EpisodeRecord), self.folder / files.EPISODES)
-        if evaluations:
-            table = as_table(evaluations, EvaluationRecord)
+        write_table(as_table(self.records, EpisodeRecord), self.folder / files.EPISODES)
+        if self.evaluations:
+            table = as_table(self.evaluations, EvaluationRecord)
             write_table(table, self.folder / files.EVALUATIONS)
 
     def _load(self, state: dict[str, Any]) -> None:
         """Go on where a checkpoint was written."""
+        begins = self.schedule.load_state_dict(state["schedule"])
+        self.updates = state["updates"]
         self.learner.load_state_dict(state["learner"])
         self.buffer.load_state_dict(state["buffer"])
         self.explorer.load_state_dict(state["explorer"])
         if self.curiosity is not None:
             self.curiosity.restore(state["curiosity"])
-        self.episode, self.step = state["episode"], state["step"]
+        if state["best"] is not None:
+            self._best = copy.deepcopy(self.learner.policy)
+            self._best.load_state_dict(state["best"])
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
+        torch.set_rng_state(state["random"])
+        if begins:
+            self._begin_stage()
+        else:
+            self.robots.load_state_dict(self.schedule.world, state["robots"])
+            torch.set_rng_state(state["random"])
+        self._anneal()
 
     def close(self) -> None:
         """Release the simulation and finish the log."""
-        self.driver.close()
+        self.robots.close()
         self.tracker.close()
-
-
-def episode_seed(seed: int, episode: int) -> int:
-    """A seed for each episode of each run."""
-    return seed * 1_000_003 + episode
 
 
 def prepare_process(settings: TrainSettings) -> None:

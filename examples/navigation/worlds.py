@@ -7,16 +7,17 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs import world_tasks
 
 _LONGEST = 60
 
 
 def parse_worlds(words: Sequence[str]) -> list[str]:
-    """The worlds that some words stand for.
+    """What some words stand for.
 
     Args:
-        words: Names of worlds, paths of world files, and spans of generated ones.
+        words: Names of worlds, paths of world files, spans of a generator's worlds, and
+            ``bars:test`` or ``bars:validation``, the worlds of a split.
 
     Returns:
         Names and paths, each of which there is.
@@ -25,12 +26,12 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
         ValueError: If there is no such world, or one is named twice.
 
     Examples:
-        >>> parse_worlds(["test", "rooms:7-9"])
-        ['test', 'rooms-7', 'rooms-8', 'rooms-9']
+        >>> parse_worlds(["test", "rooms:7-9", "bars:test"])
+        ['test', 'rooms-7', 'rooms-8', 'rooms-9', 'bars:test']
     """
     worlds: list[str] = []
     for word in words:
-        span = re.fullmatch(r"([a-z-]+):(\d{1,9})-(\d{1,9})", word)
+        span = re.fullmatch(r"([a-z]+):(\d{1,9})-(\d{1,9})", word)
         if span is None:
             worlds.append(word)
         else:
@@ -41,13 +42,14 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
     for number, world in enumerate(worlds):
         if world in worlds[:number]:
             raise ValueError(f"world {world!r} is named twice")
-        resolve_world(world)
+        world_tasks(world, episodes=1)
     return worlds
 
 
 def world_name(world: str) -> str:
     """A world as part of a file's name: that of a world file without folder and ending."""
-    return re.sub(r"[^\w.-]", "_", Path(world).stem if Path(world).suffix else world)
+    name = Path(world).stem if Path(world).suffix else world
+    return re.sub(r"[^\w.-]", "_", name.replace(":", "-"))
 
 
 def worlds_label(words: Sequence[str]) -> str:
@@ -63,7 +65,7 @@ def worlds_label(words: Sequence[str]) -> str:
         >>> worlds_label(["test", "rooms:100-109"])
         'test+rooms-100-109'
     """
-    label = "+".join(world_name(word.replace(":", "-")) for word in words)
+    label = "+".join(world_name(word) for word in words)
     if len(label) <= _LONGEST and not any(Path(word).suffix for word in words):
         return label
     # Two world files may have one name, in two folders.

@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 
 from mpfa_envs import (
     EpisodeResult,
-    NavigationEnv,
     Policy,
+    VectorNavigationEnv,
     evaluate,
-    evaluation_pairs,
     load_policy,
-    run_episodes,
+    run_tasks,
     spl,
     summarize,
+    world_tasks,
 )
-from mpfa_envs.evaluation import bootstrap, wilson
 from mpfa_envs.layers import Linear, Tanh
-from tests.envs.paper import paper_env
+from mpfa_envs.results import bootstrap, wilson
 
 POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.npz"))
 
@@ -146,14 +145,14 @@ def test_several_worlds_give_rows_that_name_theirs() -> None:
 def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made: list[NavigationEnv] = []
-    original = NavigationEnv.__init__
+    made: list[VectorNavigationEnv] = []
+    original = VectorNavigationEnv.__init__
 
-    def remember(self: NavigationEnv, **arguments: object) -> None:
-        original(self, **arguments)  # type: ignore[arg-type]
+    def remember(self: VectorNavigationEnv, *sizes: int, **arguments: object) -> None:
+        original(self, *sizes, **arguments)  # type: ignore[arg-type]
         made.append(self)
 
-    monkeypatch.setattr(NavigationEnv, "__init__", remember)
+    monkeypatch.setattr(VectorNavigationEnv, "__init__", remember)
     learned = {"robot": "burger", "max_steps": 7, "action_repeat": 2, "closeness_distance": 0.2}
     policy = steering_policy(**learned)
     evaluate(policy, "A", episodes=1)
@@ -165,23 +164,38 @@ def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
 
 
 def test_a_trajectory_starts_at_the_start_and_ends_at_the_goal() -> None:
-    env = paper_env(world="A", physics="kinematic")
-    task = evaluation_pairs("A", 1, seed=2)[0]
-    seen: list[tuple[float, float]] = []
-    trails: list[list[tuple[float, float]]] = []
-    (episode,) = run_episodes(
-        env,
-        steer,
-        [task],
-        on_step=lambda env: seen.append(env.trail[-1]),
-        on_end=lambda env, _: trails.append(env.trail),
-    )
-    (trail,) = trails
-    assert trail[0] == pytest.approx(task.start[:2])
-    assert math.dist(trail[-1], task.goal) <= env.goal_radius
-    assert seen == trail
-    driven = np.linalg.norm(np.diff(trail, axis=0), axis=1).sum()
-    assert episode.path_length == pytest.approx(driven)
+    tasks = world_tasks("A", episodes=5, seed=2)
+    trails: dict[int, list[tuple[float, float]]] = {}
+
+    def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
+        trails[number] = env.trail(robot)
+
+    arguments = {"physics": "kinematic", "max_steps": 300}
+    results = run_tasks(steer, tasks, envs_at_once=2, on_end=keep, **arguments)
+    for number, (episode, each) in enumerate(zip(results, tasks, strict=True)):
+        trail = trails[number]
+        assert trail[0] == pytest.approx(each.task.start[:2])
+        assert math.dist(trail[-1], each.task.goal) <= 0.5
+        driven = np.linalg.norm(np.diff(trail, axis=0), axis=1).sum()
+        assert episode.path_length == pytest.approx(driven)
+        assert episode.time_s == pytest.approx(0.1 * (len(trail) - 1))
+
+
+def test_the_test_worlds_of_a_generator_have_four_tasks_each() -> None:
+    tasks = world_tasks("bars:test", episodes=10)
+    names = [each.world.name for each in tasks]
+    assert names == ["bars-test-0"] * 4 + ["bars-test-1"] * 4 + ["bars-test-2"] * 2
+    assert world_tasks("bars:test", episodes=4) == tasks[:4]
+    results = evaluate(steering_policy(max_steps=20), "bars:test", episodes=6)
+    assert [(found.world, found.episode) for found in results[3:]] == [
+        ("bars-test-0", 3), ("bars-test-1", 0), ("bars-test-1", 1),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["bars", "bars:train", "bras:test"])
+def test_what_stands_for_no_tasks_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"world must be .*got '{name}'"):
+        world_tasks(name)
 
 
 @pytest.mark.parametrize(
@@ -207,9 +221,8 @@ def test_a_policy_of_one_observation_is_told_what_to_do() -> None:
         evaluate(single, "A", episodes=2, physics="kinematic", envs_at_once=2)
 
 
-def test_no_environments_are_refused() -> None:
-    with pytest.raises(ValueError, match="envs must hold at least one environment"):
-        run_episodes([], steer, evaluation_pairs("A", 1, seed=0))
+def test_no_tasks_have_no_results() -> None:
+    assert run_tasks(steer, []) == []
 
 
 def test_there_is_a_policy_to_start_from() -> None:

@@ -124,8 +124,8 @@ def trainings(process: subprocess.Popen[bytes]) -> list[int]:
 def test_a_killed_study_leaves_no_training_behind_and_goes_on_to_the_same_rows(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    arguments = [*study(tmp_path / "killed", methods=("mpfa_per",), length=40)]
-    arguments.append("checkpoint_every=1")
+    arguments = [*study(tmp_path / "killed", methods=("mpfa_per",), length=20)]
+    arguments.append("checkpoint_every=20")
     process = subprocess.Popen(
         [sys.executable, compare.__file__ or "", *arguments],
         stdout=subprocess.DEVNULL,
@@ -173,11 +173,7 @@ def test_two_studies_do_not_work_in_one_folder(
 
 
 def test_defaults_of_a_study_give_way_to_its_command_line() -> None:
-    assert with_defaults(["curriculum=A"]) == [
-        "tracking=off",
-        "evaluation.every=5000",
-        "curriculum=A",
-    ]
+    assert with_defaults(["tracking=offline"]) == ["evaluation.every=5000", "tracking=offline"]
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     training = make_training_env("D", settings)
     judging = NavigationEnv(world="D", collision_distance="contact", **env_arguments(settings))
     training.set_seed(1)
-    seen = training.reset()["observation"].numpy()
+    seen = training.reset()["observation"].numpy()[0]
     task = training.env.tasks[0]
     assert judging.reset(options=task._asdict())[0] == pytest.approx(seen)
     for name in ("max_steps", "action_repeat", "closeness_distance", "physics"):

@@ -45,9 +45,9 @@ def test_the_script_writes_tables_and_pictures(
     assert list(episodes["world"]) == ["B"] * 3
     results = evaluate_policy(load_policy(run), "B", episodes=3)
     assert list(episodes["path_length"]) == pytest.approx([r.path_length for r in results])
-    with Image.open(folder / "trajectories-B.png") as picture:
+    with Image.open(folder / "trajectories.png") as picture:
         assert picture.size[0] == 640
-    with Image.open(folder / "episode-B.gif") as animation:
+    with Image.open(folder / "episode.gif") as animation:
         assert getattr(animation, "n_frames", 1) > 1
     assert json.loads((folder / "settings.json").read_text())["card"]["learner"] == "ddpg"
     assert f"written: {folder}" in capsys.readouterr().out
@@ -67,6 +67,23 @@ def test_several_worlds_have_a_row_each_and_a_total(
     assert (run / "evaluation-A" / "episodes.csv").read_bytes() == before
     assert len(read_table(run / "evaluation-A+rooms-5-6" / "episodes.csv")) == 6
     assert "rooms-6" in capsys.readouterr().out
+
+
+def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> None:
+    words = ["bars:validation", "mazes:validation", "D"]
+    summary = evaluate.main([str(run), "--worlds", *words, "--episodes", "20"])
+    assert list(summary["world"]) == ["bars-validation", "mazes-validation", "D", "total"]
+    folder = run / f"evaluation-{worlds_label(words)}"
+    found = json.loads((folder / "evaluation.json").read_text())
+    assert sorted(found["generators"]) == ["bars", "mazes"]
+    assert sorted(found["worlds"]) == ["D"]
+    assert found["episodes"] == 60
+    for row in (found, found["generators"]["mazes"], found["worlds"]["D"]):
+        assert row["success"] + row["collision"] + row["timeout"] == pytest.approx(1.0)
+        assert {"spl", "time_s"} <= set(row)
+    with Image.open(folder / "trajectories.png") as picture:
+        # Five worlds of each generator and D: the first nine, three in a row.
+        assert picture.size[0] == 3 * 360
 
 
 def test_the_policy_that_comes_with_the_project_reaches_its_goals(
@@ -113,5 +130,5 @@ def test_worlds_and_their_label_agree() -> None:
     assert parse_worlds(["test", "rooms:100-101"]) == ["test", "rooms-100", "rooms-101"]
     words = (["test"], ["test", "A"], ["a/w.yaml"], ["b/w.yaml"])
     assert len({worlds_label(each) for each in words}) == 4
-    many = [f"random-{number}" for number in range(51)]
+    many = [f"rooms-{number}" for number in range(51)]
     assert worlds_label(many) != worlds_label(many[:50])

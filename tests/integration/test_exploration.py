@@ -10,18 +10,20 @@ from navigation.exploration import NoisyPolicy, RandomPolicy, make_explorer
 from navigation.settings import ExplorationSettings
 from torchrl_mpfa import make_actor, make_stochastic_actor
 
-SPEC = Bounded(low=-1.0, high=1.0, shape=(2,))
-OBSERVATION = torch.linspace(-1, 1, 5)
+SPEC = Bounded(low=-1.0, high=1.0, shape=(3, 2))
+OBSERVATION = torch.linspace(-1, 1, 5).expand(3, -1)
+ALL = torch.ones(3, dtype=torch.bool)
 
 
 def deviations(explorer: NoisyPolicy, count: int = 400) -> torch.Tensor:
+    """Of the actions of three robots, shape ``[count, 3, 2]``."""
     with torch.no_grad():
         chosen = explorer.policy.outputs({"observation": OBSERVATION})["action"]
         return torch.stack([explorer.act(OBSERVATION) - chosen for _ in range(count)])
 
 
 def test_noise_falls_from_its_first_to_its_last_size() -> None:
-    settings = ExplorationSettings(sigma=0.3, sigma_end=0.1, annealing_steps=100)
+    settings = ExplorationSettings(sigma=0.3, sigma_end=0.1, annealing_steps=300)
     explorer = NoisyPolicy(make_actor(5, 2), settings, SPEC)
     assert explorer.sigma == pytest.approx(0.3)
     deviations(explorer, 100)
@@ -33,20 +35,28 @@ def test_every_episode_has_its_own_share_of_the_noise_if_that_is_varied() -> Non
     settings = ExplorationSettings(sigma=0.2, sigma_end=0.2, varied=True)
     explorer = NoisyPolicy(make_actor(5, 2), settings, SPEC)
     shares = []
-    for _ in range(30):
-        explorer.begin_episode()
-        spread = deviations(explorer, 100).std().item()
-        assert spread == pytest.approx(0.2 * explorer.share, rel=0.25, abs=1e-3)
-        assert explorer.sigma == pytest.approx(0.2 * explorer.share)
-        shares.append(explorer.share)
+    for _ in range(10):
+        explorer.begin_episodes(ALL)
+        spread = deviations(explorer, 200).std(dim=(0, 2))
+        torch.testing.assert_close(spread, 0.2 * explorer.shares[:, 0], rtol=0.25, atol=2e-3)
+        assert explorer.sigma == pytest.approx(0.2 * explorer.shares.mean().item())
+        shares += explorer.shares[:, 0].tolist()
     assert min(shares) < 0.15
     assert max(shares) > 0.85
 
 
+def test_only_the_robots_that_begin_an_episode_get_another_share() -> None:
+    explorer = NoisyPolicy(make_actor(5, 2), ExplorationSettings(), SPEC)
+    explorer.begin_episodes(ALL)
+    before = explorer.shares.clone()
+    explorer.begin_episodes(torch.tensor([False, True, False]))
+    assert (explorer.shares == before).squeeze().tolist() == [True, False, True]
+
+
 def test_without_varying_the_noise_is_the_same_in_all_episodes() -> None:
     explorer = NoisyPolicy(make_actor(5, 2), ExplorationSettings(varied=False), SPEC)
-    explorer.begin_episode()
-    assert explorer.share == 1.0
+    explorer.begin_episodes(ALL)
+    assert explorer.shares.tolist() == [[1.0]] * 3
 
 
 def test_a_policy_that_is_random_by_itself_gets_no_noise() -> None:

@@ -74,16 +74,16 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
             assert picture.width == width
 
 
-def test_generated_worlds_have_tables_of_their_own_without_the_paper(study: Path) -> None:
+def test_random_worlds_have_tables_of_their_own_without_the_paper(study: Path) -> None:
     rows = pd.read_csv(study / "episodes.csv")
     rooms = rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))
     write_table(pd.concat([rows, rooms]), study / "episodes.csv")
     report.main([str(study)])
-    test, rooms = (study / "tables.md").read_text(encoding="utf-8").split("## rooms")
+    test, random = (study / "tables.md").read_text(encoding="utf-8").split("## rooms")
     assert LINE in test
-    assert LINE in rooms
+    assert LINE in random
     assert test.count("| paper |") == 2
-    assert "| paper |" not in rooms
+    assert "| paper |" not in random
 
 
 def test_two_studies_together_have_the_runs_of_both(

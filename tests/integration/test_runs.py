@@ -19,7 +19,7 @@ from navigation import files, tracking
 from navigation.checkpoints import read_checkpoint
 from navigation.command_line import composed, parse_overrides
 from navigation.files import CHECKPOINT, FolderInUse, lock
-from navigation.records import EpisodeRecord, read_table
+from navigation.records import read_table
 from navigation.running import Refused, resume, start
 from navigation.settings import register
 from navigation.training import TrainingRun
@@ -55,7 +55,7 @@ def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
     assert json.loads((tmp_path / files.SETTINGS).read_text())["seed"] == 4
     status = json.loads((tmp_path / files.STATUS).read_text())
     assert status["finished"] is True
-    assert (status["episode"], status["episodes"]) == (3, 3)
+    assert (status["unit"], status["done"], status["total"]) == ("episode", 3, 3)
     assert {path.name for path in tmp_path.iterdir()} == {
         *(files.CHECKPOINT, files.POLICY, files.SETTINGS, files.EPISODES, files.CURVE),
         *(files.STATUS, ".lock"),
@@ -122,7 +122,7 @@ def test_a_run_goes_on_with_more_episodes_and_in_another_world(tmp_path: Path) -
     begin(tmp_path / "run", episodes=2)
     assert go_on(tmp_path / "run", STAGES.format(3), "evaluation.every=10") == 0
     more = "curriculum.stages=[{world: A, episodes: 3},{world: B, episodes: 1}]"
-    assert go_on(tmp_path / "run", more, "checkpoint_every=2", "tracking=off", "threads=1") == 0
+    assert go_on(tmp_path / "run", more, "checkpoint_every=50", "tracking=off", "threads=1") == 0
     assert list(read_table(tmp_path / "run" / files.EPISODES)["world"]) == ["A", "A", "A", "B"]
     settings = json.loads((tmp_path / "run" / files.SETTINGS).read_text())
     assert settings["curriculum"]["name"] == "A3+B1"
@@ -138,6 +138,8 @@ def test_a_run_goes_on_with_more_episodes_and_in_another_world(tmp_path: Path) -
         ("method=per", "cannot change method.name=per"),
         ("seed=9", r"seed=9 \(it has 0\)"),
         ("evaluation.world=B", "evaluation.world=B"),
+        ("regime=rooms", r"cannot change regime=rooms \(it has paper\)"),
+        ("robots=4", r"cannot change robots=4 \(it has 1\)"),
         (STAGES.format(1), r"curriculum.stages may have more .* has \[A: 2\], got \[A: 1\]"),
         ("run_dir=elsewhere", "resume: run_dir is of no use, a run goes on in its folder"),
         ("overwrite=true", "resume: overwrite is of no use"),
@@ -217,39 +219,36 @@ def wait_for(file: Path, process: subprocess.Popen[str], seconds: float = 120) -
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 def test_a_killed_run_goes_on_and_signals_save(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    killed = popen(*OVERRIDES, STAGES.format(10_000), f"run_dir={folder}", "checkpoint_every=1")
+    killed = popen(*OVERRIDES, STAGES.format(10_000), f"run_dir={folder}", "checkpoint_every=20")
     wait_for(folder / CHECKPOINT, killed)
     killed.send_signal(signal.SIGKILL)
     killed.communicate(timeout=60)
-    episode = read_checkpoint(folder)["episode"]
-    assert episode >= 1
+    before = read_checkpoint(folder)["schedule"]["actions"]
+    assert before >= 20
 
-    for number in (signal.SIGTERM,):
-        (folder / files.STATUS).unlink()
-        resumed = popen(f"resume={folder}", "checkpoint_every=10000")
-        wait_for(folder / files.STATUS, resumed)
-        resumed.send_signal(number)
-        out, err = resumed.communicate(timeout=120)
-        assert resumed.returncode == 128 + number, err
-        assert f"continue with: train.py resume={folder}" in out
-        reached = read_checkpoint(folder)["episode"]
-        assert reached > episode
-        episode = reached
+    (folder / files.STATUS).unlink(missing_ok=True)
+    resumed = popen(f"resume={folder}", "checkpoint_every=1000000")
+    wait_for(folder / files.STATUS, resumed)
+    resumed.send_signal(signal.SIGTERM)
+    out, err = resumed.communicate(timeout=120)
+    assert resumed.returncode == 128 + signal.SIGTERM, err
+    assert f"continue with: train.py resume={folder}" in out
+    assert read_checkpoint(folder)["schedule"]["actions"] > before
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_stops_after_the_episode_and_twice_at_once(number: int, tmp_path: Path) -> None:
+def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])
     run = TrainingRun(settings, tmp_path)
 
-    def stop(record: EpisodeRecord) -> None:
-        if record.episode == 1:
+    def stop() -> None:
+        if run.actions == 23:
             os.kill(os.getpid(), number)
 
     assert run.train(stop) is False
-    assert (run.episode, run.stop.exit_status) == (2, 128 + number)
-    assert read_checkpoint(tmp_path)["episode"] == 2
+    assert (run.actions, run.stop.exit_status) == (23, 128 + number)
+    assert read_checkpoint(tmp_path)["schedule"]["actions"] == 23
     run.close()
     with pytest.raises(KeyboardInterrupt):
         run.stop.ask(number)

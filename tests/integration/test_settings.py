@@ -25,7 +25,8 @@ def one(*arguments: str) -> TrainSettings:
 
 
 def test_the_defaults_are_table_1_of_the_paper() -> None:
-    settings = one()
+    settings = one("regime=paper")
+    assert (settings.robots, settings.updates) == (1, 1)
     assert (settings.learner.actor_lr, settings.learner.critic_lr) == (1e-4, 1e-4)
     assert (settings.learner.gamma, settings.learner.tau) == (0.99, 0.01)
     assert (settings.method.capacity, settings.method.batch_size) == (100_000, 256)
@@ -50,8 +51,10 @@ def test_an_override_reaches_the_typed_settings() -> None:
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [
-        ([], "A"),
-        (["curriculum=paper"], "paper"),
+        ([], "rooms"),
+        (["curriculum=A"], "A"),
+        (["regime=paper"], "paper"),
+        (["curriculum.stages=[{world: mixed, actions: 500}]"], "mixed500"),
         (["curriculum.stages=[{world: D, episodes: 5}]"], "D5"),
         (["curriculum=paper", "curriculum.stages=[{world: A, episodes: 2}]"], "A2"),
         (["curriculum.stages=[{world: A, episodes: 3},{world: B, episodes: 4}]"], "A3+B4"),
@@ -119,12 +122,21 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("curriculum.name=a/b", "curriculum.name must be letters"),
         (
             "curriculum.stages=[{world: A, episodes: -3}]",
-            r"curriculum.stages\[0\].episodes must be at least 1, got -3",
+            r"curriculum.stages\[0\] must have episodes or actions, at least 1, got episodes=-3",
         ),
         (
             "curriculum.stages=[{world: A, episodes: 2},{world: Q, episodes: 2}]",
-            r"curriculum.stages\[1\].world: world must be .*got 'Q'",
+            r"curriculum.stages\[1\].world.*: world must be .*got 'Q'",
         ),
+        (
+            "curriculum.stages=[{world: A, episodes: 2},{world: A, actions: 2}]",
+            r"curriculum.stages\[1\] must count what the others count, episodes or actions",
+        ),
+        ("curriculum.stages=[{world: bras, actions: 9}]", r"stages\[0\].world.*got 'bras'"),
+        ("robots=0", "robots must be at least 1, got 0"),
+        ("updates=0", "updates must be at least 1, got 0"),
+        ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
+        ("environment.progress=none-at-all", "environment.progress must be one of straight_line"),
         ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
         ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
         ("method.fusion=entropi", "method.fusion must be one of entropy"),
@@ -133,8 +145,8 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
         ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
         (
-            "environment.clearance=99",
-            r"stages\[0\].world, environment.clearance=99.0: world 'A' has no free start",
+            "curriculum=A environment.clearance=99",
+            r"stages\[0\].world, environment.clearance=99.0: world 'A' has no start",
         ),
         ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
         ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
@@ -150,7 +162,7 @@ def test_a_value_that_cannot_be_is_one_sentence_with_its_name(arguments: str, me
 
 
 def test_every_number_and_every_word_among_the_settings_has_a_rule() -> None:
-    looked_up = {"run_dir", "resume", "device", "environment.robot", "evaluation.world"}
+    looked_up = {"run_dir", "resume", "device", "regime", "environment.robot", "evaluation.world"}
     free = {"tracking.project", "method.signals", "curriculum.stages"}
     for name, value in settings_by_name(TrainSettings()):
         if not isinstance(value, bool) and name not in looked_up | free:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from torchrl.data import RandomSampler
@@ -41,9 +39,7 @@ def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -
     evaluated, plain = train(tmp_path / "evaluated", settings), train(tmp_path / "plain", tiny())
     assert rows(evaluated) == rows(plain)
     steps = [record.total_steps for record in evaluated.evaluations]
-    # At the first end of an episode after each multiple of fifty.
-    ends = [0, *(record.total_steps for record in evaluated.records)]
-    assert steps == [end for before, end in pairwise(ends) if end // 50 > before // 50]
+    assert steps == list(range(50, evaluated.actions + 1, 50))
     for record in evaluated.evaluations:
         assert record.success + record.collision + record.timeout == pytest.approx(1.0)
         assert record.world == "validation"
@@ -67,16 +63,42 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
     tmp_path: Path, method: str, learner: str
 ) -> None:
     whole = train(tmp_path / "whole", tiny(method, learner=learner))
-    part = TrainingRun(tiny(method, learner=learner), tmp_path)
-    part.train(on_episode=lambda record: record.episode == 3 and part.stop.ask())
-    part.close()
-    assert part.episode == 4
-
+    stop_after(41, tmp_path, tiny(method, learner=learner))
     resumed = TrainingRun(tiny(method, learner=learner), tmp_path, read_checkpoint(tmp_path))
     assert resumed.train()
     resumed.close()
+    assert_same_run(resumed, whole)
 
+
+@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
+def test_many_robots_are_stopped_in_the_middle_of_their_episodes_and_go_on(
+    tmp_path: Path, physics: str
+) -> None:
+    settings = tiny(episodes=[Stage("bars", actions=150)], robots=3, updates=2)
+    settings.environment.physics = physics
+    settings.environment.progress = "shortest_path"
+    whole = train(tmp_path / "whole", settings)
+    part = stop_after(60, tmp_path, settings)
+    assert all(record.total_steps <= 60 for record in part.records)
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    assert len(whole.records) > len(part.records)
+    assert_same_run(resumed, whole)
+
+
+def stop_after(actions: int, folder: Path, settings: TrainSettings) -> TrainingRun:
+    folder.mkdir(exist_ok=True)
+    run = TrainingRun(settings, folder)
+    run.train(lambda: run.actions >= actions and run.stop.ask())
+    run.close()
+    assert actions <= run.actions < actions + settings.robots
+    return run
+
+
+def assert_same_run(resumed: TrainingRun, whole: TrainingRun) -> None:
     assert rows(resumed) == rows(whole)
+    assert resumed.actions == whole.actions
     for mine, other in zip(
         resumed.learner.loss.state_dict().values(),
         whole.learner.loss.state_dict().values(),
@@ -87,9 +109,10 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
     assert torch.equal(mine["_rng"][0], other["_rng"][0])
     if "_sum_tree" in other["_sampler"]:
         assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
-    signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
-    # NaN marks what is not known yet.
-    torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)
+    if "_signals" in other["_storage"]:
+        signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
+        # NaN marks what is not known yet.
+        torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
@@ -104,7 +127,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Pat
 def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: str) -> None:
     settings = tiny(method)
     run = train(tmp_path, settings)
-    assert run.step > settings.method.batch_size
+    assert run.actions > settings.method.batch_size
     assert all(math.isfinite(record.reward) for record in run.records)
     if not settings.method.signals:
         assert isinstance(run.buffer.sampler, RandomSampler)
@@ -119,7 +142,7 @@ def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: st
 def test_every_method_works_with_every_learner(tmp_path: Path, method: str, learner: str) -> None:
     run = train(tmp_path, tiny(method, [Stage("A", 3)], learner))
     weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
-    assert run.step > run.settings.method.batch_size
+    assert run.actions > run.settings.method.batch_size
     assert all(value.isfinite().all() for value in weights)
 
 
@@ -155,7 +178,7 @@ def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Pa
 
     part = TrainingRun(settings, tmp_path / "part")
     # Stopped between the worlds.
-    part.train(on_episode=lambda record: record.episode == 2 and part.stop.ask())
+    part.train(lambda: part.schedule.stage == 1 and part.stop.ask())
     part.close()
     resumed = TrainingRun(settings, tmp_path / "part", read_checkpoint(tmp_path / "part"))
     assert resumed.train()
@@ -167,7 +190,7 @@ def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
     assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
     assert all(r.success + r.collision + r.timeout == 1 for r in run.records)
-    assert sum(r.steps for r in run.records) == run.step == run.records[-1].total_steps
+    assert sum(r.steps for r in run.records) == run.actions == run.records[-1].total_steps
     assert (tmp_path / "episodes.csv").read_text().count("\n") == 1 + len(run.records)
 
 
@@ -179,13 +202,13 @@ def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str
     trained = run.learner.policy.outputs({"observation": observation})["action"]
     np.testing.assert_allclose(policy(observation.numpy()), trained.detach().numpy(), atol=1e-5)
     assert policy.card["episodes"] == 6
-    assert policy.card["steps"] == run.step
+    assert policy.card["steps"] == run.actions
     assert policy.env_arguments["closeness_distance"] == pytest.approx(0.25)
 
 
 def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
     save_atomically({"format": 3}, tmp_path / CHECKPOINT)
-    with pytest.raises(ValueError, match=r"format 3, this version reads 4"):
+    with pytest.raises(ValueError, match=r"format 3, this version reads 5"):
         read_checkpoint(tmp_path)
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
     with pytest.raises(ValueError, match=CHECKPOINT):
@@ -194,36 +217,77 @@ def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: P
         read_checkpoint(tmp_path / "elsewhere")
 
 
-def test_an_episode_that_fails_leaves_a_checkpoint_of_the_one_before(tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole", tiny())
+def test_an_update_that_is_refused_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
     failing = TrainingRun(tiny(), tmp_path)
-    update = failing.learner.update
+    update, count = failing.learner.update, 0
 
     def fail(draw: object) -> dict[str, torch.Tensor]:
-        if failing.episode == 4 and failing.driver.info()["path_length"] > 0.2:
-            # What a broken step would have done to the networks must not be saved.
-            for weight in failing.learner.loss.parameters():
-                weight.data.fill_(math.nan)
-            raise RuntimeError("the fifth episode fails")
-        return update(draw)
+        nonlocal count
+        count += 1
+        if count == 30:
+            raise ValueError("the loss is not finite")
+        return update(draw)  # type: ignore[arg-type]
 
     failing.learner.update = fail  # type: ignore[assignment, method-assign]
-    with pytest.raises(RuntimeError, match="fifth episode"):
+    with pytest.raises(ValueError, match="not finite"):
         failing.train()
     failing.close()
-    state = read_checkpoint(tmp_path)
-    assert state["episode"] == 4
-    assert len(pd.read_csv(tmp_path / "episodes.csv")) == 4
-    resumed = TrainingRun(tiny(), tmp_path, state)
+    resumed = TrainingRun(tiny(), tmp_path, read_checkpoint(tmp_path))
+    assert resumed.actions == failing.actions
     assert resumed.train()
     resumed.close()
-    assert rows(resumed) == rows(whole)
+
+
+def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.checkpoint_every = 30
+    failing = TrainingRun(settings, tmp_path)
+
+    def fail() -> None:
+        if failing.actions == 50:
+            for weight in failing.learner.loss.parameters():
+                weight.data.fill_(math.nan)
+            raise RuntimeError("something broke")
+
+    with pytest.raises(RuntimeError, match="something broke"):
+        failing.train(fail)
+    failing.close()
+    assert read_checkpoint(tmp_path)["schedule"]["actions"] == 30
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    assert rows(resumed) == rows(train(tmp_path / "whole", tiny()))
+
+
+def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    settings = tiny()
+    settings.evaluation.every, settings.evaluation.episodes = 20, 4
+    settings.evaluation.choose = True
+    run = TrainingRun(settings, tmp_path)
+    kept: list[dict[str, torch.Tensor]] = []
+    run.train(
+        lambda: (
+            len(run.evaluations) > len(kept)
+            and kept.append({k: v.clone() for k, v in run.learner.policy.state_dict().items()})
+        )
+    )
+    run.close()
+    scores = [(record.success, record.spl) for record in run.evaluations]
+    best = max(range(len(scores)), key=lambda number: (scores[number], number))
+    observation = np.random.default_rng(0).random((5, 24), dtype=np.float32)
+    run.learner.policy.load_state_dict(kept[best])
+    expected = run.learner.policy.outputs({"observation": torch.from_numpy(observation)})["action"]
+    np.testing.assert_allclose(
+        load_policy(tmp_path)(observation), expected.detach().numpy(), atol=1e-5
+    )
 
 
 def test_rates_fall_linearly_in_long_runs_and_with_the_cube_in_short_ones(tmp_path: Path) -> None:
     def rate_at_half(episodes: int) -> float:
         run = TrainingRun(tiny(episodes=[Stage("A", episodes)]), tmp_path)
-        run.episode = episodes // 2
+        run.schedule.count(actions=1, episodes=episodes // 2)
         run._anneal()
         run.close()
         return float(run.learner.optimizer.param_groups[0]["lr"])
@@ -254,6 +318,6 @@ def test_the_log_has_what_critic_and_actor_gave_whoever_learned_last(
 
 def test_klper_is_told_the_noise_of_the_episode_that_acts(tmp_path: Path) -> None:
     run = TrainingRun(tiny("klper"), tmp_path)
-    run.explorer.share = 0.25  # type: ignore[attr-defined]
+    run.explorer.shares.fill_(0.25)  # type: ignore[attr-defined]
     assert run.explorer.sigma == pytest.approx(0.25 * run.settings.exploration.sigma)
     run.close()

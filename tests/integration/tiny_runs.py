@@ -17,6 +17,7 @@ from navigation.training import TrainingRun
 # Two worlds, so that a change of world lies between the checkpoints too.
 STAGES = [Stage("A", 3), Stage("B", 3)]
 OVERRIDES = [
+    "regime=paper",
     "learner.width=8",
     "method.batch_size=8",
     "method.capacity=200",
@@ -29,15 +30,22 @@ OVERRIDES = [
 
 
 def tiny(
-    method: str = "mpfa_per", episodes: list[Stage] | None = None, learner: str = "ddpg"
+    method: str = "mpfa_per",
+    episodes: list[Stage] | None = None,
+    learner: str = "ddpg",
+    *,
+    robots: int = 1,
+    updates: int = 1,
 ) -> TrainSettings:
     settings = TrainSettings(
         method=replace(GROUPS["method"][method]),
         learner=GROUPS["learner"][learner](),
         curriculum=CurriculumSettings("tiny", list(episodes or STAGES)),
         environment=EnvironmentSettings(physics="kinematic", max_steps=25),
-        checkpoint_every=1000,
+        checkpoint_every=10_000,
         seed=3,
+        robots=robots,
+        updates=updates,
     )
     settings.method.capacity, settings.method.batch_size = 100, 16
     settings.learner.width = 16

@@ -1,0 +1,148 @@
+"""What evaluation episodes gave, and rates and means of them with their intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_LEVEL = 0.95
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """One evaluation episode."""
+
+    episode: int
+    """Number of the task in its world."""
+    success: bool
+    collision: bool
+    timeout: bool
+    time_s: float
+    """Simulated time [s]."""
+    path_length: float
+    """Distance driven [m]."""
+    shortest_path: float
+    """Shortest path of the task [m]."""
+    min_clearance: float
+    """Least distance between the robot's rim and an obstacle or wall [m]."""
+    spl: float
+    """Success weighted by path length, see :func:`spl`."""
+    world: str = ""
+    """Where it was."""
+
+
+def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
+    """Success weighted by path length, of one episode (https://arxiv.org/abs/1807.06757).
+
+    Args:
+        success: Whether the goal was reached.
+        path_length: Distance driven [m].
+        shortest_path: Shortest path of the task [m].
+
+    Returns:
+        0 for a failure, 1 for a success on the shortest path.
+
+    Examples:
+        >>> spl(True, path_length=4.0, shortest_path=3.0)
+        0.75
+    """
+    return success * shortest_path / max(path_length, shortest_path)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, Interval]:
+    """Rates and means with 95 % intervals; time and path count successes only.
+
+    Rates have Wilson's interval, which stays right near 0 and 1, means that of the percentile
+    bootstrap; NaN where there are no two values to tell a spread from.
+
+    Args:
+        results: The episodes.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        Estimates by name; success, collision and timeout sum to one.
+
+    Raises:
+        ValueError: If there are no results.
+    """
+    if not results:
+        raise ValueError("results must hold at least one episode")
+    rng = np.random.default_rng(seed)
+    reached = [result for result in results if result.success]
+    return {
+        "success": wilson([result.success for result in results]),
+        "collision": wilson([result.collision for result in results]),
+        "timeout": wilson([result.timeout for result in results]),
+        "spl": bootstrap([result.spl for result in results], rng),
+        "time_s": bootstrap([result.time_s for result in reached], rng),
+        "path_length": bootstrap([result.path_length for result in reached], rng),
+        "min_clearance": bootstrap([result.min_clearance for result in results], rng),
+    }
+
+
+def wilson(outcomes: Sequence[bool]) -> Interval:
+    """A rate with Wilson's 95 % interval.
+
+    Args:
+        outcomes: Of each trial; at least one.
+
+    Returns:
+        The rate and its interval.
+
+    Examples:
+        >>> interval = wilson([True] * 181 + [False] * 19)
+        >>> round(interval.low, 3), round(interval.high, 3)
+        (0.856, 0.938)
+    """
+    from scipy.stats import binomtest
+
+    test = binomtest(sum(outcomes), len(outcomes))
+    found = test.proportion_ci(_LEVEL, method="wilson")
+    return Interval(float(test.statistic), float(found.low), float(found.high))
+
+
+def bootstrap(values: Sequence[float], rng: np.random.Generator) -> Interval:
+    """A mean with its 95 % percentile bootstrap interval.
+
+    Args:
+        values: The sample; without values all is NaN, with one its interval is.
+        rng: Source of the resamples.
+
+    Returns:
+        The mean and its interval.
+
+    Examples:
+        >>> interval = bootstrap([3.0, 4.0, 5.0, 6.0], np.random.default_rng(0))
+        >>> interval.value, 3.0 <= interval.low < 4.5 < interval.high <= 6.0
+        (4.5, True)
+    """
+    from scipy import stats
+
+    if len(values) < 2:
+        return Interval(float(values[0]) if values else math.nan, math.nan, math.nan)
+    found = stats.bootstrap(
+        (np.asarray(values, dtype=np.float64),),
+        np.mean,
+        n_resamples=_RESAMPLES,
+        batch=100,
+        confidence_level=_LEVEL,
+        method="percentile",
+        rng=rng,
+    ).confidence_interval
+    return Interval(float(np.mean(values)), float(found.low), float(found.high))
