@@ -329,6 +329,8 @@ REGIMES: dict[str, dict[str, Any]] = {
             "physics": "kinematic",
             "progress": "shortest_path",
             "max_goal_distance": 20.0,
+            # Less than the paper's, as mazes and fields are narrow.
+            "clearance": 0.05,
         },
         "evaluation": {"world": "mixed:validation", "episodes": 100},
     },
