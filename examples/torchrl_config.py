@@ -3,6 +3,7 @@
     python examples/torchrl_config.py
     python examples/torchrl_config.py sampler=signal sampler.alpha=0.7 storage=signal_memmap
     python examples/torchrl_config.py sampler=random frames=20000 optimizer=adamw
+    python examples/torchrl_config.py world=mixed env.base_env.num_envs=20    many robots
     python examples/torchrl_config.py --cfg job
 
 ``torchrl_config.yaml`` has every choice.
@@ -30,6 +31,7 @@ class NavigationEnvConfig(EnvConfig):
     """The navigation task for TorchRL's group ``env``."""
 
     world: str = "A"
+    num_envs: int | None = None
     physics: str = "kinematic"
     info_keys: list[str] = field(default_factory=list)
     seed: int | None = None

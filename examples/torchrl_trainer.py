@@ -2,6 +2,7 @@
 
     python examples/torchrl_trainer.py
     python examples/torchrl_trainer.py --frames 20000 --seed 1
+    python examples/torchrl_trainer.py --world mixed --num-envs 20    many robots, ever new worlds
 
 ``torchrl_config.py`` composes the same out of Hydra's groups.
 """
@@ -48,20 +49,28 @@ class Sizes:
     width: int = 64
 
 
-def make_env(*, world: str, seed: int) -> EnvBase:
+def make_env(*, world: str, num_envs: int | None, seed: int) -> EnvBase:
     """The navigation task, with the sum of rewards that the trainer logs under its own name."""
-    env = make_navigation_env(world, physics="kinematic", info_keys=(), seed=seed)
+    env = make_navigation_env(
+        world, num_envs=num_envs, physics="kinematic", info_keys=(), seed=seed
+    )
     return TransformedEnv(env, RewardSum(in_keys=["reward"], out_keys=["reward_sum"]))
 
 
 def make_trainer(
-    sizes: Sizes, *, world: str = "A", seed: int = 0, progress_bar: bool = True
+    sizes: Sizes,
+    *,
+    world: str = "A",
+    num_envs: int | None = None,
+    seed: int = 0,
+    progress_bar: bool = True,
 ) -> DDPGTrainer:
     """Everything that learns.
 
     Args:
         sizes: How much is collected, kept and learned.
-        world: Name of the world.
+        world: Name of a world, or of a generator.
+        num_envs: Number of robots; None: one, without a batch dimension.
         seed: Seed of networks, environment, noise and replay.
         progress_bar: Whether to show one.
 
@@ -69,12 +78,13 @@ def make_trainer(
         The trainer, ready to train.
     """
     torch.manual_seed(seed)
-    env = make_env(world=world, seed=seed)
-    actor = make_actor(24, 2, action_spec=env.action_spec, width=sizes.width)
+    env = make_env(world=world, num_envs=num_envs, seed=seed)
+    spec = env.action_spec_unbatched  # Of one robot, whatever their number.
+    actor = make_actor(24, 2, action_spec=spec, width=sizes.width)
     critic = make_critic(24, 2, width=sizes.width)
     # The trainer copies the loss's actor over the collector's policy: both have the noise, which
     # the loss leaves out when it calls the actor.
-    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    noise = AdditiveGaussianModule(spec, sigma_init=0.3, sigma_end=0.3)
     policy = TensorDictSequential(actor, noise)
     loss = make_ddpg_loss(policy, critic, reward_scale=0.1)
     buffer = SignalReplayBuffer(
@@ -149,7 +159,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=Sizes.frames)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--world", default="A", help="name of a world, A to D")
+    parser.add_argument("--world", default="A", help="of a world or a generator (default: A)")
+    parser.add_argument("--num-envs", type=int, help="robots (default: one, not in a batch)")
     parser.add_argument("--no-progress", action="store_true", help="show no progress bar")
     options = parser.parse_args(arguments)
     silence()
@@ -157,6 +168,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     trainer = make_trainer(
         Sizes(frames=options.frames),
         world=options.world,
+        num_envs=options.num_envs,
         seed=options.seed,
         progress_bar=not options.no_progress,
     )

@@ -136,6 +136,13 @@ def test_torchrls_own_sampler_and_storage_fit_as_well() -> None:
     assert len(trainer.replay_buffer) == 60
 
 
+def test_many_robots_in_the_worlds_of_a_generator_are_one_setting_away() -> None:
+    trainer = tiny("world=mixed", "env.base_env.num_envs=5")
+    robots = trainer.replay_buffer[:]["collector", "traj_ids"][:20].unique()
+    assert len(robots) >= 5
+    assert_learned(trainer, "td_error", "action_gradient")
+
+
 def test_torchrls_own_networks_fit_the_loss() -> None:
     critic = "{_target_: torchrl.modules.ValueOperator, module: ${mlp}, "
     critic += "in_keys: [observation, action], out_keys: [state_action_value]}"

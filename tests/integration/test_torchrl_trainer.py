@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.trainers import (
@@ -20,6 +22,17 @@ from torchrl.trainers import (
 from torchrl.trainers.algorithms import DDPGTrainer
 from torchrl.trainers.algorithms.td3 import TD3OptimizationStepper
 
+from mpfa_envs import make_navigation_env
+from torchrl_mpfa import (
+    DDPGLearner,
+    MPFASampler,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    run_updates,
+)
 from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper, check_priority_updates
 from torchrl_trainer import Sizes, main, make_trainer
 
@@ -44,6 +57,20 @@ def known_and_replayed(trainer: Trainer) -> tuple[torch.Tensor, torch.Tensor]:
     rows = table.rows[: table.size]
     learned = [table.column[name] for name in ("td_error", "action_gradient")]
     return rows[:, learned].isfinite().all(1), rows[:, table.count_column] > 0
+
+
+def test_many_robots_in_the_worlds_of_a_generator_are_collected_flat() -> None:
+    trainer = make_trainer(TINY, world="mixed", num_envs=5, progress_bar=False)
+    PriorityStepper().register(trainer)
+    PriorityGuard().register(trainer)
+    trainer.train()
+    assert trainer.collected_frames == len(trainer.replay_buffer) == 60
+    assert trainer.replay_buffer[:]["observation"].shape == (60, 24)
+    robots = trainer.replay_buffer[:]["collector", "traj_ids"][:20].unique()
+    assert len(robots) >= 5
+    known, replayed = known_and_replayed(trainer)
+    assert known.equal(replayed)
+    assert replayed.any()
 
 
 class Forgetful(DefaultOptimizationStepper):
@@ -219,7 +246,31 @@ def test_the_example_trains_and_says_what_happened(capsys: pytest.CaptureFixture
 
 def test_the_code_of_the_page_runs() -> None:
     page = Path(__file__).parents[2] / "docs" / "torchrl_trainer.md"
-    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    names: dict[str, object] = {}
-    exec(code, names)
-    assert names["trainer"].replay_buffer.sampler.weights  # type: ignore[attr-defined]
+    in_trainer, in_loop = re.findall(
+        r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
+    )
+    names: dict[str, Any] = {}
+    exec(in_trainer, names)
+    assert names["trainer"].replay_buffer.sampler.weights
+    exec(in_loop, names)
+    assert len(names["buffer"]) == 320
+    assert names["learner"].updates == 80
+    assert names["buffer"].sampler.weights
+
+
+def test_a_collector_of_many_robots_acts_by_the_weights_that_were_learned() -> None:
+    env = make_navigation_env("A", num_envs=2, physics="kinematic", seed=0)
+    actor = make_actor(24, 2, width=8)
+    learner = DDPGLearner(make_ddpg_loss(actor, make_critic(24, 2, width=8)), actor_lr=0.1)
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(100), sampler=MPFASampler(100), batch_size=4
+    )
+    collector = Collector(
+        env, actor, frames_per_batch=8, total_frames=24, auto_register_policy_transforms=True
+    )
+    for steps in collector:
+        # The weights have not changed since these actions were taken: what acts is what learns.
+        expected = actor(steps.select("observation").clone())["action"]
+        torch.testing.assert_close(steps["action"], expected)
+        buffer.extend(steps.reshape(-1))
+        run_updates(buffer, learner, updates=3)
