@@ -84,7 +84,7 @@ def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
         {"progress": "none", "collision_distance": "contact"},
         {"progress": "shortest_path", "progress_scale": 7.0},
     ],
-    ids=str,
+    ids=lambda arguments: "-".join(arguments) or "defaults",
 )
 def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments: dict) -> None:
     ours = make(autoreset_mode=mode, **arguments)
