@@ -121,11 +121,10 @@ def run_tasks(
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
     with _progress_bar(len(tasks) if progress else None) as advance:
         for max_steps, numbers in _by_time_limit(tasks).items():
-            if max_steps is not None:
-                arguments["max_steps"] = max_steps
+            limit = {} if max_steps is None else {"max_steps": max_steps}
             robots = min(envs_at_once, len(numbers))
             arguments["world"] = _room_for([tasks[number].world for number in numbers])
-            with closing(VectorNavigationEnv(robots, **arguments)) as env:
+            with closing(VectorNavigationEnv(robots, **{**arguments, **limit})) as env:
                 for robot, number, info in _drive(
                     env, policy, tasks, deque(numbers), alone=envs_at_once == 1
                 ):

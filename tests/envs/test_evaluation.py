@@ -142,6 +142,13 @@ def test_several_worlds_give_rows_that_name_theirs() -> None:
     assert list(asdict(both[0]))[-1] == "world"
 
 
+def test_the_time_limit_of_a_generator_is_not_that_of_the_world_after_it() -> None:
+    policy = steering_policy(max_steps=20)
+    _, last = evaluate(policy, ["bars:test", "A"], episodes=1)
+    assert [last] == evaluate(policy, "A", episodes=1)
+    assert last.timeout and last.time_s == pytest.approx(2.0)
+
+
 def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
