@@ -17,6 +17,7 @@ class Schedule:
     Examples:
         >>> schedule = Schedule([Stage("A", episodes=1), Stage("B", episodes=3)])
         >>> schedule.count(actions=16, episodes=1)
+        >>> schedule.advance()
         True
         >>> schedule.world, schedule.fraction, schedule.finished
         ('B', 0.25, False)
@@ -54,22 +55,23 @@ class Schedule:
         """Whether all stages are over."""
         return self.done == self.total
 
-    def count(self, *, actions: int, episodes: int) -> bool:
+    def count(self, *, actions: int, episodes: int) -> None:
         """Count what an iteration brought.
 
         Args:
             actions: Actions of all robots.
             episodes: Episodes that ended.
-
-        Returns:
-            Whether another stage begins.
         """
         self.actions += actions
         self.episodes += episodes
         self._in_stage += episodes if self.unit == "episode" else actions
-        return self._advance()
 
-    def _advance(self) -> bool:
+    def advance(self) -> bool:
+        """Go to the next stage if the present one is over and not the last.
+
+        Returns:
+            Whether another stage begins.
+        """
         is_last = self.stage == len(self.stages) - 1
         if is_last or self._in_stage < self.stages[self.stage].length:
             return False
@@ -86,12 +88,7 @@ class Schedule:
             "episodes": self.episodes,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> bool:
-        """Go on where :meth:`state_dict` was called, perhaps with more stages than there were.
-
-        Returns:
-            Whether another stage begins.
-        """
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state_dict` was called, perhaps with more stages than there were."""
         self.stage, self._in_stage = state["stage"], state["in_stage"]
         self.actions, self.episodes = state["actions"], state["episodes"]
-        return self._advance()

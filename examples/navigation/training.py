@@ -155,7 +155,7 @@ class TrainingRun:
         )
         self.buffer.extend(rows)
         self.records += records
-        begins = self.schedule.count(actions=len(rows), episodes=len(records))
+        self.schedule.count(actions=len(rows), episodes=len(records))
         if len(self.buffer) >= (self.buffer.batch_size or 0):
             self._update(before)
         for record in records:
@@ -163,11 +163,18 @@ class TrainingRun:
             self.tracker.log_episode(record)
         if self._crossed(self.settings.evaluation.every, before):
             self._evaluate()
-        if begins:
-            if not self.settings.curriculum.carry:
-                self._build()
-            self._begin_stage()
+        # Last: a run that an error ends before here begins the stage when it goes on.
+        self._advance()
         self._anneal()
+
+    def _advance(self) -> bool:
+        """Begin the next stage if it is due, and tell whether it was."""
+        if not self.schedule.advance():
+            return False
+        if not self.settings.curriculum.carry:
+            self._build()
+        self._begin_stage()
+        return True
 
     def _crossed(self, every: int, before: int) -> bool:
         """Whether a multiple of so many actions lies between those before and those now."""
@@ -282,7 +289,7 @@ class TrainingRun:
 
     def _load(self, state: dict[str, Any]) -> None:
         """Go on where a checkpoint was written."""
-        begins = self.schedule.load_state_dict(state["schedule"])
+        self.schedule.load_state_dict(state["schedule"])
         self.updates = state["updates"]
         self.learner.load_state_dict(state["learner"])
         self.buffer.load_state_dict(state["buffer"])
@@ -295,9 +302,8 @@ class TrainingRun:
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
         torch.set_rng_state(state["random"])
-        if begins:
-            self._begin_stage()
-        else:
+        self.robots.seconds = state["robots"]["seconds"]
+        if not self._advance():
             self.robots.load_state_dict(self.schedule.world, state["robots"])
             torch.set_rng_state(state["random"])
         self._anneal()

@@ -186,6 +186,39 @@ def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Pa
     assert rows(resumed) == rows(run)
 
 
+def test_a_finished_run_begins_further_worlds_as_its_curriculum_says(tmp_path: Path) -> None:
+    settings = tiny(episodes=[Stage("A", 3)])
+    settings.curriculum.carry = False
+    train(tmp_path, settings).close()
+    state = read_checkpoint(tmp_path)
+    settings.curriculum.stages.append(Stage("B", 2))
+    resumed = TrainingRun(settings, tmp_path, state)
+    assert resumed.robots.elapsed() >= state["robots"]["seconds"]
+    assert resumed.learner.updates == len(resumed.buffer) == 0
+    assert resumed.train()
+    resumed.close()
+    assert len(resumed.buffer) == sum(record.steps for record in resumed.records[3:])
+
+
+def test_a_stage_begins_though_an_evaluation_failed_just_before_it(tmp_path: Path) -> None:
+    settings = tiny(episodes=[Stage("A", actions=40), Stage("B", actions=20)])
+    settings.evaluation.every, settings.evaluation.episodes = 40, 2
+    failing = TrainingRun(settings, tmp_path)
+
+    def fail() -> None:
+        raise RuntimeError("out of memory")
+
+    failing._evaluate = fail  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match="out of memory"):
+        failing.train()
+    failing.close()
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    whole = train(tmp_path / "whole", settings)
+    assert rows(resumed) == rows(whole)
+
+
 def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
     assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
