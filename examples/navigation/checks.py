@@ -10,10 +10,10 @@ from typing import Any
 
 import torch
 
+from mpfa_envs import world_tasks
 from mpfa_envs.robot import resolve_robot
 from navigation.environments import make_training_env
 from navigation.settings import TrainSettings
-from navigation.worlds import parse_worlds
 from torchrl_mpfa.methods.assembly import WORDS
 
 Rule = tuple[Callable[[Any], bool], str]
@@ -149,7 +149,11 @@ def check_settings(settings: TrainSettings) -> None:
                 raise ValueError(f"{name} must be {wanted}, got {value!r}")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
     _check_stages(settings)
-    _resolve("evaluation.world", lambda word: parse_worlds([word]), settings.evaluation.world)
+    _resolve(
+        "evaluation.world",
+        lambda word: world_tasks(word, episodes=1, robot=settings.environment.robot),
+        settings.evaluation.world,
+    )
     method = settings.method
     if method.capacity < method.batch_size * method.candidates:
         raise ValueError(

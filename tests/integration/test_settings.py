@@ -118,6 +118,7 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("tracking.mode=of", "tracking.mode must be one of offline, online, off, got 'of'"),
         ("evaluation.episodes=0", "evaluation.episodes must be at least 1, got 0"),
         ("evaluation.world=X", "evaluation.world: world must be .*got 'X'"),
+        ("evaluation.world=rooms:7-9", "evaluation.world: world must be rooms:validation or .*7-9"),
         ("curriculum.stages=[]", "curriculum.stages must name at least one world"),
         ("curriculum.name=a/b", "curriculum.name must be letters"),
         (
