@@ -9,7 +9,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from navigation.checks import settings_by_name
-from navigation.settings import GROUPS, Stage, TrainSettings, as_settings, curriculum_name
+from navigation.settings import GROUPS, REGIMES, Stage, TrainSettings, as_settings, curriculum_name
 
 LAWFUL = (
     "curriculum.name",
@@ -45,8 +45,9 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
         if key in OF_THE_CALL:
             continue
         if key in GROUPS and key != "regime":
-            node = GROUPS[key][str(value)]
-            config[key] = OmegaConf.structured(node)
+            chosen = OmegaConf.structured(GROUPS[key][str(value)])
+            # As at the start of the run, its regime has values of its own for any choice.
+            config[key] = OmegaConf.merge(chosen, REGIMES[before.regime].get(key, {}))
         else:
             OmegaConf.update(config, key, value)
     was_derived = before.curriculum.name == curriculum_name(before.curriculum.stages)

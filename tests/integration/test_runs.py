@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from navigation.checkpoints import read_checkpoint
 from navigation.command_line import composed, parse_overrides
 from navigation.files import CHECKPOINT, FolderInUse, lock
 from navigation.records import read_table
+from navigation.resuming import changed
 from navigation.running import Refused, resume, start
 from navigation.settings import register
 from navigation.training import TrainingRun
@@ -129,6 +131,13 @@ def test_a_run_goes_on_with_more_episodes_and_in_another_world(tmp_path: Path) -
     assert settings["evaluation"]["every"] == 10
     # Nothing was written but in the run's own folder.
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: str) -> None:
+    words = ["regime=rooms", f"learner={learner}", "curriculum=rooms", "method=per"]
+    (settings,) = composed(words)
+    assert changed(asdict(settings), parse_overrides(words)) == settings
 
 
 @pytest.mark.parametrize(
