@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -147,7 +148,9 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The rows as one document: the total, and each generator and each world under its name."""
 
     def entries(row: Mapping[str, Any]) -> dict[str, Any]:
-        kept = {name: float(row[name]) for name in _DOCUMENTED}
+        # JSON has no NaN, which the time is where no episode succeeds.
+        values = ((name, float(row[name])) for name in _DOCUMENTED)
+        kept = {name: None if math.isnan(value) else value for name, value in values}
         return {"episodes": int(row["episodes"]), **kept}
 
     document: dict[str, Any] = {**entries(rows[-1]), "generators": {}, "worlds": {}}
@@ -189,7 +192,9 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         summary = pd.DataFrame(rows)
         write_table(summary, folder / "summary.csv")
         write_table(as_table(results, EpisodeResult), folder / files.EPISODES)
-        write_text_atomically(json.dumps(as_document(rows), indent=2) + "\n", folder / EVALUATION)
+        write_text_atomically(
+            json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
+        )
         document = {"words": options.worlds, **asked, "card": policy.card}
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{options.policy}\n{printed(summary)}")

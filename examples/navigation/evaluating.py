@@ -88,6 +88,8 @@ def film(policy: Policy, episode: WorldTask, *, physics: str | None) -> list[NDA
     arguments = {**policy.env_arguments, "collision_distance": "contact", "world": episode.world}
     if physics is not None:
         arguments["physics"] = physics
+    if episode.max_steps is not None:
+        arguments["max_steps"] = episode.max_steps
     frames: list[Any] = []
     with closing(NavigationEnv(**arguments, render_mode="rgb_array")) as env:
         observation, _ = env.reset(seed=0, options=episode.task._asdict())

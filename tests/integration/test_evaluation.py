@@ -10,10 +10,10 @@ import pytest
 from PIL import Image
 
 import evaluate
+from mpfa_envs import EpisodeResult, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
-from mpfa_envs import load_policy, save_policy
 from navigation.assembly import make_learner
-from navigation.evaluating import exported_policy
+from navigation.evaluating import exported_policy, film, summary_row
 from navigation.records import read_table
 from navigation.settings import GROUPS, TrainSettings
 from navigation.worlds import parse_worlds, worlds_label
@@ -84,6 +84,19 @@ def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> N
     with Image.open(folder / "trajectories.png") as picture:
         # Five worlds of each generator and D: the first nine, three in a row.
         assert picture.size[0] == 3 * 360
+
+
+def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
+    lost = EpisodeResult(0, False, False, True, 9.0, 1.0, 2.0, 0.1, 0.0)
+    document = evaluate.as_document([{"world": "A", **summary_row([lost, lost])}])
+    assert document["time_s"] is None
+    assert document["worlds"]["A"]["timeout"] == 1.0
+
+
+def test_the_animation_ends_with_the_episode_that_it_shows(run: Path) -> None:
+    (drive,) = world_tasks("halls:validation", episodes=1)
+    frames = film(load_policy(run), drive._replace(max_steps=6), physics="kinematic")
+    assert len(frames) == 1 + 6 // 2
 
 
 def test_the_policy_that_comes_with_the_project_reaches_its_goals(
