@@ -7,7 +7,7 @@
 #                                  installed, for another build of it: a wheel file of a CPU
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
-#   COMPILE=false                  train: no compiled updates; by default if a C++ compiler is found
+#   COMPILE=false                  demo, train: no compiled updates; by default if a C++ compiler is found
 #   REGIME=paper                   train: the paper's task and numbers; by default today's, rooms
 #   DEMO_ACTIONS=80000             actions that demo trains for
 #   EPISODES=100                   episodes that demo drives in the worlds of each generator

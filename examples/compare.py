@@ -3,7 +3,7 @@
     python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners, too
     python examples/compare.py --worlds test mazes:test --episodes 40    a world, a generator's
-    python examples/compare.py --seeds 0 --methods per --folder runs/try -- curriculum=A
+    python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
 
 What follows ``--`` goes to ``train.py``. Stopped at any moment, the same command goes on: finished
 runs are left alone, others continue at their last checkpoint. A run that was trained with other

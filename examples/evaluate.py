@@ -1,14 +1,14 @@
 """Evaluate a trained policy between fixed starts and goals, in worlds or those of generators.
 
     python examples/evaluate.py runs/demo --worlds A --episodes 100
-    python examples/evaluate.py runs/demo --worlds test mazes:test bars:test
+    python examples/evaluate.py runs/demo --worlds test rooms:100-109 bars:test barn
     python examples/evaluate.py runs/demo --worlds all        every generator's test worlds
     python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
 
 Prints a row for each world or generator and their total. Writes to the folder
 ``evaluation-WORLDS`` in that of the run, for another file to runs/evaluation-NAME, or to --output:
-summary.csv (the rows with their intervals), evaluation.json (the same numbers), episodes.csv (a
-row an episode), settings.json (what was asked for, and the policy's card), trajectories.png (the
+summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (a row
+an episode), settings.json (what was asked for, and the policy's card), trajectories.png (the
 ways in up to nine worlds) and episode.gif (the longest one from above).
 """
 
@@ -54,7 +54,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--worlds",
         nargs="+",
         default=["test"],
-        help="names, world files, spans such as rooms:100-109, splits such as bars:test, or all",
+        help="names, world files, spans (rooms:100-109), splits (bars:test), barn, or all",
     )
     parser.add_argument(
         "--episodes", type=int, help="for each (default: 200 in a world, 400 of a generator)"

@@ -1,14 +1,15 @@
 """Train a navigation policy with any method and learner.
 
-    python examples/train.py                              MPFA-PER in world A
+    python examples/train.py                              MPFA-PER, 16 robots, ever new worlds
     python examples/train.py method=per seed=3            another method, another seed
-    python examples/train.py curriculum=paper             worlds A, B, C, D one after the other
+    python examples/train.py regime=paper                 Table 1, one robot, worlds A, B, C, D
+    python examples/train.py regime=paper curriculum=A    world A alone
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
-    python examples/train.py resume=runs/A-mpfa_per-ddpg-0    continue a run that was stopped
+    python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    go on with a run that was stopped
 
 ``navigation/settings.py`` has every setting; ``--help`` prints them with their values. Ctrl-C,
-SIGTERM and SIGHUP let the episode end and save. Exit status: 0; 1 after an error, the last finished
-episode being saved; 2 if a setting is wrong; 128 and the number of the signal that stopped the run.
+SIGTERM and SIGHUP let the iteration end and save. Exit status: 0; 1 after an error, the last
+iteration being saved; 2 if a setting is wrong; 128 and the number of the signal that stopped it.
 """
 
 from __future__ import annotations
