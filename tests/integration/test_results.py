@@ -43,7 +43,7 @@ def test_the_tables_of_the_further_runs_are_made_of_their_rows(runs: str, tmp_pa
 
 def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_path: Path) -> None:
     text = tables(tmp_path, "results", "results/more", "results/overlap")
-    test = text.split("## random")[0]
+    test = text.split("## rooms")[0]
     assert "| ddpg/mpfa_per | 9 | success |" in test
     # Outcomes of single runs are in the tables of their folders.
     intervals = test[test.index("|  | runs |") :]
