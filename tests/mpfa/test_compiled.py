@@ -196,7 +196,7 @@ def test_a_program_takes_the_same_hundred_steps(name, options):
     assert_alike(*learners)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
 def test_a_traced_program_does_so_too(name):
     learners = make_pair(name, TRACED, loss={"target_average": 2} if name == "ddpg" else {})
     for seed in range(4):

@@ -166,7 +166,9 @@ TRACED = {"compile": {"backend": "eager"}}
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("ddpg", PURE), ("td3", PURE), ("td3", TRACED)], ids=str
+    ("name", "options"),
+    [("ddpg", PURE), ("td3", PURE), pytest.param("td3", TRACED, marks=pytest.mark.slow)],
+    ids=str,
 )
 def test_as_one_function_a_learner_takes_the_same_steps(name, options):
     plain, traced = make_learner(name), make_learner(name, **options)
