@@ -199,6 +199,13 @@ def test_the_test_worlds_of_a_generator_have_four_tasks_each() -> None:
     ]  # fmt: skip
 
 
+def test_tasks_of_generators_have_150_seconds_and_those_of_barn_100() -> None:
+    names = {"bars:test": 1500, "mazes:validation": 1500, "barn": 1000, "A": None}
+    assert {name: world_tasks(name, episodes=1)[0].max_steps for name in names} == names
+    found = evaluate(circle, "rooms:test", episodes=1, physics="kinematic", max_steps=20)
+    assert found[0].timeout and found[0].time_s == pytest.approx(150.0)
+
+
 @pytest.mark.parametrize("name", ["bars", "bars:train", "bras:test"])
 def test_what_stands_for_no_tasks_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"world must be .*got '{name}'"):
