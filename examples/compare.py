@@ -3,16 +3,20 @@
     python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners, too
     python examples/compare.py --worlds test mazes:test --episodes 40    a world, a generator's
+    python examples/compare.py --physics wheels           evaluated on wheels, however trained
+    python examples/compare.py --arm default: --arm phi2:method.boost_factor=2    two arms of each
     python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
 
-What follows ``--`` goes to ``train.py``. Stopped at any moment, the same command goes on: finished
+What follows ``--`` goes to ``train.py``; an arm has settings of its own on top, for every learner,
+method and seed. Stopped at any moment, the same command goes on: finished
 runs are left alone, others continue at their last checkpoint. A run that was trained with other
 settings is an error, or with ``--anew`` trained again. ``report.py`` makes tables and figures of
 the folder. Files in it:
 
-    LEARNER-METHOD-SEED/   a run of train.py, and what evaluate.py wrote of it
+    LEARNER-METHOD-SEED/   a run of train.py, and what evaluate.py wrote of it; with arms
+                           LEARNER-METHOD-ARM-SEED/
     episodes.csv           every evaluation episode of every run
-    settings.json          the settings of the runs
+    settings.json          what was evaluated, and the settings of the runs
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from navigation import files
+from navigation.arms import check_free, parse_arms
 from navigation.processes import Child
 from navigation.settings import GROUPS, register
 from navigation.stopping import Stop
@@ -50,9 +55,22 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     parser.add_argument("--worlds", nargs="+", default=["test"], help="(default: test)")
     parser.add_argument("--episodes", type=int, default=200, help="for each (default: 200)")
+    parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
+    parser.add_argument(
+        "--arm",
+        action="append",
+        default=[],
+        metavar="NAME:SETTING=VALUE,...",
+        help="other settings by a name, for every run; may be given several times",
+    )
     parser.add_argument("--anew", action="store_true", help="train runs of other settings again")
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
+    try:
+        check_free(options.overrides)
+        options.arms = parse_arms(options.arm)
+    except ValueError as error:
+        parser.error(str(error))
     for group in ("method", "learner", "seed"):
         names = getattr(options, f"{group}s")
         for number, name in enumerate(names):
@@ -170,13 +188,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = parse(arguments)
     register()
-    wanted = Evaluation(tuple(options.worlds), options.episodes)
+    wanted = Evaluation(tuple(options.worlds), options.episodes, options.physics)
     jobs = [
-        Job(learner, method, seed, options.folder)
+        Job(learner, method, seed, options.folder, arm)
         # Seeds outside: a study that is cut short has as much of each method.
         for seed in options.seeds
         for learner in options.learners
         for method in options.methods
+        for arm in options.arms
     ]
     try:
         with files.lock(options.folder):

@@ -195,7 +195,9 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
+        file = options.policy / files.POLICY if options.policy.is_dir() else options.policy
         document = {"words": options.worlds, **asked, "card": policy.card}
+        document["sha256"] = files.digest(file)
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{options.policy}\n{printed(summary)}")
     print(f"written: {folder}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +26,11 @@ _OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, EPISODES, EVALUATIONS, CURVE, STATUS)
 
 class FolderInUse(RuntimeError):
     """Another process works in the folder."""
+
+
+def digest(file: Path) -> str:
+    """SHA-256 of a file, by which another one in its place is told from it."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 @contextmanager

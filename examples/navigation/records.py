@@ -83,4 +83,7 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table; one without rows if there is no such file."""
-    return pd.read_csv(path) if path.exists() else pd.DataFrame()
+    if not path.exists():
+        return pd.DataFrame()
+    # An arm may be called 3 or None: only an empty cell has no value.
+    return pd.read_csv(path, dtype={"arm": str}, keep_default_na=False, na_values=[""])

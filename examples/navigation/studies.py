@@ -1,4 +1,4 @@
-"""Studies: the runs of several methods, learners and seeds, their settings, and their rows."""
+"""Studies: the runs of several methods, learners, arms and seeds, their settings and rows."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from navigation import files
+from navigation.arms import PLAIN, Arm, with_defaults
 from navigation.checks import settings_by_name
 from navigation.command_line import composed
 from navigation.records import read_table, write_table
@@ -21,14 +22,11 @@ from navigation.worlds import worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
 SCRIPTS = Path(__file__).resolve().parents[1]
-DEFAULTS = ("tracking=off", "evaluation.every=5000")
-"""What a study has unless its command line says otherwise."""
 
 
-def with_defaults(overrides: Sequence[str]) -> list[str]:
-    """The settings of a study, but where the command line has others."""
-    given = {override.partition("=")[0] for override in overrides}
-    return [*(d for d in DEFAULTS if d.partition("=")[0] not in given), *overrides]
+def run_name(learner: str, method: str, arm: str, seed: int) -> str:
+    """Name of a run, and of its folder; an arm without a name is left out."""
+    return "-".join(part for part in (learner, method, arm, str(seed)) if part)
 
 
 @dataclass(frozen=True)
@@ -39,11 +37,14 @@ class Evaluation:
     """Worlds, as on the command line."""
     episodes: int
     """Pairs of start and goal in each of them."""
+    physics: str | None = None
+    """``wheels`` or ``kinematic``; None: as trained."""
 
     @property
     def folder(self) -> str:
         """Folder of the results, in that of a run."""
-        return f"evaluation-{worlds_label(self.words)}"
+        physics = f"-{self.physics}" if self.physics else ""
+        return f"evaluation-{worlds_label(self.words)}{physics}"
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,12 @@ class Job:
     seed: int
     folder: Path
     """Of the study."""
+    arm: Arm = PLAIN
 
     @property
     def name(self) -> str:
         """Name of the run, and of its folder."""
-        return f"{self.learner}-{self.method}-{self.seed}"
+        return run_name(self.learner, self.method, self.arm.name, self.seed)
 
     @property
     def path(self) -> Path:
@@ -69,7 +71,7 @@ class Job:
     def overrides(self, overrides: Sequence[str]) -> list[str]:
         """Its settings on the command line of ``train.py``."""
         own = [f"learner={self.learner}", f"method={self.method}", f"seed={self.seed}"]
-        return [*own, f"run_dir={self.path}", *with_defaults(overrides)]
+        return [*own, f"run_dir={self.path}", *with_defaults(self.arm.over(overrides))]
 
     def asked(self, overrides: Sequence[str]) -> TrainSettings:
         """Its settings.
@@ -77,7 +79,11 @@ class Job:
         Raises:
             ValueError: If they cannot be, or are those of several runs.
         """
-        first, *others = composed(self.overrides(overrides))
+        try:
+            first, *others = composed(self.overrides(overrides))
+        except ValueError as error:
+            where = f"--arm {self.arm.name}: " if self.arm.name else ""
+            raise ValueError(f"{where}{error}") from error
         if others:
             raise ValueError("a study takes one value for each setting, not a sweep")
         return first
@@ -91,9 +97,11 @@ class Job:
 
     def evaluates(self, wanted: Evaluation) -> list[str]:
         """The command that evaluates its policy."""
+        physics = ["--physics", wanted.physics] if wanted.physics else []
         return [
             *(sys.executable, str(SCRIPTS / "evaluate.py"), str(self.path)),
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
+            *(*physics, "--output", str(self.path / wanted.folder)),
         ]
 
     def status(self) -> Mapping[str, Any]:
@@ -105,13 +113,16 @@ class Job:
         return bool(self.status().get("finished"))
 
     def is_evaluated(self, wanted: Evaluation) -> bool:
-        """Whether its last policy was evaluated as it is asked for."""
+        """Whether the policy that it has now was evaluated as it is asked for."""
         found = _read_json(self.path / wanted.folder / files.SETTINGS)
+        policy = self.path / files.POLICY
         return (
             self.is_trained()
             and found.get("episodes") == wanted.episodes
             and found.get("words") == list(wanted.words)
-            and found.get("card", {}).get("steps") == self.status().get("steps")
+            and found.get("physics") == wanted.physics
+            and policy.exists()
+            and found.get("sha256") == files.digest(policy)
         )
 
     def differences(self, asked: TrainSettings) -> list[str]:
@@ -142,12 +153,19 @@ def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
             table = read_table(job.path / wanted.folder / files.EPISODES)
             table.insert(0, "learner", job.learner)
             table.insert(1, "method", job.method)
-            table.insert(2, "seed", job.seed)
+            table.insert(2, "arm", job.arm.name)
+            table.insert(3, "seed", job.seed)
+            settings[job.name] = trained = _read_json(job.path / files.SETTINGS)
+            table.insert(4, "physics", wanted.physics or trained["environment"]["physics"])
             tables.append(table)
-            settings[job.name] = _read_json(job.path / files.SETTINGS)
     if tables:
         write_table(pd.concat(tables), folder / files.EPISODES)
-    document = {"worlds": wanted.words, "episodes": wanted.episodes, "runs": settings}
+    document = {
+        "worlds": wanted.words,
+        "episodes": wanted.episodes,
+        "physics": wanted.physics,
+        "runs": settings,
+    }
     write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
 
 

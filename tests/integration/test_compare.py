@@ -17,10 +17,10 @@ import torch
 import compare
 import evaluate
 from navigation import files
+from navigation.arms import parse_arm, with_defaults
 from navigation.command_line import composed
 from navigation.records import read_table
 from navigation.running import Refused, resume, start
-from navigation.studies import with_defaults
 from tests.integration.tiny_runs import OVERRIDES
 
 EPISODES = "curriculum.stages=[{{world: A, episodes: {}}}]"
@@ -76,10 +76,13 @@ def test_a_study_keeps_every_episode_and_refuses_other_settings(
     worlds = ["B", "B", "rooms-7", "rooms-7", "rooms-8", "rooms-8"]
     assert list(found["world"]) == worlds * 2
     assert list(found["method"]) == ["mpfa_per"] * 6 + ["uniform"] * 6
+    assert set(found["physics"]) == {"kinematic"}
+    assert found["arm"].isna().all()
     assert (found["success"] ^ found["collision"] ^ found["timeout"]).all()
     kept = json.loads((tmp_path / files.SETTINGS).read_text())
     assert kept["runs"]["ddpg-uniform-0"]["method"]["name"] == "uniform"
     assert kept["worlds"] == ["B", "rooms:7-8"]
+    assert kept["physics"] is None
 
     # Again: nothing happens.
     checkpoint = tmp_path / "ddpg-mpfa_per-0" / files.CHECKPOINT
@@ -104,6 +107,68 @@ def test_a_study_keeps_every_episode_and_refuses_other_settings(
     assert compare.main(more) == 0
     assert len(read_table(tmp_path / files.EPISODES)) == 9
     assert checkpoint.stat().st_mtime_ns == before
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_study_is_evaluated_again_in_other_physics_and_trains_nothing_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = study(tmp_path, methods=("per",))
+    on_wheels = study(tmp_path, "--physics", "wheels", methods=("per",))
+    assert compare.main(plain) == 0
+    as_trained = read_table(tmp_path / files.EPISODES)
+    checkpoint = tmp_path / "ddpg-per-0" / files.CHECKPOINT
+    before = checkpoint.stat().st_mtime_ns
+    assert compare.main(on_wheels) == 0
+    found = read_table(tmp_path / files.EPISODES)
+    assert set(found["physics"]) == {"wheels"}
+    assert not found["path_length"].equals(as_trained["path_length"])
+    assert json.loads((tmp_path / files.SETTINGS).read_text())["physics"] == "wheels"
+    assert checkpoint.stat().st_mtime_ns == before
+    # Both stay where they are: either can be asked for again.
+    capsys.readouterr()
+    for arguments in (plain, on_wheels):
+        assert compare.main(arguments) == 0
+        assert "1 runs, 1 of them done" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_run_that_ends_in_the_middle_of_an_episode_is_evaluated_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = study(tmp_path, methods=("per",))
+    arguments[-1] = "curriculum.stages=[{world: A, actions: 30}]"
+    assert compare.main(arguments) == 0
+    assert len(read_table(tmp_path / files.EPISODES)) == 6
+    assert compare.main(arguments) == 0
+    assert "1 runs, 1 of them done" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_arms_are_trained_with_settings_of_their_own_and_told_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arms = ["--arm", "default:", "--arm", "None:method.alpha=0.3,learner.width=4"]
+    arguments = study(tmp_path, *arms, methods=("per",))
+    assert compare.main(arguments) == 0
+    found = read_table(tmp_path / files.EPISODES)
+    assert list(found["arm"]) == ["default"] * 6 + ["None"] * 6
+    kept = json.loads((tmp_path / files.SETTINGS).read_text())["runs"]
+    widths = {name: run["learner"]["width"] for name, run in kept.items()}
+    assert widths == {"ddpg-per-default-0": 8, "ddpg-per-None-0": 4}
+    assert kept["ddpg-per-None-0"]["method"]["alpha"] == 0.3
+    capsys.readouterr()
+    assert compare.main(arguments) == 0
+    assert "2 runs, 2 of them done" in capsys.readouterr().out
+
+    # Of two arms the one that has changed is named.
+    arguments[arguments.index(arms[-1])] = "None:method.alpha=0.4,learner.width=4"
+    assert compare.main(arguments) == 2
+    message = capsys.readouterr().err
+    assert "ddpg-per-None-0 was trained with method.alpha=0.3, asked for is 0.4" in message
+    arguments[arguments.index("None:method.alpha=0.4,learner.width=4")] = "None:method.alpha=-1"
+    assert compare.main(arguments) == 2
+    assert "--arm None: method.alpha must be finite" in capsys.readouterr().err
 
 
 def alive(pid: int) -> bool:
@@ -176,6 +241,15 @@ def test_defaults_of_a_study_give_way_to_its_command_line() -> None:
     assert with_defaults(["tracking=offline"]) == ["evaluation.every=5000", "tracking=offline"]
 
 
+def test_an_arm_gives_way_to_nothing_and_keeps_what_is_in_brackets_together() -> None:
+    stages = "curriculum.stages=[{world: A, actions: 5},{world: 'B,C', actions: 5}]"
+    arm = parse_arm(f"mine:method.signals=[reward,td_error], {stages},learner.gamma=0.9")
+    assert arm.settings == ("method.signals=[reward,td_error]", stages, "learner.gamma=0.9")
+    assert arm.over(["robots=2", "learner.gamma=0.5"]) == ["robots=2", *arm.settings]
+    group = parse_arm("a:curriculum=A")
+    assert group.over(["curriculum.carry=false", "robots=2"]) == ["robots=2", "curriculum=A"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -186,6 +260,15 @@ def test_defaults_of_a_study_give_way_to_its_command_line() -> None:
         (["--methods", "per", "per"], "--methods has per twice"),
         (["--worlds", "test", "test"], "world 'test' is named twice"),
         (["--worlds", "tset"], "did you mean"),
+        (["--arm", "a:", "--arm", "a:robots=2"], "--arm has a twice"),
+        (["--arm", "robots=2"], "--arm robots=2: must be NAME:SETTING=VALUE"),
+        (["--arm", "a/b:robots=2"], "with a NAME of letters, digits"),
+        (["--arm", "a:robtos=2"], "unknown setting 'robtos': did you mean 'robots'?"),
+        (["--arm", "a:method.alpha=0.5,0.6"], "--arm a:method.alpha=0.5,0.6: '0.6' is not NAME="),
+        (["--arm", "a:seed=3"], "seed is what the study gives each run"),
+        (["--", "learner=td3"], "learner is what the study gives each run"),
+        (["--", "robtos=2"], "unknown setting 'robtos'"),
+        (["--physics", "magic"], "invalid choice: 'magic'"),
     ],
 )
 def test_a_wrong_command_line_is_refused(
