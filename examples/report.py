@@ -5,9 +5,10 @@
     python examples/report.py docs/results --output runs/results
 
 Writes ``tables.md``, ``training.png`` (success and average reward over episodes and steps) and
-``evaluations.png`` (greedy success in the validation world over steps). What varies is the run, not
-the episode: intervals are for other runs, or for other runs and pairs of start and goal, and tests
-compare the means of runs (``navigation/intervals.py``).
+``evaluations.png`` (greedy success in the validation world over steps). The arms of a study
+(``compare.py --arm``) have rows and lines of their own, what was driven in other physics has tables
+of its own. What varies is the run, not the episode: intervals are for other runs, or for other runs
+and pairs of start and goal, and tests compare the means of runs (``navigation/intervals.py``).
 """
 
 from __future__ import annotations
@@ -22,16 +23,18 @@ import pandas as pd
 from navigation import files
 from navigation.figures import Runs, plot_evaluations, plot_training
 from navigation.records import read_table
+from navigation.studies import run_name
 from navigation.tables import (
     comparison_table,
     interval_table,
     outcome_table,
     power_lines,
+    rate_table,
     speed_table,
+    success_table,
 )
+from navigation.worlds import family
 from torchrl_mpfa.saving import write_text_atomically
-
-_OF_A_GENERATOR = r"^([a-z]+)(?:-validation|-test)?-\d+(?:@.*)?$"
 
 
 def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
@@ -41,21 +44,24 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
         folders: Their folders; seeds in two of them are two runs.
 
     Returns:
-        The rows of ``compare.py``; with ``arm`` (learner and method), ``run`` (its name, unique in
-        its arm), ``path`` (its folder) and ``family``: the generator of its world, or the world.
+        The rows of ``compare.py``; with ``arm`` (learner, method and the arm of the study, if it
+        has any), ``run`` (its name, unique in its arm), ``path`` (its folder) and ``family``: the
+        split of a generator that its world is of, BARN, or the world; studies that are older than
+        ``physics`` have an empty one.
     """
     tables = []
     for folder in folders:
         found = read_table(folder / files.EPISODES)
         if not len(found):
             continue
+        for column in ("arm", "physics"):
+            found[column] = found[column].fillna("") if column in found else ""
+        names = found[["learner", "method", "arm", "seed"]]
+        found["path"] = [str(folder / run_name(*each)) for each in names.itertuples(index=False)]
+        found["arm"] = names[["learner", "method", "arm"]].agg("/".join, axis=1).str.rstrip("/")
         seed = found["seed"].astype(str)
-        found["arm"] = found["learner"] + "/" + found["method"]
         found["run"] = seed if len(folders) == 1 else folder.name + "/" + seed
-        name = found["learner"] + "-" + found["method"] + "-" + seed
-        found["path"] = [str(folder / each) for each in name]
-        generator = found["world"].str.extract(_OF_A_GENERATOR, expand=False)
-        found["family"] = generator.fillna(found["world"])
+        found["family"] = found["world"].map(family)
         tables.append(found)
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
@@ -92,20 +98,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{folders}: no {files.EPISODES} with rows, which compare.py writes")
     output.mkdir(parents=True, exist_ok=True)
     parts = []
-    for family, found in rows.groupby("family", sort=False):
-        parts += [
-            f"## {family}",
-            outcome_table(found, with_paper=family == "test"),
-            interval_table(found),
-            comparison_table(found),
-            power_lines(found),
-        ]
+    for physics, driven in rows.groupby("physics", sort=False):
+        how = f", {physics!s}" if physics else ""
+        for where, found in driven.groupby("family", sort=False):
+            parts += [
+                f"## {where}{how}",
+                outcome_table(found, with_paper=where == "test"),
+                interval_table(found),
+                comparison_table(found),
+                power_lines(found),
+            ]
+        if driven["family"].nunique() > 1:
+            parts += [f"## Success in all worlds{how}", success_table(driven)]
     training = tables_of_runs(rows, files.EPISODES)
     if training:
         plot_training(training, output / "training.png")
     evaluations = tables_of_runs(rows, files.EVALUATIONS)
     if evaluations:
-        parts += ["## Evaluations during training", speed_table(evaluations)]
+        parts += [
+            "## Evaluations during training",
+            speed_table(evaluations),
+            rate_table(evaluations),
+        ]
         plot_evaluations(evaluations, output / "evaluations.png")
     text = "\n\n".join(part for part in parts if part)
     write_text_atomically(text + "\n", output / "tables.md")

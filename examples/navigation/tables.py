@@ -26,7 +26,11 @@ from navigation.intervals import (
 PAPER = {"MPFA-PER": (0.905, 19, 27.3), "PER": (0.855, 29, 31.8)}
 """Success, collisions of 200 and mean time [s] in the paper's tests."""
 GOAL = 0.9
+"""Greedy success in validation that the speed of each run is told by."""
+RATES = (0.9, 0.95)
+"""Those that the time to is told of."""
 _DIFFERENCES = (0.02, 0.05)
+_ARM = ("learner", "method", "arm")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -58,13 +62,14 @@ def scores(rows: pd.DataFrame, column: str) -> Array:
 def outcome_table(rows: pd.DataFrame, *, with_paper: bool) -> str:
     """Success of each run, and means over the runs; beside the paper's if they compare."""
     lines = []
+    width = _width(rows["arm"])
     for arm, found in rows.groupby("arm", sort=False):
         success, time = scores(found, "success"), scores(found, "time_s")
         reached = time[success == 1.0]
         rates = [f"{scores(found, name).mean():.1%}" for name in ("collision", "timeout")]
         lines.append(
             [
-                *str(arm).split("/"),
+                *_cells(str(arm), width),
                 f"{success.mean():.1%}",
                 ", ".join(f"{value:.1%}" for value in success.mean(axis=1)),
                 *rates,
@@ -74,9 +79,23 @@ def outcome_table(rows: pd.DataFrame, *, with_paper: bool) -> str:
         )
     for name, (rate, collisions, seconds) in PAPER.items() if with_paper else ():
         of_all = f"{collisions / 200:.1%}"
-        lines.append(["paper", name, f"{rate:.1%}", "", of_all, "", "", f"{seconds:.1f}"])
-    head = ["learner", "method", "success", "of each run", "collision", "timeout", "SPL"]
+        cells = _cells(f"paper/{name}", width)
+        lines.append([*cells, f"{rate:.1%}", "", of_all, "", "", f"{seconds:.1f}"])
+    head = [*_ARM[:width], "success", "of each run", "collision", "timeout", "SPL"]
     return table([*head, "time [s]"], lines)
+
+
+def success_table(rows: pd.DataFrame) -> str:
+    """Success of each arm in each world or generator, and in brackets that of its worst run."""
+    arms = list(rows["arm"].unique())
+    families = {str(name): found for name, found in rows.groupby("family", sort=False)}
+    lines = []
+    for name, found in (families | {"all": rows}).items():
+        driven = {str(arm): each for arm, each in found.groupby("arm")}
+        if name == "all":
+            driven = {arm: each for arm, each in driven.items() if _is_whole(each, len(families))}
+        lines.append([name, *(_worst(driven[arm]) if arm in driven else "" for arm in arms)])
+    return table(["mean of the runs (the worst one)", *arms], lines)
 
 
 def interval_table(rows: pd.DataFrame) -> str:
@@ -154,6 +173,7 @@ def power_lines(rows: pd.DataFrame) -> str:
 def speed_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
     """Steps until nine of ten validation goals are found, and area under that curve."""
     lines = []
+    width = _width(curves)
     for arm, runs in curves.items():
         firsts, areas = [], []
         for found in runs.values():
@@ -161,15 +181,70 @@ def speed_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
             firsts.append(f"{reached.iloc[0]:,.0f}" if len(reached) else "never")
             areas.append(area_under(found["total_steps"], found["success"]))
         each = ", ".join(f"{value:.3f}" for value in areas)
-        lines.append([*arm.split("/"), "; ".join(firsts), f"{np.mean(areas):.3f}", each])
-    head = ["learner", "method", f"steps to {GOAL:.0%}, each run", "area under the curve"]
+        lines.append([*_cells(arm, width), "; ".join(firsts), f"{np.mean(areas):.3f}", each])
+    head = [*_ARM[:width], f"steps to {GOAL:.0%}, each run", "area under the curve"]
     return table([*head, "of each run"], lines)
+
+
+def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
+    """Actions and time of training after which validation first had a rate of success."""
+    lines = []
+    width = _width(curves)
+    for arm, runs in curves.items():
+        for rate in RATES:
+            steps = [_first(found, rate, "total_steps") for found in runs.values()]
+            seconds = [_first(found, rate, "trained_for") for found in runs.values()]
+            never = sum(math.isinf(each) for each in steps)
+            medians = [_median(each) for each in (steps, seconds)]
+            lines.append([*_cells(arm, width), f"{rate:.0%}", *medians, f"{never} of {len(runs)}"])
+    head = [*_ARM[:width], "success", "actions, median of the runs", "seconds of training, median"]
+    return table([*head, "never"], lines)
 
 
 def area_under(steps: pd.Series, values: pd.Series) -> float:
     """Mean height of a curve that starts at zero, over its steps."""
     x, y = np.concatenate(([0.0], steps)), np.concatenate(([0.0], values))
     return float(np.trapezoid(y, x) / x[-1])
+
+
+def _first(found: pd.DataFrame, rate: float, column: str) -> float:
+    """Value of a column where a rate of success is first reached; infinite if it never is."""
+    reached = found[found["success"] >= rate]
+    if not len(reached):
+        return math.inf
+    return float(reached[column].iloc[0]) if column in found else math.nan
+
+
+def _median(values: Sequence[float]) -> str:
+    """The median of runs, of which more than half may not have come so far."""
+    if any(math.isnan(value) for value in values):
+        return ""
+    ordered = sorted(values)
+    middle = (ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]) / 2
+    return f"{middle:,.0f}" if math.isfinite(middle) else "never"
+
+
+def _worst(rows: pd.DataFrame) -> str:
+    """Mean success of the runs of an arm, and in brackets the run with the lowest."""
+    of_runs = scores(rows, "success").mean(axis=1)
+    if len(of_runs) == 1:
+        return f"{of_runs[0]:.1%}"
+    name = rows["run"].unique()[of_runs.argmin()]
+    return f"{of_runs.mean():.1%} ({name}: {of_runs.min():.1%})"
+
+
+def _is_whole(rows: pd.DataFrame, families: int) -> bool:
+    """Whether each run was driven in all of them."""
+    return bool((rows.groupby("run")["family"].nunique() == families).all())
+
+
+def _width(arms: Iterable[str]) -> int:
+    """Columns that the names of arms take: two, or three where a study has arms of its own."""
+    return max(arm.count("/") for arm in arms) + 1
+
+
+def _cells(arm: str, width: int) -> list[str]:
+    return [*arm.split("/"), *[""] * width][:width]
 
 
 def _ends(interval: Interval) -> str:

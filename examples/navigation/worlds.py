@@ -10,6 +10,7 @@ from pathlib import Path
 from mpfa_envs import world_tasks
 
 _LONGEST = 60
+_OF_MANY = re.compile(r"([a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
 
 
 def parse_worlds(words: Sequence[str]) -> list[str]:
@@ -44,6 +45,25 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
             raise ValueError(f"world {world!r} is named twice")
         world_tasks(world, episodes=1)
     return worlds
+
+
+def family(name: str) -> str:
+    """What a world is one of: the worlds of a generator, those of BARN, or itself.
+
+    Args:
+        name: Of the world.
+
+    Returns:
+        The name of all of them, as :func:`mpfa_envs.world_tasks` takes it where that is possible.
+
+    Examples:
+        >>> [family(name) for name in ("bars-test-7", "rooms-7", "barn-3", "test", "my-room")]
+        ['bars:test', 'rooms', 'barn', 'test', 'my-room']
+    """
+    found = _OF_MANY.fullmatch(name)
+    if found is None:
+        return name
+    return f"{found[1]}:{found[2]}" if found[2] else found[1]
 
 
 def world_name(world: str) -> str:

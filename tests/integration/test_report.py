@@ -86,6 +86,68 @@ def test_random_worlds_have_tables_of_their_own_without_the_paper(study: Path) -
     assert "| paper |" not in random
 
 
+def test_the_arms_of_a_study_have_rows_of_their_own(study: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    write_table(rows.assign(arm=rows["method"].map({"per": "None"})), study / "episodes.csv")
+    for seed in (0, 1):
+        (study / f"ddpg-per-{seed}").rename(study / f"ddpg-per-None-{seed}")
+    report.main([str(study)])
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    assert "| learner | method | arm | success | of each run |" in text
+    assert "| ddpg | mpfa_per |  | 87.5% |" in text
+    assert "| ddpg | per | None | 0.0% |" in text
+    assert "| paper | PER |  | 85.5% |" in text
+    assert "| ddpg/mpfa_per − ddpg/per/None |" in text
+    assert "| ddpg | per | None | 9,000; 9,000 | 0.472 |" in text
+
+
+def test_other_physics_have_tables_of_their_own(study: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    both = [rows.assign(physics=physics) for physics in ("wheels", "kinematic")]
+    write_table(pd.concat(both), study / "episodes.csv")
+    report.main([str(study)])
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    assert text.index("## test, wheels") < text.index("## test, kinematic")
+    assert text.count(LINE) == 2
+
+
+def test_the_worlds_of_a_generator_and_those_of_barn_are_a_row_each_with_the_worst_run(
+    study: Path,
+) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    names = ["bars-test-5", "bars-validation-5", "barn-3", "barn-4"]
+    write_table(rows.assign(world=[*names] * (len(rows) // 4)), study / "episodes.csv")
+    report.main([str(study)])
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    assert "| mean of the runs (the worst one) | ddpg/mpfa_per | ddpg/per |" in text
+    assert "| bars:test | 100.0% (0: 100.0%) | 0.0% (0: 0.0%) |" in text
+    assert "| bars:validation | 100.0% (0: 100.0%) | 0.0% (0: 0.0%) |" in text
+    # One of the two pairs in the second run.
+    assert "| barn | 75.0% (1: 50.0%) | 0.0% (0: 0.0%) |" in text
+    assert "| all | 87.5% (1: 75.0%) | 0.0% (0: 0.0%) |" in text
+
+
+def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(study: Path) -> None:
+    steps = [1000, 2000, 3000]
+    of_runs = {"mpfa_per": ([0.9, 0.2, 0.96], [0.1, 0.9, 0.94]), "per": ([0.9, 1, 1], [0, 0, 0.8])}
+    for method, runs in of_runs.items():
+        for seed, success in enumerate(runs):
+            table = pd.DataFrame({"total_steps": steps, "success": success})
+            table["trained_for"] = table["total_steps"] / 100
+            write_table(table, study / f"ddpg-{method}-{seed}" / "evaluations.csv")
+    report.main([str(study)])
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    assert "| ddpg | mpfa_per | 90% | 1,500 | 15 | 0 of 2 |" in text
+    assert "| ddpg | mpfa_per | 95% | never | never | 1 of 2 |" in text
+    assert "| ddpg | per | 90% | never | never | 1 of 2 |" in text
+    # Runs of which their time is not known.
+    table = pd.DataFrame({"total_steps": steps, "success": [0, 1, 1]})
+    for seed in (0, 1):
+        write_table(table, study / f"ddpg-per-{seed}" / "evaluations.csv")
+    report.main([str(study)])
+    assert "| ddpg | per | 90% | 2,000 |  | 0 of 2 |" in (study / "tables.md").read_text("utf-8")
+
+
 def test_two_studies_together_have_the_runs_of_both(
     study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
