@@ -155,10 +155,13 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     document: dict[str, Any] = {**entries(rows[-1]), "generators": {}, "worlds": {}}
     for row in rows:
-        generator = str(row["world"]).removesuffix("-test").removesuffix("-validation")
-        if row["world"] != "total":
-            kind = "generators" if generator in GENERATORS else "worlds"
-            document[kind][generator if kind == "generators" else row["world"]] = entries(row)
+        generator, _, split = str(row["world"]).partition("-")
+        if generator in GENERATORS and split in ("test", "validation"):
+            # Other than test worlds are named, lest both of a generator have one name.
+            name = generator if split == "test" else f"{generator}:{split}"
+            document["generators"][name] = entries(row)
+        elif row["world"] != "total":
+            document["worlds"][row["world"]] = entries(row)
     return document
 
 

@@ -108,6 +108,15 @@ __all__ = [
     "world_tasks",
 ]
 
+
+def _refuse_one_robot(world: str, **_: Any) -> Any:
+    raise gymnasium.error.Error(
+        f"world {world!r} is new in each episode, which VectorNavigationEnv alone has: use "
+        f"gymnasium.make_vec('mpfa/Navigation-{world.capitalize()}-v1', num_envs=1), or one world "
+        f"of it: gymnasium.make('mpfa/Navigation-A-v1', world='{world}-7')"
+    )
+
+
 for _id, _name in zip(ENV_IDS, WORLDS, strict=True):
     # A second import, as after a reload, must not warn about an id that is known.
     if _id not in gymnasium.registry:
@@ -121,6 +130,7 @@ for _id in VECTOR_ENV_IDS:
     if _id not in gymnasium.registry:
         gymnasium.register(
             _id,
+            entry_point="mpfa_envs:_refuse_one_robot",
             vector_entry_point="mpfa_envs.vector:VectorNavigationEnv",
             kwargs={"world": _id.split("-")[1].lower()},
         )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -25,6 +26,7 @@ Outcome = Literal["success", "collision", "timeout"]
 Color = tuple[int, int, int, int]
 Point = tuple[float, float]
 
+PAPER: Final = (255, 255, 255, 255)
 FLOOR: Final = (250, 249, 246, 255)
 GRID: Final = (236, 234, 228, 255)
 WALL: Final = (52, 58, 70, 255)
@@ -47,6 +49,8 @@ OUTCOMES: Final[dict[str, Color]] = {
 
 _FINE = 3
 """Pictures are drawn this many times larger and then reduced, which smooths all edges."""
+_MARGIN, _AFTER_TITLE, _BEFORE_LABEL, _AFTER_LABEL = (_FINE * n for n in (8, 18, 15, 16))
+"""Spaces in the strip below a picture, in fine pixels."""
 _BORDER = 0.2
 """Thickness of the walls in a picture [m]."""
 
@@ -58,23 +62,24 @@ class _Canvas:
         world: The world.
         size: Longer side of the picture [px].
         footer: Height of a strip for text below [px].
+        least_width: Of the picture [px]; a narrower world has white on either side.
     """
 
-    def __init__(self, world: World, *, size: int, footer: int = 0) -> None:
+    def __init__(self, world: World, *, size: int, footer: int = 0, least_width: int = 0) -> None:
         if isinstance(size, bool) or not isinstance(size, int) or size < 32:
             raise ValueError(f"size must be an integer of at least 32, got {size!r}")
         width, depth = (side + 2 * _BORDER for side in world.size)
         self._scale = _FINE * size / max(width, depth)
         pixels = [round(size * side / max(width, depth)) for side in (width, depth)]
-        self._left, self._top = width / 2, depth / 2
-        self._shape = pixels[0], pixels[1] + footer
-        self.image = Image.new("RGBA", (_FINE * self._shape[0], _FINE * self._shape[1]), WALL)
+        self._shape = max(pixels[0], least_width), pixels[1] + footer
+        beside = _FINE * (self._shape[0] - pixels[0]) // 2
+        self._left, self._top = width / 2 + beside / self._scale, depth / 2
+        self.image = Image.new("RGBA", (_FINE * self._shape[0], _FINE * self._shape[1]), PAPER)
         self.draw = ImageDraw.Draw(self.image)
-        self._draw_world(world)
         self.footer_top = _FINE * pixels[1]
-        if footer:
-            corner = (_FINE * self._shape[0], _FINE * self._shape[1])
-            self.draw.rectangle([(0, self.footer_top), corner], fill=(255, 255, 255, 255))
+        walls = [(beside, 0), (beside + _FINE * pixels[0] - 1, self.footer_top - 1)]
+        self.draw.rectangle(walls, fill=WALL)
+        self._draw_world(world)
 
     def at(self, x: float, y: float) -> Point:
         """Pixel of a position [m]."""
@@ -159,11 +164,10 @@ class _Canvas:
         ]
         self.draw.polygon(arrow, fill=ROBOT_FRONT)
 
-    def text(self, x: float, y: float, text: str, *, size: int = 13) -> float:
+    def text(self, x: float, y: float, text: str) -> float:
         """Write at fine pixels, centered in height; returns the fine pixel where it ends."""
-        font = ImageFont.load_default(size * _FINE)
-        self.draw.text((x, y), text, fill=TEXT, font=font, anchor="lm")
-        return x + self.draw.textlength(text, font=font)
+        self.draw.text((x, y), text, fill=TEXT, font=_font(), anchor="lm")
+        return x + _font().getlength(text)
 
     def pixels(self) -> NDArray[np.uint8]:
         """The finished picture, shape ``[height, width, 3]``."""
@@ -269,7 +273,7 @@ def render_trajectories(
         size: Longer side of the picture without the strip [px].
 
     Returns:
-        Picture of shape ``[height, width, 3]``.
+        Picture of shape ``[height, width, 3]``, as wide as the strip's text at least.
 
     Raises:
         ValueError: If the three lists differ in length, an outcome is unknown, or the size is not
@@ -289,7 +293,8 @@ def render_trajectories(
     for outcome in outcomes:
         if outcome not in get_args(Outcome):
             raise ValueError(f"outcomes must be among {get_args(Outcome)}, got {outcome!r}")
-    canvas = _Canvas(world, size=size, footer=28)
+    legend = _legend(outcomes)
+    canvas = _Canvas(world, size=size, footer=28, least_width=_footer_width(title, legend))
     ways = [[(float(x), float(y)) for x, y in trajectory] for trajectory in trajectories]
     # Successes first: they are many, and the failures above them are what one looks for.
     order = sorted(range(len(ways)), key=lambda i: outcomes[i] != "success")
@@ -307,18 +312,42 @@ def render_trajectories(
             for sign in (-1.0, 1.0):
                 tips = [(x - 0.12, y - 0.12 * sign), (x + 0.12, y + 0.12 * sign)]
                 canvas.line(tips, (*OUTCOMES["collision"][:3], 255), 2.2)
-    _write_footer(canvas, title, outcomes)
+    _write_footer(canvas, title, legend)
     return canvas.pixels()
 
 
-def _write_footer(canvas: _Canvas, title: str, outcomes: Sequence[str]) -> None:
+def _legend(outcomes: Sequence[str]) -> dict[str, Color]:
+    """How many episodes ended in each way, and the color of these; empty without episodes."""
+    if not outcomes:
+        return {}
+    return {
+        f"{name} {sum(outcome == name for outcome in outcomes)}": (*color[:3], 255)
+        for name, color in OUTCOMES.items()
+    }
+
+
+def _write_footer(canvas: _Canvas, title: str, legend: dict[str, Color]) -> None:
     """Write the title and, if there are episodes, how they ended."""
     middle = canvas.footer_top + 14 * _FINE
-    x = 8.0 * _FINE
+    x = float(_MARGIN)
     if title:
-        x = canvas.text(x, middle, title) + 18 * _FINE
-    for name, color in OUTCOMES.items() if outcomes else ():
+        x = canvas.text(x, middle, title) + _AFTER_TITLE
+    for label, color in legend.items():
         box = [(x, middle - 5 * _FINE), (x + 10 * _FINE, middle + 5 * _FINE)]
-        canvas.draw.rectangle(box, fill=(*color[:3], 255))
-        label = f"{name.replace('_', ' ')} {sum(outcome == name for outcome in outcomes)}"
-        x = canvas.text(x + 15 * _FINE, middle, label) + 16 * _FINE
+        canvas.draw.rectangle(box, fill=color)
+        x = canvas.text(x + _BEFORE_LABEL, middle, label) + _AFTER_LABEL
+
+
+def _footer_width(title: str, legend: Iterable[str]) -> int:
+    """How wide a picture must be for its title and legend [px]."""
+    width = _MARGIN + sum(
+        _BEFORE_LABEL + _font().getlength(label) + _AFTER_LABEL for label in legend
+    )
+    if title:
+        width += _font().getlength(title) + _AFTER_TITLE
+    return math.ceil(width / _FINE)
+
+
+@cache
+def _font() -> Any:
+    return ImageFont.load_default(13 * _FINE)

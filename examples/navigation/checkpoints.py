@@ -43,6 +43,34 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
     return dict(state)
 
 
+def random_state(device: str) -> Any:
+    """Where PyTorch's random numbers are.
+
+    Args:
+        device: Of the networks; noise of targets is made there.
+
+    Returns:
+        The state of the CPU's generator, with a GPU both in a dictionary.
+    """
+    if torch.device(device).type != "cuda":
+        return torch.get_rng_state()
+    return {"cpu": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state(device)}
+
+
+def set_random_state(device: str, state: Any) -> None:
+    """Go on where :func:`random_state` was called.
+
+    Args:
+        device: Of the networks.
+        state: What it gave; that of the CPU alone leaves the GPU's generator as it is.
+    """
+    if not isinstance(state, dict):
+        state = {"cpu": state}
+    torch.set_rng_state(state["cpu"])
+    if "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"], device)
+
+
 def as_tensors(value: Any) -> Any:
     """A state with tensors in place of NumPy's arrays, which a safe loader takes for code.
 

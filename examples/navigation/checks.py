@@ -13,7 +13,8 @@ import torch
 from mpfa_envs import world_tasks
 from mpfa_envs.robot import resolve_robot
 from navigation.environments import make_training_env
-from navigation.settings import TrainSettings
+from navigation.settings import EnvironmentSettings, TrainSettings
+from navigation.worlds import is_of_a_test
 from torchrl_mpfa.methods.assembly import WORDS
 
 Rule = tuple[Callable[[Any], bool], str]
@@ -46,11 +47,17 @@ NAME: Rule = (
     "letters, digits and any of . _ + -, as it names a folder",
 )
 
+MOST_ROBOTS = 4096
+"""On wheels these take 6.4 GB."""
+
 RULES: dict[str, Rule] = {
     "seed": at_least(0),
     "threads": at_least(1),
     "checkpoint_every": at_least(1),
-    "robots": at_least(1),
+    "robots": (
+        lambda value: 1 <= value <= MOST_ROBOTS,
+        f"from 1 to {MOST_ROBOTS}, as a robot takes up to 1.6 MB of memory",
+    ),
     "updates": at_least(1),
     "method.name": NAME,
     **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
@@ -162,6 +169,11 @@ def check_settings(settings: TrainSettings) -> None:
         )
     if settings.evaluation.choose and not settings.evaluation.every:
         raise ValueError("evaluation.choose needs evaluations: set evaluation.every, got 0")
+    if settings.evaluation.choose and is_of_a_test(settings.evaluation.world):
+        raise ValueError(
+            f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "
+            "got True: nothing may be chosen by the worlds of a test"
+        )
     if settings.learner.compile and settings.learner.algorithm == "sac":
         raise ValueError("learner.compile must be false with SAC, got True")
     _check_device(settings.device)
@@ -192,15 +204,29 @@ def _resolve(name: str, resolve: Callable[[str], Any], value: str) -> None:
 
 def _check_world(name: str, world: str, settings: TrainSettings) -> None:
     """Refuse a world that there is not, or in which no episode can begin."""
+    environment = replace(settings.environment, physics="kinematic")
+    error = _refusal(world, environment)
+    if error is None:
+        return
+    for setting, without in (
+        ("max_goal_distance", replace(environment, max_goal_distance=None)),
+        ("clearance", replace(environment, clearance=0.0)),
+    ):
+        if _refusal(world, without) is None:
+            name += f", environment.{setting}={getattr(environment, setting)}"
+    raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
+
+
+def _refusal(world: str, environment: EnvironmentSettings) -> Exception | None:
+    """Why no episode begins in a world, if none does."""
     try:
-        env = make_training_env(world, replace(settings.environment, physics="kinematic"))
+        env = make_training_env(world, environment)
         env.set_seed(0)
         env.reset()
     except (ValueError, OSError) as error:
-        text = " ".join(str(error).split())
-        clearance = f"environment.clearance={settings.environment.clearance}"
-        raise ValueError(f"{name}, {clearance}: {text}") from error
+        return error
     env.close()
+    return None
 
 
 def _check_device(device: str) -> None:

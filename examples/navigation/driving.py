@@ -39,6 +39,8 @@ class Robots:
         self.count = settings.robots
         self.seconds = 0.0
         """Wall-clock time of the run before this process [s]."""
+        self.given_up = 0
+        """Episodes of the run that were under way when another stage began."""
         self._started = time.perf_counter()
         self._env: NavigationTorchEnv | None = None
         self._world: str | None = None
@@ -66,6 +68,7 @@ class Robots:
         env.set_seed(seed)
         explorer.begin_episodes(torch.ones(self.count, dtype=torch.bool))
         self._state = env.reset()
+        self.given_up += int((self._steps > 0).sum())
         self._rewards.zero_()
         self._steps.zero_()
 
@@ -139,7 +142,18 @@ class Robots:
             "rewards": self._rewards.clone(),
             "steps": self._steps.clone(),
             "seconds": self.elapsed(),
+            "given_up": self.given_up,
         }
+
+    def recall(self, state: dict[str, Any]) -> None:
+        """Take over what counts for the whole run, and which episodes were under way.
+
+        Args:
+            state: What :meth:`state_dict` gave.
+        """
+        self.seconds = state["seconds"]
+        self.given_up = state.get("given_up", 0)
+        self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
         """Go on where :meth:`state_dict` was called.
@@ -153,8 +167,7 @@ class Robots:
         self._state = env.reset()
         env.env.load_state_dict(as_arrays(state["environment"]))
         self._state["observation"] = state["observation"].clone()
-        self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
-        self.seconds = state["seconds"]
+        self.recall(state)
 
     def close(self) -> None:
         """Release the environment."""

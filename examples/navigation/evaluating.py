@@ -25,7 +25,7 @@ from mpfa_envs import (
 )
 from navigation.assembly import policy_layers
 from navigation.environments import env_arguments
-from navigation.records import EpisodeRecord, EvaluationRecord
+from navigation.records import EvaluationRecord
 from navigation.settings import TrainSettings
 
 _SEED = 1
@@ -111,14 +111,15 @@ def summary_row(results: Sequence[EpisodeResult]) -> dict[str, float]:
 
 
 def exported_policy(
-    policy: TensorDictModule, settings: TrainSettings, records: Sequence[EpisodeRecord] = ()
+    policy: TensorDictModule, settings: TrainSettings, *, episodes: int = 0, steps: int = 0
 ) -> Policy:
     """The policy without noise, with what is needed to use it and how it was trained.
 
     Args:
         policy: The policy in training.
         settings: Of the run.
-        records: Its episodes so far.
+        episodes: That it was trained for.
+        steps: Actions that it was trained for.
 
     Returns:
         The policy, whose weights are copies.
@@ -130,8 +131,8 @@ def exported_policy(
             "learner": settings.learner.name,
             "curriculum": settings.curriculum.name,
             "seed": settings.seed,
-            "episodes": len(records),
-            "steps": records[-1].total_steps if records else 0,
+            "episodes": episodes,
+            "steps": steps,
         },
         env_arguments=env_arguments(settings.environment),
     )

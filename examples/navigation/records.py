@@ -62,6 +62,11 @@ class EvaluationRecord:
         return all(mine >= (other.success, other.spl) for other in others)
 
 
+def last_best(records: Sequence[EvaluationRecord]) -> EvaluationRecord:
+    """The best evaluation, of equal ones the last."""
+    return next(record for record in reversed(records) if record.is_best(records))
+
+
 def as_table(rows: Sequence[Any], kind: type[Any]) -> pd.DataFrame:
     """Rows of one kind as a table.
 

@@ -111,7 +111,9 @@ def _train(training: TrainingRun) -> int:
     if finished:
         print(f"policy: {folder / files.POLICY}   curve: {curve}")
         return 0
-    print(f"stopped after {training.actions} actions; continue with: train.py resume={folder}")
+    saved = (folder / files.CHECKPOINT).exists()
+    how = f"continue with: train.py resume={folder}" if saved else "nothing of it was saved"
+    print(f"stopped after {training.actions} actions; {how}")
     return training.stop.exit_status
 
 

@@ -231,8 +231,8 @@ class EvaluationSettings:
     every: int = 0
     """Actions between two evaluations; 0: none."""
     world: str = "validation"
-    """A world, or ``mixed:validation``: the validation worlds of a generator. Never those of a
-    test, by which nothing may be chosen."""
+    """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
+    which nothing may be chosen, are refused with ``choose``."""
     episodes: int = 20
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
     choose: bool = False
@@ -297,7 +297,8 @@ class TrainSettings:
     checkpoint_every: int = 10_000
     """Actions between two checkpoints."""
     robots: int = 1
-    """Robots that drive at once, each in a world of its own."""
+    """Robots that drive at once, each in a world of its own; those that are under way at the end of
+    a stage give up their episodes."""
     updates: int = 1
     """Updates for one action of each robot."""
     method: Method = field(default_factory=Method)

@@ -17,6 +17,8 @@ from navigation.records import EpisodeRecord, EvaluationRecord
 from navigation.settings import TrainSettings
 from torchrl_mpfa import SignalReplayBuffer
 
+AXIS = "actions"
+"""What every entry is plotted over: actions of all robots so far."""
 _MODES = {"offline": "offline", "online": "online", "off": "disabled"}
 
 
@@ -46,7 +48,8 @@ class Tracker:
             config=asdict(settings),
             allow_val_change=True,
         )
-        self._run.define_metric("evaluation/*", step_metric="evaluation/step")
+        # wandb's own step takes one value of a key, and several episodes may end at one action.
+        self._run.define_metric("*", step_metric=AXIS)
 
     def log_episode(self, record: EpisodeRecord) -> None:
         """Log one episode."""
@@ -58,14 +61,13 @@ class Tracker:
         entries["train/path_length"] = record.path_length
         entries["train/episode"] = record.episode
         entries["time/steps_per_second"] = record.total_steps / max(record.seconds, 1e-9)
-        self._run.log(entries, step=record.total_steps)
+        self._log(entries, record.total_steps)
 
     def log_evaluation(self, record: EvaluationRecord) -> None:
         """Log an evaluation."""
         rates = ("success", "collision", "timeout", "spl")
         entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
-        entries["evaluation/step"] = record.total_steps
-        self._run.log(entries, step=record.total_steps)
+        self._log(entries, record.total_steps)
 
     def log_update(
         self,
@@ -88,7 +90,10 @@ class Tracker:
             entries["priorities/importance_weight"] = _histogram(batch["priority_weight"])
             for name, value in batch["signals"].items():
                 entries[f"priorities/{name}"] = _histogram(value)
-        self._run.log(entries, step=step)
+        self._log(entries, step)
+
+    def _log(self, entries: dict[str, Any], actions: int) -> None:
+        self._run.log({**entries, AXIS: actions})
 
     def close(self) -> None:
         """Finish the run."""

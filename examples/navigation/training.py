@@ -17,14 +17,14 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from tqdm import tqdm
 
-from mpfa_envs import RandomMirror, save_policy
+from mpfa_envs import Policy, RandomMirror, save_policy
 from navigation import files
 from navigation.assembly import make_curiosity, make_learner
-from navigation.checkpoints import FORMAT
+from navigation.checkpoints import FORMAT, random_state, set_random_state
 from navigation.driving import Robots
 from navigation.evaluating import evaluate_policy, exported_policy
 from navigation.exploration import make_explorer
-from navigation.records import EpisodeRecord, EvaluationRecord, as_table, write_table
+from navigation.records import EpisodeRecord, EvaluationRecord, as_table, last_best, write_table
 from navigation.schedule import Schedule
 from navigation.settings import TrainSettings
 from navigation.stopping import Stop
@@ -248,6 +248,7 @@ class TrainingRun:
             "episodes": self.schedule.episodes,
             "steps": self.actions,
             "summary": summary,
+            "given_up": self.robots.given_up,
             "finished": self.schedule.finished,
         }
         write_text_atomically(json.dumps(status), self.folder / files.STATUS)
@@ -268,7 +269,7 @@ class TrainingRun:
             "wandb": self.tracker.run_id,
             "schedule": self.schedule.state_dict(),
             "updates": self.updates,
-            "random": torch.get_rng_state(),
+            "random": random_state(self.settings.device),
             "robots": self.robots.state_dict(),
             "learner": self.learner.state_dict(),
             "buffer": self.buffer.state_dict(),
@@ -279,13 +280,19 @@ class TrainingRun:
             "evaluations": [asdict(record) for record in self.evaluations],
         }
         save_atomically(state, self.folder / files.CHECKPOINT)
-        chosen = self._best if self.settings.evaluation.choose else None
-        policy = exported_policy(chosen or self.learner.policy, self.settings, self.records)
-        save_policy(policy, self.folder / files.POLICY)
+        save_policy(self._exported(), self.folder / files.POLICY)
         write_table(as_table(self.records, EpisodeRecord), self.folder / files.EPISODES)
         if self.evaluations:
             table = as_table(self.evaluations, EvaluationRecord)
             write_table(table, self.folder / files.EVALUATIONS)
+
+    def _exported(self) -> Policy:
+        """The policy of the run: the last one, or that which did best in its evaluations."""
+        policy, episodes, steps = self.learner.policy, self.schedule.episodes, self.actions
+        if self.settings.evaluation.choose and self._best is not None:
+            record = last_best(self.evaluations)
+            policy, episodes, steps = self._best, record.episode, record.total_steps
+        return exported_policy(policy, self.settings, episodes=episodes, steps=steps)
 
     def _load(self, state: dict[str, Any]) -> None:
         """Go on where a checkpoint was written."""
@@ -301,11 +308,11 @@ class TrainingRun:
             self._best.load_state_dict(state["best"])
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
-        torch.set_rng_state(state["random"])
-        self.robots.seconds = state["robots"]["seconds"]
+        set_random_state(self.settings.device, state["random"])
+        self.robots.recall(state["robots"])
         if not self._advance():
             self.robots.load_state_dict(self.schedule.world, state["robots"])
-            torch.set_rng_state(state["random"])
+            set_random_state(self.settings.device, state["random"])
         self._anneal()
 
     def close(self) -> None:

@@ -66,6 +66,19 @@ def family(name: str) -> str:
     return f"{found[1]}:{found[2]}" if found[2] else found[1]
 
 
+def is_of_a_test(word: str) -> bool:
+    """Whether a policy is tested there, so that nothing may be chosen by it.
+
+    Args:
+        word: A world, or the worlds of a generator or of BARN.
+
+    Examples:
+        >>> [is_of_a_test(word) for word in ("test", "bars:test", "bars-test-3", "barn", "bars-3")]
+        [True, True, True, True, False]
+    """
+    return family(word) in ("test", "barn") or family(word).endswith(":test")
+
+
 def world_name(world: str) -> str:
     """A world as part of a file's name: that of a world file without folder and ending."""
     name = Path(world).stem if Path(world).suffix else world

@@ -56,6 +56,21 @@ def test_a_long_room_gives_a_long_picture() -> None:
     assert render_trajectories(world, [], [], [], size=200).shape == (128, 200, 3)
 
 
+def test_a_narrow_world_has_its_whole_legend_below_it() -> None:
+    world = World(name="narrow", size=(2.6, 20.0))
+    ends = ["success", "collision", "timeout"]
+    picture = render_trajectories(world, [[]] * 3, [(0, 0)] * 3, ends, title="narrow", size=360)
+    footer = picture[360:].astype(int)
+    for color in OUTCOMES.values():
+        assert (abs(footer - color[:3]).sum(-1) < 10).sum() > 50
+    # Its last letter is whole: some white is beside it.
+    assert (footer[:, -10:] == 255).all()
+    dark = np.flatnonzero((picture[180] < 100).all(-1))
+    left, right = dark[0], picture.shape[1] - 1 - dark[-1]
+    assert abs(left - right) <= 1
+    assert left > 100
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -45,6 +45,12 @@ def test_every_generator_has_an_id(env_id: str) -> None:
     env.close()
 
 
+@pytest.mark.parametrize("env_id", VECTOR_ENV_IDS)
+def test_one_robot_in_the_worlds_of_a_generator_is_refused_with_what_to_do(env_id: str) -> None:
+    with pytest.raises(gymnasium.error.Error, match=f"make_vec.'{env_id}', num_envs=1"):
+        gymnasium.make(env_id)
+
+
 def test_there_is_an_id_for_each_generator() -> None:
     assert {env_id.split("-")[1].lower() for env_id in VECTOR_ENV_IDS} == set(GENERATORS)
 

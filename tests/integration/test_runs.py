@@ -246,6 +246,24 @@ def test_a_killed_run_goes_on_and_signals_save(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
+    saved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(run: TrainingRun) -> bool:
+        if saved:
+            run.save()
+        run.stop.ask()
+        run.stop.ask()
+        raise AssertionError("the second signal stops at once")
+
+    monkeypatch.setattr(TrainingRun, "train", interrupted)
+    assert begin(tmp_path) == 128 + signal.SIGINT
+    out = capsys.readouterr().out
+    assert (f"continue with: train.py resume={tmp_path}" in out) == saved
+    assert ("nothing of it was saved" in out) == (not saved)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])

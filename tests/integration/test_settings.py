@@ -134,7 +134,13 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
             r"curriculum.stages\[1\] must count what the others count, episodes or actions",
         ),
         ("curriculum.stages=[{world: bras, actions: 9}]", r"stages\[0\].world.*got 'bras'"),
-        ("robots=0", "robots must be at least 1, got 0"),
+        ("robots=0", "robots must be from 1 to 4096, as a robot takes .* of memory, got 0"),
+        ("robots=3000000", "robots must be from 1 to 4096, .* got 3000000"),
+        (
+            "evaluation.choose=true evaluation.every=9 evaluation.world=mixed:test",
+            "evaluation.choose must be false with evaluation.world=mixed:test, .* nothing may be",
+        ),
+        ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
         ("updates=0", "updates must be at least 1, got 0"),
         ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
         ("environment.progress=none-at-all", "environment.progress must be one of straight_line"),
@@ -148,6 +154,10 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         (
             "curriculum=A environment.clearance=99",
             r"stages\[0\].world, environment.clearance=99.0: world 'A' has no start",
+        ),
+        (
+            "curriculum=A environment.max_goal_distance=0.5",
+            r"stages\[0\].world, environment.max_goal_distance=0.5: max_goal_distance must be",
         ),
         ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
         ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,10 @@ import torch
 from torchrl.data import RandomSampler
 
 from mpfa_envs import load_policy
-from navigation.checkpoints import read_checkpoint
+from navigation import training
+from navigation.checkpoints import random_state, read_checkpoint, set_random_state
 from navigation.files import CHECKPOINT
+from navigation.records import EvaluationRecord
 from navigation.settings import GROUPS, Stage, TrainSettings
 from navigation.training import TrainingRun, prepare_process
 from tests.integration.tiny_runs import rows, tiny, train
@@ -219,6 +222,54 @@ def test_a_stage_begins_though_an_evaluation_failed_just_before_it(tmp_path: Pat
     assert rows(resumed) == rows(whole)
 
 
+def test_the_episodes_that_another_stage_cuts_short_are_counted(tmp_path: Path) -> None:
+    settings = tiny(episodes=[Stage("A", actions=30), Stage("B", actions=90)], robots=3)
+    settings.environment.max_steps = 200
+    run = train(tmp_path / "whole", settings)
+    before = [record for record in run.records if record.total_steps <= 30]
+    assert before == []
+    status = json.loads((tmp_path / "whole" / "status.json").read_text())
+    assert status["given_up"] == 3
+
+    # The same if the run was stopped in between, or ended there at first.
+    stop_after(60, tmp_path, settings)
+    assert read_checkpoint(tmp_path)["robots"]["given_up"] == 3
+    shorter = tiny(episodes=[Stage("A", actions=30)], robots=3)
+    shorter.environment.max_steps = 200
+    train(tmp_path / "more", shorter)
+    resumed = TrainingRun(settings, tmp_path / "more", read_checkpoint(tmp_path / "more"))
+    assert resumed.robots.given_up == 3
+    resumed.close()
+
+
+def test_the_random_numbers_of_a_gpu_are_kept_with_those_of_the_cpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    on_gpu = {"cuda:1": torch.tensor([7])}
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: on_gpu[device].clone())
+    monkeypatch.setattr(
+        torch.cuda, "set_rng_state", lambda state, device: on_gpu.update({device: state})
+    )
+    kept = random_state("cuda:1")
+    expected = torch.rand(3)
+    on_gpu["cuda:1"] = torch.tensor([8])
+    set_random_state("cuda:1", kept)
+    assert torch.equal(torch.rand(3), expected)
+    assert on_gpu["cuda:1"].item() == 7
+
+
+def test_a_checkpoint_has_the_random_numbers_of_the_device_that_it_runs_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = TrainingRun(tiny(), tmp_path)
+    asked: list[str] = []
+    monkeypatch.setattr(training, "random_state", lambda device: asked.append(device))
+    run.settings.device = "cuda:0"
+    run.save()
+    run.close()
+    assert asked == ["cuda:0"]
+
+
 def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
     run = train(tmp_path, tiny())
     assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
@@ -293,8 +344,14 @@ def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
 
 
 def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    found, successes = training.evaluate_policy, iter((0.2, 0.9))
+
+    def evaluated(*arguments: Any, **named: Any) -> EvaluationRecord:
+        return replace(found(*arguments, **named), success=next(successes, 0.5))
+
+    monkeypatch.setattr(training, "evaluate_policy", evaluated)
     settings = tiny()
     settings.evaluation.every, settings.evaluation.episodes = 20, 4
     settings.evaluation.choose = True
@@ -310,6 +367,10 @@ def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for
     scores = [(record.success, record.spl) for record in run.evaluations]
     best = max(range(len(scores)), key=lambda number: (scores[number], number))
     observation = np.random.default_rng(0).random((5, 24), dtype=np.float32)
+    assert best == 1 < len(scores) - 1
+    chosen = run.evaluations[best]
+    card = load_policy(tmp_path).card
+    assert (card["steps"], card["episodes"]) == (chosen.total_steps, chosen.episode)
     run.learner.policy.load_state_dict(kept[best])
     expected = run.learner.policy.outputs({"observation": torch.from_numpy(observation)})["action"]
     np.testing.assert_allclose(
