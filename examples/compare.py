@@ -35,7 +35,7 @@ from navigation.arms import check_free, parse_arms
 from navigation.processes import Child
 from navigation.settings import GROUPS, register
 from navigation.stopping import Stop
-from navigation.studies import Evaluation, Job, collect
+from navigation.studies import Evaluation, Job, collect, other_than_asked
 from navigation.worlds import parse_worlds
 from torchrl_mpfa.spelling import unknown
 
@@ -199,8 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     try:
         with files.lock(options.folder):
-            others = {job: job.differences(job.asked(options.overrides)) for job in jobs}
-            others = {job: found for job, found in others.items() if found}
+            others = other_than_asked(jobs, options.overrides)
             if others and not options.anew:
                 job, found = next(iter(others.items()))
                 raise ValueError(

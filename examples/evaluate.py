@@ -68,9 +68,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         value = getattr(options, name)
         if value is not None and value < least:
             parser.error(f"--{name} must be at least {least}, got {value}")
-    every = [f"{name}:test" for name in GENERATORS if name != "mixed"]
     try:
-        options.names = every if options.worlds == ["all"] else parse_worlds(options.worlds)
+        options.names = parse_worlds(options.worlds)
         options.loaded = load_policy(options.policy)
     except (ValueError, OSError) as error:
         parser.error(str(error))

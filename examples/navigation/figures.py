@@ -56,9 +56,7 @@ def plot_training(runs: Runs, path: Path, *, window: int = 20) -> None:
                 values = running_mean(table[name], window)
                 for column, x in enumerate((np.arange(1, len(table) + 1), table["total_steps"])):
                     label = arm if number == 0 else None
-                    axes[line, column].plot(
-                        x, values, color=f"C{place}", alpha=0.6, lw=1, label=label
-                    )
+                    axes[line, column].plot(x, values, **_look(place), alpha=0.6, lw=1, label=label)
     for line, title in enumerate(labels.values()):
         axes[line, 0].set_ylabel(f"{title}, mean of {window}")
     axes[1, 0].set_xlabel("episode")
@@ -80,7 +78,7 @@ def plot_evaluations(runs: Runs, path: Path) -> None:
             axis.plot(
                 table["total_steps"],
                 table["success"],
-                color=f"C{place}",
+                **_look(place),
                 alpha=0.7,
                 marker=".",
                 label=arm if number == 0 else None,
@@ -129,6 +127,11 @@ def tiled(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
 def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:
     """Mean of the last ``window`` values, of fewer at the start."""
     return values.astype(float).rolling(window, min_periods=1).mean().to_numpy()
+
+
+def _look(place: int) -> dict[str, str]:
+    """Color of an arm's lines, and another dash once all ten colors are taken."""
+    return {"color": f"C{place % 10}", "linestyle": ("-", "--", ":", "-.")[place // 10 % 4]}
 
 
 def _pyplot() -> Any:

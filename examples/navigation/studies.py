@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +137,32 @@ class Job:
             for name, value in wanted.items()
             if name not in free and had[name] != value
         ]
+
+
+def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job, list[str]]:
+    """Runs that were trained with other settings than those asked for.
+
+    Args:
+        jobs: The runs.
+        overrides: The settings of the study.
+
+    Returns:
+        Where they differ; runs as they should be are left out.
+
+    Raises:
+        ValueError: If settings cannot be.
+    """
+    asked: dict[tuple[str, str, Arm], TrainSettings] = {}
+    others = {}
+    for job in jobs:
+        # Settings are checked in their worlds, which takes a second: once for all seeds.
+        kind = job.learner, job.method, job.arm
+        if kind not in asked:
+            asked[kind] = job.asked(overrides)
+        found = job.differences(replace(asked[kind], seed=job.seed))
+        if found:
+            others[job] = found
+    return others
 
 
 def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:

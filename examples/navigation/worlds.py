@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from mpfa_envs import world_tasks
+from mpfa_envs import GENERATORS, world_tasks
 
 _LONGEST = 60
 _OF_MANY = re.compile(r"([a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
@@ -17,8 +17,9 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
     """What some words stand for.
 
     Args:
-        words: Names of worlds, paths of world files, spans of a generator's worlds, and
-            ``bars:test`` or ``bars:validation``, the worlds of a split.
+        words: Names of worlds, paths of world files, spans of a generator's worlds,
+            ``bars:test`` or ``bars:validation``, the worlds of a split, and ``all``, the test
+            worlds of every generator.
 
     Returns:
         Names and paths, each of which there is.
@@ -32,6 +33,9 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
     """
     worlds: list[str] = []
     for word in words:
+        if word == "all":
+            worlds += [f"{name}:test" for name in GENERATORS if name != "mixed"]
+            continue
         span = re.fullmatch(r"([a-z]+):(\d{1,9})-(\d{1,9})", word)
         if span is None:
             worlds.append(word)

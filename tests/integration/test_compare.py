@@ -136,12 +136,12 @@ def test_a_study_is_evaluated_again_in_other_physics_and_trains_nothing_for_it(
 def test_a_run_that_ends_in_the_middle_of_an_episode_is_evaluated_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = study(tmp_path, methods=("per",))
+    arguments = study(tmp_path, "--seeds", "0", "1", methods=("per",))
     arguments[-1] = "curriculum.stages=[{world: A, actions: 30}]"
     assert compare.main(arguments) == 0
-    assert len(read_table(tmp_path / files.EPISODES)) == 6
+    assert list(read_table(tmp_path / files.EPISODES)["seed"]) == [0] * 6 + [1] * 6
     assert compare.main(arguments) == 0
-    assert "1 runs, 1 of them done" in capsys.readouterr().out
+    assert "2 runs, 2 of them done" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import evaluate
-from mpfa_envs import EpisodeResult, load_policy, save_policy, world_tasks
+from mpfa_envs import GENERATORS, EpisodeResult, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
 from navigation.assembly import make_learner
 from navigation.evaluating import exported_policy, film, summary_row
@@ -151,6 +151,8 @@ def test_a_damaged_policy_is_refused_by_its_name(
 
 def test_worlds_and_their_label_agree() -> None:
     assert parse_worlds(["test", "rooms:100-101"]) == ["test", "rooms-100", "rooms-101"]
+    tests = [f"{name}:test" for name in GENERATORS if name != "mixed"]
+    assert parse_worlds(["all", "barn"]) == [*tests, "barn"]
     words = (["test"], ["test", "A"], ["a/w.yaml"], ["b/w.yaml"])
     assert len({worlds_label(each) for each in words}) == 4
     many = [f"rooms-{number}" for number in range(51)]

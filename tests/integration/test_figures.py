@@ -87,3 +87,18 @@ def test_evaluations_are_at_their_steps_and_rates(tmp_path: Path) -> None:
     )
     assert heights(rising, quarter=0) < 0.4 < 0.6 < heights(rising, quarter=3)
     assert heights(falling, quarter=3) < 0.4 < 0.6 < heights(falling, quarter=0)
+
+
+def test_the_eleventh_arm_has_the_color_of_the_first_and_another_line(tmp_path: Path) -> None:
+    path = tmp_path / "evaluations.png"
+    steps = [1000, 9000]
+    runs = {
+        str(n): {"0": pd.DataFrame({"total_steps": steps, "success": [n / 20] * 2})}
+        for n in range(11)
+    }
+    plot_evaluations(runs, path)
+    blue = colored(path, tuple(round(0.7 * c + 0.3 * 255) for c in BLUE), spread=30)
+    # The first is at the bottom, the eleventh in the middle; the legend is left of neither.
+    first, eleventh = (blue[rows, 300:500].any(0).mean() for rows in (slice(300, 480), slice(300)))
+    assert first == 1.0
+    assert 0.4 < eleventh < 0.9
