@@ -2,9 +2,8 @@
 
 import ast
 import sys
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 REPLAY = sorted((ROOT / "torchrl_mpfa").rglob("*.py"))
@@ -20,10 +19,16 @@ def name_of(path):
     return path.relative_to(ROOT).as_posix()
 
 
+@cache
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports(path):
     """Top-level names of all modules that a file imports, wherever in it."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -34,63 +39,69 @@ def imports(path):
 
 def calls(path):
     """Names of all functions that a file calls directly."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    calls = [node.func for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
     return {func.id for func in calls if isinstance(func, ast.Name)}
+
+
+def importers(paths, names):
+    """Those of some files that import one of some modules."""
+    return {name_of(path) for path in paths if imports(path) & names}
 
 
 def test_the_files_that_are_looked_at_are_there():
     assert len(REPLAY) >= 10
     assert len(TASKS) >= 5
+    assert len(EVERYTHING) >= 200
 
 
-@pytest.mark.parametrize("path", REPLAY, ids=name_of)
-def test_the_replay_parts_import_torch_and_torchrl_and_little_else(path):
-    allowed = {"torch", "tensordict", "torchrl", "numpy", "torchrl_mpfa"}
-    assert imports(path) - set(sys.stdlib_module_names) <= allowed
+def test_the_replay_parts_import_torch_and_torchrl_and_little_else():
+    allowed = {"torch", "tensordict", "torchrl", "numpy", "torchrl_mpfa", *sys.stdlib_module_names}
+    found = {name_of(path): imports(path) - allowed for path in REPLAY}
+    assert {name: more for name, more in found.items() if more} == {}
 
 
-@pytest.mark.parametrize("path", TASKS, ids=name_of)
-def test_the_navigation_task_does_not_know_the_replay_parts(path):
-    assert "torchrl_mpfa" not in imports(path)
+def test_the_navigation_task_does_not_know_the_replay_parts():
+    assert not importers(TASKS, {"torchrl_mpfa"})
 
 
 def test_only_the_simulation_imports_pybullet():
-    users = {name_of(path) for path in EVERYTHING if imports(path) & {"pybullet", "pybullet_utils"}}
+    users = importers(EVERYTHING, {"pybullet", "pybullet_utils"})
     assert {user for user in users if not user.startswith("tests/")} == {
         "envs/mpfa_envs/simulation.py"
     }
 
 
 def test_only_the_tracking_of_the_training_application_imports_wandb():
-    users = {name_of(path) for path in EVERYTHING if "wandb" in imports(path)}
+    users = importers(EVERYTHING, {"wandb"})
     assert {user for user in users if not user.startswith("tests/")} == {
         "examples/navigation/tracking.py"
     }
 
 
-@pytest.mark.parametrize("path", EVERYTHING, ids=name_of)
-def test_no_file_puts_folders_on_the_path(path):
+def test_no_file_puts_folders_on_the_path():
     # Packages are found because they are installed; a script finds what lies beside it.
-    assert "sys.path" not in path.read_text(encoding="utf-8") or path == Path(__file__)
+    found = [path for path in EVERYTHING if "sys.path" in path.read_text(encoding="utf-8")]
+    assert found == [Path(__file__)]
 
 
-@pytest.mark.parametrize("path", REPLAY + TASKS, ids=name_of)
-def test_no_package_file_prints_or_exits(path):
-    assert not calls(path) & {"print", "exit", "quit", "breakpoint"}
+def test_no_package_file_prints_or_exits():
+    forbidden = {"print", "exit", "quit", "breakpoint"}
+    assert not [name_of(path) for path in REPLAY + TASKS if calls(path) & forbidden]
 
 
-@pytest.mark.parametrize("path", REPLAY + TASKS, ids=name_of)
-def test_no_package_file_asserts_what_a_user_gives(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    assert not [node.lineno for node in ast.walk(tree) if isinstance(node, ast.Assert)]
+def test_no_package_file_asserts_what_a_user_gives():
+    assert not [
+        f"{name_of(path)}:{node.lineno}"
+        for path in REPLAY + TASKS
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.Assert)
+    ]
 
 
-@pytest.mark.parametrize("path", EVERYTHING, ids=name_of)
-def test_no_file_is_named_after_nothing(path):
-    assert path.stem not in {"utils", "util", "common", "helpers", "helper", "misc"}
+def test_no_file_is_named_after_nothing():
+    nothing = {"utils", "util", "common", "helpers", "helper", "misc"}
+    assert not [name_of(path) for path in EVERYTHING if path.stem in nothing]
 
 
-@pytest.mark.parametrize("path", EVERYTHING, ids=name_of)
-def test_the_source_root_of_the_tasks_is_not_imported_as_a_package(path):
-    assert "envs" not in imports(path)
+def test_the_source_root_of_the_tasks_is_not_imported_as_a_package():
+    assert not importers(EVERYTHING, {"envs"})
