@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -196,52 +197,57 @@ def test_one_wandb_run_stays_one_through_resuming(
     assert read_checkpoint(tmp_path)["wandb"] == started[0]["id"]
 
 
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, train.__file__ or "", *arguments]
+def exit_status(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
+    """What the script gives back in this process, which has all imported that it needs."""
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        train.main()
+    return caught.value.code
 
 
-def run_command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
-
-
-def test_a_wrong_setting_is_one_line_and_exit_status_2(tmp_path: Path) -> None:
-    done = run_command(f"run_dir={tmp_path / 'run'}", "learner.gamma=2")
-    assert done.returncode == 2
-    assert done.stderr == "train.py: learner.gamma must be in [0, 1], got 2.0\n"
+def test_a_wrong_setting_is_one_line_and_exit_status_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_status(monkeypatch, f"run_dir={tmp_path / 'run'}", "learner.gamma=2") == 2
+    assert capsys.readouterr().err == "train.py: learner.gamma must be in [0, 1], got 2.0\n"
     assert not (tmp_path / "run").exists()
 
 
-def popen(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
-def wait_for(file: Path, process: subprocess.Popen[str], seconds: float = 120) -> None:
+def appears(file: Path, seconds: float = 120) -> bool:
     end = time.monotonic() + seconds
-    while not file.exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end, f"{file} did not appear"
-        time.sleep(0.05)
+    while not file.exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    return file.exists()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-def test_a_killed_run_goes_on_and_signals_save(tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_and_signals_save(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "run"
-    killed = popen(*OVERRIDES, STAGES.format(10_000), f"run_dir={folder}", "checkpoint_every=20")
-    wait_for(folder / CHECKPOINT, killed)
+    words = [*OVERRIDES, STAGES.format(10_000), f"run_dir={folder}", "checkpoint_every=20"]
+    killed = subprocess.Popen(
+        [sys.executable, train.__file__ or "", *words], stderr=subprocess.PIPE, text=True
+    )
+    there = appears(folder / CHECKPOINT)
     killed.send_signal(signal.SIGKILL)
-    killed.communicate(timeout=60)
+    _, err = killed.communicate(timeout=60)
+    assert there, err
+    assert killed.returncode == -signal.SIGKILL, err
+    assert err.strip().startswith("0%"), err  # The bar comes first, no warning of any import.
     before = read_checkpoint(folder)["schedule"]["actions"]
     assert before >= 20
 
     (folder / files.STATUS).unlink(missing_ok=True)
-    resumed = popen(f"resume={folder}", "checkpoint_every=1000000")
-    wait_for(folder / files.STATUS, resumed)
-    resumed.send_signal(signal.SIGTERM)
-    out, err = resumed.communicate(timeout=120)
-    assert resumed.returncode == 128 + signal.SIGTERM, err
-    assert f"continue with: train.py resume={folder}" in out
+
+    def end_once_at_work() -> None:
+        appears(folder / files.STATUS)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=end_once_at_work, daemon=True).start()
+    status = exit_status(monkeypatch, f"resume={folder}", "checkpoint_every=1000000")
+    assert status == 128 + signal.SIGTERM
+    assert f"continue with: train.py resume={folder}" in capsys.readouterr().out
     assert read_checkpoint(folder)["schedule"]["actions"] > before
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
