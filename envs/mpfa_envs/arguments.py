@@ -11,7 +11,7 @@ from gymnasium.spaces import Box as BoxSpace
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 from mpfa_envs.lidar import Lidar
-from mpfa_envs.observation import observation_bounds, observation_slices
+from mpfa_envs.observation import Memory, observation_bounds, observation_slices
 from mpfa_envs.reward import RewardFunction, navigation_reward
 from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.worlds import World
@@ -41,6 +41,7 @@ class TaskArguments:
         progress: Progress,
         reward: RewardFunction | None,
         lidar: Mapping[str, Any] | None,
+        memory: Memory,
         closeness_distance: float | None,
         min_goal_distance: float,
         detour_chance: float,
@@ -62,6 +63,9 @@ class TaskArguments:
             navigation_reward, progress_scale=0.0 if progress == "none" else scale
         )
         self.physics = physics
+        if memory not in get_args(Memory):
+            raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")
+        self.memory: Memory = memory
         self.render_mode = render_mode
         self.max_steps = check_count("max_steps", max_steps)
         self.time_step = check_positive("time_step", time_step)
@@ -100,6 +104,6 @@ class TaskArguments:
             sectors: Number of sectors of the lidar.
             diagonal: Longest distance in a room [m].
         """
-        self.observation_slices = observation_slices(sectors)
-        low, high = observation_bounds(sectors, diagonal)
+        self.observation_slices = observation_slices(sectors, memory=self.memory)
+        low, high = observation_bounds(sectors, diagonal, memory=self.memory)
         return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)

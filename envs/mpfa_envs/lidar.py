@@ -181,19 +181,49 @@ class Lidar:
         Raises:
             ValueError: If there is noise and no generator.
         """
+        return self.reduce(self.measure(x, y, heading, rng=rng))
+
+    def measure(
+        self, x: float, y: float, heading: float, *, rng: np.random.Generator | None = None
+    ) -> NDArray[np.float64]:
+        """Measure the range of every ray, with noise.
+
+        Args:
+            x: Position of the sensor [m].
+            y: Position of the sensor [m].
+            heading: Direction of the robot's front [rad].
+            rng: Source of the noise; needed only if there is noise.
+
+        Returns:
+            Range of each ray, left to right [m], shape ``[rays]``.
+
+        Raises:
+            ValueError: If there is noise and no generator.
+        """
         ranges = self.cast(x, y, heading)
         if self.noise > 0:
             if rng is None:
                 raise ValueError(f"rng must be a Generator when noise is {self.noise}, got None")
             ranges += self.noise * rng.standard_normal(ranges.size)
             np.clip(ranges, 0.0, self.max_range, out=ranges)
+        return ranges
+
+    def reduce(self, ranges: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Give the range of every sector.
+
+        Args:
+            ranges: Range of each ray [m], shape ``[rays]``.
+
+        Returns:
+            Range of each sector [m], shape ``[sectors]``.
+        """
         if self.rays_per_sector == 1:
             return ranges
         rays = ranges.reshape(self.sectors, self.rays_per_sector)
         if self.reduction == "min":
             return np.asarray(rays.min(axis=1))
         # np.median costs as much as the whole scan.
-        rays.sort(axis=1)
+        rays = np.sort(rays, axis=1)
         middle = self.rays_per_sector // 2
         if self.rays_per_sector % 2:
             return rays[:, middle].copy()

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from mpfa_envs.checks import check_share
-from mpfa_envs.observation import observation_slices
+from mpfa_envs.observation import Memory, observation_slices
 
 
 class Mirror(nn.Module):
@@ -16,6 +16,7 @@ class Mirror(nn.Module):
 
     Args:
         sectors: Number of sectors of the lidar.
+        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
 
     Examples:
         >>> mirror = Mirror()
@@ -26,14 +27,17 @@ class Mirror(nn.Module):
     order: Tensor
     sign: Tensor
 
-    def __init__(self, *, sectors: int = 18) -> None:
+    def __init__(self, *, sectors: int = 18, memory: Memory = "none") -> None:
         super().__init__()
-        parts = observation_slices(sectors)
-        order = torch.arange(sectors + 6)
+        parts = observation_slices(sectors, memory=memory)
+        size = max(part.stop for part in parts.values())
+        order = torch.arange(size)
         order[parts["lidar"]] = order[parts["lidar"]].flip(0)
-        sign = torch.ones(sectors + 6)
+        sign = torch.ones(size)
         sign[parts["goal_direction"].start + 1] = -1.0  # The sine, positive to the left.
         sign[parts["angular_speed"]] = -1.0
+        if memory == "map":
+            sign[parts["way_direction"].start + 1] = -1.0
         self.register_buffer("order", order, persistent=False)
         self.register_buffer("sign", sign, persistent=False)
 
@@ -41,7 +45,7 @@ class Mirror(nn.Module):
         """What the robot would see in the mirrored world.
 
         Args:
-            observation: Observations, shape ``[..., sectors + 6]``.
+            observation: Observations, shape ``[..., O]``.
 
         Returns:
             Their mirror images, of the same shape.
@@ -72,6 +76,7 @@ class RandomMirror(Transform):
     Args:
         chance: Share of the transitions that are mirrored, in [0, 1].
         sectors: Number of sectors of the lidar.
+        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
         generator: Source of the choices; None: PyTorch's own.
 
     Raises:
@@ -91,11 +96,16 @@ class RandomMirror(Transform):
     """
 
     def __init__(
-        self, *, chance: float = 0.5, sectors: int = 18, generator: torch.Generator | None = None
+        self,
+        *,
+        chance: float = 0.5,
+        sectors: int = 18,
+        memory: Memory = "none",
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.chance = check_share("chance", chance)
-        self.mirror = Mirror(sectors=sectors)
+        self.mirror = Mirror(sectors=sectors, memory=memory)
         self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -17,7 +17,7 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.episodes import distance_field
-from mpfa_envs.observation import observe
+from mpfa_envs.observation import Memory, observe
 from mpfa_envs.path import shortest_length
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.distance import DistanceField
+    from mpfa_envs.map_memory import MapMemory
     from mpfa_envs.worlds import World
 
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
@@ -66,6 +67,14 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     22     linear_speed     forward speed over the robot's fastest               [-2, 2]
     23     angular_speed    turning speed over the robot's fastest, left is      [-2, 2]
                             positive
+    ====== ================ ==================================================== ==========
+
+    With ``memory="map"`` it has shape ``[27]``:
+
+    ====== ================ ==================================================== ==========
+    24-25  way_direction    cosine and sine of the direction, in the robot's     [-1, 1]
+                            frame, of the way to the goal on its map
+    26     way_length       ``length / 10 m``, longer where it is narrow         [0, 10]
     ====== ================ ==================================================== ==========
 
     **Action**, ``Box(-1, 1)`` of shape ``[2]``, float32: speed of the left and the right wheel,
@@ -109,6 +118,9 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         reward: Computes the reward in place of Eq. (25), and without progress_scale;
             ``functools.partial(navigation_reward, goal_reward=20.0)``, say.
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``.
+        memory: ``"map"``: the robot keeps a map of what its lidar met in this episode and senses
+            the way to the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it
+            senses what is before it and nothing else.
         closeness_distance: A range of this or less has closeness one [m]. None: the default of
             collision_distance, whatever that is.
         min_goal_distance: Least distance between a sampled start and goal [m].
@@ -153,6 +165,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         progress: Progress = "straight_line",
         reward: RewardFunction | None = None,
         lidar: Mapping[str, Any] | None = None,
+        memory: Memory = "none",
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         detour_chance: float = 0.8,
@@ -171,6 +184,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             progress=progress,
             reward=reward,
             lidar=lidar,
+            memory=memory,
             closeness_distance=closeness_distance,
             min_goal_distance=min_goal_distance,
             detour_chance=detour_chance,
@@ -184,6 +198,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._field: DistanceField | None = None
         self._running = False
         self._trail: list[tuple[float, float]] = []
+        self._map = self._make_map() if self.memory == "map" else None
         self._drive: Drive = (
             KinematicDrive(self.robot, time_step=self.time_step)
             if physics == "kinematic"
@@ -244,6 +259,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._min_clearance = clearance
         self._trail = [task.start[:2]]
         self._running = True
+        if self._map is not None:
+            self._map.begin(0, self.world)
         return self._observe(), self._info(False, False, False, RewardTerms())
 
     def step(
@@ -335,12 +352,23 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._running = False
         self._drive.close()
 
+    def _make_map(self) -> MapMemory:
+        """The map that the robot makes."""
+        # Imported here because it needs Numba, which takes half a second.
+        from mpfa_envs.map_memory import MapMemory
+
+        return MapMemory(1, self.robot, self.lidar)
+
     def _observe(self) -> NDArray[np.float32]:
         """Sense the world and build the observation."""
         motion = self._motion
-        ranges = self.lidar.scan(*motion[:3], rng=self.np_random if self.lidar.noise else None)
-        near = self.closeness_distance
-        return observe(ranges, motion, self._goal, self._distance, self.robot, near)
+        lidar = self.lidar
+        rays = lidar.measure(*motion[:3], rng=self.np_random if lidar.noise else None)
+        way = None
+        if self._map is not None:
+            way = self._map.remember(np.array([motion]), np.array([self._goal]), rays[None])[0]
+        ranges, near = lidar.reduce(rays), self.closeness_distance
+        return observe(ranges, motion, self._goal, self._distance, self.robot, near, way)
 
     def _info(
         self, success: bool, collision: bool, timeout: bool, terms: RewardTerms

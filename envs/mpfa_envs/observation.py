@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -13,12 +13,18 @@ if TYPE_CHECKING:
     from mpfa_envs.drives import Motion
     from mpfa_envs.robot import RobotModel
 
+Memory = Literal["none", "map"]
+"""What a robot remembers of its episode."""
+
 GOAL_CLOSENESS_DISTANCE: Final = 0.3
 """A goal at this distance or nearer has closeness one [m]."""
 DISTANCE_SCALE: Final = 10.0
 """What the distance to the goal is divided by in the observation [m]."""
 SPEED_BOUND: Final = 2.0
 """Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
+
+WAY_BOUND: Final = 10.0
+"""The scaled length of the way is clipped to this: where all ways are blocked it is very long."""
 
 _FLAGS = ("success", "collision", "timeout")
 _NUMBERS = (
@@ -42,11 +48,12 @@ INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
 """Keys of the info dictionary of every reset and step, with the type of their value."""
 
 
-def observation_slices(sectors: int = 18) -> dict[str, slice]:
+def observation_slices(sectors: int = 18, *, memory: Memory = "none") -> dict[str, slice]:
     """Name the parts of the observation.
 
     Args:
         sectors: Number of sectors of the lidar.
+        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
 
     Returns:
         Where each part lies, in order.
@@ -64,6 +71,8 @@ def observation_slices(sectors: int = 18) -> dict[str, slice]:
         "linear_speed": 1,
         "angular_speed": 1,
     }
+    if memory == "map":
+        widths.update({"way_direction": 2, "way_length": 1})
     slices, first = {}, 0
     for name, width in widths.items():
         slices[name] = slice(first, first + width)
@@ -76,20 +85,24 @@ OBSERVATION: Final = observation_slices()
 
 
 def observation_bounds(
-    sectors: int, diagonal: float
+    sectors: int, diagonal: float, *, memory: Memory = "none"
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Give the least and the greatest observation.
 
     Args:
         sectors: Number of sectors of the lidar.
         diagonal: Longest distance in the room [m].
+        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
 
     Returns:
-        Two arrays of shape ``[sectors + 6]``.
+        Two arrays of shape ``[sectors + 6]``, with a map ``[sectors + 9]``.
     """
     far = diagonal / DISTANCE_SCALE
     low = [0.0] * sectors + [-1.0, -1.0, 0.0, 0.0, -SPEED_BOUND, -SPEED_BOUND]
     high = [1.0] * sectors + [1.0, 1.0, 1.0, far, SPEED_BOUND, SPEED_BOUND]
+    if memory == "map":
+        low += [-1.0, -1.0, 0.0]
+        high += [1.0, 1.0, WAY_BOUND]
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
 
 
@@ -100,6 +113,7 @@ def observe(
     distance: float,
     robot: RobotModel,
     closeness_distance: float,
+    way: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
     """Build an observation.
 
@@ -110,19 +124,22 @@ def observe(
         distance: Distance between the two [m].
         robot: Whose greatest speeds scale the speeds.
         closeness_distance: A range of this or less has closeness one [m].
+        way: Direction (x, y) and length [m] of the way that the robot's map leaves; None: it has
+            no map.
 
     Returns:
-        The observation, shape ``[sectors + 6]``; :func:`observation_slices` names its parts.
+        The observation, shape ``[sectors + 6]``, with a map ``[sectors + 9]``;
+        :func:`observation_slices` names its parts.
     """
     x, y, heading, linear_speed, angular_speed = motion
     sectors = ranges.size
-    observation = np.empty(sectors + 6, dtype=np.float32)
+    observation = np.empty(sectors + (6 if way is None else 9), dtype=np.float32)
     near = closeness_distance
     np.divide(near, np.maximum(ranges, near), out=observation[:sectors])
     # A robot on the goal sees it ahead.
     bearing = math.atan2(goal[1] - y, goal[0] - x) - heading if distance else 0.0
     bound = SPEED_BOUND
-    observation[sectors:] = (
+    observation[sectors : sectors + 6] = (
         math.cos(bearing),
         math.sin(bearing),
         min(GOAL_CLOSENESS_DISTANCE / distance, 1.0) if distance else 1.0,
@@ -130,4 +147,7 @@ def observe(
         min(max(linear_speed / robot.max_wheel_speed, -bound), bound),
         min(max(angular_speed / robot.max_angular_speed, -bound), bound),
     )
+    if way is not None:
+        length = min(way[2] / DISTANCE_SCALE, WAY_BOUND)
+        observation[sectors + 6 :] = way[0], way[1], length
     return observation

@@ -25,6 +25,7 @@ from mpfa_envs.kernels.step import (
     measure_ways,
     settle,
 )
+from mpfa_envs.map_memory import MapMemory
 from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
 from mpfa_envs.reward import RewardFunction, StepOutcome, navigation_reward
@@ -50,6 +51,7 @@ NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
 """Its numbers, likewise."""
 _TRAIL = 500
 """Time steps that there is room for at first."""
+_NO_WAYS = np.zeros((0, 3))
 
 
 class RobotBatch:
@@ -86,8 +88,11 @@ class RobotBatch:
         """Positions since the start of the episode [m], ``[N, steps, 2]``."""
         self.ranges = np.zeros((count, lidar.angles.size))
         """Range of each ray [m], ``[N, rays]``."""
-        self.observations = np.zeros((count, lidar.sectors + 6), dtype=np.float32)
-        """What they sense, ``[N, 24]``."""
+        self.memory = MapMemory(count, rules.robot, lidar) if rules.memory == "map" else None
+        """The maps that they make, if they make any."""
+        width = max(part.stop for part in rules.observation_slices.values())
+        self.observations = np.zeros((count, width), dtype=np.float32)
+        """What they sense, ``[N, O]``."""
         self.drives = make_drives(rules.physics, rules.robot, count, time_step=rules.time_step)
         """How they move."""
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
@@ -130,6 +135,8 @@ class RobotBatch:
         numbers[POSE : POSE + 3] = x, y, heading
         self.trails[index, 0] = x, y
         self.running[index] = True
+        if self.memory is not None:
+            self.memory.begin(index, episode.world)
 
     def wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
         """Read actions, as :meth:`~mpfa_envs.RobotModel.wheel_speeds` reads one.
@@ -182,6 +189,7 @@ class RobotBatch:
             "tasks": [task and (task.start, task.goal) for task in self.tasks],
             "trails": self.trails[:, : last + 1].copy(),
             "drives": self.drives.state_dict(),
+            "memory": {} if self.memory is None else self.memory.state_dict(),
             **{name: array.copy() for name, array in self._arrays().items()},
         }
 
@@ -203,6 +211,8 @@ class RobotBatch:
         tasks = [None if task is None else read_task(task) for task in state["tasks"]]
         last = int(values["steps"].max())
         trails = read_array(state, "trails", np.zeros((len(tasks), last + 1, 2)))
+        if self.memory is not None:
+            self.memory.load_state_dict(state.get("memory", {}))
         self._lengthen_trails(last)
         self.trails[:, : last + 1] = trails
         for name, array in arrays.items():
@@ -263,8 +273,21 @@ class RobotBatch:
             for index in np.flatnonzero(chosen).tolist():
                 ranges[index] += lidar.noise * rngs[index].standard_normal(ranges.shape[1])
             np.clip(ranges, 0.0, lidar.max_range, out=ranges)
+        ways = _NO_WAYS
+        if self.memory is not None:
+            motions, goals = self.episodes.motions, self.episodes.goals
+            ways = self.memory.remember(motions, goals, ranges, chosen)
         median = lidar.reduction == "median"
-        observe_all(self.episodes, chosen, ranges, median, self._scales, self.observations)
+        observe_all(
+            self.episodes,
+            chosen,
+            ranges,
+            median,
+            self._scales,
+            ways,
+            lidar.sectors,
+            self.observations,
+        )
 
     def _lengthen_trails(self, steps: int) -> None:
         """Make room for so many time steps."""

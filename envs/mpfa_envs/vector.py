@@ -17,7 +17,7 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.episodes import EpisodeSource, WorldChoice
 from mpfa_envs.kernels.step import outcomes
-from mpfa_envs.observation import INFO_TYPES
+from mpfa_envs.observation import INFO_TYPES, Memory
 from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
 from mpfa_envs.robot import RobotModel
 from mpfa_envs.robot_batch import FLAGS, NUMBERS, RobotBatch
@@ -73,6 +73,7 @@ class VectorNavigationEnv(
         reward: Computes the reward in place of Eq. (25), robot by robot and hence slowly, unless it
             is a ``functools.partial`` of :func:`~mpfa_envs.navigation_reward`.
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults.
+        memory: What a robot remembers of its episode.
         closeness_distance: A range of this or less has closeness one [m].
         min_goal_distance: Least distance between a sampled start and goal [m].
         max_goal_distance: Longest way between them [m].
@@ -122,6 +123,7 @@ class VectorNavigationEnv(
         progress: Progress = "straight_line",
         reward: RewardFunction | None = None,
         lidar: Mapping[str, Any] | None = None,
+        memory: Memory = "none",
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         max_goal_distance: float = math.inf,
@@ -145,6 +147,7 @@ class VectorNavigationEnv(
             progress=progress,
             reward=reward,
             lidar=lidar,
+            memory=memory,
             closeness_distance=closeness_distance,
             min_goal_distance=min_goal_distance,
             detour_chance=detour_chance,
@@ -203,7 +206,7 @@ class VectorNavigationEnv(
 
     @property
     def observations(self) -> NDArray[np.float32]:
-        """The last observations, ``[N, 24]``."""
+        """The last observations, ``[N, O]``."""
         return self._batch.observations.copy()
 
     @property
@@ -284,7 +287,7 @@ class VectorNavigationEnv(
                 each. Both hold for this episode and no later one.
 
         Returns:
-            Observations ``[N, 24]`` and infos; a robot that does not start keeps its own.
+            Observations ``[N, O]`` and infos; a robot that does not start keeps its own.
 
         Raises:
             ValueError: If a seed is negative, or the options are not tasks that can be driven; the
@@ -320,7 +323,7 @@ class VectorNavigationEnv(
                 rows, with a reward of zero.
 
         Returns:
-            Observations ``[N, 24]``, rewards, terminations and truncations ``[N]``, and infos.
+            Observations ``[N, O]``, rewards, terminations and truncations ``[N]``, and infos.
 
         Raises:
             ValueError: If the actions are not two numbers for each robot, or only is no mask of

@@ -36,6 +36,7 @@ def describe(rules: TaskArguments, lidar: Lidar, robots: int) -> dict[str, Any]:
         "collision_distance": rules.collision_distance,
         "closeness_distance": rules.closeness_distance,
         "progress": rules.progress,
+        "memory": rules.memory,
         "rays": lidar.angles.size,
         "sectors": lidar.sectors,
     }

@@ -220,6 +220,8 @@ class EnvironmentSettings:
     """Longest way of a sampled task [m]; null: as it comes."""
     episodes_per_world: int = 1
     """Episodes of a robot in a world of a generator before it gets another one."""
+    memory: str = "none"
+    """``map``: the robot remembers what its lidar met and senses the way that this leaves open."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""
 

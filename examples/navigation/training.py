@@ -95,7 +95,7 @@ class TrainingRun:
         )
         self.buffer, self.select = replay.buffer, replay.select
         if settings.environment.mirror:
-            self.buffer.append_transform(RandomMirror())
+            self.buffer.append_transform(RandomMirror(memory=settings.environment.memory))
 
     def _begin_stage(self) -> None:
         seed = self.settings.seed * 1_000_003 + self.schedule.stage

@@ -83,6 +83,7 @@ def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
         {"reward": lambda outcome: RewardTerms(other=outcome.clearance), "time_step": 0.2},
         {"progress": "none", "collision_distance": "contact"},
         {"progress": "shortest_path", "progress_scale": 7.0},
+        {"memory": "map", "lidar": {"noise": 0.02}},
     ],
     ids=lambda arguments: "-".join(arguments) or "defaults",
 )

@@ -35,6 +35,7 @@ CASES: list[dict[str, Any]] = [
     {"world": "bars", "progress": "shortest_path", "lidar": {"noise": 0.02}},
     {"world": "mixed", "episodes_per_world": 3, "autoreset_mode": AutoresetMode.SAME_STEP},
     {"world": ["A", "D"], "physics": "wheels"},
+    {"world": "bars", "memory": "map"},
 ]
 
 
@@ -135,6 +136,7 @@ def with_value(value: object, *keys: str) -> Callable[[dict[str, Any]], None]:
         (with_value(np.zeros((3, 5)), "batch", "motions"), r"motions .* \(2, 5\), got \(3, 5\)"),
         (with_value([None], "batch", "tasks"), "tasks of the state must have 2 entries"),
         (with_value([{}, {}], "batch", "worlds"), "worlds must hold the fields of a World"),
+        (with_value("map", "arguments", "memory"), "memory = 'none', got one with 'map'"),
         (with_value([3, 4], "batch", "tasks"), "task must be a start and a goal, got 3"),
     ],
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from mpfa_envs.kernels import njit
 from mpfa_envs.kernels.step import DISTANCE
-from mpfa_envs.observation import DISTANCE_SCALE, GOAL_CLOSENESS_DISTANCE, SPEED_BOUND
+from mpfa_envs.observation import DISTANCE_SCALE, GOAL_CLOSENESS_DISTANCE, SPEED_BOUND, WAY_BOUND
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,6 +24,8 @@ def observe_all(
     ranges: NDArray[np.float64],
     median: bool,
     scales: tuple[float, float, float],
+    ways: NDArray[np.float64],
+    sectors: int,
     observations: NDArray[np.float32],
 ) -> None:
     """Build the observations of the chosen robots.
@@ -34,9 +36,11 @@ def observe_all(
         ranges: Range of each ray [m], ``[N, rays]``.
         median: Whether a sector reports the median of its rays and not the nearest.
         scales: Range with closeness one [m]; fastest speed of a wheel [m/s], fastest turn [rad/s].
-        observations: Where the observations go, ``[N, sectors + 6]``.
+        ways: Direction (x, y) and length [m] of the ways that the robots' maps leave, ``[N, 3]``;
+            without rows where there are no maps.
+        sectors: Number of sectors of the lidar.
+        observations: Where the observations go, ``[N, O]``.
     """
-    sectors = observations.shape[1] - 6
     count = ranges.shape[1] // sectors
     near, fastest, fastest_turn = scales
     for robot in range(observations.shape[0]):
@@ -65,6 +69,9 @@ def observe_all(
         seen[sectors + 2], seen[sectors + 3] = closeness, distance / DISTANCE_SCALE
         seen[sectors + 4] = min(max(speed, -SPEED_BOUND), SPEED_BOUND)
         seen[sectors + 5] = min(max(turn, -SPEED_BOUND), SPEED_BOUND)
+        if ways.shape[0] > 0:
+            seen[sectors + 6], seen[sectors + 7] = ways[robot, 0], ways[robot, 1]
+            seen[sectors + 8] = min(ways[robot, 2] / DISTANCE_SCALE, WAY_BOUND)
 
 
 @njit

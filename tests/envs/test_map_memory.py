@@ -1,0 +1,169 @@
+"""The way on a robot's map, against SciPy's Dijkstra on the same map, and what it is good for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from mpfa_envs import (
+    Box,
+    Lidar,
+    MapMemory,
+    NavigationEnv,
+    VectorNavigationEnv,
+    World,
+    generate_world,
+    observation_slices,
+)
+from mpfa_envs.map_memory import RESOLUTION
+from mpfa_envs.robot import ROBOTS
+from tests.envs.shapes import random_shapes
+
+ROBOT = ROBOTS["turtlebot2"]
+FACTORS = (1, 3, 30)
+POCKET = World(
+    name="pocket",
+    boxes=(Box(1.0, -1.5, 1.2, 1.5), Box(-1.0, 1.3, 1.0, 1.5), Box(-1.0, -1.5, 1.0, -1.3)),
+)
+"""A U that is open to the left."""
+
+
+def scan(memory: MapMemory, lidar: Lidar, pose: tuple[float, float, float], goal: tuple) -> list:
+    motions = np.array([[*pose, 0.0, 0.0]])
+    return memory.remember(motions, np.array([goal]), lidar.cast(*pose)[None])[0].tolist()
+
+
+def levels_of_points(points: np.ndarray, memory: MapMemory) -> np.ndarray:
+    """What the points that the lidar met make of each cell."""
+    columns, rows = memory.arrays.shapes[0]
+    origin = memory.arrays.origins[0]
+    x = origin[0] + RESOLUTION * np.arange(columns)[:, None, None]
+    y = origin[1] + RESOLUTION * np.arange(rows)[None, :, None]
+    gaps = np.hypot(x - points[:, 0], y - points[:, 1]).min(axis=2) - ROBOT.radius
+    return np.where(gaps <= 0.02, 2, np.where(gaps <= 0.17, 1, 0))
+
+
+def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
+    """Costs of the ways from all cells to the goal, by SciPy."""
+    columns, rows = levels.shape
+    edges = []
+    for i in range(columns):
+        for j in range(rows):
+            for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
+                to = i + di, j + dj
+                if 0 <= to[0] < columns and 0 <= to[1] < rows:
+                    factor = max(FACTORS[levels[i, j]], FACTORS[levels[to]])
+                    length = 14 if di and dj else 10
+                    edges.append((i * rows + j, to[0] * rows + to[1], factor * length))
+    starts, ends, costs = np.array(edges).T
+    graph = csr_array((costs.astype(float), (starts, ends)), shape=(levels.size, levels.size))
+    found = dijkstra(graph, directed=False, indices=goal[0] * rows + goal[1])
+    return found.reshape(levels.shape)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_way_is_the_cheapest_on_the_map_after_every_scan(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    world = random_shapes(rng, boxes=4, cylinders=4)
+    lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
+    memory.begin(0, world)
+    goal, points = (3.9, 2.9), []
+    pose = np.array([-4.0, -3.0, 0.0])
+    for _ in range(6):
+        angles = pose[2] + lidar.angles
+        ranges = lidar.cast(*pose)
+        met = ranges < lidar.max_range
+        points += [
+            pose[:2] + r * np.array([math.cos(a), math.sin(a)])
+            for r, a in zip(ranges[met], angles[met], strict=True)
+        ]
+        way = scan(memory, lidar, tuple(pose), goal)
+        levels = levels_of_points(np.array(points), memory)
+        np.testing.assert_array_equal(memory.arrays.levels[0], levels)
+        cell, end = (
+            tuple(np.rint((np.array(at) - memory.arrays.origins[0]) / RESOLUTION).astype(int))
+            for at in (pose[:2], goal)
+        )
+        assert way[2] == pytest.approx(cheapest(levels, end)[cell] * RESOLUTION / 10)
+        assert math.hypot(way[0], way[1]) == pytest.approx(1.0)
+        pose += [rng.uniform(0.0, 0.6), rng.uniform(0.0, 0.5), rng.uniform(-0.5, 0.5)]
+
+
+def test_the_way_leads_straight_to_a_goal_that_can_be_seen() -> None:
+    world = World(name="empty")
+    memory = MapMemory(1, ROBOT, Lidar(world))
+    memory.begin(0, world)
+    way = scan(memory, Lidar(world), (0.0, 0.0, 0.5), (1.0, 1.0))
+    bearing = math.pi / 4 - 0.5
+    assert way[:2] == pytest.approx([math.cos(bearing), math.sin(bearing)])
+    assert way[2] == pytest.approx(1.4)
+
+
+def test_an_episode_begins_with_an_empty_map() -> None:
+    memory = MapMemory(2, ROBOT, Lidar(POCKET))
+    memory.begin(0, POCKET)
+    before = scan(memory, Lidar(POCKET), (0.0, 0.0, 0.0), (3.0, 0.0))
+    assert memory.arrays.levels[0].any()
+    assert not memory.arrays.levels[1].any()
+    memory.begin(0, POCKET)
+    assert not memory.arrays.levels[0].any()
+    assert scan(memory, Lidar(POCKET), (0.0, 0.0, 0.0), (3.0, 0.0)) == before
+
+
+def test_nothing_of_the_room_is_known_before_it_was_seen() -> None:
+    lidar, empty = Lidar(POCKET), Lidar(World(name="empty"))
+    ways = []
+    for sensor in (lidar, empty):
+        memory = MapMemory(1, ROBOT, sensor)
+        memory.begin(0, POCKET)
+        # The pocket is behind the robot.
+        ways.append(scan(memory, sensor, (-2.0, 0.0, math.pi), (3.0, 0.0)))
+    assert ways[0] == ways[1]
+
+
+def follow(observation: np.ndarray, part: str) -> np.ndarray:
+    """Drive towards a direction that is sensed."""
+    across, up = observation[observation_slices(memory="map")[part]]
+    turn = np.clip(1.5 * math.atan2(up, across), -1.0, 1.0)
+    speed = 1.0 - abs(turn)
+    return np.clip(2 * np.array([speed - turn, speed + turn]) - 1, -1.0, 1.0)
+
+
+def test_the_way_leads_out_of_a_pocket_that_the_straight_line_leads_into() -> None:
+    env = NavigationEnv(world=POCKET, physics="kinematic", memory="map", max_steps=1000)
+    ends = {}
+    for part in ("way_direction", "goal_direction"):
+        observation, info = env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
+        ended = False
+        while not ended:
+            observation, _, terminated, truncated, info = env.step(follow(observation, part))
+            ended = terminated or truncated
+        ends[part] = info["success"]
+    assert ends == {"way_direction": True, "goal_direction": False}
+    env.close()
+
+
+def test_the_map_adds_to_the_observation_and_changes_nothing_of_it() -> None:
+    worlds = [generate_world("mazes", 3), generate_world("halls", 4)]
+    envs = [
+        VectorNavigationEnv(2, world=worlds, physics="kinematic", memory=memory)
+        for memory in ("none", "map")
+    ]
+    rng = np.random.default_rng(0)
+    seen = [env.reset(seed=0)[0] for env in envs]
+    for _ in range(50):
+        np.testing.assert_array_equal(seen[0], seen[1][:, :24])
+        assert envs[1].observation_space.contains(seen[1])
+        actions = rng.uniform(-0.5, 1.0, (2, 2)).astype(np.float32)
+        seen = [env.step(actions)[0] for env in envs]
+    for env in envs:
+        env.close()
+
+
+def test_an_unknown_memory_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"memory must be one of \('none', 'map'\), got 'lstm'"):
+        NavigationEnv(memory="lstm")  # type: ignore[arg-type]
