@@ -55,7 +55,7 @@ class MapMemory:
         >>> memory.begin(0, wall)
         >>> ranges = lidar.cast(0.0, 0.0, 0.0)[None]
         >>> way = memory.remember(np.zeros((1, 5)), np.array([[3.0, 0.0]]), ranges)[0]
-        >>> abs(way[1]) > 0.5, way[2] > 3.0  # Around the wall, which is longer.
+        >>> bool(abs(way[1]) > 0.5), bool(way[2] > 3.0)  # Around the wall, which is longer.
         (True, True)
     """
 
@@ -127,7 +127,7 @@ class MapMemory:
             ValueError: If something is missing or of another shape; nothing has changed then.
         """
         count = len(self._ways)
-        sides = np.shape(state.get("levels"))[1:]
+        sides = np.shape(state.get("levels", ()))[1:]
         if len(sides) != 2:
             raise ValueError(f"levels of the state must have shape [N, columns, rows], got {sides}")
         likes = {
