@@ -23,9 +23,9 @@ RESOLUTION: Final = 0.1
 """Side of a cell [m]."""
 _MARGIN: Final = 5
 """Cells around the room: where it ends is not known before a wall was seen."""
-_BLOCKED: Final = 0.02
+_BLOCKED: Final = 0.06
 """Clearance of the robot's rim below which a cell is blocked [m]."""
-_NEAR: Final = 0.17
+_NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
 
 

@@ -44,7 +44,7 @@ def levels_of_points(points: np.ndarray, memory: MapMemory) -> np.ndarray:
     x = origin[0] + RESOLUTION * np.arange(columns)[:, None, None]
     y = origin[1] + RESOLUTION * np.arange(rows)[None, :, None]
     gaps = np.hypot(x - points[:, 0], y - points[:, 1]).min(axis=2) - ROBOT.radius
-    return np.where(gaps <= 0.02, 2, np.where(gaps <= 0.17, 1, 0))
+    return np.where(gaps <= 0.06, 2, np.where(gaps <= 0.22, 1, 0))
 
 
 def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
