@@ -31,9 +31,13 @@ from tests.integration.tiny_runs import OVERRIDES
 STAGES = "curriculum.stages=[{{world: A, episodes: {}}}]"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
+    register()
+
+
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
-    register()
     threads = torch.get_num_threads()
     yield
     torch.set_flush_denormal(False)
@@ -168,8 +172,7 @@ def test_what_a_run_cannot_change_on_its_way_is_refused_by_name(
 
 
 @pytest.fixture(scope="module")
-def two_episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    register()
+def two_episodes(registered: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     begin(folder, episodes=2)
     return folder

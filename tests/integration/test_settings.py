@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from itertools import zip_longest
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -12,11 +12,14 @@ from navigation.command_line import composed, parse_overrides
 from navigation.settings import GROUPS, Stage, TrainSettings, register
 
 
-@pytest.fixture(autouse=True)
-def hydra_at_work() -> Iterator[None]:
-    GlobalHydra.instance().clear()
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
     register()
-    yield
+
+
+@pytest.fixture(autouse=True)
+def hydra_at_rest() -> None:
+    GlobalHydra.instance().clear()
 
 
 def one(*arguments: str) -> TrainSettings:
@@ -38,9 +41,10 @@ def test_the_paper_curriculum_has_a_thousand_episodes() -> None:
     assert sum(stage.episodes for stage in stages) == 1000
 
 
-@pytest.mark.parametrize(("group", "choice"), [(g, c) for g, cs in GROUPS.items() for c in cs])
-def test_every_choice_of_every_group_passes_the_checks(group: str, choice: str) -> None:
-    one(f"{group}={choice}")
+# The first choices of all groups together, the second ones, and so on.
+@pytest.mark.parametrize("choices", [*zip_longest(*GROUPS.values())], ids=str)
+def test_every_choice_of_every_group_passes_the_checks(choices: tuple[str | None, ...]) -> None:
+    one(*(f"{group}={each}" for group, each in zip(GROUPS, choices, strict=True) if each))
 
 
 def test_an_override_reaches_the_typed_settings() -> None:

@@ -15,9 +15,13 @@ SMALL = ["capacity=32", "batch_size=4"]
 CHOOSY = {"la3p", "klper"}
 
 
-@pytest.fixture
-def composed():
+@pytest.fixture(scope="module")
+def registered():
     register_configs()
+
+
+@pytest.fixture
+def composed(registered):
     with initialize(version_base=None, config_path=None):
         yield lambda *overrides: compose(overrides=list(overrides))
 
