@@ -97,10 +97,23 @@ def test_the_way_leads_straight_to_a_goal_that_can_be_seen() -> None:
     world = World(name="empty")
     memory = MapMemory(1, ROBOT, Lidar(world))
     memory.begin(0, world)
-    way = scan(memory, Lidar(world), (0.0, 0.0, 0.5), (1.0, 1.0))
-    bearing = math.pi / 4 - 0.5
+    # Not the middle of a cell.
+    way = scan(memory, Lidar(world), (0.0, 0.0, 0.5), (1.0, 0.93))
+    bearing = math.atan2(0.93, 1.0) - 0.5
     assert way[:2] == pytest.approx([math.cos(bearing), math.sin(bearing)])
-    assert way[2] == pytest.approx(1.4)
+    assert way[2] == pytest.approx(1.37, abs=0.1)
+
+
+def test_a_robot_that_has_not_looked_around_keeps_its_map_and_its_way() -> None:
+    lidar, memory = Lidar(POCKET), MapMemory(2, ROBOT, Lidar(POCKET))
+    motions, goals = np.zeros((2, 5)), np.full((2, 2), 3.0)
+    for index in range(2):
+        memory.begin(index, POCKET)
+    ranges = np.tile(lidar.cast(0.0, 0.0, 0.0), (2, 1))
+    ways = memory.remember(motions, goals, ranges, np.array([False, True])).copy()
+    assert not memory.arrays.levels[0].any() and memory.arrays.levels[1].any()
+    np.testing.assert_array_equal(ways[0], 0.0)
+    assert ways[1].any()
 
 
 def test_an_episode_begins_with_an_empty_map() -> None:
