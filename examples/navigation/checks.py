@@ -66,6 +66,7 @@ RULES: dict[str, Rule] = {
     "method.batch_size": at_least(1),
     "method.candidates": at_least(1),
     "method.replay_cap": at_least(1),
+    "method.recency": (lambda value: 0.0 <= value < 1.0, "in [0, 1)"),
     "method.target_average": at_least(1),
     "method.alpha": NOT_NEGATIVE,
     "method.beta": SHARE,

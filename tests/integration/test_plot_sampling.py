@@ -62,6 +62,12 @@ def test_combined_replay_has_the_newest_in_every_batch() -> None:
     assert found["critic"].argmax() == len(found["critic"]) - 1
 
 
+def test_replay_by_age_samples_the_newest_most() -> None:
+    _, found = count_samples(METHODS["geometric"])
+    tenths = found["critic"].reshape(10, -1).mean(1)
+    assert tenths[-1] > 1.1 * tenths[0]
+
+
 def test_the_capped_replay_lets_go_of_what_it_sampled_most() -> None:
     capped, per = means_by_kind("mw"), means_by_kind("td_reward")
     assert capped["goal"] < per["goal"]
@@ -99,6 +105,6 @@ def test_every_method_has_a_page_with_its_figure_its_command_and_its_source(name
     assert f"[`{name}`]({name}.md)" in (DOCS / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["klper", "averaged_ddpg", "hvper", "mw"])
+@pytest.mark.parametrize("name", ["klper", "averaged_ddpg", "geometric", "hvper", "mw"])
 def test_a_reconstruction_is_called_one(name: str) -> None:
     assert "reconstruction" in (DOCS / f"{name}.md").read_text(encoding="utf-8").lower()

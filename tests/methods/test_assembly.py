@@ -40,8 +40,8 @@ def test_every_method_gives_batches_and_takes_what_its_loss_writes(name):
                 draw.batch["signals", signal] = torch.rand(count)
             if replay.signals and draw.gives_signals:
                 replay.buffer.update_tensordict_priority(draw.batch)
-        assert draws == (3 if name == "la3p" else 1)
-        assert count == (4 if name == "la3p" else 8)
+        assert draws == {"la3p": 3, "uniform_halves": 2}.get(name, 1)
+        assert count == (4 if name in {"la3p", "uniform_halves"} else 8)
 
 
 def test_a_setting_reaches_its_part():

@@ -12,7 +12,7 @@ from torchrl_mpfa.configs import CONFIGS, register_configs
 from torchrl_mpfa.methods import METHODS, Method, Replay
 
 SMALL = ["capacity=32", "batch_size=4"]
-CHOOSY = {"la3p", "klper"}
+CHOOSY = {"la3p", "klper", "uniform_halves"}
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from tests.mpfa.transitions import same
 from torchrl_mpfa import MPFASampler, TreeSampler
 from torchrl_mpfa.methods import make_replay
 
-METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer"]
+METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer", "geometric"]
 
 
 def make_trained(name, *, seed=0, capacity=12):
@@ -101,6 +101,7 @@ OWN = [
     ("la3p", "_sum_tree", lambda t: t * 0, "'_sum_tree' of the saved sampler must be positive"),
     ("cer", "_newest", NOTHING, "'_newest' is missing"),
     ("cer", "_newest", ["0"], "'_newest' of the saved sampler must be None, or a place"),
+    ("geometric", "_newest", NOTHING, "'_newest' is missing"),
     ("cer", "_newest", -3, "'_newest' of the saved sampler must be None, or a place"),
 ]
 CASES = [(name, *case) for name in METHODS[:4] for case in COMMON] + OWN

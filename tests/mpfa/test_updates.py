@@ -231,6 +231,8 @@ def newest_in(batch):
         ("mpfa_per", {"stratified": True}, 3),
         ("mw", {}, 3),
         ("cer", {}, 3),
+        ("geometric", {}, 1),
+        ("uniform_halves", {}, 3),
         ("la3p", {}, 9),
         ("klper", {}, 3),
     ],

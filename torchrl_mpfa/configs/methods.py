@@ -8,17 +8,13 @@ from typing import Any, get_type_hints
 from torchrl.trainers.algorithms.configs.data import ReplayBufferBaseConfig
 
 from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
+from torchrl_mpfa.methods.assembly import has_one_batch_a_step
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.selection import one_batch
 
 _PLACE = "torchrl_mpfa.configs.methods"
 _BESIDE = ("storage", "device", "policy", "sigma", "generator")
 """Arguments of :func:`~torchrl_mpfa.methods.make_replay` beside the settings."""
-
-
-def _one_batch_a_step(method: Method) -> bool:
-    """Whether a trainer that samples one batch for each update trains by the method."""
-    return method.selection != "split" and method.candidates == 1
 
 
 def _config(name: str, target: str) -> type:
@@ -61,7 +57,7 @@ METHOD_CONFIGS: dict[tuple[str, str], type] = {
     **{
         ("replay_buffer", f"signal_{name}"): _config(name, "_make_buffer")
         for name, method in METHODS.items()
-        if _one_batch_a_step(method)
+        if has_one_batch_a_step(method)
     },
 }
 """Every method in the group ``replay``, and as a buffer those that sample one batch a step."""

@@ -7,6 +7,8 @@ from torchrl_mpfa.methods.assembly import Replay, loss_options, make_replay
 from torchrl_mpfa.methods.catalogue import ALIASES, METHODS, Method
 from torchrl_mpfa.methods.cer import CombinedSampler
 from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
+from torchrl_mpfa.methods.geometric import GeometricSampler, geometric_age
+from torchrl_mpfa.methods.halves import uniform_halves
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
@@ -29,6 +31,7 @@ __all__ = [
     "CappedSampler",
     "CombinedSampler",
     "Curiosity",
+    "GeometricSampler",
     "LA3PSampler",
     "LowestDivergence",
     "Method",
@@ -37,6 +40,7 @@ __all__ = [
     "Replay",
     "ReplayPenalty",
     "gaussian_divergence",
+    "geometric_age",
     "intrinsic_reward",
     "loss_options",
     "make_replay",
@@ -44,5 +48,6 @@ __all__ = [
     "relative_error",
     "relative_value",
     "split_draws",
+    "uniform_halves",
     "value_schedule",
 ]

@@ -15,6 +15,8 @@ from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.methods.catalogue import METHODS, Method
 from torchrl_mpfa.methods.cer import CombinedSampler
+from torchrl_mpfa.methods.geometric import GeometricSampler
+from torchrl_mpfa.methods.halves import uniform_halves
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
@@ -45,9 +47,11 @@ _FUSIONS: dict[str, Callable[[Method], Fusion]] = {
     "scaled": lambda method: ScaledFusion(_equal(method)),
     "value_schedule": lambda method: value_schedule(),
 }
-_UNIFORM: dict[str, Callable[[], RandomSampler]] = {
-    "uniform": RandomSampler,
-    "newest": CombinedSampler,
+_UNIFORM: dict[str, Callable[[Method], RandomSampler]] = {
+    "uniform": lambda method: RandomSampler(),
+    "halves": lambda method: RandomSampler(),
+    "newest": lambda method: CombinedSampler(),
+    "geometric": lambda method: GeometricSampler(rate=method.recency),
 }
 _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "prioritized": SignalSampler,
@@ -55,6 +59,7 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "capped": CappedSampler,
     "split": LA3PSampler,
 }
+_SELECTIONS: dict[str, Selection] = {"split": split_draws, "halves": uniform_halves}
 WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
     "fusion": set(_FUSIONS),
@@ -174,6 +179,11 @@ def loss_options(method: str | Method) -> dict[str, Any]:
     }
 
 
+def has_one_batch_a_step(method: Method) -> bool:
+    """Whether what samples one batch for each update, and no more, trains by the method."""
+    return method.selection not in _SELECTIONS and method.candidates == 1
+
+
 def signals_of(method: Method) -> list[Signal]:
     """The signals that a method names; an unknown name is one that the loss learns."""
     return [_SIGNALS.get(name, Signal(name)) for name in method.signals]
@@ -188,7 +198,7 @@ def learned_signals(method: Method) -> list[str]:
 def make_sampler(method: Method) -> SignalSampler | RandomSampler:
     """The sampler that the settings describe: signals, fusion, adjustments, selection."""
     if method.selection in _UNIFORM:
-        return _UNIFORM[method.selection]()
+        return _UNIFORM[method.selection](method)
     more: dict[str, Any] = {}
     if method.selection == "capped":
         more["replay_cap"] = method.replay_cap
@@ -233,8 +243,8 @@ def make_adjustments(method: Method) -> list[Adjustment]:
 def _make_selection(
     method: Method, policy: TensorDictModule | None, sigma: float | Callable[[], float] | None
 ) -> Selection:
-    if method.selection == "split":
-        return split_draws
+    if method.selection in _SELECTIONS:
+        return _SELECTIONS[method.selection]
     if policy is not None and sigma is not None and method.candidates > 1:
         choose = LowestDivergence(policy, batches=method.candidates, sigma=sigma)
         return lambda buffer: (

@@ -35,7 +35,10 @@ class Method:
     """Penalty on replays (HVPER); 0: none."""
     selection: str = "prioritized"
     """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
-    ``rank``, ``capped`` (MW) or ``split`` (LA3P)."""
+    ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P) or
+    ``halves`` (two updates on uniform halves)."""
+    recency: float = 3e-5
+    """rho of ``geometric``: by how much less often each older transition is sampled."""
     candidates: int = 1
     """Batches of which the most on-policy one is trained on (KLPER)."""
     replay_cap: int = 1024
@@ -133,7 +136,9 @@ METHODS: dict[str, Method] = {
     "lap": Method("lap", **_LAP),
     "pal": Method("pal", **_UNIFORM, loss_function="pal", alpha=0.4),
     "la3p": Method("la3p", **_LAP, selection="split"),
+    "uniform_halves": Method("uniform_halves", **{**_UNIFORM, "selection": "halves"}),
     "cer": Method("cer", **{**_UNIFORM, "selection": "newest"}),
+    "geometric": Method("geometric", **{**_UNIFORM, "selection": "geometric"}),
     # Another word for uniform replay, for learners that are not DDPG.
     "uniform": Method("uniform", **_UNIFORM),
 }

@@ -1,0 +1,115 @@
+r"""Replay by age: the older a transition, the less often, by a truncated geometric law.
+
+After "When does non-uniform replay matter" (2026), https://arxiv.org/abs/2605.10236. **A
+reconstruction**: that sampling follows a truncated geometric distribution of the age is said by its
+abstract; the form of the law and its rate are our reading:
+
+.. math::
+
+    P(k) = \frac{\rho (1 - \rho)^k}{1 - (1 - \rho)^N}, \qquad k = 0, \dots, N - 1
+
+where the age :math:`k` of a transition counts those that were written after it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.data import Storage
+
+from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.samplers.newest import NewestSampler
+
+
+def geometric_age(share: Tensor, *, rate: float, count: int) -> Tensor:
+    r"""The age below which a share of a truncated geometric law lies.
+
+    The inverse of its distribution function,
+    :math:`k = \lfloor \ln(1 - u (1 - (1 - \rho)^N)) / \ln(1 - \rho) \rfloor`: of shares that are
+    uniform in [0, 1) the ages follow the law.
+
+    Args:
+        share: Shares :math:`u`, in double precision, shape ``[B]``.
+        rate: :math:`\rho` in [0, 1); 0 is the limit, uniform ages.
+        count: Number of ages ``N``.
+
+    Returns:
+        Ages from 0 to ``N - 1``, shape ``[B]``.
+
+    Examples:
+        >>> share = torch.tensor([0.0, 0.5, 0.99], dtype=torch.double)
+        >>> geometric_age(share, rate=0.5, count=100).tolist()
+        [0, 1, 6]
+    """
+    if rate == 0:
+        age = share * count
+    else:
+        step = math.log1p(-rate)
+        # log1p and expm1 keep what a small rate would lose beside 1.
+        age = torch.log1p(share * math.expm1(count * step)) / step
+    # Rounding can carry the last share one age too far.
+    return age.long().clamp_(0, count - 1)
+
+
+class GeometricSampler(NewestSampler):
+    r"""Samples the newest transition most often, each older one :math:`1 - \rho` times as often.
+
+    Ages are those of the ring buffer. In a storage of several dimensions age goes along the first,
+    time, and the other places are uniform.
+
+    Args:
+        rate: :math:`\rho`; the age at which a transition is sampled half as often as the newest is
+            about :math:`0.69 / \rho`. With 0 sampling is uniform.
+
+    Raises:
+        ValueError: If ``rate`` is not in [0, 1).
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> buffer = TensorDictReplayBuffer(
+        ...     storage=LazyTensorStorage(1000), sampler=GeometricSampler(rate=0.1), batch_size=64
+        ... )
+        >>> index = buffer.extend(TensorDict({"reward": torch.rand(1000)}, [1000]))
+        >>> bool(buffer.sample()["index"].min() > 800)
+        True
+    """
+
+    def __init__(self, *, rate: float = 3e-5) -> None:
+        check_range("rate", rate, low=0)
+        if rate >= 1:
+            raise ValueError(f"rate must be in [0, 1), got {rate}")
+        super().__init__()
+        self.rate = rate
+
+    @property
+    def divisible(self) -> bool:
+        """Whether ``U * B`` slots, sampled at once, are as good as ``U`` batches of ``B``."""
+        return True
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Any]]:
+        """Sample slots.
+
+        Args:
+            storage: The storage to sample from.
+            batch_size: ``B``.
+
+        Returns:
+            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
+            each; and no information.
+
+        Raises:
+            RuntimeError: If the storage is empty.
+        """
+        index, info = super().sample(storage, batch_size)
+        if self.newest is None:
+            return index, info
+        along = index if isinstance(index, tuple) else (index,)
+        around = len(storage) if len(along) == 1 else storage._len_along_dim0
+        share = torch.rand(batch_size, generator=storage._rng, dtype=torch.double)
+        age = geometric_age(share, rate=self.rate, count=around)
+        along[0].copy_((self.newest[0] - age) % around)
+        return index, info
