@@ -1,6 +1,12 @@
 """Replay whose priority is fused from several signals, as TorchRL parts."""
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import (
+    Adjustment,
+    BatchFacts,
+    Counting,
+    PositiveBoost,
+    PositiveDecay,
+)
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.learners import DDPGLearner, Learner, SACLearner, TD3Learner
 from torchrl_mpfa.losses import (
@@ -43,6 +49,7 @@ __all__ = [
     "Adjustment",
     "Annealed",
     "BatchFacts",
+    "Counting",
     "DDPGLearner",
     "DirectModule",
     "Draw",

@@ -11,18 +11,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.positive import Level, check_level, is_positive
 
+if TYPE_CHECKING:
+    from torchrl_mpfa.storages.table import SignalTable
+
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
 
 
-def boost_positive(priority: Tensor, *, boost: float = 3.0, bound: Bound = "floor") -> Tensor:
+def boost_positive(
+    priority: Tensor, *, boost: float | Tensor = 3.0, bound: Bound = "floor"
+) -> Tensor:
     r"""Raised priority of a positive transition, :math:`p' = \max(\varphi p, 1)` (Eq. 22).
 
     Args:
@@ -42,6 +47,37 @@ def boost_positive(priority: Tensor, *, boost: float = 3.0, bound: Bound = "floo
     if bound == "floor":
         return raised.clamp_min(1.0)
     return raised.clamp_max(1.0) if bound == "cap" else raised
+
+
+def adaptive_boost(positive_share: Tensor, *, target: float, highest: float) -> Tensor:
+    r"""Factor of Eq. (22) that follows how rare positive transitions are.
+
+    .. math::
+
+        \varphi = \min\left(\max\left(\frac{s}{1 - s} \cdot \frac{1 - q}{q},\, 1\right),
+        \varphi_{\max}\right)
+
+    With it positive transitions, a share :math:`q` of the buffer, have a share :math:`s` of the
+    total priority, were all priorities equal before: their odds :math:`q / (1 - q)` become those of
+    :math:`s`. It is bounded from below, as what is common needs no boost and is never held back,
+    and from above, as importance weights cannot mend a batch that is a few transitions many times.
+    The paper has a constant and names its adaptation as future work; this form is ours.
+
+    Args:
+        positive_share: Share :math:`q` of the transitions in the buffer that are positive, ``[]``.
+        target: Share :math:`s` of the total priority that they are to have, in (0, 1).
+        highest: :math:`\varphi_{\max}`, at least 1; what it is where nothing is positive.
+
+    Returns:
+        The factor, shape ``[]``.
+
+    Examples:
+        >>> share = torch.tensor([0.5, 0.25, 0.01])
+        >>> adaptive_boost(share, target=0.5, highest=10.0).tolist()
+        [1.0, 3.0, 10.0]
+    """
+    odds = target / (1.0 - target) * (1.0 - positive_share) / positive_share
+    return odds.clamp(1.0, highest)
 
 
 def decay_factor(position: Tensor, *, sharpness: float = 0.01) -> Tensor:
@@ -86,12 +122,15 @@ class BatchFacts:
         replay_count: How often each was sampled so far, this batch included, shape ``[B]``.
         index: Slots in the storage, shape ``[B]``.
         mean_reward: Mean reward of the buffer when its probabilities were last counted.
+        counted: What the adjustment that is asked counted over the buffer, if it is
+            :class:`Counting`; None before its first count.
     """
 
     reward: Tensor
     replay_count: Tensor
     index: Tensor
     mean_reward: float = 0.0
+    counted: Tensor | None = None
 
 
 @runtime_checkable
@@ -100,6 +139,32 @@ class Adjustment(Protocol):
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Adjust priorities, shape ``[B]`` to ``[B]``, not negative."""
+        ...
+
+
+@runtime_checkable
+class Counting(Protocol):
+    """An adjustment that depends on the whole buffer, which is counted from time to time.
+
+    What it counts is handed to it as ``BatchFacts.counted``, and saved with the sampler.
+    """
+
+    @property
+    def counts(self) -> bool:
+        """Whether it wants to count at all."""
+        ...
+
+    def count(self, table: SignalTable, priority: Tensor) -> Tensor:
+        """Count.
+
+        Args:
+            table: Signals, rewards and times of every slot, ``N`` of which are filled.
+            priority: Fused priorities, eps included and not adjusted, shape ``[N]``; NaN where not
+                all signals are known yet.
+
+        Returns:
+            Finite numbers, of the same shape each time.
+        """
         ...
 
 
@@ -113,11 +178,13 @@ class PositiveBoost:
     r"""Eq. (22) for positive transitions, all others unchanged.
 
     Args:
-        boost: Factor :math:`\varphi`.
+        boost: Factor :math:`\varphi`; with ``target_share`` its upper bound.
         bound: See :func:`boost_positive`.
         positive_above: A transition is positive when its reward is above this. With 0 (the paper)
             every step towards the goal is; a value just under the goal reward leaves only goals,
             and ``"mean"``, the mean reward of the buffer, suits rewards of one sign.
+        target_share: Share of the total priority that :func:`adaptive_boost` gives positive
+            transitions, by a factor that follows how many the buffer holds; 0: a fixed factor.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -131,16 +198,38 @@ class PositiveBoost:
     boost: float = 3.0
     bound: Bound = "floor"
     positive_above: Level = 0.0
+    target_share: float = 0.0
 
     def __post_init__(self) -> None:
         _check_positive("boost", self.boost)
         check_level(self.positive_above)
+        if not 0.0 <= self.target_share < 1.0:
+            raise ValueError(f"target_share must be in [0, 1), got {self.target_share}")
+        if self.target_share > 0 and self.boost < 1:
+            raise ValueError(f"boost must be at least 1 with a target_share, got {self.boost}")
         if self.bound not in ("floor", "cap", "none"):
             raise ValueError(f"bound must be 'floor', 'cap' or 'none', got {self.bound!r}")
 
+    @property
+    def counts(self) -> bool:
+        """Whether the factor follows the buffer."""
+        return self.target_share > 0
+
+    def count(self, table: SignalTable, priority: Tensor) -> Tensor:
+        """Share of the transitions in the buffer that are positive, shape ``[]``."""
+        rewards = table.rewards
+        mean = float(rewards.mean())
+        return is_positive(rewards, self.positive_above, mean=mean).double().mean()
+
+    def factor(self, counted: Tensor | None) -> float | Tensor:
+        """The factor, given what :meth:`count` gave; before it, the one that is given."""
+        if not self.counts or counted is None:
+            return self.boost
+        return adaptive_boost(counted, target=self.target_share, highest=self.boost)
+
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Boost the positive transitions, shape ``[B]``."""
-        raised = boost_positive(priority, boost=self.boost, bound=self.bound)
+        raised = boost_positive(priority, boost=self.factor(batch.counted), bound=self.bound)
         positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
         return torch.where(positive, raised, priority)
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,11 +24,12 @@ import torch
 from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting
 from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.weighing import asks
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.storages.table import SignalTable
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
@@ -63,6 +65,10 @@ def check_adjustment(adjustment: Adjustment) -> None:
         reward = torch.randn(count, generator=generator, dtype=torch.double) * 3
         replays = torch.randint(1, 50, (count,), generator=generator).double()
         facts = BatchFacts(reward, replays, torch.arange(count), mean_reward=float(reward.mean()))
+        if asks(adjustment) and isinstance(adjustment, Counting):
+            table = _table(("reward", "td_error"), scale=1.0, offset=0.0)
+            known = table.rows[: table.size, : len(table.names)].sum(1)
+            facts = replace(facts, counted=adjustment.count(table, known))
         before = [each.clone() for each in (priority, reward, replays)]
         found = adjustment(priority, facts)
         _require(

@@ -89,9 +89,13 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, weighted, optio
         torch.testing.assert_close(value.reshape(log[key].shape), log[key].detach())
 
 
+@pytest.mark.parametrize("bend", [None, 0.2])
 @pytest.mark.parametrize("name", MAKE)
-def test_the_critic_may_learn_by_another_distance(name):
+def test_the_critic_may_learn_by_another_distance_and_with_another_bend(name, bend):
     expected, batch = (make_batch() for _ in range(2))
+    if bend is not None:
+        for each in (expected, batch):
+            each["bend"] = torch.full((len(each),), bend)
     loss, whole = make_loss(name), make_loss(name)
     torch.manual_seed(5)
     gradients, _ = by_losses(name, loss, expected, loss_function="smooth_l1")

@@ -69,3 +69,13 @@ def test_with_scaled_rewards_the_bend_is_where_it_is_without(name):
     plain = distance(torch.zeros(20), error, name)
     scaled = distance(torch.zeros(20), 0.1 * error, name, unit=0.1)
     torch.testing.assert_close(scaled, 0.01 * plain)
+
+
+@pytest.mark.parametrize("name", ["smooth_l1", "pal"])
+def test_a_bend_for_each_transition_is_that_of_the_loss_in_its_units(name):
+    error = torch.randn(20, generator=seeded(1)) * 3
+    bend = torch.full((20,), 0.3)
+    by_row = distance(torch.zeros(2, 20), error.expand(2, 20), name, unit=bend)
+    by_all = distance(torch.zeros(2, 20), error.expand(2, 20), name, unit=0.3)
+    torch.testing.assert_close(by_row, by_all)
+    assert not torch.allclose(by_row, distance(torch.zeros(2, 20), error.expand(2, 20), name))

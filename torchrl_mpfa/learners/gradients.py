@@ -46,6 +46,7 @@ class Transitions(NamedTuple):
     steps: Tensor | None
     weight: Tensor | None
     noise: Tensor | None
+    bend: Tensor | None
 
 
 class Inputs(NamedTuple):
@@ -167,6 +168,7 @@ class Gradients:
         after, action = batch["next"], batch[self._action]
         steps = batch.get(loss.value_estimator.tensor_keys.steps_to_next_obs, None)
         weight = batch.get(keys.priority_weight, None) if loss.importance == "critic" else None
+        bend = batch.get(keys.bend, None)
         return Transitions(
             state=self._state(batch),
             action=action,
@@ -177,6 +179,7 @@ class Gradients:
             steps=None if steps is None else steps.reshape(-1),
             weight=None if weight is None else weight.reshape(-1),
             noise=None if noise is None else noise(action),
+            bend=None if bend is None else bend.reshape(-1),
         )
 
     def _critics_part(
@@ -189,6 +192,7 @@ class Gradients:
         """Gradients of the critics (Eq. 11), signals (Eqs. 13-14), and values for the log."""
         parts, module = self.parts, self.parts.critic.module
         state, action, weight = given.state, given.action, given.weight
+        unit = self._scale * (1.0 if given.bend is None else given.bend)
         target = bootstrap_target(
             given.reward * self._scale,
             next_value,
@@ -205,7 +209,7 @@ class Gradients:
                 value,
                 target,
                 loss_function,
-                unit=self._scale,
+                unit=unit,
                 pal_alpha=self._pal_alpha,
                 logits=torch.stack([out[LOGITS] for out in each]) if with_bins else None,
                 value_range=self._value_range,

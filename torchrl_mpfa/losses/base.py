@@ -267,11 +267,12 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             target = self._target(tensordict, next_value)
         td_error = (target - value).detach()
         self._write_signals(tensordict, td_error, value)
+        bend = tensordict.get(self.tensor_keys.bend, None)
         loss = critic_loss(
             value,
             target,
             name,
-            unit=self.reward_scale,
+            unit=self.reward_scale * (1.0 if bend is None else bend.reshape(-1)),
             pal_alpha=self.pal_alpha,
             logits=logits,
             value_range=self.value_range,

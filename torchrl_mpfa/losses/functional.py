@@ -130,7 +130,7 @@ def critic_loss(
     target: Tensor,
     loss_function: str,
     *,
-    unit: float,
+    unit: float | Tensor,
     pal_alpha: float,
     logits: Tensor | None = None,
     value_range: Range | None = None,
@@ -170,7 +170,7 @@ def distance(
     target: Tensor,
     loss_function: str,
     *,
-    unit: float = 1.0,
+    unit: float | Tensor = 1.0,
     pal_alpha: float = 0.4,
 ) -> Tensor:
     """Loss of each transition by the name of its distance.
@@ -183,7 +183,8 @@ def distance(
         target: Targets, of the same shape.
         loss_function: ``"l1"``, ``"l2"``, ``"smooth_l1"`` or ``"pal"``.
         unit: Error at which the last two bend. A loss whose rewards are scaled gives its factor
-            here, so that they bend at an error of one in units of the environment's reward.
+            here, so that they bend at an error of one in units of the environment's reward; a
+            bend that moves comes as a number for each transition, shape ``[B]``.
         pal_alpha: Priority exponent that PAL stands for.
 
     Returns:
@@ -201,7 +202,9 @@ def distance(
     if loss_function == PAL:
         return pal_distance((target - value) / unit, alpha=pal_alpha) * unit**2
     if loss_function == "smooth_l1":
-        return torch.nn.functional.huber_loss(value, target, reduction="none", delta=unit)
+        error = (target - value) / unit
+        bent = torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
+        return bent * unit**2
     found: Tensor = distance_loss(value, target, loss_function)
     return found
 

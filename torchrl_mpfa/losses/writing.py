@@ -31,6 +31,7 @@ class SignalKeys:
     td_error_signal: NestedKey = TD_ERROR.key
     action_gradient_signal: NestedKey = ACTION_GRADIENT.key
     value_signal: NestedKey = (SIGNALS_KEY, VALUE)
+    bend: NestedKey = "bend"
 
 
 class SignalWriting:

@@ -224,6 +224,7 @@ def make_adjustments(method: Method) -> list[Adjustment]:
             boost=method.boost_factor,
             bound=method.boost_bound,  # type: ignore[arg-type]
             positive_above=method.positive_above,
+            target_share=method.boost_target,
         )
         made.append(boost)
     if method.decay:
@@ -234,7 +235,7 @@ def make_adjustments(method: Method) -> list[Adjustment]:
         )
         made.append(decay)
     if method.priority_floor > 0:
-        made.append(PriorityFloor(method.priority_floor))
+        made.append(PriorityFloor(method.priority_floor, method.floor_quantile))
     if method.replay_penalty > 0:
         made.append(ReplayPenalty(penalty=method.replay_penalty, floor=method.eps))
     return made

@@ -31,6 +31,9 @@ class Method:
     """Decay positive transitions above the batch mean, Eqs. 23-24."""
     priority_floor: float = 0.0
     """Least priority, in units of the reward (LAP's 1); 0: none."""
+    floor_quantile: float = 0.0
+    """Share of the priorities in the buffer below which the floor, and with it the bend of the
+    loss, moves; 0: the floor is a constant."""
     replay_penalty: float = 0.0
     """Penalty on replays (HVPER); 0: none."""
     selection: str = "prioritized"
@@ -56,7 +59,10 @@ class Method:
     eps: float = 0.05
     """Added to every priority, Eq. 21."""
     boost_factor: float = 3.0
-    """phi of Eq. 22."""
+    """phi of Eq. 22; its upper bound where ``boost_target`` is above 0."""
+    boost_target: float = 0.0
+    """Share of the total priority that positive transitions are to have, by a phi that follows how
+    rare they are in the buffer; 0: phi is fixed."""
     boost_bound: str = "floor"
     """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
     decay_sharpness: float = 0.01
@@ -103,6 +109,7 @@ _LAP: dict[str, Any] = {
 METHODS: dict[str, Method] = {
     # The paper's method, and its ablations.
     "mpfa_per": Method(),
+    "mpfa_adaptive": Method("mpfa_adaptive", boost_target=0.5, boost_factor=10.0),
     "mpf_per": Method("mpf_per", boost=False, decay=False),
     "td_reward": Method("td_reward", ["reward", "td_error"], boost=False, decay=False),
     "td_loss": Method("td_loss", ["td_error", "action_gradient"], boost=False, decay=False),

@@ -9,10 +9,43 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.storages.table import SignalTable
+
+BEND = "bend"
+"""Entry of a batch that tells the loss where to bend, in the units of the environment's reward."""
+_LEAST = 1e-6
+"""Where all errors are zero, their quantile is no bend."""
+
+
+def running_bend(priority: Tensor, *, quantile: float, otherwise: float) -> Tensor:
+    """The priority below which a share of the known ones lies.
+
+    Args:
+        priority: Priorities, shape ``[N]``; NaN where none is known yet.
+        quantile: The share, in (0, 1].
+        otherwise: What to give where none is known.
+
+    Returns:
+        The least of them that is not exceeded by that share, a positive number, shape ``[]``.
+
+    Examples:
+        >>> float(running_bend(torch.tensor([4.0, 1.0, torch.nan]), quantile=0.5, otherwise=9.0))
+        1.0
+    """
+    known = priority[~priority.isnan()]
+    if len(known) == 0:
+        return priority.new_tensor(otherwise)
+    # Selection in place of torch.quantile's sorting, which takes several times as long.
+    place = max(math.ceil(quantile * len(known)), 1)
+    return known.kthvalue(place).values.clamp_min(_LEAST)
 
 
 @dataclass(frozen=True)
@@ -22,9 +55,12 @@ class PriorityFloor:
     Args:
         floor: The floor in the units of the environment's reward. LAP's 1 is where its Huber loss
             bends: of a loss with rewards scaled by ``s`` it is ``1 / s``.
+        quantile: Share of the priorities in the buffer that are to lie below the floor, which then
+            moves with them, and with it the bend of the loss: sampled batches have it as
+            ``"bend"``. The floor that is given counts until errors are known. 0: a constant floor.
 
     Raises:
-        ValueError: If the floor is not positive and finite.
+        ValueError: If the floor is not positive and finite, or the quantile not in [0, 1].
 
     Examples:
         >>> import torch
@@ -34,11 +70,30 @@ class PriorityFloor:
     """
 
     floor: float = 1.0
+    quantile: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.floor < math.inf:
             raise ValueError(f"floor must be positive and finite, got {self.floor}")
+        if not 0.0 <= self.quantile <= 1.0:
+            raise ValueError(f"quantile must be in [0, 1], got {self.quantile}")
+
+    @property
+    def counts(self) -> bool:
+        """Whether the floor moves."""
+        return self.quantile > 0
+
+    def count(self, table: SignalTable, priority: Tensor) -> Tensor:
+        """The floor of the moment, shape ``[]``."""
+        return running_bend(priority, quantile=self.quantile, otherwise=self.floor)
+
+    def entries(self, counted: Tensor | None, count: int) -> dict[str, Tensor]:
+        """The bend for the loss of a batch of this many transitions, if it moves."""
+        if not self.counts:
+            return {}
+        bend = torch.tensor(self.floor) if counted is None else counted
+        return {BEND: bend.float().expand(count).clone()}
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Raise what is below the floor, shape ``[B]``."""
-        return priority.clamp_min(self.floor)
+        return priority.clamp_min(self.floor if batch.counted is None else batch.counted)

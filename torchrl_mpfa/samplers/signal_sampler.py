@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -22,7 +23,15 @@ from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.samplers.states import entry
 from torchrl_mpfa.samplers.statistics import batch_statistics
 from torchrl_mpfa.samplers.tree import TreeSampler, in_dimensions_of
-from torchrl_mpfa.samplers.weighing import Weighing, check_weighing, weights_of
+from torchrl_mpfa.samplers.weighing import (
+    Weighing,
+    check_counted,
+    check_weighing,
+    count_anew,
+    counted_state,
+    entries_of,
+    weights_of,
+)
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.storages.table import SignalTable
@@ -157,7 +166,8 @@ class SignalSampler(TreeSampler):
             ValueError: If ``batch_size`` is not positive.
         """
         slots, weight = self._sampled(storage, batch_size)
-        info = {"priority_weight": weight}
+        told = entries_of(self._weighing, self.adjustments, len(slots))
+        info = {"priority_weight": weight, **told}
         self._last_batch = (slots, weight)
         table = getattr(storage, "signal_table", None)
         if table is not None:
@@ -262,7 +272,7 @@ class SignalSampler(TreeSampler):
         weighing, fused = self._weighing, []
         for one, of_one in zip(slots.split(sizes), rows.split(sizes), strict=True):
             if len(one):
-                weighing = self._weigh(table, one, weighing)
+                weighing = self._counted(table, one, self._weigh(table, one, weighing), weighing)
                 fused.append(self._fused(table, of_one, one, weighing))
         priority = fused[0] if len(fused) == 1 else torch.cat(fused)
         highest = self._checked(priority, "adjusted priorities")
@@ -303,8 +313,10 @@ class SignalSampler(TreeSampler):
             index=slots,
             mean_reward=weighing.mean_reward,
         )
-        for adjust in self.adjustments:
-            priority = adjust(priority, facts)
+        for adjust, counted in zip_longest(self.adjustments, weighing.counted):
+            priority = adjust(
+                priority, facts if counted is None else replace(facts, counted=counted)
+            )
         if priority.shape != slots.shape:
             raise ValueError(
                 f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
@@ -362,6 +374,24 @@ class SignalSampler(TreeSampler):
             self._warn_once(text)
         return Weighing(weights, float(table.rewards.mean()), table.writes)
 
+    def _counted(
+        self, table: SignalTable, index: Tensor, weighing: Weighing, last: Weighing | None
+    ) -> Weighing:
+        """The weighing with what the adjustments counted, anew if enough has changed."""
+
+        def priority(weighing: Weighing) -> Tensor:
+            return fuse(table.rows[: table.size, self._columns], weighing.weights, eps=self._eps)
+
+        return count_anew(
+            weighing,
+            last,
+            self.adjustments,
+            table,
+            priority,
+            learned=len(index),
+            always=self.entropy_refresh == 0,
+        )
+
     def stats(self, storage: Storage) -> dict[str, float]:
         """What the priorities are made of; see ``docs/metrics.md`` for each entry.
 
@@ -383,6 +413,7 @@ class SignalSampler(TreeSampler):
             "_weights": self.weights,
             "_weighed_at": 0 if self._weighing is None else self._weighing.writes,
             "_mean_reward": 0.0 if self._weighing is None else self._weighing.mean_reward,
+            **counted_state(self._weighing, self.adjustments),
         }
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
@@ -396,6 +427,7 @@ class SignalSampler(TreeSampler):
         if (found := entry(state_dict, "_signals")) != names:
             raise ValueError(f"signals of the saved sampler are {found}, of this one {names}")
         check_weighing(state_dict, names)
+        check_counted(state_dict, self.adjustments)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -409,6 +441,9 @@ class SignalSampler(TreeSampler):
                 self._ordered(state_dict["_weights"]),
                 state_dict["_mean_reward"],
                 state_dict["_weighed_at"],
+                tuple(state_dict.get("_counted", ())),
+                state_dict.get("_counted_writes", 0),
+                state_dict.get("_learned_since", 0),
             )
 
     def _ordered(self, weights: Mapping[str, float]) -> Tensor:

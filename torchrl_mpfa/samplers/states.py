@@ -81,7 +81,7 @@ class SavedTrees(PrioritizedSampler):
         state = self.state_dict()
         save_atomically(state, path / "sampler.pt")
         plain = {key: value for key, value in state.items() if not isinstance(value, Tensor)}
-        text = json.dumps(plain, indent=2)
+        text = json.dumps(plain, indent=2, default=lambda value: f"{[*value.shape]} numbers")
         (path / "sampler_metadata.json").write_text(text, encoding="utf-8")
 
     def check_dump(self, path: str | Path) -> dict[str, Any]:

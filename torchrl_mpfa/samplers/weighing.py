@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.adjustment import Adjustment
 from torchrl_mpfa.checks import check_finite
 from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.samplers.states import check_count, check_number, entry, refuse
 from torchrl_mpfa.storages.table import SignalTable
+
+_COUNT_REFRESH = 1 / 16
+"""Share of the buffer that may change before the adjustments count it anew."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,77 @@ class Weighing:
     mean_reward: float
     writes: int
     """Transitions that had been written."""
+    counted: tuple[Tensor | None, ...] = ()
+    """What each adjustment counted; empty where none does."""
+    counted_writes: int = 0
+    """Transitions that had been written when they did."""
+    learned_since: int = 0
+    """Transitions that were learned from since."""
+
+
+def asks(adjustment: Adjustment) -> bool:
+    """Whether an adjustment wants to count the buffer."""
+    return bool(getattr(adjustment, "counts", False))
+
+
+def entries_of(
+    weighing: Weighing | None, adjustments: Sequence[Adjustment], count: int
+) -> dict[str, Tensor]:
+    """What adjustments that count have to tell the loss of a batch, each of shape ``[B]``."""
+    counted = () if weighing is None else weighing.counted
+    found: dict[str, Tensor] = {}
+    for each, value in zip_longest(adjustments, counted):
+        if asks(each) and hasattr(each, "entries"):
+            found.update(each.entries(value, count))
+    return found
+
+
+def count_anew(
+    weighing: Weighing,
+    last: Weighing | None,
+    adjustments: Sequence[Adjustment],
+    table: SignalTable,
+    priority: Callable[[Weighing], Tensor],
+    *,
+    learned: int,
+    always: bool,
+) -> Weighing:
+    """Have the adjustments count the buffer if enough of it changed since they last did.
+
+    Both what is written and what is learned from changes it. With a sixteenth between two counts a
+    row that is learned from costs as much as sixteen that are read, whatever the capacity.
+
+    Args:
+        weighing: The present one.
+        last: The one before it; None at first.
+        adjustments: The adjustments.
+        table: Signals of every slot.
+        priority: Gives the fused priorities of all filled slots, shape ``[N]``.
+        learned: Transitions that are learned from now.
+        always: Whether to count whatever has changed.
+
+    Returns:
+        The weighing with what was counted, now or last.
+    """
+    if not any(map(asks, adjustments)):
+        return weighing
+    if last is not None and last.counted:
+        changed = table.writes - last.counted_writes + last.learned_since
+        if 0 <= changed <= _COUNT_REFRESH * table.size and not always:
+            return replace(
+                weighing,
+                counted=last.counted,
+                counted_writes=last.counted_writes,
+                learned_since=last.learned_since + learned,
+            )
+    fused = priority(weighing)
+    counted = [each.count(table, fused) if asks(each) else None for each in adjustments]  # type: ignore[attr-defined]
+    for value in counted:
+        if value is not None:
+            check_finite("what an adjustment counted", value)
+    return replace(
+        weighing, counted=tuple(counted), counted_writes=table.writes, learned_since=learned
+    )
 
 
 def weights_of(fusion: Fusion, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
@@ -55,3 +131,37 @@ def check_weighing(state: Mapping[str, Any], names: Sequence[str]) -> None:
     mean = entry(state, "_mean_reward")
     if not (isinstance(mean, int | float) and math.isfinite(mean)):
         refuse("_mean_reward", "a finite number", mean)
+
+
+def counted_state(weighing: Weighing | None, adjustments: Sequence[Adjustment]) -> dict[str, Any]:
+    """What the adjustments counted, to be saved; nothing where none counts."""
+    if not any(map(asks, adjustments)):
+        return {}
+    if weighing is None:
+        return {"_counted": [], "_counted_writes": 0, "_learned_since": 0}
+    return {
+        "_counted": [None if value is None else value.clone() for value in weighing.counted],
+        "_counted_writes": weighing.counted_writes,
+        "_learned_since": weighing.learned_since,
+    }
+
+
+def check_counted(state: Mapping[str, Any], adjustments: Sequence[Adjustment]) -> None:
+    """Refuse a saved state whose counts are not those of these adjustments.
+
+    Raises:
+        ValueError: If an entry is missing or not what it must be.
+    """
+    asking = [asks(each) for each in adjustments]
+    if not any(asking):
+        return
+    counted = entry(state, "_counted")
+    fits = isinstance(counted, list) and (
+        not counted
+        or [isinstance(value, Tensor) and bool(value.isfinite().all()) for value in counted]
+        == asking
+    )
+    if not fits:
+        refuse("_counted", f"empty, or finite numbers for {sum(asking)} adjustments", counted)
+    check_count(state, "_counted_writes")
+    check_count(state, "_learned_since")

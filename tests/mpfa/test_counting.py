@@ -1,0 +1,253 @@
+"""Adjustments that count the buffer: when they count, what they are told, and what is saved."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.methods.replays import make_buffer, make_transitions, seeded, set_signals
+from torchrl_mpfa import PositiveBoost, SignalSampler
+from torchrl_mpfa.adjustment import adaptive_boost
+from torchrl_mpfa.methods import METHODS, PriorityFloor, make_replay
+from torchrl_mpfa.methods.lap import running_bend
+from torchrl_mpfa.testing import check_adjustment
+
+
+class Census:
+    """Counts how often it was asked, and keeps what it was told."""
+
+    counts = True
+
+    def __init__(self):
+        self.asked, self.told, self.priority = 0, [], None
+
+    def count(self, table, priority):
+        self.asked += 1
+        self.priority = priority.clone()
+        return torch.tensor(float(self.asked))
+
+    def __call__(self, priority, batch):
+        self.told.append(None if batch.counted is None else int(batch.counted))
+        return priority
+
+
+def make_counted(capacity=64, batch_size=4, **options):
+    census = Census()
+    sampler = SignalSampler(
+        capacity, 0.6, 0.4, 0.05, signals=["td_error"], adjustments=[census], **options
+    )
+    return make_buffer(sampler, capacity, batch_size), census
+
+
+def train(buffer, rounds):
+    for number in range(rounds):
+        batch = buffer.sample()
+        batch["signals", "td_error"] = torch.rand(len(batch), generator=seeded(number))
+        buffer.update_tensordict_priority(batch)
+
+
+def test_an_adjustment_counts_when_a_sixteenth_of_the_buffer_was_learned_from_or_written():
+    buffer, census = make_counted()  # A sixteenth are four transitions, a batch.
+    train(buffer, 1)
+    assert census.asked == 1
+    train(buffer, 1)
+    assert census.asked == 1  # Four have changed, and no more.
+    train(buffer, 1)
+    assert census.asked == 2
+    buffer.extend(make_transitions(5))
+    train(buffer, 1)
+    assert census.asked == 3
+    assert census.told == [1, 1, 2, 3]
+
+
+def test_every_update_counts_where_the_entropies_are_counted_at_every_update():
+    buffer, census = make_counted(entropy_refresh=0)
+    train(buffer, 5)
+    assert census.asked == 5
+
+
+def test_it_is_shown_the_fused_priorities_of_what_is_known():
+    buffer, census = make_counted(8, 8, entropy_refresh=0)
+    errors = torch.arange(8.0)
+    set_signals(buffer, td_error=errors)
+    assert census.priority.isnan().all()
+    set_signals(buffer, td_error=errors)
+    torch.testing.assert_close(census.priority, errors.double() + 0.05)
+
+
+@pytest.mark.parametrize("way", ["state", "folder"])
+@pytest.mark.parametrize(
+    ("name", "settings"), [("mpfa_adaptive", {}), ("lap", {"floor_quantile": 0.5})]
+)
+def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(name, settings, way, tmp_path):
+    def make(seed):
+        replay = make_replay(name, capacity=200, batch_size=8, generator=seeded(seed), **settings)
+        replay.buffer.extend(make_transitions(200, seed=seed))
+        return replay
+
+    def learn(replay, rounds):
+        found = []
+        for number in range(rounds):
+            batch = replay.buffer.sample()
+            for signal in replay.signals:
+                batch["signals", signal] = torch.rand(8, generator=seeded(number)) * 3
+            replay.buffer.update_tensordict_priority(batch)
+            found.append(batch["index"])
+        return torch.cat(found)
+
+    first, second = make(0), make(1)
+    learn(first, 3)  # Between two counts.
+    if way == "state":
+        second.buffer.load_state_dict(first.buffer.state_dict())
+    else:
+        first.buffer.dumps(tmp_path)
+        second.buffer.loads(tmp_path)
+    assert learn(first, 20).equal(learn(second, 20))
+    states = [replay.buffer.sampler.state_dict() for replay in (first, second)]
+    assert [str(state["_counted"]) for state in states] == [str(states[0]["_counted"])] * 2
+
+
+@pytest.mark.parametrize("value", [None, [], [torch.tensor(torch.nan), None], [1.0, None]])
+def test_a_saved_count_that_does_not_fit_is_refused_and_nothing_counted_is_none(value):
+    first, second = (
+        make_replay("mpfa_adaptive", capacity=9, batch_size=2).buffer.sampler for _ in range(2)
+    )
+    state = {**first.state_dict(), "_counted": value}
+    if value == []:
+        second.load_state_dict(state)
+        return
+    with pytest.raises(ValueError, match="'_counted' of the saved sampler must be empty, or"):
+        second.load_state_dict(state)
+    assert "_counted" not in make_replay("mpfa_per", capacity=9).buffer.sampler.state_dict()
+
+
+def test_a_count_that_is_not_finite_is_refused_and_changes_nothing():
+    buffer, census = make_counted()
+    census.count = lambda table, priority: torch.tensor(torch.nan)
+    before = buffer.sampler.priorities()
+    with pytest.raises(ValueError, match="what an adjustment counted must be finite"):
+        train(buffer, 1)
+    assert buffer.sampler.priorities().equal(before)
+
+
+# Eq. 22 with a factor that follows the buffer.
+
+
+def phi_by_hand(rewards, level, target, highest):
+    positive = sum(reward > level for reward in rewards)
+    if positive == 0:
+        return highest
+    ratio = target / (1 - target) * (len(rewards) - positive) / positive
+    return min(max(ratio, 1.0), highest)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, 9.0])
+def test_the_rarer_positive_transitions_are_the_larger_is_phi(level):
+    rewards = torch.randn(40, generator=seeded(2))
+    boost = PositiveBoost(boost=6.0, positive_above=level, target_share=0.4)
+    sampler = SignalSampler(
+        40, 0.6, 0.4, 0.0, signals=["td_error"], adjustments=[boost], entropy_refresh=0
+    )
+    buffer = make_buffer(sampler, 40, 8, filled=0)
+    buffer.extend(TensorDict({"next": {"reward": rewards.unsqueeze(1)}}, [40]))
+    errors = torch.rand(40, generator=seeded(3)) * 2
+    set_signals(buffer, td_error=errors)
+    phi = phi_by_hand(rewards.tolist(), level, 0.4, 6.0)
+    expected = [
+        max(phi * error, 1.0) if reward > level else error
+        for error, reward in zip(errors.tolist(), rewards.tolist(), strict=True)
+    ]
+    assert sampler.priorities().tolist() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("target", [0.1, 0.5, 0.8])
+def test_of_equal_priorities_the_positive_ones_get_the_share_that_is_wanted(target):
+    for positive in (1, 10, 40):
+        phi = float(adaptive_boost(torch.tensor(positive / 100), target=target, highest=1e9))
+        found = positive * phi / (positive * phi + 100 - positive)
+        assert found == pytest.approx(max(target, positive / 100), rel=1e-5)
+
+
+def test_phi_falls_as_goals_fill_the_buffer_and_stays_within_its_bounds():
+    found = [
+        float(adaptive_boost(torch.tensor(n / 1000.0), target=0.5, highest=10.0))
+        for n in range(1001)
+    ]
+    assert found == sorted(found, reverse=True)
+    assert found[0] == 10.0
+    assert found[500] == found[1000] == 1.0
+    assert 1.0 < found[200] < 10.0
+
+
+def share_of_goals(name, goals):
+    """Share of a batch that are goals, of which a buffer of 2,000 has this many."""
+    replay = make_replay(
+        name, capacity=2000, batch_size=20_000, generator=seeded(0), positive_above=1.0
+    )
+    rewards = torch.full((2000, 1), -0.1)
+    rewards[:goals] = 1.1  # Above the level, and hardly larger than others.
+    replay.buffer.extend(TensorDict({"next": {"reward": rewards}}, [2000]))
+    known = {"td_error": torch.ones(2000), "action_gradient": torch.ones(2000)}
+    for _ in range(2):
+        set_signals(replay.buffer, **known)
+    return float((replay.buffer.sample()["index"] < goals).double().mean())
+
+
+def test_rare_goals_are_sampled_more_often_than_by_a_constant_and_common_ones_less():
+    assert share_of_goals("mpfa_adaptive", 40) > 1.5 * share_of_goals("mpfa_per", 40)
+    assert share_of_goals("mpfa_adaptive", 1200) < share_of_goals("mpfa_per", 1200)
+
+
+def test_a_target_that_cannot_be_is_refused_and_the_parts_pass_the_checks():
+    with pytest.raises(ValueError, match=r"target_share must be in \[0, 1\), got 1.0"):
+        PositiveBoost(target_share=1.0)
+    with pytest.raises(ValueError, match=r"boost must be at least 1 with a target_share, got 0\.5"):
+        PositiveBoost(boost=0.5, target_share=0.3)
+    with pytest.raises(ValueError, match=r"quantile must be in \[0, 1\], got 1.5"):
+        PriorityFloor(quantile=1.5)
+    for part in (PositiveBoost(target_share=0.5), PriorityFloor(quantile=0.5)):
+        check_adjustment(part)
+    assert METHODS["mpfa_adaptive"].boost_target == 0.5
+
+
+# LAP with a bend that moves.
+
+
+@pytest.mark.parametrize("quantile", [0.01, 0.25, 0.5, 0.9, 1.0])
+def test_the_bend_is_the_least_error_that_is_not_exceeded_by_its_share(quantile):
+    values = torch.rand(37, generator=seeded(5), dtype=torch.double)
+    ordered = sorted(values.tolist())
+    below = [v for v in ordered if sum(o <= v for o in ordered) >= quantile * len(ordered) - 1e-9]
+    data = torch.cat([values, values.new_full((5,), torch.nan)])
+    assert float(running_bend(data, quantile=quantile, otherwise=9.0)) == below[0]
+
+
+def lap_frequencies(scale, **settings):
+    replay = make_replay("lap", capacity=100, batch_size=50_000, generator=seeded(0), **settings)
+    replay.buffer.extend(make_transitions(100))
+    errors = torch.linspace(0.01, 4.0, 100) * scale
+    for _ in range(2):
+        set_signals(replay.buffer, td_error=errors)
+    found = replay.buffer.sample()
+    return torch.bincount(found["index"], minlength=100) / 50_000, found
+
+
+def test_with_small_rewards_lap_is_uniform_and_with_a_quantile_it_is_what_it_is_with_large_ones():
+    uniform, _ = lap_frequencies(0.01)
+    assert (uniform - 0.01).abs().max() < 0.002
+    small, of_small = lap_frequencies(0.01, floor_quantile=0.5)
+    large, of_large = lap_frequencies(1.0, floor_quantile=0.5)
+    assert (small - large).abs().max() < 0.002
+    assert small[90:].mean() > 1.2 * small[:50].mean()
+    assert (small[:50] - small[:50].mean()).abs().max() < 0.002
+    assert of_large["bend"].unique().tolist() == pytest.approx([2.005], abs=0.03)
+    assert of_small["bend"].unique().tolist() == pytest.approx([0.02005], abs=3e-4)
+
+
+def test_the_bend_is_that_of_the_method_until_errors_are_known():
+    replay = make_replay("lap", capacity=10, batch_size=4, floor_quantile=0.5)
+    replay.buffer.extend(make_transitions(10))
+    assert replay.buffer.sample()["bend"].tolist() == [1.0] * 4
+    assert "bend" not in make_replay("lap", capacity=10).buffer.sampler.state_dict()
+    set_signals(replay.buffer, td_error=torch.zeros(10))
+    set_signals(replay.buffer, td_error=torch.zeros(10))
+    assert 0 < replay.buffer.sample()["bend"][0] < 1e-5
