@@ -42,10 +42,17 @@ def cluttered(name: str, seed: int, *, boxes: int = 0, cylinders: int = 0, size:
     )
 
 
-def _stepper(world: World, *, physics: Any, robots: int = ROBOTS) -> Call:
+def _stepper(
+    world: World, *, physics: Any = "kinematic", memory: Any = "none", robots: int = ROBOTS
+) -> Call:
     """A call that makes one time step of all robots."""
     env = VectorNavigationEnv(
-        robots, world=world, physics=physics, action_repeat=1, detour_chance=0.0
+        robots,
+        world=world,
+        physics=physics,
+        memory=memory,
+        action_repeat=1,
+        detour_chance=0.0,
     )
     env.reset(seed=0)
     actions = np.tile(np.array(_CIRCLE, dtype=np.float32), (robots, 1))
@@ -78,19 +85,21 @@ def _torchrl_stepper(world: World) -> Call:
 
 
 def measure(*, quick: bool) -> list[Entry]:
-    """Measure kinematic robots among 30 obstacles, 300 cylinders and in TorchRL, and wheels.
+    """Measure kinematic robots among 30 obstacles, with a map, among 300 cylinders, and wheels.
 
     Args:
         quick: Fewer and shorter rounds.
 
     Returns:
-        Rates; the ratio of ``vector_cylinders`` is its time over that of ``vector_kinematic``.
+        Rates, that of TorchRL's environment among them; the ratios of ``vector_map`` and
+        ``vector_cylinders`` are their times over that of ``vector_kinematic``.
     """
     sparse = cluttered("thirty", 1, boxes=20, cylinders=10, size=14.0)
     dense = cluttered("three hundred", 2, cylinders=300, size=20.0)
     calls: dict[str, Callable[[], object]] = {
-        "vector_kinematic": _stepper(sparse, physics="kinematic"),
-        "vector_cylinders": _stepper(dense, physics="kinematic"),
+        "vector_kinematic": _stepper(sparse),
+        "vector_map": _stepper(sparse, memory="map"),
+        "vector_cylinders": _stepper(dense),
         "vector_wheels": _stepper(sparse, physics="wheels", robots=16),
     }
     calls["torchrl_vector"] = _torchrl_stepper(sparse)
@@ -105,7 +114,7 @@ def measure(*, quick: bool) -> list[Entry]:
             ratio=timings[name].ratio(timings["vector_kinematic"]),
             baseline="vector_kinematic",
         )
-        if name == "vector_cylinders"
+        if name in ("vector_map", "vector_cylinders")
         else entry(name, rate, "steps/s")
         for name, rate in rates.items()
     ]
