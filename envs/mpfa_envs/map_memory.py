@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.kernels.route import UNKNOWN, MapArrays, remember
+from mpfa_envs.kernels.route import BLOCKED, UNKNOWN, MapArrays, follow_way, remember
 from mpfa_envs.vector_state import read_array
 
 if TYPE_CHECKING:
@@ -27,6 +27,17 @@ _BLOCKED: Final = 0.06
 """Clearance of the robot's rim below which a cell is blocked [m]."""
 _NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
+
+
+class Sketch(NamedTuple):
+    """A robot's map as a picture needs it."""
+
+    blocked: list[tuple[float, float]]
+    """Centers of the cells where the robot's center cannot be (x, y) [m]."""
+    way: list[tuple[float, float]]
+    """Centers of the cells of its way to the goal, in order (x, y) [m]."""
+    resolution: float
+    """Side of a cell [m]."""
 
 
 class MapMemory:
@@ -111,6 +122,34 @@ class MapMemory:
         directions, lengths = self._directions, self._lengths
         remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._ways)
         return self._ways
+
+    def sketch(self, index: int, x: float, y: float) -> Sketch:
+        """What a robot remembers, to be drawn.
+
+        Args:
+            index: Number of the robot.
+            x: Where it is [m].
+            y: Where it is [m].
+
+        Returns:
+            Its map and its way.
+        """
+        columns, rows = self.arrays.shapes[index]
+        levels = self.arrays.levels[index, :columns, :rows]
+        costs = self.arrays.costs[index, :columns, :rows]
+        origin = self.arrays.origins[index]
+        places = [
+            np.argwhere(levels == BLOCKED),
+            follow_way(levels, costs, *self._cell(index, x, y)),
+        ]
+        blocked, way = ((origin + RESOLUTION * cells).tolist() for cells in places)
+        return Sketch([(u, v) for u, v in blocked], [(u, v) for u, v in way], RESOLUTION)
+
+    def _cell(self, index: int, x: float, y: float) -> tuple[int, int]:
+        """Column and row of a position in a robot's map."""
+        place = (np.array((x, y)) - self.arrays.origins[index]) / RESOLUTION
+        cell = np.clip(np.floor(place + 0.5).astype(int), 0, self.arrays.shapes[index] - 1)
+        return int(cell[0]), int(cell[1])
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """The maps and the ways, as arrays."""

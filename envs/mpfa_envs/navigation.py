@@ -345,6 +345,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             goal_radius=self.goal_radius,
             trail=self._trail,
             rays=(self.lidar.angles, self.lidar.cast(*motion[:3])),
+            sketch=None if self._map is None else self._map.sketch(0, motion.x, motion.y),
         )
 
     def close(self) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from mpfa_envs.map_memory import Sketch
     from mpfa_envs.robot import RobotModel
     from mpfa_envs.worlds import World
 
@@ -39,6 +40,8 @@ ROBOT_FRONT: Final = (255, 255, 255, 255)
 RAY: Final = (0, 140, 150, 120)
 RAY_AREA: Final = (0, 160, 170, 26)
 TRAIL: Final = (37, 99, 186, 255)
+WAY: Final = (230, 126, 0, 255)
+MET: Final = (230, 126, 0, 52)
 TEXT: Final = (40, 44, 52, 255)
 OUTCOMES: Final[dict[str, Color]] = {
     "success": (37, 99, 186, 190),
@@ -201,6 +204,7 @@ def render_scene(
     goal_radius: float,
     trail: Sequence[Point] = (),
     rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    sketch: Sketch | None = None,
     size: int = 480,
 ) -> NDArray[np.uint8]:
     """Render one moment of an episode.
@@ -213,6 +217,7 @@ def render_scene(
         goal_radius: Distance that reaches the goal [m].
         trail: Where it has been (x, y) [m].
         rays: Angles in the robot's frame [rad] and ranges [m] of its lidar.
+        sketch: What the robot remembers, if it makes a map.
         size: Longer side of the picture [px].
 
     Returns:
@@ -232,6 +237,12 @@ def render_scene(
     """
     canvas = _Canvas(world, size=size)
     x, y, heading = pose
+    if sketch is not None:
+        half = sketch.resolution / 2
+        with canvas.layer():
+            for at_x, at_y in sketch.blocked:
+                canvas.rectangle(at_x - half, at_y - half, at_x + half, at_y + half, fill=MET)
+        canvas.line([(x, y), *sketch.way], WAY, 1.5)
     if rays is not None:
         ends = [
             (x + reach * math.cos(heading + angle), y + reach * math.sin(heading + angle))

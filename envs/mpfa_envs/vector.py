@@ -429,6 +429,7 @@ class VectorNavigationEnv(
         # Imported here because training does not render.
         from mpfa_envs.render import render_scene
 
+        memory = self._batch.memory
         return tuple(
             render_scene(
                 self._batch.worlds[index],
@@ -438,6 +439,7 @@ class VectorNavigationEnv(
                 goal_radius=self.goal_radius,
                 trail=self.trail(index),
                 rays=(self.lidar.angles, self._batch.ranges[index]),
+                sketch=None if memory is None else memory.sketch(index, x, y),
             )
             for index, (x, y, heading) in enumerate(self.poses.tolist())
         )

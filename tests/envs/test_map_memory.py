@@ -20,6 +20,7 @@ from mpfa_envs import (
     observation_slices,
 )
 from mpfa_envs.map_memory import RESOLUTION
+from mpfa_envs.render import WAY
 from mpfa_envs.robot import ROBOTS
 from tests.envs.shapes import random_shapes
 
@@ -180,3 +181,22 @@ def test_the_map_adds_to_the_observation_and_changes_nothing_of_it() -> None:
 def test_an_unknown_memory_is_refused() -> None:
     with pytest.raises(ValueError, match=r"memory must be one of \('none', 'map'\), got 'lstm'"):
         NavigationEnv(memory="lstm")  # type: ignore[arg-type]
+
+
+def test_a_picture_shows_what_was_met_and_the_way_to_the_goal() -> None:
+    env = NavigationEnv(
+        world=POCKET, physics="kinematic", memory="map", render_mode="rgb_array", max_steps=20
+    )
+    env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
+    memory = env.unwrapped._map
+    sketch = memory.sketch(0, 0.0, 0.0)
+    assert math.dist(sketch.way[0], (0.0, 0.0)) < 0.25
+    assert math.dist(sketch.way[-1], (3.0, 0.0)) < 0.1
+    steps = [math.dist(a, b) for a, b in zip(sketch.way, sketch.way[1:], strict=False)]
+    assert max(steps) == pytest.approx(math.sqrt(2) * RESOLUTION)
+    assert len(sketch.blocked) == (memory.arrays.levels[0] == 2).sum() > 50
+    # Past what it sees of an arm of the pocket, which is the part before it.
+    assert min(x for x, y in sketch.way if abs(y) > 1.4) < -0.3
+    orange = (env.render() == WAY[:3]).all(axis=-1)
+    assert 100 < orange.sum() < 5000
+    env.close()

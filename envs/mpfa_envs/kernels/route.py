@@ -149,15 +149,40 @@ def _costs_the_same(levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int,
 
     It is the cheapest then: what is seen makes other ways costlier, and none cheaper.
     """
-    while costs[i, j] > 0:
+    cells = follow_way(levels, costs, i, j)
+    if len(cells) > 0:
+        i, j = cells[-1, 0], cells[-1, 1]
+    return bool(costs[i, j] == 0)
+
+
+@njit
+def follow_way(
+    levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int, j: int
+) -> NDArray[np.int64]:
+    """Give the cells of the way from a cell to the goal, as far as it was found.
+
+    Args:
+        levels: The map, ``[columns, rows]``.
+        costs: Costs of the ways, ``[columns, rows]``.
+        i: Column of the cell.
+        j: Its row.
+
+    Returns:
+        Columns and rows, ``[cells, 2]``, without the first cell.
+    """
+    cells = np.empty((costs.size, 2), dtype=np.int64)
+    count = 0
+    while 0 < costs[i, j] < UNKNOWN:
         for move in range(8):
             cost = _step_cost(levels, i, j, move)
             if cost >= 0 and costs[i + _ACROSS[move], j + _UP[move]] == costs[i, j] - cost:
                 i, j = i + _ACROSS[move], j + _UP[move]
                 break
         else:
-            return False
-    return True
+            break
+        cells[count, 0], cells[count, 1] = i, j
+        count += 1
+    return cells[:count]
 
 
 @njit
