@@ -26,7 +26,7 @@ from torchrl_mpfa.networks import (
     make_stochastic_actor,
 )
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.samplers import MPFASampler, SignalSampler, TreeSampler
+from torchrl_mpfa.samplers import MixtureSampler, MPFASampler, SignalSampler, TreeSampler
 from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 from torchrl_mpfa.selection import Draw, Selection, one_batch
 from torchrl_mpfa.signals import (
@@ -58,6 +58,7 @@ __all__ = [
     "Fusion",
     "Learner",
     "MPFASampler",
+    "MixtureSampler",
     "PositiveBoost",
     "PositiveDecay",
     "SACLearner",

@@ -58,10 +58,13 @@ def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
     if len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
         return None
     # A fusion may stand around another one.
-    found = (getattr(getattr(part, "fusion", part), "positive_above", "mean") for part in parts)
-    for level in {level for level in found if level != "mean"}:
+    inner = [getattr(part, "fusion", part) for part in parts]
+    found = [(getattr(part, "positive_above", "mean"), hasattr(part, "weights")) for part in inner]
+    for level in {level for level, _ in found if level != "mean"}:
         above = int((rewards > float(level)).sum())
-        if above in (0, len(rewards)):
+        # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
+        waits = above == 0 and float(level) > 0 and (level, True) not in found
+        if above in (0, len(rewards)) and not waits:
             return (
                 f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
                 f"above {level}: by Eq. (17) TD error and gradient get no weight beside the "

@@ -166,6 +166,11 @@ def check_settings(settings: TrainSettings) -> None:
         settings.evaluation.world,
     )
     method = settings.method
+    if method.combination == "mixture" and method.selection != "prioritized":
+        raise ValueError(
+            f"method.combination must be sum or product with method.selection={method.selection}, "
+            "got mixture"
+        )
     if method.capacity < method.batch_size * method.candidates:
         raise ValueError(
             f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "

@@ -49,6 +49,7 @@ class SignalSamplerConfig(SamplerConfig):
     adjustments: list[Any] | None = field(default_factory=list)
     entropy_refresh: float = 1 / 256
     stratified: bool = False
+    combination: str = "sum"
     _target_: str = "torchrl_mpfa.configs.replay._make_signal_sampler"
     _convert_: str = "all"
 

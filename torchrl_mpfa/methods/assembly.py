@@ -31,6 +31,7 @@ from torchrl_mpfa.methods.rank import RankSampler
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.positive import check_level
 from torchrl_mpfa.replay import SignalReplayBuffer
+from torchrl_mpfa.samplers.mixture import MixtureSampler
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.selection import Selection, one_batch
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
@@ -63,6 +64,7 @@ _SELECTIONS: dict[str, Selection] = {"split": split_draws, "halves": uniform_hal
 WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
     "fusion": set(_FUSIONS),
+    "combination": {"sum", "product", "mixture"},
     "boost_bound": {"floor", "cap", "none"},
     "decay_position": {"batch", "rank", "count"},
     "population": {"buffer", "batch"},
@@ -199,10 +201,17 @@ def make_sampler(method: Method) -> SignalSampler | RandomSampler:
     """The sampler that the settings describe: signals, fusion, adjustments, selection."""
     if method.selection in _UNIFORM:
         return _UNIFORM[method.selection](method)
+    kind, fusion = _PRIORITIZED[method.selection], _FUSIONS[method.fusion](method)
     more: dict[str, Any] = {}
     if method.selection == "capped":
         more["replay_cap"] = method.replay_cap
-    return _PRIORITIZED[method.selection](
+    if method.combination == "product":
+        more["combination"] = "product"
+    elif method.combination == "mixture":
+        kind = MixtureSampler
+    if method.combination != "sum" and isinstance(fusion, ScaledFusion):
+        fusion = _equal(method)
+    return kind(
         method.capacity,
         method.alpha,
         method.beta,
@@ -210,7 +219,7 @@ def make_sampler(method: Method) -> SignalSampler | RandomSampler:
         max_priority_within_buffer=method.max_priority_within_buffer,
         stratified=method.stratified,
         signals=signals_of(method),
-        fusion=_FUSIONS[method.fusion](method),
+        fusion=fusion,
         adjustments=make_adjustments(method),
         **more,
     )
@@ -274,6 +283,10 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
     for name, words in WORDS.items():
         if getattr(made, name) not in words:
             raise ValueError(unknown(name, getattr(made, name), words))
+    if made.combination == "mixture" and made.selection in set(_PRIORITIZED) - {"prioritized"}:
+        raise ValueError(
+            f"combination 'mixture' needs selection='prioritized', got {made.selection!r}"
+        )
     check_level(made.positive_above)
     counts = ("capacity", "batch_size", "candidates", "target_average")
     check_counts(**{name: getattr(made, name) for name in counts})

@@ -25,6 +25,10 @@ class Method:
     fusion: str = "entropy"
     """``entropy`` (Eqs. 15-20), ``fixed`` (equal weights), ``scaled`` (equal shares: each signal
     is divided by its mean) or ``value_schedule`` (HVPER)."""
+    combination: str = "sum"
+    """What is made of the weighted signals: their ``sum`` (Eq. 21) or ``product``, or a
+    ``mixture``: each signal has a tree of its own, and its share of a batch. The latter two need
+    no scale: ``scaled`` is the same as ``fixed``."""
     boost: bool = True
     """Raise positive transitions, Eq. 22."""
     decay: bool = True
@@ -110,6 +114,15 @@ METHODS: dict[str, Method] = {
     # The paper's method, and its ablations.
     "mpfa_per": Method(),
     "mpfa_adaptive": Method("mpfa_adaptive", boost_target=0.5, boost_factor=10.0),
+    "mpfa_plus": Method(
+        "mpfa_plus",
+        fusion="scaled",
+        # Signals are in units of their means, of which a floor of 1 is not one.
+        boost_bound="none",
+        # More than a step can bring, and less than a goal.
+        positive_above=1.0,
+        decay=False,
+    ),
     "mpf_per": Method("mpf_per", boost=False, decay=False),
     "td_reward": Method("td_reward", ["reward", "td_error"], boost=False, decay=False),
     "td_loss": Method("td_loss", ["td_error", "action_gradient"], boost=False, decay=False),

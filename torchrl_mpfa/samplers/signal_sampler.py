@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,11 +13,12 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts
-from torchrl_mpfa.checks import bounds, check_counts, check_finite, check_index, check_range
-from torchrl_mpfa.fusion import FixedFusion, Fusion, fuse
+from torchrl_mpfa.checks import bounds, check_counts, check_index, check_range
+from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import one_sided
 from torchrl_mpfa.samplers.binding import signal_table_of
+from torchrl_mpfa.samplers.rows import check_signals, with_signals
 from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.samplers.states import entry
 from torchrl_mpfa.samplers.statistics import batch_statistics
@@ -71,6 +71,8 @@ class SignalSampler(TreeSampler):
             written transition, whatever the capacity.
         stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
             priority, as the PER paper does, in place of ``B`` independent ones.
+        combination: What is made of signals and weights: their ``"sum"`` (Eq. 21), or their
+            ``"product"``, :func:`~torchrl_mpfa.fusion.fuse_product`.
 
     Raises:
         ValueError: If an argument is out of its range, or the fusion names a signal that is not
@@ -100,7 +102,11 @@ class SignalSampler(TreeSampler):
         adjustments: Sequence[Adjustment] = (),
         entropy_refresh: float = _ENTROPY_REFRESH,
         stratified: bool = False,
+        combination: str = "sum",
     ) -> None:
+        if combination not in COMBINATIONS:
+            raise ValueError(unknown("combination", combination, COMBINATIONS))
+        self.combination = combination
         check_range("entropy_refresh", entropy_refresh, low=0)
         self.signals = as_signals(signals)
         self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
@@ -252,7 +258,7 @@ class SignalSampler(TreeSampler):
         sizes = [len(slots) // batches] * batches
         if len(check_index(slots, table.size)) < len(slots):
             raise IndexError(f"index must be in [0, {table.size}), the filled slots, got -1")
-        rows = self._with_signals(table, slots, signals)
+        rows = with_signals(table, slots, signals, self._learned)
         stale = 0
         if written_at is not None:
             if written_at.numel() != slots.numel():
@@ -265,7 +271,7 @@ class SignalSampler(TreeSampler):
                 stale = int((~live).sum())
                 sizes = live.reshape(batches, -1).sum(1).tolist()
                 rows, slots = rows[live], slots[live]
-        self._check_signals(rows[:, self._columns])
+        check_signals(rows[:, self._columns], self._names, self._learned)
         if slots.numel() == 0:
             return stale
 
@@ -284,29 +290,9 @@ class SignalSampler(TreeSampler):
         self._set(slots, priority, highest)
         return stale
 
-    def _with_signals(
-        self, table: SignalTable, slots: Tensor, signals: Mapping[str, Tensor]
-    ) -> Tensor:
-        """Rows of the table with the learned signals of a batch in them, shape ``[B, K]``."""
-        rows = table.rows.index_select(0, slots)
-        for name, priority_of in self._learned.items():
-            if name not in signals:
-                raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
-            value = signals[name].detach()
-            if value.numel() != slots.numel():
-                raise ValueError(
-                    f"signal {name!r} must have one number per transition, got shape "
-                    f"{[*value.shape]} for {slots.numel()} slots"
-                )
-            value = value.reshape(-1)
-            if priority_of is not None:
-                value = priority_of(value)
-            rows.select(1, table.column[name]).copy_(value)
-        return rows
-
     def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
         """Priorities of Eqs. (21)-(24), eps included, shape ``[B]``."""
-        priority = fuse(rows[:, self._columns], weighing.weights, eps=self._eps)
+        priority = self._combined(rows, weighing)
         facts = BatchFacts(
             reward=rows.select(1, table.reward_column),
             replay_count=rows.select(1, table.count_column),
@@ -322,6 +308,11 @@ class SignalSampler(TreeSampler):
                 f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
             )
         return priority.to(torch.double)
+
+    def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
+        """Priorities before any adjustment, eps included, shape ``[B]``."""
+        combine = COMBINATIONS[self.combination]
+        return combine(rows[:, self._columns], weighing.weights, eps=self._eps)
 
     def bind(self, storage: Storage) -> SignalTable:
         """Take the signals of a storage as those to fuse.
@@ -349,18 +340,6 @@ class SignalSampler(TreeSampler):
             self._table = table
         return table
 
-    def _check_signals(self, chosen: Tensor) -> None:
-        if len(chosen) == 0:
-            return
-        # A NaN makes both of these NaN, so that one pass finds whatever is wrong.
-        low, high = bounds(chosen)
-        if low >= 0 and high < math.inf:
-            return
-        for name, value in zip(self._names, chosen.unbind(1), strict=True):
-            if name not in self._learned and bool(value.isnan().any()):
-                raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
-            check_finite(f"signal {name!r}", value)
-
     def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
         """Count the probabilities of Eqs. (16)-(17) anew if enough changed since the last count."""
         fresh = table.writes - (0 if last is None else last.writes)
@@ -378,16 +357,12 @@ class SignalSampler(TreeSampler):
         self, table: SignalTable, index: Tensor, weighing: Weighing, last: Weighing | None
     ) -> Weighing:
         """The weighing with what the adjustments counted, anew if enough has changed."""
-
-        def priority(weighing: Weighing) -> Tensor:
-            return fuse(table.rows[: table.size, self._columns], weighing.weights, eps=self._eps)
-
         return count_anew(
             weighing,
             last,
             self.adjustments,
             table,
-            priority,
+            lambda made: self._combined(table.rows[: table.size], made),
             learned=len(index),
             always=self.entropy_refresh == 0,
         )

@@ -1,0 +1,153 @@
+"""A mixture of samplings: each signal has a tree of its own, and its part of every batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_mpfa.moving_fusion import ScaledFusion
+from torchrl_mpfa.priorities import importance_weights
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.states import entry, refuse
+from torchrl_mpfa.samplers.tree import TreeSampler
+
+
+class MixtureSampler(SignalSampler):
+    r"""Samples each transition by one of the signals, chosen by the weights of the fusion.
+
+    .. math::
+
+        P(i) = \sum_k \frac{w_k}{\sum_j w_j} \cdot
+        \frac{(p_i^k + \epsilon)^\alpha}{\sum_l (p_l^k + \epsilon)^\alpha}
+
+    A signal has its share of a batch whatever its scale and however rare its peaks are: a few large
+    rewards cannot crowd out the TD errors, as they can in a sum. What adjustments make of the sum
+    of Eq. (21), as a factor, holds for each signal; a fresh transition gets the highest priority by
+    each of them. Importance weights are divided by a bound of the largest one, that of a transition
+    which is the least by every signal.
+
+    Args:
+        *args: As :class:`~torchrl_mpfa.SignalSampler`.
+        **kwargs: As :class:`~torchrl_mpfa.SignalSampler`. The fusion tells the shares; one that
+            divides signals by their scale is refused, as they have none here.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> sampler = MixtureSampler(1000, 0.6, 0.4, 0.05, signals=["reward", "td_error"])
+        >>> sampler.shares.tolist()
+        [0.5, 0.5]
+    """
+
+    KIND = "mixture"
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if isinstance(self.fusion, ScaledFusion):
+            raise ValueError("fusion of a mixture must not be scaled: give the one inside of it")
+        if self.combination != "sum":
+            raise ValueError(f"combination of a mixture must be 'sum', got {self.combination!r}")
+
+    def _init(self) -> None:
+        super()._init()
+        self._parts = {
+            signal.name: TreeSampler(
+                self._max_capacity,
+                self._alpha,
+                self._beta,
+                0.0,
+                max_priority_within_buffer=self._max_priority_within_buffer,
+            )
+            for signal in self.signals
+        }
+
+    @property
+    def shares(self) -> Tensor:
+        """Share of each signal in a batch, in the order of their columns, shape ``[K]``."""
+        if self._weighing is None:
+            return torch.full((len(self._names),), 1.0 / len(self._names), dtype=torch.double)
+        return self._weighing.weights / self._weighing.weights.sum()
+
+    def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
+        super()._write(slots, priority, learned=learned)
+        if not learned:
+            for part in self._parts.values():
+                part.mark_update(slots)
+            return
+        for name, value in self._by_signal(slots, priority).items():
+            self._parts[name]._set(slots, value, float(value.max()))
+
+    def _by_signal(self, slots: Tensor, priority: Tensor) -> dict[str, Tensor]:
+        """The priority of each slot by each of the signals, shape ``[B]``."""
+        if self._table is None or self._weighing is None:
+            return dict.fromkeys(self._names, priority)
+        rows = self._table.rows[slots]
+        factor = priority / self._combined(rows, self._weighing)
+        found = {}
+        for name in self._names:
+            value = (rows[:, self._table.column[name]] + self._eps) * factor
+            # A priority that was set directly, of a transition whose signals are not known.
+            found[name] = torch.where(value.isfinite(), value, priority)
+        return found
+
+    def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
+        shares = self.shares
+        chosen = torch.multinomial(shares, batch_size, replacement=True, generator=self._rng)
+        index = torch.empty(batch_size, dtype=torch.long)
+        trees = [self._parts[name] for name in self._names]
+        totals = [part._sum_tree.query(0, size) for part in trees]
+        lowest = sum(
+            share * part._min_tree.query(0, size) / total
+            for share, part, total in zip(shares.tolist(), trees, totals, strict=True)
+        )
+        if not (min(totals) > 0 and lowest > 0):
+            raise RuntimeError(
+                f"every priority must be positive to sample, got sums of {totals} by signal: raise "
+                "eps, or give the buffer its sampler before its data"
+            )
+        for number, part in enumerate(trees):
+            rows = (chosen == number).nonzero().squeeze(1)
+            if len(rows):
+                index[rows] = self._proportional(part._sum_tree, size, len(rows))
+        probability = torch.zeros(batch_size, dtype=torch.double)
+        for share, part, total in zip(shares.tolist(), trees, totals, strict=True):
+            leaf = torch.as_tensor(part._sum_tree[index]).reshape(-1)
+            probability += leaf * (share / total)
+        return index, importance_weights(probability, beta=self._beta, lowest=lowest)
+
+    def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
+        super()._retransform_priority_trees(old_alpha, new_alpha)
+        for part in self._parts.values():
+            part.alpha = new_alpha
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next batches depend on; tensors and plain values only."""
+        parts = {name: part.state_dict() for name, part in self._parts.items()}
+        return {**super().state_dict(), "_parts": parts}
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            ValueError: If an entry is missing, of another sampler, or not what it must be.
+        """
+        super().check_state(state_dict)
+        parts = entry(state_dict, "_parts")
+        if not isinstance(parts, Mapping) or sorted(parts) != sorted(self._parts):
+            refuse("_parts", f"a tree for each of {sorted(self._parts)}", parts)
+        for name, part in self._parts.items():
+            part.check_state(parts[name])
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: See :meth:`check_state`.
+        """
+        super().load_state_dict(state_dict)
+        for name, part in self._parts.items():
+            part.load_state_dict(state_dict["_parts"][name])

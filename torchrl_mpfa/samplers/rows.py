@@ -1,0 +1,73 @@
+"""The rows of a batch in the table of signals: what was learned goes in, and is checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from torch import Tensor
+
+from torchrl_mpfa.checks import bounds, check_finite
+from torchrl_mpfa.storages.table import SignalTable
+
+Learned = Mapping[str, Callable[[Tensor], Tensor] | None]
+"""Signals that the loss learns, each with what makes a priority of it, if anything does."""
+
+
+def with_signals(
+    table: SignalTable, slots: Tensor, signals: Mapping[str, Tensor], learned: Learned
+) -> Tensor:
+    """Rows of the table with the learned signals of a batch in them; the table stays as it is.
+
+    Args:
+        table: The table.
+        slots: Slots of the batch, shape ``[B]``.
+        signals: Signals by name, each of shape ``[B]`` or ``[B, 1]``.
+        learned: Those that must be there.
+
+    Returns:
+        The rows, one for each slot.
+
+    Raises:
+        KeyError: If a signal is missing.
+        ValueError: If one has not one number per transition.
+    """
+    rows = table.rows.index_select(0, slots)
+    for name, priority_of in learned.items():
+        if name not in signals:
+            raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
+        value = signals[name].detach()
+        if value.numel() != slots.numel():
+            raise ValueError(
+                f"signal {name!r} must have one number per transition, got shape "
+                f"{[*value.shape]} for {slots.numel()} slots"
+            )
+        value = value.reshape(-1)
+        if priority_of is not None:
+            value = priority_of(value)
+        rows.select(1, table.column[name]).copy_(value)
+    return rows
+
+
+def check_signals(chosen: Tensor, names: Sequence[str], learned: Learned) -> None:
+    """Refuse signals that cannot be fused.
+
+    Args:
+        chosen: Signals, shape ``[B, K]``.
+        names: Their names.
+        learned: Which of them the loss learns.
+
+    Raises:
+        KeyError: If the stored transitions lack one.
+        ValueError: If one is negative or not finite.
+    """
+    if len(chosen) == 0:
+        return
+    # A NaN makes both of these NaN, so that one pass finds whatever is wrong.
+    low, high = bounds(chosen)
+    if low >= 0 and high < math.inf:
+        return
+    for name, value in zip(names, chosen.unbind(1), strict=True):
+        if name not in learned and bool(value.isnan().any()):
+            raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
+        check_finite(f"signal {name!r}", value)
