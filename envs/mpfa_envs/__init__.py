@@ -21,6 +21,7 @@ from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
 from mpfa_envs.robot import ROBOTS, RobotModel
 from mpfa_envs.shapes import Box, Cylinder, Polygon
 from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
+from mpfa_envs.walkers import Walker
 from mpfa_envs.world_file import WorldFileError, load_world, save_world
 from mpfa_envs.worlds import World, WorldArrays
 
@@ -81,6 +82,7 @@ __all__ = [
     "StepOutcome",
     "Task",
     "VectorNavigationEnv",
+    "Walker",
     "World",
     "WorldArrays",
     "WorldFileError",

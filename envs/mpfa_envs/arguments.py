@@ -42,6 +42,7 @@ class TaskArguments:
         reward: RewardFunction | None,
         lidar: Mapping[str, Any] | None,
         memory: Memory,
+        history: int,
         closeness_distance: float | None,
         min_goal_distance: float,
         detour_chance: float,
@@ -66,6 +67,7 @@ class TaskArguments:
         if memory not in get_args(Memory):
             raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")
         self.memory: Memory = memory
+        self.history = check_count("history", history, least=0)
         self.render_mode = render_mode
         self.max_steps = check_count("max_steps", max_steps)
         self.time_step = check_positive("time_step", time_step)
@@ -104,6 +106,7 @@ class TaskArguments:
             sectors: Number of sectors of the lidar.
             diagonal: Longest distance in a room [m].
         """
-        self.observation_slices = observation_slices(sectors, memory=self.memory)
-        low, high = observation_bounds(sectors, diagonal, memory=self.memory)
+        remembered: Any = {"memory": self.memory, "history": self.history}
+        self.observation_slices = observation_slices(sectors, **remembered)
+        low, high = observation_bounds(sectors, diagonal, **remembered)
         return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)

@@ -97,13 +97,21 @@ class Lidar:
         self._leave = np.empty((count, rays))
         self._missed = np.empty((count, rays), dtype=np.bool_)
 
-    def cast(self, x: float, y: float, heading: float) -> NDArray[np.float64]:
+    def cast(
+        self,
+        x: float,
+        y: float,
+        heading: float,
+        *,
+        moving: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
         """Measure every ray without noise.
 
         Args:
             x: Position of the sensor [m].
             y: Position of the sensor [m].
             heading: Direction of the robot's front [rad].
+            moving: Circles (x, y, radius) that are not of the world [m], shape ``[K, 3]``.
 
         Returns:
             Range of each ray [m], shape ``[rays]``; zero in an obstacle.
@@ -131,6 +139,9 @@ class Lidar:
         ranges: NDArray[np.float64] = enter.min(axis=0)
         if self._circles is not None:
             np.minimum(ranges, self._cast_at_circles(*self._circles), out=ranges)
+        if moving is not None and len(moving):
+            centers, squares = moving[:, :2].T[..., None], moving[:, 2:] ** 2
+            np.minimum(ranges, self._cast_at_circles(centers, squares), out=ranges)
         if self._polygons is not None:
             np.minimum(ranges, self._cast_at_polygons(self._polygons), out=ranges)
         np.maximum(ranges, 0.0, out=ranges)
@@ -184,7 +195,13 @@ class Lidar:
         return self.reduce(self.measure(x, y, heading, rng=rng))
 
     def measure(
-        self, x: float, y: float, heading: float, *, rng: np.random.Generator | None = None
+        self,
+        x: float,
+        y: float,
+        heading: float,
+        *,
+        rng: np.random.Generator | None = None,
+        moving: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Measure the range of every ray, with noise.
 
@@ -193,6 +210,7 @@ class Lidar:
             y: Position of the sensor [m].
             heading: Direction of the robot's front [rad].
             rng: Source of the noise; needed only if there is noise.
+            moving: As in :meth:`cast`.
 
         Returns:
             Range of each ray, left to right [m], shape ``[rays]``.
@@ -200,7 +218,7 @@ class Lidar:
         Raises:
             ValueError: If there is noise and no generator.
         """
-        ranges = self.cast(x, y, heading)
+        ranges = self.cast(x, y, heading, moving=moving)
         if self.noise > 0:
             if rng is None:
                 raise ValueError(f"rng must be a Generator when noise is {self.noise}, got None")

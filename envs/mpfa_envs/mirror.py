@@ -17,6 +17,7 @@ class Mirror(nn.Module):
     Args:
         sectors: Number of sectors of the lidar.
         memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
+        history: Number of earlier scans that it senses.
 
     Examples:
         >>> mirror = Mirror()
@@ -27,12 +28,15 @@ class Mirror(nn.Module):
     order: Tensor
     sign: Tensor
 
-    def __init__(self, *, sectors: int = 18, memory: Memory = "none") -> None:
+    def __init__(self, *, sectors: int = 18, memory: Memory = "none", history: int = 0) -> None:
         super().__init__()
-        parts = observation_slices(sectors, memory=memory)
+        parts = observation_slices(sectors, memory=memory, history=history)
         size = max(part.stop for part in parts.values())
         order = torch.arange(size)
         order[parts["lidar"]] = order[parts["lidar"]].flip(0)
+        if history:
+            scans = order[parts["lidar_history"]].view(history, sectors)
+            order[parts["lidar_history"]] = scans.flip(1).flatten()
         sign = torch.ones(size)
         sign[parts["goal_direction"].start + 1] = -1.0  # The sine, positive to the left.
         sign[parts["angular_speed"]] = -1.0
@@ -77,6 +81,7 @@ class RandomMirror(Transform):
         chance: Share of the transitions that are mirrored, in [0, 1].
         sectors: Number of sectors of the lidar.
         memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
+        history: Number of earlier scans that it senses.
         generator: Source of the choices; None: PyTorch's own.
 
     Raises:
@@ -101,11 +106,12 @@ class RandomMirror(Transform):
         chance: float = 0.5,
         sectors: int = 18,
         memory: Memory = "none",
+        history: int = 0,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.chance = check_share("chance", chance)
-        self.mirror = Mirror(sectors=sectors, memory=memory)
+        self.mirror = Mirror(sectors=sectors, memory=memory, history=history)
         self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -17,7 +17,7 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.episodes import distance_field
-from mpfa_envs.observation import Memory, observe
+from mpfa_envs.observation import Memory, add_history, observe
 from mpfa_envs.path import shortest_length
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
@@ -27,12 +27,14 @@ from mpfa_envs.reward import (
 )
 from mpfa_envs.robot import RobotModel
 from mpfa_envs.tasks import Task, check_task, sample_task
+from mpfa_envs.walkers import no_encounters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.distance import DistanceField
     from mpfa_envs.map_memory import MapMemory
+    from mpfa_envs.walker_batch import WalkerBatch
     from mpfa_envs.worlds import World
 
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
@@ -48,6 +50,10 @@ PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
 
 The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
 """
+
+
+_ALONE: Final = np.ones(1, dtype=np.bool_)
+_NOBODY: Final = np.zeros((0, 5))
 
 
 class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
@@ -77,6 +83,9 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     26     way_length       ``length / 10 m``, longer where it is narrow         [0, 10]
     ====== ================ ==================================================== ==========
 
+    With ``history=K`` there are ``18 K`` more at the end, ``lidar_history``: the lidar's sectors at
+    the K decisions before, the newest first, and when an episode begins the first ones K times.
+
     **Action**, ``Box(-1, 1)`` of shape ``[2]``, float32: speed of the left and the right wheel,
     from the robot's slowest (0.05 m/s for the TurtleBot2) to its fastest (0.5 m/s). It neither
     stops nor reverses. Actions are clipped to the box.
@@ -92,9 +101,13 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     ``shortest_path`` [m], the shortest path that ends the episode: from the start to the goal's
     center for a disc of the robot's radius, less the goal's radius, so that
     ``success * shortest_path / max(path_length, shortest_path)`` is the SPL; ``min_clearance`` [m],
-    the least distance so far between the robot's rim and an obstacle or wall; ``distance`` to the
-    goal's center [m]; the pose ``x``, ``y`` [m], ``heading`` [rad]; and the terms of the reward,
-    ``reward_goal``, ``reward_collision``, ``reward_progress``, ``reward_other``.
+    the least distance so far between the robot's rim and an obstacle, wall or walker; ``distance``
+    to the goal's center [m]; the pose ``x``, ``y`` [m], ``heading`` [rad]; the terms of the reward,
+    ``reward_goal``, ``reward_collision``, ``reward_progress``, ``reward_other``; and of the
+    walkers, so far: ``walker_distance`` [m], the least distance between the robot's rim and theirs,
+    ``intrusion_time`` [s], for which it was below 0.5 m, and ``time_to_collision`` [s], the least
+    time after which robot and walker would have touched had both gone on as they went, at most
+    10 s; without walkers they are infinite, zero and infinite.
 
     Args:
         world: ``"A"`` to ``"D"``, ``"validation"``, ``"test"``, the path of a YAML file or a
@@ -121,6 +134,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         memory: ``"map"``: the robot keeps a map of what its lidar met in this episode and senses
             the way to the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it
             senses what is before it and nothing else.
+        history: How many earlier scans it senses beside the last one, sector by sector: those of
+            the decisions before, the newest first, by which it may tell what moves.
         closeness_distance: A range of this or less has closeness one [m]. None: the default of
             collision_distance, whatever that is.
         min_goal_distance: Least distance between a sampled start and goal [m].
@@ -166,6 +181,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         reward: RewardFunction | None = None,
         lidar: Mapping[str, Any] | None = None,
         memory: Memory = "none",
+        history: int = 0,
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         detour_chance: float = 0.8,
@@ -185,6 +201,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             reward=reward,
             lidar=lidar,
             memory=memory,
+            history=history,
             closeness_distance=closeness_distance,
             min_goal_distance=min_goal_distance,
             detour_chance=detour_chance,
@@ -199,6 +216,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._running = False
         self._trail: list[tuple[float, float]] = []
         self._map = self._make_map() if self.memory == "map" else None
+        self._walkers = self._make_walkers() if self.world.walkers else None
         self._drive: Drive = (
             KinematicDrive(self.robot, time_step=self.time_step)
             if physics == "kinematic"
@@ -214,6 +232,11 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     def trail(self) -> list[tuple[float, float]]:
         """Positions (x, y) of the current episode so far [m]."""
         return list(self._trail)
+
+    @property
+    def walkers(self) -> NDArray[np.float64]:
+        """The walkers: (x, y), their speeds in both directions, and their radii, ``[K, 5]``."""
+        return _NOBODY if self._walkers is None else self._walkers.of(0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -255,8 +278,10 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         if self.progress == "shortest_path":
             self._field = distance_field(self.world, self.collision_distance, task.goal)
         self._way = self._way_from(*task.start[:2])
-        clearance = self.world.clearance(*task.start[:2]) - self.robot.radius
-        self._min_clearance = clearance
+        if self._walkers is not None:
+            self._walkers.begin(0, task.start[:2], self.np_random)
+        self._encounters = np.array(no_encounters(bool(self.world.walkers)))[:, None]
+        self._min_clearance = self._to_obstacle(*task.start[:2]) - self.robot.radius
         self._trail = [task.start[:2]]
         self._running = True
         if self._map is not None:
@@ -296,7 +321,11 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         Returns:
             Whether the goal was reached, the robot collided, or time is up; and the reward.
         """
+        if self._walkers is not None:
+            self._walkers.move(_ALONE)
         motion = self._drive.move(left, right)
+        if self._walkers is not None:
+            self._walkers.count_encounters(np.array([motion]), _ALONE, self._encounters)
         self._steps += 1
         self._path_length += math.dist(motion[:2], self._motion[:2])
         self._motion = motion
@@ -304,7 +333,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         previous = self._way
         self._distance = math.dist(self._goal, motion[:2])
         self._way = self._way_from(motion.x, motion.y)
-        to_obstacle = self.world.clearance(motion.x, motion.y)
+        to_obstacle = self._to_obstacle(motion.x, motion.y)
         clearance = to_obstacle - self.robot.radius
         self._min_clearance = min(self._min_clearance, clearance)
         success = self._distance <= self.goal_radius
@@ -315,6 +344,11 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         truncated = not (success or collision) and self._steps >= self.max_steps
         self._running = not (success or collision or truncated)
         return success, collision, truncated, terms
+
+    def _to_obstacle(self, x: float, y: float) -> float:
+        """Distance to the nearest obstacle, wall or walker [m]."""
+        walker = math.inf if self._walkers is None else self._walkers.clearance(0, x, y)
+        return min(self.world.clearance(x, y), walker)
 
     def _way_from(self, x: float, y: float) -> float:
         """What is left of the way to the goal, as the progress is measured [m]."""
@@ -336,7 +370,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         # Imported here because training does not render.
         from mpfa_envs.render import render_scene
 
-        motion = self._motion
+        motion, walkers = self._motion, self.walkers
+        ranges = self.lidar.cast(*motion[:3], moving=walkers[:, [0, 1, 4]])
         return render_scene(
             self.world,
             robot=self.robot,
@@ -344,8 +379,9 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             goal=self._task.goal,
             goal_radius=self.goal_radius,
             trail=self._trail,
-            rays=(self.lidar.angles, self.lidar.cast(*motion[:3])),
+            rays=(self.lidar.angles, ranges),
             sketch=None if self._map is None else self._map.sketch(0, motion.x, motion.y),
+            walkers=walkers,
         )
 
     def close(self) -> None:
@@ -360,16 +396,35 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
 
         return MapMemory(1, self.robot, self.lidar)
 
+    def _make_walkers(self) -> WalkerBatch:
+        """What moves around the robot."""
+        # Imported here for the same reason.
+        from mpfa_envs.walker_batch import WalkerBatch
+        from mpfa_envs.world_batch import WorldBatch
+
+        worlds = WorldBatch([self.world])
+        return WalkerBatch(worlds, radius=self.robot.radius, time_step=self.time_step)
+
     def _observe(self) -> NDArray[np.float32]:
         """Sense the world and build the observation."""
         motion = self._motion
         lidar = self.lidar
-        rays = lidar.measure(*motion[:3], rng=self.np_random if lidar.noise else None)
+        rng, walkers = self.np_random if lidar.noise else None, self._walkers
+        moving = None if walkers is None else walkers.circles(0)
+        rays = lidar.measure(*motion[:3], rng=rng, moving=moving)
         way = None
         if self._map is not None:
-            way = self._map.remember(np.array([motion]), np.array([self._goal]), rays[None])[0]
+            motions, seen = np.array([motion]), rays[None]
+            if walkers is not None:
+                seen = walkers.without(motions, lidar, seen)
+            way = self._map.remember(motions, np.array([self._goal]), seen)[0]
         ranges, near = lidar.reduce(rays), self.closeness_distance
-        return observe(ranges, motion, self._goal, self._distance, self.robot, near, way)
+        seen = observe(ranges, motion, self._goal, self._distance, self.robot, near, way)
+        if self.history:
+            last = self._observation if self._steps else None
+            self._observation = seen = add_history(seen, last, lidar.sectors, self.history)
+            return seen.copy()
+        return seen
 
     def _info(
         self, success: bool, collision: bool, timeout: bool, terms: RewardTerms
@@ -392,6 +447,9 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             "x": motion.x,
             "y": motion.y,
             "heading": motion.heading,
+            "walker_distance": float(self._encounters[0, 0]),
+            "intrusion_time": float(self._encounters[1, 0]),
+            "time_to_collision": float(self._encounters[2, 0]),
         }
 
     def check_task(self, options: dict[str, Any]) -> Task:

@@ -40,6 +40,9 @@ _NUMBERS = (
     "x",
     "y",
     "heading",
+    "walker_distance",
+    "intrusion_time",
+    "time_to_collision",
 )
 INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
     **dict.fromkeys(_FLAGS, bool),
@@ -48,12 +51,15 @@ INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
 """Keys of the info dictionary of every reset and step, with the type of their value."""
 
 
-def observation_slices(sectors: int = 18, *, memory: Memory = "none") -> dict[str, slice]:
+def observation_slices(
+    sectors: int = 18, *, memory: Memory = "none", history: int = 0
+) -> dict[str, slice]:
     """Name the parts of the observation.
 
     Args:
         sectors: Number of sectors of the lidar.
         memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
+        history: Number of earlier scans that it senses.
 
     Returns:
         Where each part lies, in order.
@@ -73,6 +79,8 @@ def observation_slices(sectors: int = 18, *, memory: Memory = "none") -> dict[st
     }
     if memory == "map":
         widths.update({"way_direction": 2, "way_length": 1})
+    if history:
+        widths["lidar_history"] = sectors * history
     slices, first = {}, 0
     for name, width in widths.items():
         slices[name] = slice(first, first + width)
@@ -85,7 +93,7 @@ OBSERVATION: Final = observation_slices()
 
 
 def observation_bounds(
-    sectors: int, diagonal: float, *, memory: Memory = "none"
+    sectors: int, diagonal: float, *, memory: Memory = "none", history: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Give the least and the greatest observation.
 
@@ -93,9 +101,11 @@ def observation_bounds(
         sectors: Number of sectors of the lidar.
         diagonal: Longest distance in the room [m].
         memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
+        history: Number of earlier scans that it senses.
 
     Returns:
-        Two arrays of shape ``[sectors + 6]``, with a map ``[sectors + 9]``.
+        Two arrays of shape ``[sectors + 6]``, with a map ``[sectors + 9]``, and ``sectors`` more
+        for each earlier scan.
     """
     far = diagonal / DISTANCE_SCALE
     low = [0.0] * sectors + [-1.0, -1.0, 0.0, 0.0, -SPEED_BOUND, -SPEED_BOUND]
@@ -103,6 +113,8 @@ def observation_bounds(
     if memory == "map":
         low += [-1.0, -1.0, 0.0]
         high += [1.0, 1.0, WAY_BOUND]
+    low += [0.0] * sectors * history
+    high += [1.0] * sectors * history
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
 
 
@@ -151,3 +163,24 @@ def observe(
         length = min(way[2] / DISTANCE_SCALE, WAY_BOUND)
         observation[sectors + 6 :] = way[0], way[1], length
     return observation
+
+
+def add_history(
+    observation: NDArray[np.float32], last: NDArray[np.float32] | None, sectors: int, history: int
+) -> NDArray[np.float32]:
+    """Append the scans of earlier decisions to an observation, the newest first.
+
+    Args:
+        observation: What the robot senses now.
+        last: The observation before it, with its own earlier scans; None at the start of an
+            episode, where the robot has always seen what it sees.
+        sectors: Number of sectors of the lidar.
+        history: Number of earlier scans.
+
+    Returns:
+        The observation with ``history * sectors`` numbers more.
+    """
+    if last is None:
+        return np.concatenate((observation, np.tile(observation[:sectors], history)))
+    older = last[len(observation) :][: sectors * (history - 1)]
+    return np.concatenate((observation, last[:sectors], older))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mpfa_envs.shapes import Box, Cylinder, Polygon
+from mpfa_envs.walkers import Walker
 from mpfa_envs.worlds import World
 
 
@@ -31,6 +32,24 @@ def world_to_plain(world: World) -> dict[str, Any]:
         "polygons": [[list(vertex) for vertex in polygon.vertices] for polygon in world.polygons],
         "start_regions": [_edges(box) for box in world.start_regions],
         "goal_regions": [_edges(box) for box in world.goal_regions],
+        "walkers": [walker_to_plain(walker) for walker in world.walkers],
+    }
+
+
+def walker_to_plain(walker: Walker) -> dict[str, Any]:
+    """Turn a walker into plain values.
+
+    Args:
+        walker: The walker.
+
+    Returns:
+        Its fields by name.
+    """
+    return {
+        "radius": float(walker.radius),
+        "speed": float(walker.speed),
+        "behavior": walker.behavior,
+        "waypoints": [list(point) for point in walker.waypoints],
     }
 
 
@@ -57,6 +76,10 @@ def world_from_plain(values: dict[str, Any]) -> World:
             ),
             start_regions=tuple(Box(*edges) for edges in values["start_regions"]),
             goal_regions=tuple(Box(*edges) for edges in values["goal_regions"]),
+            walkers=tuple(
+                Walker(**{**walker, "waypoints": tuple((x, y) for x, y in walker["waypoints"])})
+                for walker in values["walkers"]
+            ),
         )
     except (KeyError, TypeError, IndexError) as error:
         raise ValueError(f"worlds must hold the fields of a World, got {values!r}") from error

@@ -42,6 +42,9 @@ RAY_AREA: Final = (0, 160, 170, 26)
 TRAIL: Final = (37, 99, 186, 255)
 WAY: Final = (230, 126, 0, 255)
 MET: Final = (230, 126, 0, 52)
+WALKER: Final = (104, 168, 96, 255)
+WALKER_EDGE: Final = (48, 104, 48, 255)
+ROUND: Final = (104, 168, 96, 160)
 TEXT: Final = (40, 44, 52, 255)
 OUTCOMES: Final[dict[str, Color]] = {
     "success": (37, 99, 186, 190),
@@ -107,6 +110,10 @@ class _Canvas:
             self.disc(cylinder.x, cylinder.y, cylinder.radius, fill=OBSTACLE, outline=OBSTACLE_EDGE)
         for polygon in world.polygons:
             self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
+        with self.layer():
+            for walker in world.walkers:
+                for leg in walker.legs:
+                    self.line(leg, ROUND, 1.2)
 
     def rectangle(
         self,
@@ -167,6 +174,12 @@ class _Canvas:
         ]
         self.draw.polygon(arrow, fill=ROBOT_FRONT)
 
+    def walker(self, state: Sequence[float]) -> None:
+        """Draw a walker as a disc with a line to where it will be in a second."""
+        x, y, speed_x, speed_y, radius = state
+        self.disc(x, y, radius, fill=WALKER, outline=WALKER_EDGE)
+        self.line([(x, y), (x + speed_x, y + speed_y)], WALKER_EDGE, 1.6)
+
     def text(self, x: float, y: float, text: str) -> float:
         """Write at fine pixels, centered in height; returns the fine pixel where it ends."""
         self.draw.text((x, y), text, fill=TEXT, font=_font(), anchor="lm")
@@ -205,6 +218,7 @@ def render_scene(
     trail: Sequence[Point] = (),
     rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     sketch: Sketch | None = None,
+    walkers: NDArray[np.float64] | None = None,
     size: int = 480,
 ) -> NDArray[np.uint8]:
     """Render one moment of an episode.
@@ -218,6 +232,8 @@ def render_scene(
         trail: Where it has been (x, y) [m].
         rays: Angles in the robot's frame [rad] and ranges [m] of its lidar.
         sketch: What the robot remembers, if it makes a map.
+        walkers: (x, y), the speeds in both directions and the radius [m, m/s] of each walker,
+            ``[K, 5]``.
         size: Longer side of the picture [px].
 
     Returns:
@@ -257,6 +273,8 @@ def render_scene(
                 canvas.disc(*end, 0.035, fill=RAY)
     canvas.goal(*goal, goal_radius)
     canvas.line(trail, TRAIL, 2.0)
+    for walker in () if walkers is None else walkers.tolist():
+        canvas.walker(walker)
     canvas.robot(x, y, heading, robot.radius)
     return canvas.pixels()
 
@@ -273,7 +291,7 @@ def render_trajectories(
     """Render the paths of many episodes into one picture of their world.
 
     A ring marks a start, a red dot a goal and a cross a collision. The strip below counts how the
-    episodes ended.
+    episodes ended. Of walkers the rounds between their waypoints are shown.
 
     Args:
         world: A name, the path of a YAML file or a world.

@@ -16,6 +16,7 @@ from mpfa_envs.kernels.motion import scale_actions
 from mpfa_envs.kernels.observation import observe_all
 from mpfa_envs.kernels.step import (
     DISTANCE,
+    ENCOUNTERS,
     MIN_CLEARANCE,
     POSE,
     REWARD,
@@ -32,6 +33,8 @@ from mpfa_envs.reward import RewardFunction, StepOutcome, navigation_reward
 from mpfa_envs.tasks import read_task
 from mpfa_envs.vector_drives import make_drives
 from mpfa_envs.vector_state import read_array
+from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.walkers import no_encounters
 from mpfa_envs.world_batch import WorldBatch
 
 if TYPE_CHECKING:
@@ -71,6 +74,10 @@ class RobotBatch:
         """Start and goal of each robot's episode; None before the first."""
         self.worlds = WorldBatch(worlds)
         """The world that each robot is in."""
+        self.walkers = WalkerBatch(
+            self.worlds, radius=rules.robot.radius, time_step=rules.time_step
+        )
+        """What moves around each robot."""
         self._fields = FieldBatch(count) if rules.progress == "shortest_path" else None
         self.episodes = EpisodeArrays(
             motions=np.zeros((count, 5)),
@@ -101,12 +108,13 @@ class RobotBatch:
         self._scales = rules.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed
         self._payments = payments_of(rules.reward)
 
-    def begin(self, index: int, episode: Episode) -> None:
+    def begin(self, index: int, episode: Episode, rng: np.random.Generator) -> None:
         """Start an episode of a robot.
 
         Args:
             index: Number of the robot.
             episode: What it is to drive.
+            rng: Its source of randomness, of which the walkers take their starts.
         """
         task, episodes = episode.task, self.episodes
         if self.worlds[index] is not episode.world:
@@ -118,7 +126,9 @@ class RobotBatch:
         if self._fields is not None and episode.field is not None:
             self._fields[index] = episode.field
             way = episode.field.at(x, y)
-        clearance = episode.world.clearance(x, y) - self._rules.robot.radius
+        self.walkers.begin(index, (x, y), rng)
+        clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
+        clearance -= self._rules.robot.radius
         self.drives.place(index, x, y, heading)
         self.tasks[index] = task
         episodes.motions[index] = x, y, heading, 0.0, 0.0
@@ -133,6 +143,7 @@ class RobotBatch:
         numbers[MIN_CLEARANCE] = clearance
         numbers[DISTANCE] = distance
         numbers[POSE : POSE + 3] = x, y, heading
+        numbers[ENCOUNTERS:] = no_encounters(bool(episode.world.walkers))
         self.trails[index, 0] = x, y
         self.running[index] = True
         if self.memory is not None:
@@ -171,7 +182,9 @@ class RobotBatch:
         episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
         self._lengthen_trails(int(episodes.steps.max()) + self._rules.action_repeat)
         for _ in range(self._rules.action_repeat):
+            self.walkers.move(running)
             self.drives.move(episodes.motions, running, speeds)
+            self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
             judge(episodes, worlds, running, self.trails, self._lengths, self._rules.max_steps)
             if self._fields is not None:
                 measure_ways(episodes, running, self._fields.arrays)
@@ -189,6 +202,7 @@ class RobotBatch:
             "tasks": [task and (task.start, task.goal) for task in self.tasks],
             "trails": self.trails[:, : last + 1].copy(),
             "drives": self.drives.state_dict(),
+            "walkers": self.walkers.state_dict(),
             "memory": {} if self.memory is None else self.memory.state_dict(),
             **{name: array.copy() for name, array in self._arrays().items()},
         }
@@ -209,6 +223,7 @@ class RobotBatch:
                 raise ValueError(f"{name} of the state must have {len(self.tasks)} entries")
         worlds = [world_from_plain(plain) for plain in state["worlds"]]
         tasks = [None if task is None else read_task(task) for task in state["tasks"]]
+        walkers = self.walkers.read(state.get("walkers", {}), worlds)
         last = int(values["steps"].max())
         trails = read_array(state, "trails", np.zeros((len(tasks), last + 1, 2)))
         if self.memory is not None:
@@ -228,6 +243,7 @@ class RobotBatch:
             if self._fields is not None:
                 distance = self._rules.collision_distance
                 self._fields[index] = distance_field(world, distance, task.goal)
+        self.walkers.load(walkers)
         self.drives.load_state_dict(state["drives"], starts, self.episodes.motions.copy())
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
@@ -276,7 +292,8 @@ class RobotBatch:
         ways = _NO_WAYS
         if self.memory is not None:
             motions, goals = self.episodes.motions, self.episodes.goals
-            ways = self.memory.remember(motions, goals, ranges, chosen)
+            seen = self.walkers.without(motions, lidar, ranges)
+            ways = self.memory.remember(motions, goals, seen, chosen)
         median = lidar.reduction == "median"
         observe_all(
             self.episodes,
@@ -286,6 +303,7 @@ class RobotBatch:
             self._scales,
             ways,
             lidar.sectors,
+            self._rules.history,
             self.observations,
         )
 

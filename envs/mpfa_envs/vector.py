@@ -74,6 +74,7 @@ class VectorNavigationEnv(
             is a ``functools.partial`` of :func:`~mpfa_envs.navigation_reward`.
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults.
         memory: What a robot remembers of its episode.
+        history: How many earlier scans it senses beside the last one.
         closeness_distance: A range of this or less has closeness one [m].
         min_goal_distance: Least distance between a sampled start and goal [m].
         max_goal_distance: Longest way between them [m].
@@ -124,6 +125,7 @@ class VectorNavigationEnv(
         reward: RewardFunction | None = None,
         lidar: Mapping[str, Any] | None = None,
         memory: Memory = "none",
+        history: int = 0,
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         max_goal_distance: float = math.inf,
@@ -148,6 +150,7 @@ class VectorNavigationEnv(
             reward=reward,
             lidar=lidar,
             memory=memory,
+            history=history,
             closeness_distance=closeness_distance,
             min_goal_distance=min_goal_distance,
             detour_chance=detour_chance,
@@ -211,7 +214,7 @@ class VectorNavigationEnv(
 
     @property
     def info_tables(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """The infos as two tables, ``[3, N]`` and ``[12, N]``: the rows are flags and numbers."""
+        """The infos as two tables, ``[3, N]`` and ``[15, N]``: the rows are flags and numbers."""
         return self._batch.episodes.flags.copy(), self._batch.episodes.numbers.copy()
 
     def check_task(
@@ -248,6 +251,17 @@ class VectorNavigationEnv(
         """
         rows = self._batch.trails[index, : self._batch.episodes.steps[index] + 1]
         return [(x, y) for x, y in rows.tolist()]
+
+    def walkers(self, index: int) -> NDArray[np.float64]:
+        """The walkers around a robot: (x, y), their speeds in both directions, and their radii.
+
+        Args:
+            index: Number of the robot.
+
+        Returns:
+            Shape ``[K, 5]`` [m, m/s, m].
+        """
+        return self._batch.walkers.of(index)
 
     def set_seed(self, seed: int | Sequence[int | None]) -> None:
         """Seed the episodes that begin from now on, without beginning any.
@@ -359,7 +373,8 @@ class VectorNavigationEnv(
 
     def _begin(self, index: int, given: tuple[World, Task | None] | None) -> None:
         """Start the next episode of a robot, the given one or one that is drawn."""
-        self._batch.begin(index, self._source.draw(index, self._rngs[index], given))
+        rng = self._rngs[index]
+        self._batch.begin(index, self._source.draw(index, rng, given), rng)
 
     def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
         """An array for each key of the info, and a mask of the chosen robots, or of all."""
@@ -440,6 +455,7 @@ class VectorNavigationEnv(
                 trail=self.trail(index),
                 rays=(self.lidar.angles, self._batch.ranges[index]),
                 sketch=None if memory is None else memory.sketch(index, x, y),
+                walkers=self.walkers(index),
             )
             for index, (x, y, heading) in enumerate(self.poses.tolist())
         )

@@ -37,6 +37,7 @@ def describe(rules: TaskArguments, lidar: Lidar, robots: int) -> dict[str, Any]:
         "closeness_distance": rules.closeness_distance,
         "progress": rules.progress,
         "memory": rules.memory,
+        "history": rules.history,
         "rays": lidar.angles.size,
         "sectors": lidar.sectors,
     }

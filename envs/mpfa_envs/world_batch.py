@@ -22,7 +22,7 @@ class BatchArrays(NamedTuple):
     boxes: NDArray[np.float64]
     """(x_min, y_min, x_max, y_max) [m], ``[N, most boxes, 4]``."""
     circles: NDArray[np.float64]
-    """(x, y, radius) [m], ``[N, most circles, 3]``."""
+    """(x, y, radius) [m], ``[N, most circles, 3]``; walkers come after the cylinders."""
     segments: NDArray[np.float64]
     """Edges of polygons (x0, y0, x1, y1) [m], ``[N, most edges, 4]``."""
     polygon_ends: NDArray[np.int64]
@@ -33,6 +33,8 @@ class BatchArrays(NamedTuple):
 
 class WorldBatch:
     """A world for each of many robots; setting one copies its shapes and nothing else.
+
+    Walkers have a row each behind the cylinders, for others to write where they are.
 
     Args:
         worlds: The worlds, in the order of the robots.
@@ -59,6 +61,8 @@ class WorldBatch:
             np.empty((robots, 0), dtype=np.int64),
             np.zeros((robots, 4), dtype=np.int64),
         )
+        # The same without the walkers.
+        self._standing = self._rooms.counts.copy()
         for robot, world in enumerate(worlds):
             self[robot] = world
 
@@ -66,6 +70,11 @@ class WorldBatch:
     def arrays(self) -> BatchArrays:
         """What the compiled loops read; setting a larger world may replace the arrays."""
         return self._rooms
+
+    @property
+    def standing(self) -> BatchArrays:
+        """The same arrays, in which only what stands counts."""
+        return self._rooms._replace(counts=self._standing)
 
     def __len__(self) -> int:
         return len(self._worlds)
@@ -78,6 +87,9 @@ class WorldBatch:
 
     def __setitem__(self, robot: int, world: World) -> None:
         rows = world.arrays
+        walkers = [(0.0, 0.0, walker.radius) for walker in world.walkers]
+        if walkers:
+            rows = rows._replace(circles=np.concatenate((rows.circles, walkers)))
         self._rooms.half_sizes[robot] = rows.half_size
         for column, name in enumerate(("boxes", "circles", "segments", "polygon_ends")):
             count = len(getattr(rows, name))
@@ -87,6 +99,8 @@ class WorldBatch:
                 self._rooms = self._rooms._replace(**{name: table})  # type: ignore[arg-type]
             table[robot, :count] = getattr(rows, name)
             self._rooms.counts[robot, column] = count
+        self._standing[robot] = self._rooms.counts[robot]
+        self._standing[robot, 1] -= len(walkers)
         self._worlds[robot] = world
 
 

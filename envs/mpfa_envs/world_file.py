@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,7 +12,9 @@ import numpy as np
 import yaml
 
 from mpfa_envs.checks import did_you_mean
+from mpfa_envs.plain_worlds import walker_to_plain
 from mpfa_envs.shapes import Box, Cylinder, Polygon
+from mpfa_envs.walkers import Walker
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
@@ -24,7 +27,8 @@ _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
     "goal": ("x_min", "x_max", "y_min", "y_max"),
 }
 """Keys of a file that hold lists, and the keys of an entry."""
-_KEYS: Final = ("name", "size", "polygons", *_SHAPES)
+_WALKER: Final = ("radius", "speed", "behavior", "waypoints")
+_KEYS: Final = ("name", "size", "polygons", "walkers", *_SHAPES)
 _REGION_CLEARANCE: Final = 0.5
 """A region must hold a point this far from every obstacle: what the TurtleBot2 asks for [m]."""
 _FINEST: Final = 0.01
@@ -93,10 +97,7 @@ class _Reader:
         entries = self.mapping(root, "the file", _KEYS)
         name = self._path.stem
         if "name" in entries:
-            node = entries["name"]
-            if not isinstance(node, yaml.ScalarNode) or not node.value.strip():
-                raise self.error(node, "name must be text")
-            name = node.value
+            name = self.text(entries["name"], "name")
         if "size" not in entries:
             raise self.error(root, "size is missing; it is a list [width, depth] in meters")
         size = self.size(entries["size"])
@@ -122,6 +123,7 @@ class _Reader:
             polygons=polygons,
             start_regions=starts,
             goal_regions=goals,
+            walkers=self.walkers(entries, world),
         )
 
     def built(self, node: yaml.Node | None, **parts: Any) -> World:
@@ -164,6 +166,12 @@ class _Reader:
             got = node.value if isinstance(node, yaml.ScalarNode) else "something else"
             raise self.error(node, f"{what} must be a number in meters, got {got!r}")
         return value
+
+    def text(self, node: yaml.Node, what: str) -> str:
+        """Read a word or more."""
+        if not isinstance(node, yaml.ScalarNode) or not node.value.strip():
+            raise self.error(node, f"{what} must be text")
+        return str(node.value)
 
     def pair(self, node: yaml.Node, what: str, form: str) -> tuple[float, float]:
         """Read a list of two numbers."""
@@ -219,6 +227,28 @@ class _Reader:
                 raise self.error(node, f"{what} lies outside the room {room.room}, got {polygon}")
             polygons.append(polygon)
         return tuple(polygons)
+
+    def walkers(self, entries: dict[str, yaml.Node], world: World) -> tuple[Walker, ...]:
+        """Read a list of walkers that have room in the world."""
+        walkers: list[Walker] = []
+        for node in self.items(entries["walkers"], "walkers") if "walkers" in entries else ():
+            given = self.mapping(node, "an entry of walkers", _WALKER)
+            values: dict[str, Any] = {
+                name: self.number(given[name], name) for name in _WALKER[:2] if name in given
+            }
+            if "behavior" in given:
+                values["behavior"] = self.text(given["behavior"], "behavior")
+            if "waypoints" in given:
+                values["waypoints"] = tuple(
+                    self.pair(point, "a waypoint", "[x, y]")
+                    for point in self.items(given["waypoints"], "waypoints")
+                )
+            try:
+                walkers.append(Walker(**values))
+                replace(world, walkers=(walkers[-1],))
+            except ValueError as error:
+                raise self.error(node, str(error)) from error
+        return tuple(walkers)
 
     def regions(self, entries: dict[str, yaml.Node], key: str, world: World) -> tuple[Box, ...]:
         """Read regions in which a robot has room."""
@@ -295,5 +325,7 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
         content["polygons"] = [
             [list(vertex) for vertex in polygon.vertices] for polygon in world.polygons
         ]
+    if world.walkers:
+        content["walkers"] = [walker_to_plain(walker) for walker in world.walkers]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
     Path(path).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A world: a rectangular room with boxes, cylinders and polygons on its floor."""
+"""A world: a rectangular room with boxes, cylinders and polygons on its floor, and walkers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from mpfa_envs.shapes import Box, Cylinder, Polygon, Shape
+from mpfa_envs.walkers import MOST_WALKERS, Walker
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from mpfa_envs.shapes import Point
 
 __all__ = ["LARGEST_SIDE", "MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
 
@@ -21,6 +24,8 @@ LARGEST_SIDE: Final = 1000.0
 """No room is wider or deeper than this [m]."""
 MOST_OBSTACLES: Final = 1000
 """No room has more obstacles."""
+_APART: Final = 0.02
+"""Places of a line whose clearance is looked at are this far apart, at most [m]."""
 _CHUNK: Final = 2_000_000
 """Distances between points and obstacles that are computed at once."""
 
@@ -53,10 +58,12 @@ class World:
             are at most 1,000.
         start_regions: Where an episode may start; empty: anywhere in the room.
         goal_regions: Where a goal may lie; empty: anywhere in the room.
+        walkers: What moves, at most 100. All else that is said of a world, its clearance, its
+            paths, its tasks, is said of the obstacles, which stand.
 
     Raises:
-        ValueError: If the size is out of its range, there are too many obstacles, or something does
-            not lie in the room.
+        ValueError: If the size is out of its range, there are too many obstacles or walkers, or
+            something does not lie in the room or a walker cannot go between its waypoints.
 
     Examples:
         >>> from mpfa_envs import Box, World
@@ -72,6 +79,7 @@ class World:
     polygons: tuple[Polygon, ...] = ()
     start_regions: tuple[Box, ...] = ()
     goal_regions: tuple[Box, ...] = ()
+    walkers: tuple[Walker, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.size) != 2 or not all(math.isfinite(side) and side > 0 for side in self.size):
@@ -87,6 +95,21 @@ class World:
             for shape in getattr(self, field):
                 if not self.holds(shape):
                     raise ValueError(f"{field} must lie in the room {self.room}, got {shape}")
+        self._check_walkers()
+
+    def _check_walkers(self) -> None:
+        """Refuse walkers that have no room."""
+        if len(self.walkers) > MOST_WALKERS:
+            raise ValueError(f"walkers must be at most {MOST_WALKERS}, got {len(self.walkers)}")
+        for walker in self.walkers:
+            if 2 * walker.radius >= min(self.size):
+                raise ValueError(f"walkers must fit in the room {self.room}, got {walker}")
+            for leg in walker.legs:
+                if self.clearance_along(*leg) < walker.radius:
+                    raise ValueError(
+                        "walkers must keep their radius from obstacles and walls between their "
+                        f"waypoints, which {walker} does not from {leg[0]} to {leg[1]}"
+                    )
 
     def __hash__(self) -> int:
         """Worlds are keys of caches, and hundreds of obstacles are hashed once only."""
@@ -95,7 +118,9 @@ class World:
     @cached_property
     def _hash(self) -> int:
         """Hash of all numbers; without the name it is the same in every process."""
-        return hash((self.size, self.obstacles, self.start_regions, self.goal_regions))
+        return hash(
+            (self.size, self.obstacles, self.start_regions, self.goal_regions, self.walkers)
+        )
 
     def renamed(self, name: str) -> World:
         """Give the same world another name; what was computed of it is kept."""
@@ -223,6 +248,19 @@ class World:
             if self.polygons:
                 nearest[part] = np.minimum(nearest[part], self._to_polygons(points[part]))
         return nearest
+
+    def clearance_along(self, start: Point, end: Point) -> float:
+        """Measure the least clearance on the line between two points.
+
+        Args:
+            start: Position (x, y) [m].
+            end: Position (x, y) [m].
+
+        Returns:
+            Distance [m], the least of places 0.02 m apart.
+        """
+        steps = math.ceil(math.dist(start, end) / _APART) + 1
+        return float(self.clearances(np.linspace(start, end, steps)).min())
 
     def inside_polygons(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell in which polygons points lie.

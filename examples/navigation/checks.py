@@ -112,6 +112,7 @@ RULES: dict[str, Rule] = {
     "environment.detour_chance": SHARE,
     "environment.progress": choice("straight_line", "shortest_path", "none"),
     "environment.memory": choice("none", "map"),
+    "environment.history": at_least(0),
     "environment.max_goal_distance": POSITIVE,
     "environment.episodes_per_world": at_least(1),
     "evaluation.every": at_least(0),

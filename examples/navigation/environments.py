@@ -27,6 +27,7 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "max_steps": settings.max_steps,
         "action_repeat": settings.action_repeat,
         "memory": settings.memory,
+        "history": settings.history,
         # The lidar saturates where the training ends an episode, and tells all distances above.
         "closeness_distance": collision_distance(settings),
     }

@@ -223,6 +223,9 @@ class EnvironmentSettings:
     memory: str = "none"
     """``map``: the robot makes a map of what its lidar met and senses the way to the goal that is
     open on it; ``none``: it senses what is before it alone."""
+    history: int = 0
+    """Earlier scans of the lidar that it senses beside the last one, by which it may tell what
+    moves."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""
 

@@ -65,7 +65,7 @@ class TrainingRun:
         env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
-        self._memory = env.env.memory
+        self._remembered = {"memory": env.env.memory, "history": env.env.history}
         self._build()
         self.updates = 0
         self.records: list[EpisodeRecord] = []
@@ -97,7 +97,7 @@ class TrainingRun:
         )
         self.buffer, self.select = replay.buffer, replay.select
         if settings.environment.mirror:
-            self.buffer.append_transform(RandomMirror(memory=self._memory))
+            self.buffer.append_transform(RandomMirror(**self._remembered))
 
     def _begin_stage(self) -> None:
         seed = self.settings.seed * 1_000_003 + self.schedule.stage

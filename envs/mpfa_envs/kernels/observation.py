@@ -26,6 +26,7 @@ def observe_all(
     scales: tuple[float, float, float],
     ways: NDArray[np.float64],
     sectors: int,
+    history: int,
     observations: NDArray[np.float32],
 ) -> None:
     """Build the observations of the chosen robots.
@@ -39,6 +40,7 @@ def observe_all(
         ways: Direction (x, y) and length [m] of the ways that the robots' maps leave, ``[N, 3]``;
             without rows where there are no maps.
         sectors: Number of sectors of the lidar.
+        history: Number of earlier scans in the observations.
         observations: Where the observations go, ``[N, O]``.
     """
     count = ranges.shape[1] // sectors
@@ -47,6 +49,10 @@ def observe_all(
         if not chosen[robot]:
             continue
         seen = observations[robot]
+        start = seen.shape[0] - sectors * history
+        # The last scan moves to the first place of the earlier ones, and these one place on.
+        for index in range(seen.shape[0] - 1, start - 1, -1):
+            seen[index] = seen[index - sectors] if index >= start + sectors else seen[index - start]
         for sector in range(sectors):
             first = sector * count
             if median:
@@ -56,6 +62,9 @@ def observe_all(
                 for ray in range(first + 1, first + count):
                     nearest = min(nearest, ranges[robot, ray])
             seen[sector] = near / max(nearest, near)
+        if episodes.steps[robot] == 0:
+            for index in range(start, seen.shape[0]):
+                seen[index] = seen[(index - start) % sectors]
         motion = episodes.motions[robot]
         speed, turn = motion[3] / fastest, motion[4] / fastest_turn
         distance = episodes.numbers[DISTANCE, robot]

@@ -30,6 +30,8 @@ MIN_CLEARANCE: Final = 7
 DISTANCE: Final = 8
 POSE: Final = 9
 """First of x, y and the heading."""
+ENCOUNTERS: Final = 12
+"""First of what is counted of walkers: distance, time in personal space, time to collision."""
 
 
 class EpisodeArrays(NamedTuple):
@@ -40,7 +42,7 @@ class EpisodeArrays(NamedTuple):
     goals: NDArray[np.float64]
     """Positions (x, y) [m], ``[N, 2]``."""
     numbers: NDArray[np.float64]
-    """The numbers of the info dictionary, ``[12, N]``."""
+    """The numbers of the info dictionary, ``[15, N]``."""
     flags: NDArray[np.bool_]
     """Its flags, ``[3, N]``."""
     steps: NDArray[np.int64]

@@ -1,0 +1,103 @@
+"""Cylinders that move: how large, how fast, and where to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, get_args
+
+if TYPE_CHECKING:
+    from mpfa_envs.shapes import Point
+
+Behavior = Literal["straight", "waypoints"]
+"""How a walker finds its way."""
+
+MOST_WALKERS: Final = 100
+"""No world has more walkers."""
+MOST_WAYPOINTS: Final = 100
+"""No walker has more waypoints."""
+FASTEST: Final = 5.0
+"""No walker is faster [m/s]."""
+PERSONAL_SPACE: Final = 0.5
+"""A robot that comes nearer to a walker, rim to rim, is in its personal space [m]."""
+HORIZON: Final = 10.0
+"""No collision that lies farther ahead is looked for [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walker:
+    """An upright cylinder that moves through a room, say a person.
+
+    Where it starts is drawn in every episode, by the robot's seed.
+
+    Args:
+        radius: Radius [m].
+        speed: Speed, that never changes [m/s], at most 5.
+        behavior: ``"straight"``: from anywhere in any direction, straight ahead until it meets a
+            wall, an obstacle or another walker, off which it bounces. ``"waypoints"``: from one
+            waypoint to the next, after the last one to the first, from anywhere on this round; it
+            walks through other walkers. Neither sees the robot.
+        waypoints: Where a walker with ``"waypoints"`` goes (x, y) [m], two at least.
+
+    Raises:
+        ValueError: If a number is out of its range, the behavior is unknown or the waypoints do
+            not fit it.
+
+    Examples:
+        >>> from mpfa_envs import NavigationEnv, Walker, World
+        >>> guard = Walker(behavior="waypoints", waypoints=((-3, 0), (3, 0)))
+        >>> world = World(name="guarded", walkers=(guard, Walker(speed=0.2)))
+        >>> env = NavigationEnv(world=world, physics="kinematic")
+        >>> _ = env.reset(seed=0)
+        >>> env.walkers.shape  # x, y, the speeds in both directions, and the radius
+        (2, 5)
+    """
+
+    radius: float = 0.25
+    speed: float = 0.3
+    behavior: Behavior = "straight"
+    waypoints: tuple[Point, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.radius) and self.radius > 0.0):
+            raise ValueError(f"radius must be a positive number, got {self.radius!r}")
+        if not 0.0 < self.speed <= FASTEST:
+            raise ValueError(f"speed must be above 0 and at most {FASTEST:g}, got {self.speed!r}")
+        if self.behavior not in get_args(Behavior):
+            raise ValueError(f"behavior must be one of {get_args(Behavior)}, got {self.behavior!r}")
+        if self.behavior == "straight":
+            if self.waypoints:
+                raise ValueError(
+                    f"waypoints must be empty with behavior='straight', got {self.waypoints}"
+                )
+        elif not 2 <= len(self.waypoints) <= MOST_WAYPOINTS:
+            raise ValueError(
+                f"waypoints must be 2 to {MOST_WAYPOINTS} with behavior={self.behavior!r}, got "
+                f"{len(self.waypoints)}"
+            )
+        points = tuple((float(x), float(y)) for x, y in self.waypoints)
+        if not all(math.isfinite(number) for point in points for number in point):
+            raise ValueError(f"waypoints must be finite, got {self.waypoints}")
+        # The dataclass is frozen; nobody has seen the walker yet.
+        object.__setattr__(self, "waypoints", points)
+        for one, other in self.legs:
+            if one == other:
+                raise ValueError(f"waypoints must differ from the ones before them, got {one}")
+
+    @property
+    def legs(self) -> tuple[tuple[Point, Point], ...]:
+        """The ways from each waypoint to the next, and from the last to the first [m]."""
+        return tuple(zip(self.waypoints, (*self.waypoints[1:], *self.waypoints[:1]), strict=True))
+
+
+def no_encounters(walkers: bool) -> tuple[float, float, float]:
+    """What is counted of encounters with walkers when an episode begins.
+
+    Args:
+        walkers: Whether there are any.
+
+    Returns:
+        Least distance between the rims [m], time in personal space [s] and least time to collision
+        [s], infinite where there is nobody to collide with.
+    """
+    return math.inf, 0.0, HORIZON if walkers else math.inf

@@ -1,0 +1,397 @@
+"""Walkers: their ways against plain geometry, and both environments against each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    INFO_TYPES,
+    Box,
+    Cylinder,
+    Lidar,
+    MapMemory,
+    NavigationEnv,
+    Polygon,
+    VectorNavigationEnv,
+    Walker,
+    World,
+    load_world,
+    save_world,
+)
+from mpfa_envs.kernels.walkers import time_to_collision
+from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs.robot import ROBOTS
+from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.world_batch import WorldBatch
+
+ROUND = ((-3.0, 0.5), (3.0, 0.5), (3.0, -3.0))
+BUSY = World(
+    name="busy",
+    boxes=(Box(1.0, 1.0, 2.0, 3.0),),
+    cylinders=(Cylinder(-2.0, -2.0, 0.5),),
+    polygons=(Polygon(((-3.0, 1.5), (-1.5, 2.0), (-3.0, 3.0))),),
+    walkers=(
+        *(Walker(speed=0.2 + 0.1 * number, radius=0.2) for number in range(4)),
+        *(Walker(behavior="waypoints", waypoints=ROUND, speed=speed) for speed in (0.3, 0.5)),
+    ),
+)
+STANDING = replace(BUSY, walkers=())
+
+
+def batch_of(world: World, seed: int = 0, time_step: float = 0.1) -> WalkerBatch:
+    batch = WalkerBatch(WorldBatch([world]), radius=0.18, time_step=time_step)
+    batch.begin(0, (4.0, 4.0), np.random.default_rng(seed))
+    return batch
+
+
+def walk(batch: WalkerBatch, steps: int) -> np.ndarray:
+    """States of the walkers after each step, ``[steps, K, 5]``."""
+    states = []
+    for _ in range(steps):
+        batch.move(np.ones(1, dtype=np.bool_))
+        states.append(batch.of(0))
+    return np.array(states)
+
+
+def test_a_walker_between_walls_bounces_as_a_folded_line_does() -> None:
+    world = World(name="empty", size=(6.0, 4.0), walkers=(Walker(radius=0.3, speed=0.4),))
+    batch = batch_of(world, time_step=0.02)
+    x, y, speed_x, speed_y, _ = batch.of(0)[0].tolist()
+    seen = walk(batch, 3000)[:, 0]
+    times = 0.02 * np.arange(1, 3001)
+    for column, place, speed, half in ((0, x, speed_x, 2.7), (1, y, speed_y, 1.7)):
+        # Unfolded, the walker goes on behind the wall; each bounce may be a stride early.
+        far = (place + speed * times + half) % (4 * half)
+        folded = np.where(far > 2 * half, 4 * half - far, far) - half
+        assert np.abs(seen[:, column] - folded).max() < 0.1
+        assert (np.abs(np.diff(np.sign(seen[:, column + 2]))) > 0).sum() >= 2
+    np.testing.assert_allclose(np.hypot(seen[:, 2], seen[:, 3]), 0.4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_straight_walkers_run_into_nothing_and_never_stop_for_long(seed: int) -> None:
+    world = replace(BUSY, walkers=BUSY.walkers[:4] * 2)
+    seen = walk(batch_of(world, seed), 1000)
+    gaps = np.array([world.clearances(step[:, :2]) - step[:, 4] for step in seen])
+    assert gaps.min() > -1e-9
+    for one in range(8):
+        for other in range(one):
+            apart = np.hypot(*(seen[:, one, :2] - seen[:, other, :2]).T) - 0.4
+            assert apart.min() > -0.06  # Both may take a stride at once.
+    way = np.hypot(*np.diff(seen[:, :, :2], axis=0).transpose(2, 0, 1)).sum(axis=0)
+    speeds = np.array([walker.speed for walker in world.walkers])
+    np.testing.assert_array_less(0.9 * 100 * speeds, way)
+    assert (np.hypot(seen[..., 2], seen[..., 3]) - speeds).max() < 1e-9
+
+
+def test_a_walker_bounces_off_a_thin_wall_however_long_a_time_step_is() -> None:
+    wall = Box(-0.01, -2.0, 0.01, 2.0)
+    world = World(name="halves", size=(8.0, 4.0), boxes=(wall,), walkers=(Walker(speed=2.0),))
+    batch = batch_of(world, time_step=1.0)
+    side = np.sign(batch.of(0)[0, 0])
+    assert (np.sign(walk(batch, 300)[:, 0, 0]) == side).all()
+
+
+def test_a_walker_is_on_its_round_where_its_speed_brings_it() -> None:
+    batch = batch_of(BUSY)
+    corners = np.array([*ROUND, ROUND[0]])
+    ends = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
+
+    def along(place: np.ndarray) -> float:
+        """How far along the round a place is [m]."""
+        for first, last, before in zip(corners, corners[1:], ends, strict=False):
+            way = np.hypot(*(last - first))
+            share = (place - first) @ (last - first) / way**2
+            if 0.0 <= share <= 1.0 and np.allclose(first + share * (last - first), place):
+                return before + share * way
+        raise AssertionError(place)
+
+    start = along(batch.of(0)[5, :2])
+    for step, states in enumerate(walk(batch, 700), 1):
+        expected = (start + 0.05 * step) % ends[-1]
+        off = (along(states[5, :2]) - expected + ends[-1] / 2) % ends[-1] - ends[-1] / 2
+        assert abs(off) < 1e-9
+        assert np.hypot(*states[5, 2:4]) == pytest.approx(0.5)
+
+
+def test_walkers_start_apart_from_the_robot_and_elsewhere_in_each_episode() -> None:
+    batch = WalkerBatch(WorldBatch([BUSY]), radius=0.18, time_step=0.1)
+    rng, places = np.random.default_rng(0), []
+    for _ in range(50):
+        batch.begin(0, (0.0, -1.0), rng)
+        states = batch.of(0)
+        assert (np.hypot(states[:, 0], states[:, 1] + 1.0) - states[:, 4]).min() >= 1.0
+        assert (BUSY.clearances(states[:, :2]) - states[:, 4]).min() > -1e-9
+        gaps = np.hypot(*(states[:, None, :2] - states[None, :, :2]).transpose(2, 0, 1))
+        assert (gaps + np.eye(6) >= states[:, 4] + states[:, None, 4]).all()
+        places.append(states[:, :2])
+    assert np.std(places, axis=0).min() > 0.5
+
+
+def test_a_walker_that_fits_nowhere_is_told_of() -> None:
+    world = World(name="full", size=(2.0, 2.0), boxes=(Box(-0.9, -0.9, 0.9, 0.9),))
+    with pytest.raises(ValueError, match=r"world 'full' has no place for Walker\(radius=0.25"):
+        batch_of(replace(world, walkers=(Walker(),)))
+
+
+def assert_same_episode(world: World, seed: int, **arguments: object) -> set[str]:
+    """Drive one robot in both environments; how its episodes ended."""
+    given = {"physics": "kinematic", "collision_distance": "contact", "max_steps": 200} | arguments
+    one, many = NavigationEnv(world=world, **given), VectorNavigationEnv(2, world=world, **given)
+    rng, ends = np.random.default_rng(seed), set()
+    observation, info = one.reset(seed=seed)
+    seen, infos = many.reset(seed=[seed, seed + 1])
+    for _ in range(100):
+        np.testing.assert_allclose(seen[0], observation, atol=1e-9)
+        np.testing.assert_allclose(many.walkers(0), one.walkers, atol=1e-9)
+        for name in INFO_TYPES:
+            assert infos[name][0] == pytest.approx(info[name], abs=1e-9), name
+        action = rng.uniform(-0.3, 1.0, 2).astype(np.float32)
+        observation, reward, terminated, truncated, info = one.step(action)
+        seen, rewards, *_, infos = many.step(np.stack((action, -action)))
+        assert rewards[0] == pytest.approx(reward, abs=1e-9)
+        if terminated or truncated:
+            ends.add(next(name for name in ("success", "collision", "timeout") if info[name]))
+            observation, info = one.reset()
+            seen, _, _, _, infos = many.step(np.stack((action, -action)))
+    one.close()
+    many.close()
+    return ends
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{}, {"lidar": {"noise": 0.02}, "memory": "map"}, {"progress": "shortest_path"}],
+    ids=lambda arguments: "-".join(arguments) or "defaults",
+)
+def test_a_robot_among_walkers_drives_the_same_episodes_in_both_environments(
+    arguments: dict[str, object],
+) -> None:
+    ends = set().union(*(assert_same_episode(BUSY, seed, **arguments) for seed in range(2)))
+    assert "collision" in ends
+
+
+def test_wheels_meet_the_same_walkers_in_both_environments() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    assert_same_episode(BUSY, 1, physics="wheels", collision_distance=0.25)
+
+
+def frozen(world: World, walkers: np.ndarray) -> World:
+    """A world in which the walkers stand as cylinders."""
+    cylinders = [Cylinder(x, y, radius) for x, y, _, _, radius in walkers.tolist()]
+    return replace(world, cylinders=(*world.cylinders, *cylinders), walkers=())
+
+
+def test_walkers_are_seen_and_run_into_as_cylinders_would_be() -> None:
+    env = VectorNavigationEnv(1, world=BUSY, physics="kinematic", collision_distance="contact")
+    rng, collisions = np.random.default_rng(0), 0
+    env.reset(seed=3)
+    for _ in range(300):
+        *_, infos = env.step(rng.uniform(0.2, 1.0, (1, 2)).astype(np.float32))
+        world = frozen(BUSY, env.walkers(0))
+        pose = env.poses[0].tolist()
+        if infos["sim_time"][0] > 0:  # The walkers of a new episode have not walked yet.
+            collision = world.clearance(*pose[:2]) <= 0.18 and not infos["success"][0]
+            assert infos["collision"][0] == collision
+            collisions += bool(collision and BUSY.clearance(*pose[:2]) > 0.18)
+        expected = Lidar(world).cast(*pose)
+        np.testing.assert_allclose(env._batch.ranges[0], expected, atol=1e-9)
+    assert collisions > 2
+
+
+def test_a_map_holds_what_stands_and_no_walker() -> None:
+    rows = []
+    for world in (BUSY, STANDING):
+        lidar, worlds = Lidar(STANDING, noise=0.01), WorldBatch([world])
+        memory = MapMemory(1, ROBOTS["turtlebot2"], lidar)
+        memory.begin(0, world)
+        batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
+        batch.begin(0, (0.0, -1.0), np.random.default_rng(0))
+        rng, hits = np.random.default_rng(1), 0
+        for heading in np.linspace(-3.0, 3.0, 60):
+            batch.move(np.ones(1, dtype=np.bool_))
+            motions = np.array([[0.0, -1.0, heading, 0.0, 0.0]])
+            ranges = lidar.measure(*motions[0, :3], rng=rng, moving=batch.circles(0))[None]
+            seen = batch.without(motions, lidar, ranges)
+            hits += int((seen != ranges).sum())
+            memory.remember(motions, np.array([[4.0, 4.0]]), seen)
+        rows.append(memory.arrays.levels[0] > 0)
+        assert (hits > 100) == bool(world.walkers)
+    # What a walker hid from view is not there; nothing else is.
+    assert rows[0].sum() > 0.9 * rows[1].sum()
+    assert not (rows[0] & ~rows[1]).any()
+
+
+def test_what_follows_a_saved_state_is_the_same_to_the_bit() -> None:
+    few = replace(BUSY, name="few", walkers=BUSY.walkers[3:5])
+
+    def make(worlds: list[World]) -> VectorNavigationEnv:
+        return VectorNavigationEnv(3, world=worlds, physics="kinematic", lidar={"noise": 0.02})
+
+    def drive(env: VectorNavigationEnv, first: int, last: int) -> bytes:
+        seen = []
+        for step in range(first, last):
+            actions = np.random.default_rng(step).uniform(-0.3, 1.0, (3, 2)).astype(np.float32)
+            observations, rewards, *_, infos = env.step(actions)
+            seen += [observations, rewards, infos["walker_distance"], infos["intrusion_time"]]
+            seen += [env.walkers(index) for index in range(3)]
+        return b"".join(array.tobytes() for array in seen)
+
+    env, other = make([BUSY, few, STANDING]), make([BUSY, few, STANDING])
+    env.reset(seed=1)
+    drive(env, 0, 30)
+    state = env.state_dict()
+    expected = drive(env, 30, 80)
+    other.reset(seed=2, options={"worlds": [STANDING, BUSY, few]})
+    drive(other, 0, 5)
+    other.load_state_dict(state)
+    assert drive(other, 30, 80) == expected
+    del state["batch"]["walkers"]["states"]
+    before = other.walkers(0)
+    with pytest.raises(ValueError, match="states of the state must have rows for 6 walkers"):
+        other.load_state_dict(state)
+    np.testing.assert_array_equal(other.walkers(0), before)
+
+
+def test_walkers_do_not_depend_on_how_many_robots_there_are() -> None:
+    seen = []
+    for robots in (1, 5):
+        env = VectorNavigationEnv(robots, world=BUSY, physics="kinematic")
+        env.reset(seed=4)
+        for _ in range(20):
+            env.step(np.full((robots, 2), 0.3, dtype=np.float32))
+        seen.append(env.walkers(0))
+    np.testing.assert_array_equal(*seen)
+
+
+def test_the_walkers_of_a_robot_that_waits_stand_still() -> None:
+    env = VectorNavigationEnv(2, world=BUSY, physics="kinematic")
+    env.reset(seed=0)
+    before = env.walkers(1)
+    env.step(np.zeros((2, 2)), only=np.array([True, False]))
+    np.testing.assert_array_equal(env.walkers(1), before)
+
+
+def plain_time(x: float, y: float, speed_x: float, speed_y: float, reach: float) -> float:
+    """The first of many instants at which the discs overlap."""
+    times = np.linspace(0.0, 10.0, 10_001)
+    near = np.hypot(x + speed_x * times, y + speed_y * times) <= reach
+    return float(times[np.argmax(near)]) if near.any() else 10.0
+
+
+def test_the_time_to_collision_is_the_first_at_which_the_discs_overlap() -> None:
+    rng, found = np.random.default_rng(0), []
+    for _ in range(300):
+        x, y, speed_x, speed_y = (rng.uniform(-1.0, 1.0, 4) * (3.0, 3.0, 1.0, 1.0)).tolist()
+        expected = plain_time(x, y, speed_x, speed_y, 0.43)
+        if expected in (0.0, 10.0) or abs(expected - 10.0) > 0.01:
+            found.append(expected)
+            ours = time_to_collision(x, y, speed_x, speed_y, 0.43)
+            assert ours == pytest.approx(expected, abs=1.1e-3)
+    assert {0.0, 10.0} < set(found)
+    assert time_to_collision(2.0, 0.0, 0.0, 0.0, 0.5) == 10.0
+
+
+def test_encounters_are_counted_over_an_episode() -> None:
+    env = NavigationEnv(world=BUSY, physics="kinematic", action_repeat=1, lidar={"sectors": 4})
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        assert (info["walker_distance"], info["intrusion_time"]) == (math.inf, 0.0)
+        nearest, near, least, ended = math.inf, 0, 10.0, False
+        while not ended:
+            _, _, terminated, truncated, info = env.step(np.array([0.8, 0.75], np.float32))
+            ended = terminated or truncated
+            x, y, heading = (info[name] for name in ("x", "y", "heading"))
+            speed = env._motion.linear_speed
+            gaps = [math.hypot(w[0] - x, w[1] - y) - w[4] - 0.18 for w in env.walkers]
+            nearest, near = min(nearest, *gaps), near + (min(gaps) < 0.5)
+            least = min(
+                least,
+                *(
+                    plain_time(
+                        w[0] - x, w[1] - y,
+                        w[2] - speed * math.cos(heading), w[3] - speed * math.sin(heading),
+                        w[4] + 0.18,
+                    )
+                    for w in env.walkers
+                ),
+            )  # fmt: skip
+            assert info["walker_distance"] == pytest.approx(nearest, abs=1e-9)
+            assert info["intrusion_time"] == pytest.approx(0.1 * near)
+            assert info["time_to_collision"] == pytest.approx(least, abs=1.1e-3)
+
+
+def test_without_walkers_nobody_is_met() -> None:
+    env = VectorNavigationEnv(1, world=STANDING, physics="kinematic")
+    env.reset(seed=0)
+    infos = env.step(np.ones((1, 2)))[-1]
+    met = [infos[key][0] for key in ("walker_distance", "intrusion_time", "time_to_collision")]
+    assert met == [math.inf, 0.0, math.inf]
+    assert env.walkers(0).shape == (0, 5)
+
+
+def test_a_world_with_walkers_comes_back_equal(tmp_path: Path) -> None:
+    save_world(BUSY, tmp_path / "busy.yaml")
+    assert load_world(tmp_path / "busy.yaml") == BUSY
+    assert world_from_plain(world_to_plain(BUSY)) == BUSY
+    assert hash(BUSY) == hash(replace(BUSY)) != hash(STANDING)
+    (tmp_path / "short.yaml").write_text("size: [4, 4]\nwalkers:\n  - {speed: 0.2}\n")
+    assert load_world(tmp_path / "short.yaml").walkers == (Walker(speed=0.2),)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("{radius: -1}", "busy.yaml:3: radius must be a positive number, got -1.0"),
+        ("{speed: fast}", "busy.yaml:3: speed must be a number .*got 'fast'"),
+        ("{behaviour: straight}", "busy.yaml:3: unknown key 'behaviour'.*did you mean 'behavior'"),
+        ("{behavior: [1]}", r"busy.yaml:3: behavior must be text"),
+        ("{behavior: waypoint}", "busy.yaml:3: behavior must be one of .*got 'waypoint'"),
+        ("{behavior: waypoints, waypoints: [[0, 0], [9, 0]]}", "busy.yaml:3: walkers must keep"),
+        ("{radius: 3}", "busy.yaml:3: walkers must fit in the room"),
+    ],
+)
+def test_a_bad_walker_in_a_file_is_named_with_its_line(
+    entry: str, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / "busy.yaml").write_text(f"size: [4, 4]\nwalkers:\n  - {entry}\n")
+    with pytest.raises(ValueError, match=message):
+        load_world(tmp_path / "busy.yaml")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Walker(radius=0.0), "radius must be a positive number, got 0.0"),
+        (lambda: Walker(radius=math.nan), "radius must be a positive number, got nan"),
+        (lambda: Walker(speed=0.0), "speed must be above 0 and at most 5, got 0.0"),
+        (lambda: Walker(speed=9.0), "speed must be above 0 and at most 5, got 9.0"),
+        (lambda: Walker(behavior="fly"), "behavior must be one of .*got 'fly'"),
+        (lambda: Walker(waypoints=ROUND), "waypoints must be empty with behavior='straight'"),
+        (lambda: Walker(behavior="waypoints"), "waypoints must be 2 to 100 .*got 0"),
+        (
+            lambda: Walker(behavior="waypoints", waypoints=((0, 0), (0, 0), (1, 1))),
+            r"waypoints must differ from the ones before them, got \(0.0, 0.0\)",
+        ),
+        (
+            lambda: Walker(behavior="waypoints", waypoints=((0, 0), (math.inf, 0))),
+            "waypoints must be finite",
+        ),
+        (
+            lambda: replace(
+                BUSY, walkers=(Walker(behavior="waypoints", waypoints=((0, 2), (3, 2))),)
+            ),
+            r"walkers must keep their radius .* from \(0.0, 2.0\) to \(3.0, 2.0\)",
+        ),
+        (lambda: World(name="many", walkers=(Walker(),) * 101), "walkers must be at most 100, got"),
+    ],
+)
+def test_a_bad_walker_is_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
