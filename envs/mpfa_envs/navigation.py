@@ -414,16 +414,16 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         rays = lidar.measure(*motion[:3], rng=rng, moving=moving)
         way = None
         if self._map is not None:
-            motions, seen = np.array([motion]), rays[None]
+            motions, met = np.array([motion]), rays[None]
             if walkers is not None:
-                seen = walkers.without(motions, lidar, seen)
-            way = self._map.remember(motions, np.array([self._goal]), seen)[0]
+                met = walkers.without(motions, lidar, met)
+            way = self._map.remember(motions, np.array([self._goal]), met)[0]
         ranges, near = lidar.reduce(rays), self.closeness_distance
         seen = observe(ranges, motion, self._goal, self._distance, self.robot, near, way)
         if self.history:
             last = self._observation if self._steps else None
-            self._observation = seen = add_history(seen, last, lidar.sectors, self.history)
-            return seen.copy()
+            seen = add_history(seen, last, lidar.sectors, self.history)
+            self._observation = seen.copy()
         return seen
 
     def _info(

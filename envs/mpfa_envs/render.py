@@ -44,7 +44,7 @@ WAY: Final = (230, 126, 0, 255)
 MET: Final = (230, 126, 0, 52)
 WALKER: Final = (104, 168, 96, 255)
 WALKER_EDGE: Final = (48, 104, 48, 255)
-ROUND: Final = (104, 168, 96, 160)
+ROUND: Final = (176, 210, 168, 255)
 TEXT: Final = (40, 44, 52, 255)
 OUTCOMES: Final[dict[str, Color]] = {
     "success": (37, 99, 186, 190),
@@ -110,10 +110,9 @@ class _Canvas:
             self.disc(cylinder.x, cylinder.y, cylinder.radius, fill=OBSTACLE, outline=OBSTACLE_EDGE)
         for polygon in world.polygons:
             self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
-        with self.layer():
-            for walker in world.walkers:
-                for leg in walker.legs:
-                    self.line(leg, ROUND, 1.2)
+        for walker in world.walkers:
+            for leg in walker.legs:
+                self.line(leg, ROUND, 1.2)
 
     def rectangle(
         self,

@@ -65,7 +65,7 @@ class TrainingRun:
         env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
-        self._remembered = {"memory": env.env.memory, "history": env.env.history}
+        self._remembered: dict[str, Any] = {"memory": env.env.memory, "history": env.env.history}
         self._build()
         self.updates = 0
         self.records: list[EpisodeRecord] = []
