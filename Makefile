@@ -9,7 +9,7 @@
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   COMPILE=false                  demo, train: no compiled updates; by default if a C++ compiler is found
 #   REGIME=paper                   train: the paper's task and numbers; by default today's, rooms
-#   DEMO_ACTIONS=80000             actions that demo trains for
+#   DEMO_ACTIONS=40000             actions that demo trains for
 #   EPISODES=100                   episodes that demo drives in the worlds of each generator
 #   SLOW=1                         test: the slow tests as well
 #   WORKERS=4                      test: processes, 2 by default; 0: one, with its output as it comes
@@ -23,7 +23,7 @@ PYTHON ?=
 TORCH_INSTALL_ARGS ?=
 ARGS ?=
 REGIME ?= rooms
-DEMO_ACTIONS ?= 80000
+DEMO_ACTIONS ?= 40000
 EPISODES ?= 100
 COMPILE ?= $(if $(shell command -v "$${CXX:-g++}" 2>/dev/null),true,false)
 SLOW ?=

@@ -85,7 +85,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["demo"],
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
-                "[{world: mixed, actions: 80000}]",
+                "[{world: mixed, actions: 40000}]",
                 "python examples/evaluate.py runs/demo --worlds all --episodes 100",
                 "cp runs/demo/evaluation-all/evaluation.json",
             ],

@@ -97,8 +97,10 @@ def write_animation(frames: Sequence[NDArray[np.uint8]], path: Path) -> None:
     """
     step = -(-len(frames) // _GIF_FRAMES)
     chosen = [Image.fromarray(frame) for frame in [*frames[:-1:step], frames[-1]]]
-    # One palette of the whole episode and no dithering: what stands still is stored once.
-    palette = chosen[0].quantize(64)
+    # One palette of the whole episode and no dithering: what stands still is stored once. Ways and
+    # maps are longest at the end, scans differ in the middle.
+    samples = [np.asarray(chosen[place]) for place in (0, len(chosen) // 2, -1)]
+    palette = Image.fromarray(np.concatenate(samples)).quantize(64)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chosen]
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=50 * step, loop=0, optimize=True
