@@ -106,8 +106,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     ``reward_goal``, ``reward_collision``, ``reward_progress``, ``reward_other``; and of the
     walkers, so far: ``walker_distance`` [m], the least distance between the robot's rim and theirs,
     ``intrusion_time`` [s], for which it was below 0.5 m, and ``time_to_collision`` [s], the least
-    time after which robot and walker would have touched had both gone on as they went, at most
-    10 s; without walkers they are infinite, zero and infinite.
+    time after which robot and walker would have touched had both gone on as they went; without
+    walkers, or far from all of them, they are 10 m, zero and 10 s.
 
     Args:
         world: ``"A"`` to ``"D"``, ``"validation"``, ``"test"``, the path of a YAML file or a
@@ -280,7 +280,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._way = self._way_from(*task.start[:2])
         if self._walkers is not None:
             self._walkers.begin(0, task.start[:2], self.np_random)
-        self._encounters = np.array(no_encounters(bool(self.world.walkers)))[:, None]
+        self._encounters = np.array(no_encounters())[:, None]
         self._min_clearance = self._to_obstacle(*task.start[:2]) - self.robot.radius
         self._trail = [task.start[:2]]
         self._running = True

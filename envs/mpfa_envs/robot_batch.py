@@ -143,7 +143,7 @@ class RobotBatch:
         numbers[MIN_CLEARANCE] = clearance
         numbers[DISTANCE] = distance
         numbers[POSE : POSE + 3] = x, y, heading
-        numbers[ENCOUNTERS:] = no_encounters(bool(episode.world.walkers))
+        numbers[ENCOUNTERS:] = no_encounters()
         self.trails[index, 0] = x, y
         self.running[index] = True
         if self.memory is not None:

@@ -20,6 +20,8 @@ FASTEST: Final = 5.0
 """No walker is faster [m/s]."""
 PERSONAL_SPACE: Final = 0.5
 """A robot that comes nearer to a walker, rim to rim, is in its personal space [m]."""
+FAR: Final = 10.0
+"""A walker that is farther from a robot than this does not count [m]."""
 HORIZON: Final = 10.0
 """No collision that lies farther ahead is looked for [s]."""
 
@@ -90,14 +92,11 @@ class Walker:
         return tuple(zip(self.waypoints, (*self.waypoints[1:], *self.waypoints[:1]), strict=True))
 
 
-def no_encounters(walkers: bool) -> tuple[float, float, float]:
+def no_encounters() -> tuple[float, float, float]:
     """What is counted of encounters with walkers when an episode begins.
-
-    Args:
-        walkers: Whether there are any.
 
     Returns:
         Least distance between the rims [m], time in personal space [s] and least time to collision
-        [s], infinite where there is nobody to collide with.
+        [s]. They are finite, as what is stored and logged must be.
     """
-    return math.inf, 0.0, HORIZON if walkers else math.inf
+    return FAR, 0.0, HORIZON
