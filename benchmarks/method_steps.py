@@ -14,6 +14,8 @@ from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 
 BASELINE = "ddpg"
 _FILL = 10_000
+_EPISODE = 100
+"""Transitions of an episode."""
 _SIGMA = 0.2
 
 
@@ -32,8 +34,10 @@ def make_step(method: Method) -> Call:
     curiosity = make_curiosity(method, *sizes)
     replay = make_replay(method, policy=learner.policy, sigma=_SIGMA)
     buffer = replay.buffer
-    buffer.extend(make_transitions(_FILL))
-    transition = make_transitions(1)
+    filling, transition = make_transitions(_FILL), make_transitions(1)
+    filling["episode"] = torch.arange(_FILL).unsqueeze(1) // _EPISODE
+    transition["episode"] = torch.full((1, 1), _FILL // _EPISODE)
+    buffer.extend(filling)
 
     def step() -> None:
         buffer.extend(transition)

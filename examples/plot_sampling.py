@@ -39,6 +39,7 @@ REPLAY_CAP = 60
 """In place of 1,024, which so few training steps do not reach."""
 RECENCY = 1e-3
 """In place of 3e-5, by which so small a buffer is as good as uniform."""
+EPISODE_LENGTH = 50
 SIGMA = 0.2
 OBSERVATION_SIZE, ACTION_SIZE = 8, 2
 KINDS = ("approaching", "moving away", "goal", "collision")
@@ -86,6 +87,7 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
         {
             "observation": observation,
             "action": action,
+            "episode": torch.arange(count).unsqueeze(1) // EPISODE_LENGTH,
             "next": {"reward": torch.as_tensor(reward, dtype=torch.float).unsqueeze(1)},
         },
         [count],

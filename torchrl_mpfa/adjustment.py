@@ -122,6 +122,7 @@ class BatchFacts:
         replay_count: How often each was sampled so far, this batch included, shape ``[B]``.
         index: Slots in the storage, shape ``[B]``.
         mean_reward: Mean reward of the buffer when its probabilities were last counted.
+        written_at: When each was written, as a count of writes, shape ``[B]``; None if unknown.
         counted: What the adjustment that is asked counted over the buffer, if it is
             :class:`Counting`; None before its first count.
     """
@@ -130,6 +131,7 @@ class BatchFacts:
     replay_count: Tensor
     index: Tensor
     mean_reward: float = 0.0
+    written_at: Tensor | None = None
     counted: Tensor | None = None
 
 

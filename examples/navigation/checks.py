@@ -74,6 +74,8 @@ RULES: dict[str, Rule] = {
     "method.eps": NOT_NEGATIVE,
     "method.priority_floor": NOT_NEGATIVE,
     "method.floor_quantile": SHARE,
+    "method.reliability": NOT_NEGATIVE,
+    "method.update_block": at_least(1),
     "method.replay_penalty": NOT_NEGATIVE,
     "method.boost_factor": POSITIVE,
     "method.boost_target": (lambda value: 0.0 <= value < 1.0, "in [0, 1)"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -47,6 +48,9 @@ class Robots:
         self._state: TensorDictBase | None = None
         self._rewards = torch.zeros(self.count, dtype=torch.double)
         self._steps = torch.zeros(self.count, dtype=torch.long)
+        self._numbers = torch.zeros(self.count, 1, dtype=torch.long)
+        """Number of the episode that each robot is in."""
+        self._begun = 0
 
     def environment(self, world: str) -> NavigationTorchEnv:
         """The environment of a stage, kept for as long as its world stays the same."""
@@ -66,14 +70,21 @@ class Robots:
         """
         env = self.environment(world)
         env.set_seed(seed)
-        explorer.begin_episodes(torch.ones(self.count, dtype=torch.bool))
+        self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
         self._state = env.reset()
         self.given_up += int((self._steps > 0).sum())
         self._rewards.zero_()
         self._steps.zero_()
 
+    def _begin_episodes(self, begun: Tensor, explorer: Explorer) -> None:
+        """Number the episodes that begin, and tell the explorer of them."""
+        count = int(begun.sum())
+        self._numbers[begun, 0] = torch.arange(self._begun, self._begun + count)
+        self._begun += count
+        explorer.begin_episodes(begun)
+
     def drive(
-        self, explorer: Explorer, *, actions: int, episode: int
+        self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[str] = ()
     ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
         """Take one action with each robot.
 
@@ -81,15 +92,18 @@ class Robots:
             explorer: What acts.
             actions: Of the run before these.
             episode: Episodes of the run that have ended.
+            entries: What else the transitions must have: ``"episode"``.
 
         Returns:
-            The entries of :data:`TRANSITION`, batch size ``[robots]``, and the records of the
-            episodes that ended.
+            The entries of :data:`TRANSITION` and those others, batch size ``[robots]``, and the
+            records of the episodes that ended.
         """
         assert self._env is not None and self._state is not None
         state, self._state = self._env.step_and_maybe_reset(
             self._act(explorer, self._state, actions)
         )
+        if "episode" in entries:
+            state.set("episode", self._numbers.clone())
         after = state["next"]
         self._rewards += after["reward"].squeeze(-1)
         self._steps += 1
@@ -99,10 +113,10 @@ class Robots:
             for robot in done.nonzero().squeeze(-1).tolist():
                 number, total = episode + len(records), actions + self.count
                 records.append(self._record(after, robot, episode=number, total_steps=total))
-            explorer.begin_episodes(done)
+            self._begin_episodes(done, explorer)
             self._rewards[done] = 0.0
             self._steps[done] = 0
-        return state.select(*TRANSITION), records
+        return state.select(*TRANSITION, *entries), records
 
     @torch.no_grad()
     def _act(self, explorer: Explorer, state: TensorDictBase, actions: int) -> TensorDictBase:
@@ -141,6 +155,8 @@ class Robots:
             "observation": observation.clone(),
             "rewards": self._rewards.clone(),
             "steps": self._steps.clone(),
+            "numbers": self._numbers.clone(),
+            "begun": self._begun,
             "seconds": self.elapsed(),
             "given_up": self.given_up,
         }
@@ -154,6 +170,8 @@ class Robots:
         self.seconds = state["seconds"]
         self.given_up = state.get("given_up", 0)
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
+        if "numbers" in state:
+            self._numbers, self._begun = state["numbers"].clone(), state["begun"]
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
         """Go on where :meth:`state_dict` was called.

@@ -68,6 +68,8 @@ class TrainingRun:
         self._remembered: dict[str, Any] = {"memory": env.env.memory, "history": env.env.history}
         self._build()
         self.updates = 0
+        self._waiting = 0
+        """Iterations whose updates are still to be made."""
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
         self._bonus: dict[str, Tensor] = {}
@@ -95,7 +97,7 @@ class TrainingRun:
             policy=self.learner.policy,
             sigma=lambda: self.explorer.sigma,
         )
-        self.buffer, self.select = replay.buffer, replay.select
+        self.buffer, self.select, self.entries = replay.buffer, replay.select, replay.entries
         if settings.environment.mirror:
             self.buffer.append_transform(RandomMirror(**self._remembered))
 
@@ -153,7 +155,10 @@ class TrainingRun:
         """One action of each robot, and the updates for them."""
         before = self.actions
         rows, records = self.robots.drive(
-            self.explorer, actions=before, episode=self.schedule.episodes
+            self.explorer,
+            actions=before,
+            episode=self.schedule.episodes,
+            entries=self.entries,
         )
         self.buffer.extend(rows)
         self.records += records
@@ -175,6 +180,7 @@ class TrainingRun:
             return False
         if not self.settings.curriculum.carry:
             self._build()
+            self._waiting = 0
         self._begin_stage()
         return True
 
@@ -183,15 +189,22 @@ class TrainingRun:
         return every > 0 and before // every != self.actions // every
 
     def _update(self, before: int) -> None:
-        losses, batch = run_updates(
-            self.buffer,
-            self.learner,
-            self.select,
-            updates=self.settings.updates,
-            prepare=self._prepared,
-        )
-        self.updates += self.settings.updates
-        if self._crossed(self.settings.tracking.log_every, before):
+        """The updates that are due: those of this iteration, or all since the last block."""
+        self._waiting += 1
+        if not self._crossed(self.settings.method.update_block, before):
+            return
+        begun = self.actions - self._waiting * self.settings.robots
+        for _ in range(self._waiting):
+            losses, batch = run_updates(
+                self.buffer,
+                self.learner,
+                self.select,
+                updates=self.settings.updates,
+                prepare=self._prepared,
+            )
+            self.updates += self.settings.updates
+        self._waiting = 0
+        if self._crossed(self.settings.tracking.log_every, begun):
             self.tracker.log_update(self.actions, {**losses, **self._bonus}, self.buffer, batch)
 
     def _prepared(self, draw: Draw) -> Draw:
@@ -271,6 +284,7 @@ class TrainingRun:
             "wandb": self.tracker.run_id,
             "schedule": self.schedule.state_dict(),
             "updates": self.updates,
+            "waiting": self._waiting,
             "random": random_state(self.settings.device),
             "robots": self.robots.state_dict(),
             "learner": self.learner.state_dict(),
@@ -299,7 +313,7 @@ class TrainingRun:
     def _load(self, state: dict[str, Any]) -> None:
         """Go on where a checkpoint was written."""
         self.schedule.load_state_dict(state["schedule"])
-        self.updates = state["updates"]
+        self.updates, self._waiting = state["updates"], state.get("waiting", 0)
         self.learner.load_state_dict(state["learner"])
         self.buffer.load_state_dict(state["buffer"])
         self.explorer.load_state_dict(state["explorer"])

@@ -68,6 +68,12 @@ def test_replay_by_age_samples_the_newest_most() -> None:
     assert tenths[-1] > 1.1 * tenths[0]
 
 
+def test_a_reliable_error_is_sampled_more_often_than_one_early_in_its_episode() -> None:
+    _, found = count_samples(METHODS["reaper"])
+    by_step = found["critic"].reshape(-1, plot_sampling.EPISODE_LENGTH).mean(0)
+    assert by_step[-10:].mean() > 1.2 * by_step[:10].mean()
+
+
 def test_the_capped_replay_lets_go_of_what_it_sampled_most() -> None:
     capped, per = means_by_kind("mw"), means_by_kind("td_reward")
     assert capped["goal"] < per["goal"]
@@ -105,6 +111,8 @@ def test_every_method_has_a_page_with_its_figure_its_command_and_its_source(name
     assert f"[`{name}`]({name}.md)" in (DOCS / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["klper", "averaged_ddpg", "geometric", "hvper", "mw"])
+@pytest.mark.parametrize(
+    "name", ["klper", "averaged_ddpg", "geometric", "hvper", "mw", "reaper", "rud"]
+)
 def test_a_reconstruction_is_called_one(name: str) -> None:
     assert "reconstruction" in (DOCS / f"{name}.md").read_text(encoding="utf-8").lower()

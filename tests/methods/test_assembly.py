@@ -20,6 +20,7 @@ def make_whole_transitions(count):
     made = make_transitions(count)
     made["observation"] = torch.randn(count, 6, generator=seeded(1))
     made["action"] = torch.rand(count, 2, generator=seeded(2)) * 2 - 1
+    made["episode"] = torch.arange(count).unsqueeze(1) // 10
     return made
 
 

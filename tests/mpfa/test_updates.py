@@ -42,6 +42,7 @@ def make_rows(count, seed=0):
         {
             "observation": normal(OBSERVATION),
             "action": normal(ACTION).tanh(),
+            "episode": torch.arange(count).unsqueeze(1) // 10,
             "next": {**after, "done": end, "terminated": end.clone()},
         },
         [count],

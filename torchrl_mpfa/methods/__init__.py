@@ -22,9 +22,11 @@ from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
 from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler, rank_share
+from torchrl_mpfa.methods.reaper import EPISODE, Reliability, reliability
 
 __all__ = [
     "ALIASES",
+    "EPISODE",
     "METHODS",
     "RELATIVE_ERROR",
     "RELATIVE_VALUE",
@@ -37,6 +39,7 @@ __all__ = [
     "Method",
     "PriorityFloor",
     "RankSampler",
+    "Reliability",
     "Replay",
     "ReplayPenalty",
     "gaussian_divergence",
@@ -47,6 +50,7 @@ __all__ = [
     "rank_share",
     "relative_error",
     "relative_value",
+    "reliability",
     "split_draws",
     "uniform_halves",
     "value_schedule",

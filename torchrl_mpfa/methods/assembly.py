@@ -28,9 +28,11 @@ from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
 from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler
+from torchrl_mpfa.methods.reaper import EPISODE, Reliability
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.positive import check_level
 from torchrl_mpfa.replay import SignalReplayBuffer
+from torchrl_mpfa.samplers.binding import signal_table_of
 from torchrl_mpfa.samplers.mixture import MixtureSampler
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.selection import Selection, one_batch
@@ -84,12 +86,14 @@ class Replay:
         select: From the buffer to what the updates of one training step are made from.
         signals: The signals that the loss has to write, by name.
         method: The settings that it was made from.
+        entries: What transitions must have beside the usual, by name.
     """
 
     buffer: SignalReplayBuffer
     select: Selection
     signals: tuple[str, ...]
     method: Method
+    entries: tuple[str, ...] = ()
 
 
 def make_replay(
@@ -142,9 +146,11 @@ def make_replay(
     if made.candidates > 1 and (policy is None or sigma is None):
         missing = " and ".join(n for n, v in (("policy", policy), ("sigma", sigma)) if v is None)
         raise ValueError(f"method {made.name!r} needs {missing}: it chooses on-policy batches")
-    signals = signals_of(made)
+    kept = [*signals_of(made), *([EPISODE] if made.reliability > 0 else [])]
     if storage is None:
-        storage = SignalTensorStorage(made.capacity, signals=signals or MPFA_SIGNALS, device=device)
+        storage = SignalTensorStorage(made.capacity, signals=kept or MPFA_SIGNALS, device=device)
+    if made.reliability > 0:
+        signal_table_of(storage, kept, made.capacity)
     buffer = SignalReplayBuffer(
         storage=storage,
         sampler=make_sampler(made),
@@ -152,7 +158,7 @@ def make_replay(
         generator=generator,
     )
     select = _make_selection(made, policy, sigma)
-    return Replay(buffer, select, tuple(learned_signals(made)), made)
+    return Replay(buffer, select, tuple(learned_signals(made)), made, entries_of(made))
 
 
 def loss_options(method: str | Method) -> dict[str, Any]:
@@ -179,6 +185,11 @@ def loss_options(method: str | Method) -> dict[str, Any]:
         "target_average": made.target_average,
         "pal_alpha": made.alpha,
     }
+
+
+def entries_of(method: Method) -> tuple[str, ...]:
+    """What transitions must have beside the usual: ``"episode"``, a number, shape ``[B, 1]``."""
+    return (EPISODE.name,) if method.reliability > 0 else ()
 
 
 def has_one_batch_a_step(method: Method) -> bool:
@@ -245,6 +256,8 @@ def make_adjustments(method: Method) -> list[Adjustment]:
         made.append(decay)
     if method.priority_floor > 0:
         made.append(PriorityFloor(method.priority_floor, method.floor_quantile))
+    if method.reliability > 0:
+        made.append(Reliability(method.reliability, alpha=method.alpha))
     if method.replay_penalty > 0:
         made.append(ReplayPenalty(penalty=method.replay_penalty, floor=method.eps))
     return made
@@ -288,6 +301,6 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
             f"combination 'mixture' needs selection='prioritized', got {made.selection!r}"
         )
     check_level(made.positive_above)
-    counts = ("capacity", "batch_size", "candidates", "target_average")
+    counts = ("capacity", "batch_size", "candidates", "target_average", "update_block")
     check_counts(**{name: getattr(made, name) for name in counts})
     return made

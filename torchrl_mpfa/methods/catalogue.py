@@ -40,6 +40,9 @@ class Method:
     loss, moves; 0: the floor is a constant."""
     replay_penalty: float = 0.0
     """Penalty on replays (HVPER); 0: none."""
+    reliability: float = 0.0
+    """omega of ReaPER: power of how reliable a TD error is; 0: none. Transitions must have
+    ``"episode"``."""
     selection: str = "prioritized"
     """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
     ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P) or
@@ -91,6 +94,8 @@ class Method:
     """Critics of which the target is the mean, one more kept at each end of an episode."""
     optimizer: str = "adam"
     """``adam`` or ``radam``."""
+    update_block: int = 1
+    """Actions between two blocks of updates, of which there are as many as otherwise (RUD)."""
     curiosity: bool = False
     """Whether rewards get a bonus for what the robot could not foresee (ICM)."""
     curiosity_scale: float = 0.01
@@ -142,6 +147,7 @@ METHODS: dict[str, Method] = {
         replay_penalty=0.25,
         eps=0.01,
     ),
+    "rud": Method("rud", **_UNIFORM, update_block=1000),
     "ddpg_radam": Method("ddpg_radam", **_PER, optimizer="radam", curiosity=True),
     "mw": Method(
         "mw",
@@ -153,6 +159,7 @@ METHODS: dict[str, Method] = {
     ),
     # What else there is today.
     "rank_per": Method("rank_per", **_PER, selection="rank", alpha=0.7, beta=0.5),
+    "reaper": Method("reaper", **_PER, reliability=0.2),
     "lap": Method("lap", **_LAP),
     "pal": Method("pal", **_UNIFORM, loss_function="pal", alpha=0.4),
     "la3p": Method("la3p", **_LAP, selection="split"),

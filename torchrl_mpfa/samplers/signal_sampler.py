@@ -298,6 +298,7 @@ class SignalSampler(TreeSampler):
             replay_count=rows.select(1, table.count_column),
             index=slots,
             mean_reward=weighing.mean_reward,
+            written_at=rows.select(1, table.time_column),
         )
         for adjust, counted in zip_longest(self.adjustments, weighing.counted):
             priority = adjust(
