@@ -2,7 +2,7 @@
 
     python examples/evaluate.py runs/demo --worlds A --episodes 100
     python examples/evaluate.py runs/demo --worlds test rooms:100-109 bars:test barn
-    python examples/evaluate.py runs/demo --worlds all        every generator's test worlds
+    python examples/evaluate.py runs/demo --worlds all        all test worlds in which nothing moves
     python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
 
 Prints a row for each world or generator and their total. Writes to the folder
@@ -42,6 +42,12 @@ _PICTURED = 9
 _DOCUMENTED = ("success", "collision", "timeout", "spl", "time_s")
 _COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
 _SECONDS = {"time_s": "{:.1f}", "min_clearance": "{:.3f}"}
+_ENCOUNTERS = {
+    "walker_distance": "{:.3f}",
+    "intrusion_time": "{:.1f}",
+    "time_to_collision": "{:.2f}",
+}
+"""What there is where people walk."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -89,8 +95,9 @@ def output_folder(policy: Path, words: Sequence[str]) -> Path:
 def printed(summary: pd.DataFrame) -> str:
     """The table on the screen: estimates, and the interval of success."""
     table = summary[["world", "episodes"]].copy()
-    for name, form in {**_COLUMNS, **_SECONDS}.items():
-        table[name] = summary[name].map(form.format)
+    for name, form in {**_COLUMNS, **_SECONDS, **_ENCOUNTERS}.items():
+        if name in summary:
+            table[name] = summary[name].map(form.format).where(summary[name].notna(), "")
     ends = zip(summary["success_low"], summary["success_high"], strict=True)
     table.insert(3, "95 %", [f"[{low:.1%}, {high:.1%}]" for low, high in ends])
     return table.to_string(index=False)
@@ -112,10 +119,15 @@ def write_pictures(policy: Policy, driven: Sequence[Drives], folder: Path, **how
     pictures = [picture_of(world, drives, size=size) for world, drives in worlds[:_PICTURED]]
     Image.fromarray(tiled(pictures)).save(folder / "trajectories.png")
     # The success with the longest way shows most; any episode if there is none.
-    episodes = [pair for each in driven for pair in zip(each.results, each.tasks, strict=True)]
-    reached = [pair for pair in episodes if pair[0].success]
-    _, shown = max(reached or episodes, key=lambda pair: pair[0].path_length)
-    write_animation(film(policy, shown, **how), folder / "episode.gif")
+    episodes = [
+        (result, task, number)
+        for each in driven
+        for number, (result, task) in enumerate(zip(each.results, each.tasks, strict=True))
+    ]
+    reached = [each for each in episodes if each[0].success]
+    _, shown, number = max(reached or episodes, key=lambda each: each[0].path_length)
+    # The number of a task is the seed of its walkers, and of the noise.
+    write_animation(film(policy, shown, seed=number, **how), folder / "episode.gif")
 
 
 def worlds_in(drives: Drives) -> list[tuple[World, Drives]]:

@@ -44,7 +44,7 @@ ENV_IDS = tuple(f"mpfa/Navigation-{name}-v1" for name in WORLDS)
 """The ids that ``gymnasium.make`` knows once this package is imported."""
 VECTOR_ENV_IDS = tuple(
     f"mpfa/Navigation-{name}-v1"
-    for name in ("Rooms", "Clutter", "Bars", "Fields", "Halls", "Mazes", "Mixed")
+    for name in ("Rooms", "Clutter", "Bars", "Fields", "Halls", "Mazes", "Mixed", "Crowd")
 )
 """The ids of the generators' worlds, which only ``gymnasium.make_vec`` knows."""
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"

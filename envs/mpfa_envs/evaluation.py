@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from mpfa_envs.arguments import Physics
 from mpfa_envs.checks import check_count
 from mpfa_envs.policy import Policy
-from mpfa_envs.results import EpisodeResult, spl
+from mpfa_envs.results import ENCOUNTERS, EpisodeResult, spl
 from mpfa_envs.task_sets import WorldTask, world_tasks
 from mpfa_envs.vector import VectorNavigationEnv
 from mpfa_envs.worlds import World
@@ -231,6 +231,7 @@ def _result(
         min_clearance=float(info["min_clearance"][robot]),
         spl=spl(success, path_length=driven, shortest_path=shortest),
         world=world.name,
+        **({name: float(info[name][robot]) for name in ENCOUNTERS} if world.walkers else {}),
     )
 
 

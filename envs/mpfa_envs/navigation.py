@@ -214,6 +214,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._task: Task | None = None
         self._field: DistanceField | None = None
         self._running = False
+        self._observation: NDArray[np.float32] | None = None
         self._trail: list[tuple[float, float]] = []
         self._map = self._make_map() if self.memory == "map" else None
         self._walkers = self._make_walkers() if self.world.walkers else None

@@ -11,6 +11,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+ENCOUNTERS = ("walker_distance", "intrusion_time", "time_to_collision")
+"""What is told of walkers, in the info of an environment and of an episode."""
 _LEVEL = 0.95
 _RESAMPLES = 2000
 
@@ -31,11 +33,18 @@ class EpisodeResult:
     shortest_path: float
     """Shortest path of the task [m]."""
     min_clearance: float
-    """Least distance between the robot's rim and an obstacle or wall [m]."""
+    """Least distance between the robot's rim and an obstacle, wall or walker [m]."""
     spl: float
     """Success weighted by path length, see :func:`spl`."""
     world: str = ""
     """Where it was."""
+    walker_distance: float | None = None
+    """Least distance between the robot's rim and a walker's [m]; None where nobody walks."""
+    intrusion_time: float | None = None
+    """Time in the personal space of a walker, within 0.5 m of its rim [s]."""
+    time_to_collision: float | None = None
+    """Least time after which robot and walker would have touched had both gone on as they went, at
+    most 10 s [s]."""
 
 
 def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
@@ -76,7 +85,8 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         seed: Seed of the bootstrap.
 
     Returns:
-        Estimates by name; success, collision and timeout sum to one.
+        Estimates by name; success, collision and timeout sum to one. Means of encounters with
+        walkers are among them if there were any, over the episodes with walkers.
 
     Raises:
         ValueError: If there are no results.
@@ -85,7 +95,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         raise ValueError("results must hold at least one episode")
     rng = np.random.default_rng(seed)
     reached = [result for result in results if result.success]
-    return {
+    summary = {
         "success": wilson([result.success for result in results]),
         "collision": wilson([result.collision for result in results]),
         "timeout": wilson([result.timeout for result in results]),
@@ -94,6 +104,11 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         "path_length": bootstrap([result.path_length for result in reached], rng),
         "min_clearance": bootstrap([result.min_clearance for result in results], rng),
     }
+    for name in ENCOUNTERS:
+        values = [getattr(result, name) for result in results]
+        if met := [value for value in values if value is not None]:
+            summary[name] = bootstrap(met, rng)
+    return summary
 
 
 def wilson(outcomes: Sequence[bool]) -> Interval:

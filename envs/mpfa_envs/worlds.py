@@ -24,7 +24,7 @@ LARGEST_SIDE: Final = 1000.0
 """No room is wider or deeper than this [m]."""
 MOST_OBSTACLES: Final = 1000
 """No room has more obstacles."""
-_APART: Final = 0.02
+_APART: Final = 0.05
 """Places of a line whose clearance is looked at are this far apart, at most [m]."""
 _CHUNK: Final = 2_000_000
 """Distances between points and obstacles that are computed at once."""
@@ -257,7 +257,7 @@ class World:
             end: Position (x, y) [m].
 
         Returns:
-            Distance [m], the least of places 0.02 m apart.
+            Distance [m], the least of places 0.05 m apart.
         """
         steps = math.ceil(math.dist(start, end) / _APART) + 1
         return float(self.clearances(np.linspace(start, end, steps)).min())

@@ -83,7 +83,9 @@ def drive(
     return Drives(tasks, results, trails)
 
 
-def film(policy: Policy, episode: WorldTask, *, physics: str | None) -> list[NDArray[np.uint8]]:
+def film(
+    policy: Policy, episode: WorldTask, *, physics: str | None, seed: int = 0
+) -> list[NDArray[np.uint8]]:
     """Pictures of an episode, each of shape ``[height, width, 3]``."""
     arguments = {**policy.env_arguments, "collision_distance": "contact", "world": episode.world}
     if physics is not None:
@@ -92,7 +94,7 @@ def film(policy: Policy, episode: WorldTask, *, physics: str | None) -> list[NDA
         arguments["max_steps"] = episode.max_steps
     frames: list[Any] = []
     with closing(NavigationEnv(**arguments, render_mode="rgb_array")) as env:
-        observation, _ = env.reset(seed=0, options=episode.task._asdict())
+        observation, _ = env.reset(seed=seed, options=episode.task._asdict())
         ended = False
         while not ended:
             frames.append(env.render())

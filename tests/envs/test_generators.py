@@ -26,6 +26,7 @@ from mpfa_envs import (
     world_seed,
 )
 from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.plain_worlds import walker_to_plain
 
 NAMES = list(GENERATORS)
 PINNED = {
@@ -36,6 +37,7 @@ PINNED = {
     "halls": ("937971d5560e", "c893ea64c501"),
     "mazes": ("382b054aa625", "4624390959b7"),
     "mixed": ("8b6268b6671e", "9467986caa96"),
+    "crowd": ("08e7dcdb63cd", "de2e7de11388"),
 }
 """World 7 for training, and world 7 of the test at full difficulty."""
 
@@ -43,6 +45,8 @@ PINNED = {
 def fingerprint(world: World) -> str:
     """All numbers of a world; what a printer may change with the version is left out."""
     text = repr([part.tolist() for part in world.arrays])
+    if world.walkers:
+        text += repr([list(walker_to_plain(walker).values()) for walker in world.walkers])
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -185,7 +189,8 @@ def test_splits_and_counts_out_of_range_are_refused() -> None:
         generator_tasks("bars", "test", worlds=1, tasks=0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+# A harder crowd has more walkers.
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "crowd"])
 def test_difficulty_means_more_obstacles_in_the_way(name: str) -> None:
     def free_share(difficulty: float) -> float:
         grids = [
@@ -307,8 +312,20 @@ def test_bars_meet_and_make_pockets() -> None:
 
 def test_mixed_worlds_are_of_all_kinds() -> None:
     kinds = Counter(GENERATORS["mixed"](random.Random(seed), 0.5).name for seed in range(120))
-    assert set(kinds) == set(NAMES) - {"mixed"}
+    assert set(kinds) == set(NAMES) - {"mixed", "crowd"}
     assert min(kinds.values()) > 8
+
+
+def test_a_crowd_has_two_to_ten_walkers_six_unless_told_otherwise() -> None:
+    numbers = {
+        at: {len(generate_world("crowd", seed, difficulty=at).walkers) for seed in range(8)}
+        for at in (0.0, 0.5, 1.0, None)
+    }
+    assert numbers == {0.0: {2}, 0.5: {6}, 1.0: {10}, None: {6}}
+    walkers = [walker for seed in range(20) for walker in generate_world("crowd", seed).walkers]
+    behaviors = Counter(walker.behavior for walker in walkers)
+    assert set(behaviors) == {"straight", "waypoints"} and min(behaviors.values()) > 50
+    assert all(0.1 <= walker.speed <= 0.3 and 0.2 <= walker.radius <= 0.3 for walker in walkers)
 
 
 def test_the_benchmark_measures_a_new_world_and_its_field() -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +22,14 @@ from mpfa_envs import (
     VectorNavigationEnv,
     Walker,
     World,
+    evaluate,
     load_world,
     save_world,
+    summarize,
 )
 from mpfa_envs.kernels.walkers import time_to_collision
 from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs.render import WALKER
 from mpfa_envs.robot import ROBOTS
 from mpfa_envs.walker_batch import WalkerBatch
 from mpfa_envs.world_batch import WorldBatch
@@ -334,6 +338,42 @@ def test_without_walkers_nobody_is_met() -> None:
     met = [infos[key][0] for key in ("walker_distance", "intrusion_time", "time_to_collision")]
     assert met == [10.0, 0.0, 10.0]
     assert env.walkers(0).shape == (0, 5)
+
+
+def test_results_and_their_means_tell_of_walkers_where_there_are_any() -> None:
+    given: dict[str, Any] = {"physics": "kinematic", "max_steps": 60}
+    results = evaluate(lambda seen: np.ones(2), ["A", BUSY], episodes=6, **given)
+    assert all(found.walker_distance is None for found in results[:6])
+    met = results[6:]
+    assert all(found.walker_distance >= found.min_clearance for found in met)  # type: ignore
+    summary = summarize(results)
+    times = [found.time_to_collision for found in met]
+    assert summary["time_to_collision"].value == pytest.approx(np.mean(times))
+    assert "intrusion_time" in summary and "intrusion_time" not in summarize(results[:6])
+    # The number of a task, here from 0 on, is the seed of its walkers.
+    alone, together = (
+        evaluate(policy, BUSY, episodes=6, envs_at_once=count, **given)
+        for policy, count in ((lambda _: np.ones(2), 1), (lambda seen: np.ones((len(seen), 2)), 3))
+    )
+    assert alone == together
+
+
+def test_a_picture_shows_the_walkers_where_they_are() -> None:
+    given: dict[str, Any] = {"physics": "kinematic", "render_mode": "rgb_array"}
+    one, many = NavigationEnv(world=BUSY, **given), VectorNavigationEnv(1, world=BUSY, **given)
+    one.reset(seed=0)
+    many.reset(seed=[0])
+    picture = one.render()
+    assert picture is not None
+    np.testing.assert_array_equal(many.render()[0], picture)  # type: ignore[index]
+    for x, y, speed_x, speed_y, radius in one.walkers.tolist():
+        # Beside the line that shows where it goes.
+        aside = 0.5 * radius / math.hypot(speed_x, speed_y)
+        at = x - aside * speed_y, y + aside * speed_x
+        column, row = (
+            (5.2 + sign * each) * 480 / 10.4 for sign, each in zip((1, -1), at, strict=True)
+        )
+        assert picture[int(row), int(column)].tolist() == list(WALKER[:3])
 
 
 def test_a_world_with_walkers_comes_back_equal(tmp_path: Path) -> None:

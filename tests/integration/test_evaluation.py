@@ -95,6 +95,16 @@ def test_two_splits_of_a_generator_are_apart_in_the_document(run: Path) -> None:
     assert episodes == {"bars": 2, "bars:validation": 2}
 
 
+def test_the_table_tells_of_walkers_where_there_are_any(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    how = ["--episodes", "2", "--no-pictures", "--output", str(run / "crowd")]
+    summary = evaluate.main([str(run), "--worlds", "crowd:validation", "A", *how])
+    assert summary["intrusion_time"].notna().tolist() == [True, False, True]
+    header = next(line for line in capsys.readouterr().out.splitlines() if "min_clearance" in line)
+    assert header.split()[-3:] == ["walker_distance", "intrusion_time", "time_to_collision"]
+
+
 def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
     lost = EpisodeResult(0, False, False, True, 9.0, 1.0, 2.0, 0.1, 0.0)
     document = evaluate.as_document([{"world": "A", **summary_row([lost, lost])}])
@@ -150,7 +160,7 @@ def test_a_damaged_policy_is_refused_by_its_name(
 
 def test_worlds_and_their_label_agree() -> None:
     assert parse_worlds(["test", "rooms:100-101"]) == ["test", "rooms-100", "rooms-101"]
-    tests = [f"{name}:test" for name in GENERATORS if name != "mixed"]
+    tests = [f"{name}:test" for name in GENERATORS if name not in ("mixed", "crowd")]
     assert parse_worlds(["all", "barn"]) == [*tests, "barn"]
     words = (["test"], ["test", "A"], ["a/w.yaml"], ["b/w.yaml"])
     assert len({worlds_label(each) for each in words}) == 4

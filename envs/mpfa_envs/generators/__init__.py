@@ -19,6 +19,7 @@ from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.distance import FreeGrid, has_task, sample_task_on_grid
 from mpfa_envs.generators.bars import bars
 from mpfa_envs.generators.clutter import clutter
+from mpfa_envs.generators.crowd import crowd
 from mpfa_envs.generators.fields import fields
 from mpfa_envs.generators.halls import halls
 from mpfa_envs.generators.mazes import mazes
@@ -41,6 +42,7 @@ GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(
         "halls": halls,
         "mazes": mazes,
         "mixed": mixed,
+        "crowd": crowd,
     }
 )
 """The generators by name."""
@@ -48,6 +50,8 @@ ROBOT_DISTANCE: Final = 0.25
 """In every world there is a task whose way keeps this: a TurtleBot2 with 0.07 m to spare [m]."""
 _SPLIT_SIZE: Final = 10**9
 _ATTEMPTS: Final = 100
+_HALFWAY: Final = ("rooms", "crowd")
+"""Generators whose worlds have a difficulty of 0.5 unless told otherwise."""
 _TASK_STREAM: Final = 7312590
 _NAME = re.compile(r"([a-z]+)(?:-(validation|test))?-([0-9]{1,9})(?:@(1|0?\.[0-9]+|0))?")
 
@@ -85,7 +89,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         name: A generator, one of :data:`GENERATORS`.
         seed: Seed below 3 * 10⁹, as :func:`world_seed` gives them.
         difficulty: From 0 to 1; each generator says what it means. None: the seed's own, uniform
-            over this range; 0.5 for ``"rooms"``.
+            over this range; 0.5 for ``"rooms"`` and ``"crowd"``.
 
     Returns:
         The world, in which there is a task for a TurtleBot2 with 0.07 m to spare. It is called
@@ -110,7 +114,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
     for attempt in range(_ATTEMPTS):
         rng = _source(name, int(seed), attempt)
         # Rooms are as they were before there were others, so that their seeds mean the same.
-        own = 0.5 if name == "rooms" else rng.random()
+        own = 0.5 if name in _HALFWAY else rng.random()
         world = generator(rng, own if difficulty is None else difficulty)
         if _can_be_driven(world):
             return world.renamed(_world_name(name, int(seed), difficulty))
