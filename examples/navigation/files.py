@@ -15,13 +15,14 @@ POLICY = "policy.npz"
 SETTINGS = "settings.json"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
+UPDATES = "updates.csv"
 CURVE = "learning_curve.png"
 STATUS = "status.json"
 PREVIOUS = "previous"
 """Where the files of a run go that is started anew."""
 _LOCK = ".lock"
 # The checkpoint first: once it is gone, nothing can go on with the old run.
-_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, EPISODES, EVALUATIONS, CURVE, STATUS)
+_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, EPISODES, EVALUATIONS, UPDATES, CURVE, STATUS)
 
 
 class FolderInUse(RuntimeError):

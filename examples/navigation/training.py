@@ -30,6 +30,7 @@ from navigation.schedule import Schedule
 from navigation.settings import TrainSettings
 from navigation.stopping import Stop
 from navigation.tracking import Tracker
+from navigation.updates import UpdateLog
 from torchrl_mpfa import Draw, SignalSampler, run_updates, save_atomically
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.saving import write_text_atomically
@@ -66,6 +67,8 @@ class TrainingRun:
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
         self._remembered: dict[str, Any] = {"memory": env.env.memory, "history": env.env.history}
+        capacity, scale = settings.method.capacity, settings.learner.reward_scale
+        self.log = UpdateLog(capacity, reward_scale=scale)
         self._build()
         self.updates = 0
         self._waiting = 0
@@ -98,6 +101,7 @@ class TrainingRun:
             sigma=lambda: self.explorer.sigma,
         )
         self.buffer, self.select, self.entries = replay.buffer, replay.select, replay.entries
+        self.log.forget(method.capacity)
         if settings.environment.mirror:
             self.buffer.append_transform(RandomMirror(**self._remembered))
 
@@ -160,11 +164,13 @@ class TrainingRun:
             episode=self.schedule.episodes,
             entries=self.entries,
         )
-        self.buffer.extend(rows)
+        self.log.wrote(self.buffer.extend(rows), rows["next", "reward"])
         self.records += records
         self.schedule.count(actions=len(rows), episodes=len(records))
         if len(self.buffer) >= (self.buffer.batch_size or 0):
             self._update(before)
+        if self._crossed(self.settings.tracking.log_every, before):
+            self.log.add(self.actions, episode=self.schedule.episodes, buffer=self.buffer)
         for record in records:
             self.learner.end_episode()
             self.tracker.log_episode(record)
@@ -204,12 +210,15 @@ class TrainingRun:
             )
             self.updates += self.settings.updates
         self._waiting = 0
+        self.log.learned(losses)
         if self._crossed(self.settings.tracking.log_every, begun):
             self.tracker.log_update(self.actions, {**losses, **self._bonus}, self.buffer, batch)
 
     def _prepared(self, draw: Draw) -> Draw:
         """A draw where the networks are, with the bonus of curiosity in its rewards."""
         device = self.settings.device
+        if draw.gives_signals:
+            self.log.learns(draw.batch["index"])
         if device != "cpu":
             draw = replace(draw, batch=draw.batch.to(device))
         if self.curiosity is not None and draw.gives_signals:
@@ -294,6 +303,7 @@ class TrainingRun:
             "best": None if self._best is None else dict(self._best.state_dict()),
             "records": [asdict(record) for record in self.records],
             "evaluations": [asdict(record) for record in self.evaluations],
+            "log": self.log.state_dict(),
         }
         save_atomically(state, self.folder / files.CHECKPOINT)
         save_policy(self._exported(), self.folder / files.POLICY)
@@ -301,6 +311,7 @@ class TrainingRun:
         if self.evaluations:
             table = as_table(self.evaluations, EvaluationRecord)
             write_table(table, self.folder / files.EVALUATIONS)
+        write_table(self.log.table(), self.folder / files.UPDATES)
 
     def _exported(self) -> Policy:
         """The policy of the run: the last one, or that which did best in its evaluations."""
@@ -324,6 +335,8 @@ class TrainingRun:
             self._best.load_state_dict(state["best"])
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
+        if "log" in state:  # A checkpoint may be older than the rows.
+            self.log.load_state_dict(state["log"])
         set_random_state(self.settings.device, state["random"])
         self.robots.recall(state["robots"])
         if not self._advance():

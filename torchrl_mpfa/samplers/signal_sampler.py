@@ -25,6 +25,7 @@ from torchrl_mpfa.samplers.statistics import batch_statistics
 from torchrl_mpfa.samplers.tree import TreeSampler, in_dimensions_of
 from torchrl_mpfa.samplers.weighing import (
     Weighing,
+    boost_factor,
     check_counted,
     check_weighing,
     count_anew,
@@ -376,10 +377,11 @@ class SignalSampler(TreeSampler):
 
         Returns:
             Weights, entropies and shares of the signals, fractions of positive transitions,
-            effective sample size and age of the last batch.
+            effective sample size and age of the last batch, and the factor of the boost.
         """
         table = self.bind(storage)
-        return batch_statistics(self._names, self.weights, self.fusion, table, self._last_batch)
+        found = batch_statistics(self._names, self.weights, self.fusion, table, self._last_batch)
+        return {**found, **boost_factor(self._weighing, self.adjustments)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.adjustment import Adjustment
+from torchrl_mpfa.adjustment import Adjustment, PositiveBoost
 from torchrl_mpfa.checks import check_finite
 from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.samplers.states import check_count, check_number, entry, refuse
@@ -131,6 +131,15 @@ def check_weighing(state: Mapping[str, Any], names: Sequence[str]) -> None:
     mean = entry(state, "_mean_reward")
     if not (isinstance(mean, int | float) and math.isfinite(mean)):
         refuse("_mean_reward", "a finite number", mean)
+
+
+def boost_factor(weighing: Weighing | None, adjustments: Sequence[Adjustment]) -> dict[str, float]:
+    """The factor of Eq. (22) as it is now, by its name in the log; nothing without a boost."""
+    counted = () if weighing is None else weighing.counted
+    for each, value in zip_longest(adjustments, counted):
+        if isinstance(each, PositiveBoost):
+            return {"boost_factor": float(each.factor(value))}
+    return {}
 
 
 def counted_state(weighing: Weighing | None, adjustments: Sequence[Adjustment]) -> dict[str, Any]:

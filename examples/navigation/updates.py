@@ -1,0 +1,144 @@
+"""What a run learned from, in rows: one for every so many actions, with or without wandb."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from torchrl_mpfa import SignalReplayBuffer
+
+_NEVER = -1
+COLUMNS = (
+    "total_steps",
+    "episode",
+    "updates",
+    "reward",
+    "average_reward",
+    "td_error",
+    "td_error_age",
+    "td_error_age_buffer",
+    "fresh",
+    "positive_batch",
+    "positive_buffer",
+    "phi",
+)
+"""Those of every method, each explained in ``docs/metrics.md``; ``weight_SIGNAL`` come after."""
+
+
+class UpdateLog:
+    """Rows of what the critic learned from, and how long ago it had last seen that.
+
+    A method's priorities know the TD error that a transition had when the critic last learned from
+    it. That age is kept here for every slot, of uniform replay too, which could not do without it
+    if it had priorities.
+
+    Args:
+        capacity: Slots of the buffer.
+        reward_scale: Factor of rewards in the loss; TD errors are told in units of the reward.
+    """
+
+    def __init__(self, capacity: int, *, reward_scale: float) -> None:
+        self.rows: list[dict[str, float]] = []
+        self._scale = reward_scale
+        self._reward, self._actions, self._updates = 0.0, 0, 0
+        self.forget(capacity)
+
+    def forget(self, capacity: int) -> None:
+        """Begin with an empty buffer."""
+        self._learned_at = torch.full((capacity,), _NEVER, dtype=torch.long)
+        self._index = self._before = torch.empty(0, dtype=torch.long)
+        self._squares: Tensor | None = None
+
+    def wrote(self, index: Tensor, rewards: Tensor) -> None:
+        """Take note of new transitions.
+
+        Args:
+            index: Their slots, shape ``[B]``.
+            rewards: Their rewards, shape ``[B, 1]``.
+        """
+        self._learned_at[index] = _NEVER
+        self._reward += float(rewards.sum())
+        self._actions += len(index)
+
+    def learns(self, index: Tensor) -> None:
+        """Take note that the critic learns from a batch, before it does.
+
+        Args:
+            index: Its slots, shape ``[B]``.
+        """
+        self._index, self._before = index, self._learned_at[index]
+        self._updates += 1
+        self._learned_at[index] = self._updates
+
+    def learned(self, losses: Mapping[str, Tensor]) -> None:
+        """Take note of what the last update gave, with TorchRL's ``"td_error"``, the squares."""
+        self._squares = losses.get("td_error")
+
+    def add(self, total_steps: int, *, episode: int, buffer: SignalReplayBuffer) -> None:
+        """Add a row.
+
+        Args:
+            total_steps: Actions of the run so far.
+            episode: Episodes of the run that have ended.
+            buffer: What is sampled from.
+        """
+        rewards = buffer.storage.signal_table.rewards
+        stats = buffer.stats()
+        seen = self._learned_at[: len(rewards)]
+        row: dict[str, float] = {
+            "total_steps": total_steps,
+            "episode": episode,
+            "updates": self._updates,
+            "reward": self._reward,
+            "average_reward": self._reward / max(self._actions, 1),
+            "td_error_age_buffer": _mean(self._updates - seen[seen != _NEVER]),
+            "positive_buffer": _mean(rewards > 0),
+            "phi": stats.get("boost_factor", math.nan),
+        }
+        if self._squares is not None:
+            known = self._before[self._before != _NEVER]
+            row |= {
+                "td_error": _mean(self._squares.sqrt()) / self._scale,
+                # The errors are those from before this update.
+                "td_error_age": _mean(self._updates - known),
+                "fresh": _mean(self._before == _NEVER),
+                "positive_batch": _mean(rewards[self._index] > 0),
+            }
+        weights = {name: value for name, value in stats.items() if name.startswith("weight/")}
+        row |= {name.replace("/", "_"): value for name, value in weights.items()}
+        self.rows.append(row)
+        self._reward, self._actions, self._squares = 0.0, 0, None
+
+    def table(self) -> pd.DataFrame:
+        """The rows as a table, the columns of all methods first."""
+        found = pd.DataFrame(self.rows)
+        own = sorted(set(found.columns) - set(COLUMNS))
+        return found.reindex(columns=[*COLUMNS, *own])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next row depends on, and the rows."""
+        return {
+            "rows": self.rows,
+            "learned_at": self._learned_at,
+            "last": (self._index, self._before, self._squares),
+            "updates": self._updates,
+            "reward": self._reward,
+            "actions": self._actions,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where :meth:`state_dict` was called."""
+        self.rows = list(state["rows"])
+        self._learned_at, self._updates = state["learned_at"].clone(), state["updates"]
+        self._index, self._before, self._squares = state["last"]
+        self._reward, self._actions = state["reward"], state["actions"]
+
+
+def _mean(values: Tensor) -> float:
+    """Mean of numbers or flags; NaN of none."""
+    return float(values.double().mean())
