@@ -37,6 +37,9 @@ def make_step(method: Method) -> Call:
     filling, transition = make_transitions(_FILL), make_transitions(1)
     filling["episode"] = torch.arange(_FILL).unsqueeze(1) // _EPISODE
     transition["episode"] = torch.full((1, 1), _FILL // _EPISODE)
+    for rows in (filling, transition):
+        rows["behavior_mean"] = rows["action"].clone()
+        rows["behavior_sigma"] = torch.full((len(rows), 1), _SIGMA)
     buffer.extend(filling)
 
     def step() -> None:

@@ -75,7 +75,8 @@ class RandomMirror(Transform):
     The mirror image of a transition is as true as the transition itself, with the same reward and
     end. What a loss then writes, say the TD error, is that of what it was shown. A learner that
     sees both has twice as many worlds to learn from, and no favorite side. Append it to a replay
-    buffer; what is stored stays as it was.
+    buffer; what is stored stays as it was. ``"behavior_mean"``, an action without its noise, is
+    mirrored where a batch has it.
 
     Args:
         chance: Share of the transitions that are mirrored, in [0, 1].
@@ -128,5 +129,8 @@ class RandomMirror(Transform):
         for key in ("observation", ("next", "observation")):
             seen = tensordict.get(key)
             tensordict.set(key, torch.where(chosen, self.mirror.observation(seen), seen))
-        done = tensordict.get("action")
-        return tensordict.set("action", torch.where(chosen, self.mirror.action(done), done))
+        for key in ("action", "behavior_mean"):
+            done = tensordict.get(key, None)
+            if done is not None:
+                tensordict.set(key, torch.where(chosen, self.mirror.action(done), done))
+        return tensordict

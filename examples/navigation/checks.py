@@ -74,6 +74,8 @@ RULES: dict[str, Rule] = {
     "method.eps": NOT_NEGATIVE,
     "method.priority_floor": NOT_NEGATIVE,
     "method.floor_quantile": SHARE,
+    "method.far_share": SHARE,
+    "method.far_cutoff": POSITIVE,
     "method.reliability": NOT_NEGATIVE,
     "method.update_block": at_least(1),
     "method.replay_penalty": NOT_NEGATIVE,

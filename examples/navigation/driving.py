@@ -26,6 +26,8 @@ TRANSITION = (
     ("next", "terminated"),
 )
 """What a buffer keeps of a step."""
+_UNIFORM_SIGMA = 3**-0.5
+"""Standard deviation of actions that are uniform in [-1, 1]."""
 
 
 class Robots:
@@ -92,7 +94,8 @@ class Robots:
             explorer: What acts.
             actions: Of the run before these.
             episode: Episodes of the run that have ended.
-            entries: What else the transitions must have: ``"episode"``.
+            entries: What else the transitions must have: ``"episode"``, or ``"behavior_mean"``
+                and ``"behavior_sigma"``, the actions without noise and the spread of that.
 
         Returns:
             The entries of :data:`TRANSITION` and those others, batch size ``[robots]``, and the
@@ -100,7 +103,7 @@ class Robots:
         """
         assert self._env is not None and self._state is not None
         state, self._state = self._env.step_and_maybe_reset(
-            self._act(explorer, self._state, actions)
+            self._act(explorer, self._state, actions, entries)
         )
         if "episode" in entries:
             state.set("episode", self._numbers.clone())
@@ -119,12 +122,22 @@ class Robots:
         return state.select(*TRANSITION, *entries), records
 
     @torch.no_grad()
-    def _act(self, explorer: Explorer, state: TensorDictBase, actions: int) -> TensorDictBase:
+    def _act(
+        self, explorer: Explorer, state: TensorDictBase, actions: int, entries: Sequence[str]
+    ) -> TensorDictBase:
         assert self._env is not None
         if actions < self.settings.exploration.random_steps:
-            return self._env.rand_action(state)
-        observation = state.get("observation").to(self.settings.device)
-        return state.set("action", explorer.act(observation).cpu())
+            state = self._env.rand_action(state)
+            mean = torch.zeros_like(state["action"])
+            behavior = mean, torch.full((self.count, 1), _UNIFORM_SIGMA)
+        else:
+            observation = state.get("observation").to(self.settings.device)
+            state = state.set("action", explorer.act(observation).cpu())
+            behavior = explorer.behavior()
+        if "behavior_mean" in entries:
+            for name, value in zip(("behavior_mean", "behavior_sigma"), behavior, strict=True):
+                state.set(name, value.clone())
+        return state
 
     def _record(
         self, after: TensorDictBase, robot: int, *, episode: int, total_steps: int

@@ -36,6 +36,13 @@ class Explorer(Protocol):
         """From observations, shape ``[N, O]``, to actions, shape ``[N, A]``."""
         ...
 
+    def behavior(self) -> tuple[Tensor, Tensor]:
+        """Mean, ``[N, A]``, and standard deviation, ``[N, 1]``, of the actions that it gave last.
+
+        The noise is a Gaussian, whose clipping is not counted.
+        """
+        ...
+
     def state_dict(self) -> dict[str, Any]:
         """What the next action depends on, but for the policy and the random numbers."""
         ...
@@ -83,11 +90,16 @@ class NoisyPolicy:
     def act(self, observation: Tensor) -> Tensor:
         """The policy's actions and noise."""
         chosen = self.policy.outputs({"observation": observation})["action"]
+        self._behavior = chosen.cpu(), self.shares * float(self.noise.sigma)
         with set_exploration_type(ExplorationType.RANDOM):
             noisy = self.noise(TensorDict({"action": chosen})).get("action")
         self.noise.step(len(observation))
         action: Tensor = chosen.lerp(noisy, self.shares.to(chosen.device))
         return action
+
+    def behavior(self) -> tuple[Tensor, Tensor]:
+        """The policy's actions, and each robot's share of the noise."""
+        return self._behavior
 
     def state_dict(self) -> dict[str, Any]:
         """The state of the noise, and the shares of it."""
@@ -120,7 +132,13 @@ class RandomPolicy:
         with set_exploration_type(ExplorationType.RANDOM):
             found = self.policy.outputs({"observation": observation})
         action: Tensor = found["action"]
+        mean = found["preactivation"].tanh().cpu()
+        self._behavior = mean, torch.full((len(mean), 1), self.sigma)
         return action
+
+    def behavior(self) -> tuple[Tensor, Tensor]:
+        """The most likely actions, and what stands for their spread."""
+        return self._behavior
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing."""

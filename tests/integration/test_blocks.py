@@ -52,7 +52,7 @@ def test_the_policy_stays_as_it_is_within_a_block(tmp_path: Path) -> None:
     assert moved == [60, 120]
 
 
-@pytest.mark.parametrize("method", ["rud", "reaper"])
+@pytest.mark.parametrize("method", ["rud", "reaper", "ref_er"])
 def test_a_run_that_is_stopped_within_a_block_goes_on_alike(tmp_path: Path, method: str) -> None:
     settings = blocky(30, method)
     whole = train(tmp_path / "whole", settings)

@@ -12,14 +12,17 @@ from torchrl_mpfa.methods import ALIASES, METHODS, Method, loss_options, make_re
 
 
 def more(name):
-    """What KLPER needs besides."""
-    return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if name == "klper" else {}
+    """What KLPER and ReF-ER need besides."""
+    asks = name in {"klper", "ref_er"}
+    return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if asks else {}
 
 
 def make_whole_transitions(count):
     made = make_transitions(count)
     made["observation"] = torch.randn(count, 6, generator=seeded(1))
     made["action"] = torch.rand(count, 2, generator=seeded(2)) * 2 - 1
+    made["behavior_mean"] = made["action"] + 0.1
+    made["behavior_sigma"] = torch.full((count, 1), 0.3)
     made["episode"] = torch.arange(count).unsqueeze(1) // 10
     return made
 

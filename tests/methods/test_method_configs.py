@@ -12,7 +12,7 @@ from torchrl_mpfa.configs import CONFIGS, register_configs
 from torchrl_mpfa.methods import METHODS, Method, Replay
 
 SMALL = ["capacity=32", "batch_size=4"]
-CHOOSY = {"la3p", "klper", "uniform_halves"}
+CHOOSY = {"la3p", "klper", "ref_er", "uniform_halves"}
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,9 @@ def composed(registered):
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_is_made_by_its_name(composed, name):
     config = composed(f"+replay={name}", *(f"replay.{each}" for each in SMALL)).replay
-    more = {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if name == "klper" else {}
+    more = (
+        {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if name in {"klper", "ref_er"} else {}
+    )
     replay = instantiate(config, **more)
     assert isinstance(replay, Replay)
     expected = {**vars(METHODS[name]), "capacity": 32, "batch_size": 4}

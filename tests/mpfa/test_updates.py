@@ -43,6 +43,8 @@ def make_rows(count, seed=0):
             "observation": normal(OBSERVATION),
             "action": normal(ACTION).tanh(),
             "episode": torch.arange(count).unsqueeze(1) // 10,
+            "behavior_mean": normal(ACTION).tanh(),
+            "behavior_sigma": torch.full((count, 1), 0.3),
             "next": {**after, "done": end, "terminated": end.clone()},
         },
         [count],

@@ -24,6 +24,7 @@ from torchrl_mpfa.losses.functional import (
     saturation,
     smoothed_action,
 )
+from torchrl_mpfa.losses.trust import Trust, read_trust, trusted_loss
 from torchrl_mpfa.losses.writing import VALUE
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
@@ -55,6 +56,7 @@ class Inputs(NamedTuple):
     transitions: Transitions | None
     actor_state: State | None
     loss_function: str
+    trust: Trust | None
 
 
 class Found(NamedTuple):
@@ -108,6 +110,7 @@ class Gradients:
             transitions=None if trains == "actor" else self._transitions(batch),
             actor_state=None if trains == "critic" else self._state(batch),
             loss_function=loss_function or self._loss.loss_function,
+            trust=None if trains == "critic" else read_trust(batch),
         )
 
     def write_signals(self, batch: TensorDictBase, signals: Parameters) -> None:
@@ -153,7 +156,7 @@ class Gradients:
                 critics, given.transitions, next_value, given.loss_function
             )
         if given.actor_state is not None:
-            of_actor, more = self._actors_part(actor, critics, given.actor_state)
+            of_actor, more = self._actors_part(actor, critics, given.actor_state, given.trust)
             log = {**log, **more}
         return Found(of_critic, of_actor, signals, log)
 
@@ -236,14 +239,19 @@ class Gradients:
         return of_critic, signals, log
 
     def _actors_part(
-        self, actor_parameters: Parameters, critic_parameters: Parameters, state: State
+        self,
+        actor_parameters: Parameters,
+        critic_parameters: Parameters,
+        state: State,
+        trust: Trust | None,
     ) -> tuple[Parameters, Parameters]:
         """Gradients of the actor, by the first critic, and values for the log."""
         actor, first = self.parts.actor.module, self._first(critic_parameters)
 
         def of_policy(parameters: Parameters) -> tuple[Tensor, Parameters]:
             chosen = self._chosen(_with(actor, parameters), state)
-            loss = -self._q(first, state, chosen[self._action]).mean()
+            value = self._q(first, state, chosen[self._action])
+            loss = trusted_loss(-value, chosen[self._action], trust).mean()
             before = chosen.get(self._preactivation)
             if before is None:
                 return loss, {}

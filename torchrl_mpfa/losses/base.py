@@ -18,6 +18,7 @@ from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
 from torchrl_mpfa.losses.functional import DISTANCES, action_gradient, critic_loss, saturation
 from torchrl_mpfa.losses.refusals import check_networks, value_range_of
 from torchrl_mpfa.losses.targets import EstimatedTargets
+from torchrl_mpfa.losses.trust import read_trust, trusted_loss
 from torchrl_mpfa.losses.writing import DEFAULT_SIGNALS, WRITTEN, SignalWriting
 from torchrl_mpfa.networks import DirectModule, UnitLinear
 from torchrl_mpfa.selection import Trains
@@ -314,7 +315,8 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         networks = self._networks()
         chosen = call(networks.actor, read_inputs(networks.actor, tensordict))
         value = self._value(networks.frozen_critic, tensordict, chosen)
-        loss = self._reduce(-value, tensordict)
+        action = chosen[self.tensor_keys.action]
+        loss = self._reduce(trusted_loss(-value, action, read_trust(tensordict)), tensordict)
         loss, log = self._penalize_saturation(loss, chosen.get(self.tensor_keys.preactivation))
         return loss, value.detach(), log
 

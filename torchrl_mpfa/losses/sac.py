@@ -15,6 +15,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl_mpfa.losses.calling import StackedNetworks, bind, read_inputs
 from torchrl_mpfa.losses.functional import least_value, soft_value
 from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.losses.trust import read_trust, trusted_loss
 from torchrl_mpfa.losses.twin import TwinCritics
 from torchrl_mpfa.losses.writing import SignalKeys
 from torchrl_mpfa.networks import StochasticActor
@@ -112,7 +113,8 @@ class SignalSACLoss(TwinCritics, SACLoss):
         inputs = read_inputs(critics.network, tensordict, {keys.action: action})
         found = critics.call([inputs] * self.num_qvalue_nets)
         values = torch.stack([out[keys.state_action_value].squeeze(-1) for out in found])
-        loss = self._reduce(-soft_value(values, log_prob, alpha=self._alpha), tensordict)
+        of_each = -soft_value(values, log_prob, alpha=self._alpha)
+        loss = self._reduce(trusted_loss(of_each, action, read_trust(tensordict)), tensordict)
         loss, metadata = self._penalize_saturation(loss, preactivation)
         least = least_value(values.detach())
         return loss, {"log_prob": log_prob.detach(), "state_action_value_actor": least, **metadata}

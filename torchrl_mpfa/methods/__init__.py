@@ -23,6 +23,7 @@ from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler, rank_share
 from torchrl_mpfa.methods.reaper import EPISODE, Reliability, reliability
+from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler, importance_ratio
 
 __all__ = [
     "ALIASES",
@@ -40,10 +41,13 @@ __all__ = [
     "PriorityFloor",
     "RankSampler",
     "Reliability",
+    "RememberForget",
+    "RememberingSampler",
     "Replay",
     "ReplayPenalty",
     "gaussian_divergence",
     "geometric_age",
+    "importance_ratio",
     "intrinsic_reward",
     "loss_options",
     "make_replay",

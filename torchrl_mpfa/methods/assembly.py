@@ -13,6 +13,7 @@ from torchrl.data import RandomSampler, Storage
 from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
+from torchrl_mpfa.losses.trust import BEHAVIOR
 from torchrl_mpfa.methods.catalogue import METHODS, Method
 from torchrl_mpfa.methods.cer import CombinedSampler
 from torchrl_mpfa.methods.geometric import GeometricSampler
@@ -29,6 +30,7 @@ from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler
 from torchrl_mpfa.methods.reaper import EPISODE, Reliability
+from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.positive import check_level
 from torchrl_mpfa.replay import SignalReplayBuffer
@@ -54,6 +56,7 @@ _UNIFORM: dict[str, Callable[[Method], RandomSampler]] = {
     "uniform": lambda method: RandomSampler(),
     "halves": lambda method: RandomSampler(),
     "newest": lambda method: CombinedSampler(),
+    "near_policy": lambda method: RememberingSampler(),
     "geometric": lambda method: GeometricSampler(rate=method.recency),
 }
 _PRIORITIZED: dict[str, type[SignalSampler]] = {
@@ -118,7 +121,7 @@ def make_replay(
         storage: Where the transitions lie; by default a new
             :class:`~torchrl_mpfa.SignalTensorStorage`. It must keep the signals of the method.
         device: Device of a new storage; ``"auto"``: that of the first transition.
-        policy: The policy in training, which KLPER asks what it would do.
+        policy: The policy in training, which KLPER and ReF-ER ask what it would do.
         sigma: Standard deviation of the exploration noise in units of the action, for KLPER; a
             function tells that of the episode that acts.
         **settings: Other values for fields of :class:`~torchrl_mpfa.methods.Method`.
@@ -143,6 +146,8 @@ def make_replay(
     given = {"capacity": capacity, "batch_size": batch_size}
     given = {name: value for name, value in given.items() if value is not None}
     made = _settled(method, {**given, **settings})
+    if made.selection == "near_policy" and policy is None:
+        raise ValueError(f"method {made.name!r} needs policy: it compares actions with its own")
     if made.candidates > 1 and (policy is None or sigma is None):
         missing = " and ".join(n for n, v in (("policy", policy), ("sigma", sigma)) if v is None)
         raise ValueError(f"method {made.name!r} needs {missing}: it chooses on-policy batches")
@@ -188,13 +193,19 @@ def loss_options(method: str | Method) -> dict[str, Any]:
 
 
 def entries_of(method: Method) -> tuple[str, ...]:
-    """What transitions must have beside the usual: ``"episode"``, a number, shape ``[B, 1]``."""
-    return (EPISODE.name,) if method.reliability > 0 else ()
+    """What transitions must have beside the usual.
+
+    ``"episode"``, a number, shape ``[B, 1]``; ``"behavior_mean"``, the action without its noise,
+    ``[B, A]``, and ``"behavior_sigma"``, the standard deviation of that, ``[B, 1]``.
+    """
+    of_behavior = BEHAVIOR if method.selection == "near_policy" else ()
+    return ((EPISODE.name,) if method.reliability > 0 else ()) + of_behavior
 
 
 def has_one_batch_a_step(method: Method) -> bool:
     """Whether what samples one batch for each update, and no more, trains by the method."""
-    return method.selection not in _SELECTIONS and method.candidates == 1
+    own = {*_SELECTIONS, "near_policy"}
+    return method.selection not in own and method.candidates == 1
 
 
 def signals_of(method: Method) -> list[Signal]:
@@ -268,6 +279,8 @@ def _make_selection(
 ) -> Selection:
     if method.selection in _SELECTIONS:
         return _SELECTIONS[method.selection]
+    if method.selection == "near_policy" and policy is not None:
+        return RememberForget(policy, far_share=method.far_share, cutoff=method.far_cutoff)
     if policy is not None and sigma is not None and method.candidates > 1:
         choose = LowestDivergence(policy, batches=method.candidates, sigma=sigma)
         return lambda buffer: (

@@ -45,8 +45,12 @@ class Method:
     ``"episode"``."""
     selection: str = "prioritized"
     """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
-    ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P) or
-    ``halves`` (two updates on uniform halves)."""
+    ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P),
+    ``halves`` (two updates on uniform halves) or ``near_policy`` (ReF-ER)."""
+    far_share: float = 0.1
+    """Share of transitions that may be far from the policy before ``near_policy`` holds it."""
+    far_cutoff: float = 4.0
+    """C of ``near_policy``: a ratio of densities of 1 + C or its inverse is far."""
     recency: float = 3e-5
     """rho of ``geometric``: by how much less often each older transition is sampled."""
     candidates: int = 1
@@ -147,6 +151,7 @@ METHODS: dict[str, Method] = {
         replay_penalty=0.25,
         eps=0.01,
     ),
+    "ref_er": Method("ref_er", **{**_UNIFORM, "selection": "near_policy", "importance": "critic"}),
     "rud": Method("rud", **_UNIFORM, update_block=1000),
     "ddpg_radam": Method("ddpg_radam", **_PER, optimizer="radam", curiosity=True),
     "mw": Method(

@@ -1,0 +1,214 @@
+"""ReF-ER: which transitions are far, what of them is learned, and how the policy is held."""
+
+import math
+
+import pytest
+import torch
+
+from tests.methods.replays import make_buffer, make_transitions, seeded
+from tests.mpfa.test_updates import ACTION, OBSERVATION, make_learner, make_rows
+from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss, make_td3_loss
+from torchrl_mpfa.learners.gradients import Gradients
+from torchrl_mpfa.losses.trust import Trust, trusted_loss
+from torchrl_mpfa.methods import (
+    RememberForget,
+    RememberingSampler,
+    importance_ratio,
+    loss_options,
+    make_replay,
+)
+from torchrl_mpfa.methods.ref_er import next_weight
+
+COUNT = 200
+
+
+def density(action, mean, sigma):
+    """Density of an action by a Gaussian, one dimension after the other."""
+    found = 1.0
+    for a, m in zip(action, mean, strict=True):
+        found *= math.exp(-((a - m) ** 2) / (2 * sigma**2)) / (sigma * math.sqrt(2 * math.pi))
+    return found
+
+
+def random_actions(seed, count=COUNT):
+    return torch.rand(count, 2, generator=seeded(seed), dtype=torch.double) * 2 - 1
+
+
+def test_the_ratio_is_that_of_two_densities():
+    action, now, then = (random_actions(seed) for seed in range(3))
+    sigma = torch.rand(COUNT, 1, generator=seeded(3), dtype=torch.double) + 0.2
+    found = importance_ratio(action, now, then, sigma)
+    expected = [
+        density(a, n, s) / density(a, t, s)
+        for a, n, t, (s,) in zip(
+            action.tolist(), now.tolist(), then.tolist(), sigma.tolist(), strict=True
+        )
+    ]
+    assert found.tolist() == pytest.approx(expected)
+
+
+def make_ref_er(learner, rows, **settings):
+    replay = make_replay(
+        "ref_er",
+        capacity=COUNT,
+        batch_size=COUNT,
+        generator=seeded(0),
+        policy=learner.policy,
+        **settings,
+    )
+    replay.buffer.extend(rows)
+    return replay
+
+
+def rows_near_and_far(learner, shift):
+    """Every other action is what the policy would do; the others are this far from it."""
+    rows = make_rows(COUNT)
+    with torch.no_grad():
+        now = learner.policy(rows.select("observation"))["action"]
+    moved = now.clone()
+    moved[1::2] += shift
+    rows["action"], rows["behavior_mean"] = moved, moved.clone()
+    return rows
+
+
+def test_far_transitions_have_no_weight_and_near_ones_have_all_of_it():
+    learner = make_learner(**loss_options("ref_er"))
+    replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
+    (draw,) = replay.select(replay.buffer)
+    far = (draw.batch["index"] % 2).bool()
+    assert draw.batch["priority_weight"].equal((~far).float())
+    assert draw.batch["policy_weight"].equal((~far).float())  # beta is 1 at first.
+    assert draw.batch["behavior_weight"].abs().max() == 0
+
+
+def test_what_is_far_teaches_neither_critic_nor_actor():
+    """The update is that of the near transitions alone, over the size of the batch."""
+    learner = make_learner(**loss_options("ref_er"))
+    replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
+    (draw,) = replay.select(replay.buffer)
+    loss = learner.loss
+    losses, _ = loss.losses(draw.batch)
+    near = draw.batch["priority_weight"].bool()
+    alone = draw.batch[near].exclude("policy_weight", "priority_weight")
+    expected, _ = loss.losses(alone)
+    for name in ("loss_value", "loss_actor"):
+        scaled = expected[name] * near.sum() / len(near)
+        torch.testing.assert_close(losses[name], scaled, rtol=1e-4, atol=1e-6)
+
+
+def test_the_weight_moves_as_its_rule_says_and_the_policy_is_held_once_too_many_are_far():
+    learner = make_learner(**loss_options("ref_er"))
+    replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
+    sampler, weight = replay.buffer.sampler, 1.0
+    for number in range(5):
+        (draw,) = replay.select(replay.buffer)
+        assert draw.batch["policy_weight"].max() == pytest.approx(weight)
+        assert draw.batch["behavior_weight"].min() == pytest.approx(1 - weight, abs=1e-6)
+        far = 1 - float(draw.batch["priority_weight"].mean())
+        assert far > 0.3
+        weight = 0.9 * weight  # eta is 0.1 B / N, and here B = N.
+        assert sampler.policy_weight == pytest.approx(weight)
+        assert sampler.batches == number + 1
+    near = make_ref_er(learner, rows_near_and_far(learner, 0.0))
+    near.buffer.sampler.policy_weight = 0.5
+    list(near.select(near.buffer))
+    assert near.buffer.sampler.policy_weight == pytest.approx(0.55)
+    assert next_weight(0.5, far=0.1, allowed=0.1, rate=0.2) == pytest.approx(0.6)
+
+
+def test_a_held_policy_returns_to_its_behavior_and_a_free_one_does_not():
+    distances = {}
+    for name, settings in (("ref_er", {"far_share": 0.0}), ("ddpg", {})):
+        learner = make_learner(**loss_options("ref_er"))
+        rows = rows_near_and_far(learner, 0.6)
+        replay = make_replay(
+            name,
+            capacity=COUNT,
+            batch_size=64,
+            policy=learner.policy,
+            generator=seeded(0),
+            **settings,
+        )
+        replay.buffer.extend(rows)
+        for _ in range(150):
+            for draw in replay.select(replay.buffer):
+                learner.update(draw)
+        with torch.no_grad():
+            now = learner.policy(rows.select("observation"))["action"]
+        distances[name] = float((now - rows["behavior_mean"]).square().mean())
+    assert distances["ref_er"] < 0.5 * distances["ddpg"]
+
+
+def test_the_loss_of_the_actor_is_that_of_the_formula():
+    loss, weight, held = (torch.rand(5, generator=seeded(n)) for n in range(3))
+    action, mean = (random_actions(n, 5).float() for n in (3, 4))
+    sigma = torch.rand(5, 1, generator=seeded(5)) + 0.2
+    found = trusted_loss(loss, action, Trust(weight, held, mean, sigma))
+    for row in range(5):
+        divergence = sum(
+            (float(a) - float(m)) ** 2 / (2 * float(sigma[row]) ** 2)
+            for a, m in zip(action[row], mean[row], strict=True)
+        )
+        expected = float(weight[row]) * float(loss[row]) + float(held[row]) * divergence
+        assert float(found[row]) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_the_compiled_update_has_the_gradients_of_the_losses(name):
+    torch.manual_seed(0)
+    make = {"ddpg": make_ddpg_loss, "td3": make_td3_loss}[name]
+    more = {"bounds": (-1.0, 1.0)} if name == "td3" else {}
+    loss = make(
+        make_actor(OBSERVATION, ACTION, width=8),
+        make_critic(OBSERVATION, ACTION, width=8),
+        signals=[],
+        **more,
+    )
+    rows = make_rows(20)
+    rows["policy_weight"], rows["behavior_weight"] = torch.rand(20), torch.rand(20)
+    expected, _ = loss._actors_part(rows)
+    whole = Gradients(loss)
+    parts = whole.parts
+    actor = dict(parts.actor.module.named_parameters())
+    given = whole.inputs(rows, "actor", None)
+    found = whole(actor, dict(parts.critic_parameters), {}, {}, given)
+    torch.testing.assert_close(found.log["loss_actor"], expected["loss_actor"].detach())
+    del rows["policy_weight"]
+    free, _ = loss._actors_part(rows)
+    assert not torch.isclose(free["loss_actor"], expected["loss_actor"])
+
+
+@pytest.mark.parametrize("way", ["state", "folder"])
+def test_the_weight_is_saved(way, tmp_path):
+    first, second = (make_buffer(RememberingSampler(), 9, 2) for _ in range(2))
+    first.sampler.policy_weight, first.sampler.batches = 0.25, 7
+    if way == "state":
+        second.load_state_dict(first.state_dict())
+    else:
+        first.dumps(tmp_path)
+        second.loads(tmp_path)
+    assert (second.sampler.policy_weight, second.sampler.batches) == (0.25, 7)
+    for state in ({"_batches": 1}, {"_policy_weight": 1.5, "_batches": 1}):
+        with pytest.raises(ValueError, match="'_policy_weight'"):
+            second.sampler.load_state_dict(state)
+    assert second.sampler.policy_weight == 0.25
+
+
+def test_what_is_missing_or_out_of_range_is_named():
+    with pytest.raises(ValueError, match="method 'ref_er' needs policy"):
+        make_replay("ref_er")
+    policy = make_actor(6, 2, width=8)
+    with pytest.raises(ValueError, match=r"far_share must be in \[0, 1\], got 2"):
+        RememberForget(policy, far_share=2)
+    with pytest.raises(ValueError, match="cutoff must be positive and finite, got 0"):
+        RememberForget(policy, cutoff=0)
+    with pytest.raises(TypeError, match="buffer must have a RememberingSampler"):
+        next(RememberForget(policy)(make_buffer(make_replay("ddpg").buffer.sampler, 5, 2)))
+    replay = make_replay("ref_er", policy=policy, capacity=10, batch_size=4)
+    assert replay.entries == ("behavior_mean", "behavior_sigma")
+    rows = make_transitions(10)
+    rows["observation"], rows["action"] = torch.rand(10, 6), torch.rand(10, 2)
+    replay.buffer.extend(rows)
+    with pytest.raises(KeyError, match="behavior_sigma"):
+        list(replay.select(replay.buffer))

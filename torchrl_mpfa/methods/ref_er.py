@@ -1,0 +1,216 @@
+r"""ReF-ER: remember and forget. What the policy would no longer do teaches nothing.
+
+Novati and Koumoutsakos (2019), "Remember and forget for experience replay",
+https://arxiv.org/abs/1807.05827. Of transitions whose importance ratio
+
+.. math::
+
+    \rho_i = \frac{\pi(a_i | s_i)}{\mu_i(a_i)}
+
+is outside of :math:`(1 / c, c)` neither critic nor actor learn, and the actor is held near the
+behavior :math:`\mu` by a divergence whose weight grows for as long as too many are. A deterministic
+policy counts as a Gaussian around its action, as wide as the behavior was.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.data import RandomSampler, TensorDictReplayBuffer
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from torchrl_mpfa.losses.trust import (
+    BEHAVIOR_MEAN,
+    BEHAVIOR_SIGMA,
+    BEHAVIOR_WEIGHT,
+    POLICY_WEIGHT,
+)
+from torchrl_mpfa.samplers.states import check_count, check_number, refuse
+from torchrl_mpfa.selection import Draw
+
+LEAST_SIGMA = 0.2
+"""Noise below this counts as this, the authors' own: a policy without any has no ratio."""
+_CUTOFF_DECAY = 5e-7
+_RATE = 0.1
+_FILE = "trust.json"
+
+
+def importance_ratio(action: Tensor, now: Tensor, then: Tensor, sigma: Tensor) -> Tensor:
+    r"""Density of an action by the policy of today over that by the behavior, :math:`\rho`.
+
+    Args:
+        action: What was done, shape ``[B, A]``.
+        now: What the policy would do, shape ``[B, A]``.
+        then: Mean of the behavior, shape ``[B, A]``.
+        sigma: Standard deviation of both, shape ``[B, 1]``.
+
+    Returns:
+        Ratios, shape ``[B]``.
+
+    Examples:
+        >>> zero, one = torch.zeros(1, 1), torch.ones(1, 1)
+        >>> round(importance_ratio(zero, zero, one, one).item(), 4)  # e to the half
+        1.6487
+    """
+    exponent = (action - then).square() - (action - now).square()
+    return (exponent / (2 * sigma.square())).sum(-1).exp()
+
+
+def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> float:
+    r"""Weight :math:`\beta` of the policy's gradient after a batch of which a share is far.
+
+    Args:
+        weight: :math:`\beta` before, in [0, 1].
+        far: Share of the transitions that are far.
+        allowed: Share :math:`D` that may be.
+        rate: :math:`\eta`, how fast it moves.
+
+    Returns:
+        :math:`(1 - \eta) \beta` where too many are far, :math:`(1 - \eta) \beta + \eta` else.
+
+    Examples:
+        >>> next_weight(0.5, far=0.3, allowed=0.1, rate=0.1)
+        0.45
+        >>> next_weight(0.5, far=0.0, allowed=0.1, rate=0.1)
+        0.55
+    """
+    return (1.0 - rate) * weight + (0.0 if far > allowed else rate)
+
+
+class RememberingSampler(RandomSampler):
+    r"""Uniform sampling by a sampler that keeps and saves what ReF-ER adapts.
+
+    Examples:
+        >>> RememberingSampler().policy_weight
+        1.0
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.policy_weight = 1.0
+        self.batches = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """The weight of the policy's gradient, and the batches so far."""
+        return {"_policy_weight": self.policy_weight, "_batches": self.batches}
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Refuse a state that does not fit, before anything changes.
+
+        Raises:
+            ValueError: If an entry is missing or not what it must be.
+        """
+        check_number(state_dict, "_policy_weight")
+        if state_dict["_policy_weight"] > 1:
+            refuse("_policy_weight", "in [0, 1]", state_dict["_policy_weight"])
+        check_count(state_dict, "_batches")
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: See :meth:`check_state`.
+        """
+        self.check_state(state_dict)
+        self.policy_weight = state_dict["_policy_weight"]
+        self.batches = state_dict["_batches"]
+
+    def dumps(self, path: str | Path) -> None:
+        """Save in a folder."""
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _FILE).write_text(json.dumps(self.state_dict()), encoding="utf-8")
+
+    def check_dump(self, path: str | Path) -> dict[str, Any]:
+        """Read a saved sampler and refuse it as :meth:`check_state` does."""
+        state: dict[str, Any] = json.loads((Path(path) / _FILE).read_text(encoding="utf-8"))
+        self.check_state(state)
+        return state
+
+    def loads(self, path: str | Path) -> None:
+        """Restore from a folder.
+
+        Raises:
+            ValueError: See :meth:`check_state`.
+        """
+        self.load_state_dict(self.check_dump(path))
+
+
+class RememberForget:
+    r"""Selection of ReF-ER: a uniform batch whose far transitions have no weight.
+
+    Args:
+        policy: The current policy; reads what its ``in_keys`` name, writes ``"action"``.
+        far_share: Share :math:`D` of far transitions up to which the policy is set free.
+        cutoff: :math:`C` of :math:`c = 1 + C / (1 + 5 \cdot 10^{-7} t)`, after ``t`` batches.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor
+        >>> RememberForget(make_actor(24, 2)).limit(0)
+        5.0
+    """
+
+    def __init__(
+        self, policy: TensorDictModule, *, far_share: float = 0.1, cutoff: float = 4.0
+    ) -> None:
+        if not 0.0 <= far_share <= 1.0:
+            raise ValueError(f"far_share must be in [0, 1], got {far_share}")
+        if not 0.0 < cutoff < math.inf:
+            raise ValueError(f"cutoff must be positive and finite, got {cutoff}")
+        self.policy = policy
+        self.far_share = far_share
+        self.cutoff = cutoff
+
+    def limit(self, batches: int) -> float:
+        """The ratio :math:`c` from which on a transition is far, after so many batches."""
+        return 1.0 + self.cutoff / (1.0 + _CUTOFF_DECAY * batches)
+
+    @torch.no_grad()
+    def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+        """Sample a batch, and say what of it counts.
+
+        Args:
+            buffer: The buffer, with a :class:`RememberingSampler`.
+
+        Yields:
+            One draw.
+
+        Raises:
+            TypeError: If the buffer has another sampler.
+            KeyError: If the transitions lack mean or standard deviation of the behavior.
+        """
+        sampler = buffer.sampler
+        if not isinstance(sampler, RememberingSampler):
+            raise TypeError(f"buffer must have a RememberingSampler, got {type(sampler).__name__}")
+        batch = buffer.sample()
+        read = batch.select(*self.policy.in_keys)
+        parameter = next(self.policy.parameters())
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            now = self.policy(read.to(parameter.device))["action"].to(batch["action"].device)
+        sigma = batch[BEHAVIOR_SIGMA].clamp_min(LEAST_SIGMA)
+        ratio = importance_ratio(batch["action"], now, batch[BEHAVIOR_MEAN], sigma)
+        limit = self.limit(sampler.batches)
+        near = ((ratio > 1.0 / limit) & (ratio < limit)).to(sigma.dtype)
+        weight = sampler.policy_weight
+        batch[BEHAVIOR_SIGMA] = sigma
+        batch["priority_weight"] = near
+        batch[POLICY_WEIGHT] = weight * near
+        batch[BEHAVIOR_WEIGHT] = torch.full_like(near, 1.0 - weight)
+        sampler.policy_weight = next_weight(
+            weight,
+            far=1.0 - float(near.mean()),
+            allowed=self.far_share,
+            rate=min(_RATE * len(batch) / len(buffer), 1.0),
+        )
+        sampler.batches += 1
+        yield Draw(batch)
