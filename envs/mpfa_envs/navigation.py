@@ -323,7 +323,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             Whether the goal was reached, the robot collided, or time is up; and the reward.
         """
         if self._walkers is not None:
-            self._walkers.move(_ALONE)
+            self._walkers.move(_ALONE, np.array([self._motion]))
         motion = self._drive.move(left, right)
         if self._walkers is not None:
             self._walkers.count_encounters(np.array([motion]), _ALONE, self._encounters)

@@ -182,7 +182,7 @@ class RobotBatch:
         episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
         self._lengthen_trails(int(episodes.steps.max()) + self._rules.action_repeat)
         for _ in range(self._rules.action_repeat):
-            self.walkers.move(running)
+            self.walkers.move(running, episodes.motions)
             self.drives.move(episodes.motions, running, speeds)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
             judge(episodes, worlds, running, self.trails, self._lengths, self._rules.max_steps)

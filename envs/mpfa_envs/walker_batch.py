@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.kernels.walkers import (
+    ORCA,
     STRAIGHT,
     WAYPOINTS,
     WalkerArrays,
@@ -16,6 +17,7 @@ from mpfa_envs.kernels.walkers import (
     nearest_walker,
     walk,
 )
+from mpfa_envs.orca import OrcaRoom
 from mpfa_envs.vector_state import read_array
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ _ROUNDS: Final = 20
 _MARGIN: Final = 0.05
 """A ray that ends this near to a walker, and three deviations of its noise, met it [m]."""
 _CHANGING: Final = ("states", "targets")
-_BEHAVIORS: Final = {"straight": STRAIGHT, "waypoints": WAYPOINTS}
+_BEHAVIORS: Final = {"straight": STRAIGHT, "waypoints": WAYPOINTS, "orca": ORCA}
 
 
 class WalkerBatch:
@@ -59,7 +61,7 @@ class WalkerBatch:
         >>> batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
         >>> batch.begin(0, (0.0, 0.0), np.random.default_rng(0))
         >>> before = batch.of(0)
-        >>> batch.move(np.array([True]))
+        >>> batch.move(np.array([True]), np.zeros((1, 5)))
         >>> float(np.hypot(*(batch.of(0) - before)[0, :2]).round(6))  # 0.3 m/s for 0.1 s
         0.03
     """
@@ -77,6 +79,8 @@ class WalkerBatch:
             waypoint_counts=np.zeros((count, 0), dtype=np.int64),
             counts=np.zeros(count, dtype=np.int64),
         )
+        self._rooms: dict[int, OrcaRoom] = {}
+        """The worlds of the robots around whom somebody avoids others."""
 
     def begin(self, index: int, start: Point, rng: np.random.Generator) -> None:
         """Put the walkers of a robot's world where they start.
@@ -98,8 +102,18 @@ class WalkerBatch:
         self._arrays.states[index, :count], self._arrays.targets[index, :count] = states, targets
         self._place(index)
 
-    def move(self, running: NDArray[np.bool_]) -> None:
-        """Let the walkers of some robots, ``[N]``, walk for one time step."""
+    def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
+        """Let walkers walk for one time step.
+
+        Args:
+            running: The walkers of which robots, ``[N]``.
+            motions: Poses and speeds of the robots, ``[N, 5]``, for those who avoid them.
+        """
+        for index, room in self._rooms.items():
+            if running[index]:
+                count = self._arrays.counts[index]
+                states, targets = self._arrays.states[index], self._arrays.targets[index]
+                room.choose(motions[index], states[:count], targets[:count])
         if self.present:
             walk(self._arrays, self._worlds.standing, running, self._time_step)
 
@@ -207,6 +221,9 @@ class WalkerBatch:
         self._make_room(count, max((len(each.waypoints) for each in world.walkers), default=0))
         arrays = self._arrays
         arrays.counts[index] = count
+        self._rooms.pop(index, None)
+        if any(walker.behavior == "orca" for walker in world.walkers):
+            self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
         for number, walker in enumerate(world.walkers):
             arrays.bodies[index, number] = walker.radius, walker.speed
             arrays.behaviors[index, number] = _BEHAVIORS[walker.behavior]

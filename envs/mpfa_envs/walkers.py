@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 if TYPE_CHECKING:
     from mpfa_envs.shapes import Point
 
-Behavior = Literal["straight", "waypoints"]
+Behavior = Literal["straight", "waypoints", "orca"]
 """How a walker finds its way."""
 
 MOST_WALKERS: Final = 100
@@ -34,12 +34,14 @@ class Walker:
 
     Args:
         radius: Radius [m].
-        speed: Speed, that never changes [m/s], at most 5.
+        speed: Speed [m/s], at most 5.
         behavior: ``"straight"``: from anywhere in any direction, straight ahead until it meets a
             wall, an obstacle or another walker, off which it bounces. ``"waypoints"``: from one
             waypoint to the next, after the last one to the first, from anywhere on this round; it
-            walks through other walkers. Neither sees the robot.
-        waypoints: Where a walker with ``"waypoints"`` goes (x, y) [m], two at least.
+            walks through other walkers. Neither sees the robot. ``"orca"``: likewise between
+            waypoints, no faster than its speed, around obstacles, other walkers and the robot
+            (:class:`~mpfa_envs.orca.OrcaRoom`), which needs ``pip install 'torchrl-mpfa[orca]'``.
+        waypoints: Where a walker goes that is not ``"straight"`` (x, y) [m], two at least.
 
     Raises:
         ValueError: If a number is out of its range, the behavior is unknown or the waypoints do

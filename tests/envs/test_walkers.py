@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def walk(batch: WalkerBatch, steps: int) -> np.ndarray:
     """States of the walkers after each step, ``[steps, K, 5]``."""
     states = []
     for _ in range(steps):
-        batch.move(np.ones(1, dtype=np.bool_))
+        batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
         states.append(batch.of(0))
     return np.array(states)
 
@@ -181,6 +182,74 @@ def test_a_robot_among_walkers_drives_the_same_episodes_in_both_environments(
     assert "collision" in ends
 
 
+POLITE = replace(
+    BUSY,
+    name="polite",
+    walkers=(
+        *(
+            Walker(behavior="orca", waypoints=points, radius=0.2, speed=0.4)
+            for points in (
+                ROUND,
+                ROUND[::-1],
+                ((-4.0, -4.0), (4.0, -4.0)),
+                ((4.0, -4.0), (-4.0, -4.0)),
+            )
+        ),
+        Walker(radius=0.2),
+    ),
+)
+
+
+def test_who_avoids_others_runs_into_nobody_who_does_and_gets_around() -> None:
+    pytest.importorskip("pyrvo", reason="an extra")
+    seen = walk(batch_of(POLITE), 1500)
+    assert min(POLITE.clearances(step[:4, :2]).min() for step in seen) > 0.18
+    for one in range(4):
+        for other in range(one):
+            assert np.hypot(*(seen[:, one, :2] - seen[:, other, :2]).T).min() > 0.38
+    way = np.hypot(*np.diff(seen[:, :4, :2], axis=0).transpose(2, 0, 1)).sum(axis=0)
+    assert way.min() > 0.7 * 150 * 0.4
+    assert np.hypot(seen[:, :4, 2], seen[:, :4, 3]).max() < 0.401
+
+
+def test_who_avoids_others_goes_around_a_robot_that_stands_in_the_way() -> None:
+    pytest.importorskip("pyrvo", reason="an extra")
+    there_and_back = Walker(behavior="orca", waypoints=((-3.0, 0.01), (3.0, 0.01)))
+    batch = WalkerBatch(
+        WorldBatch([World(name="lane", walkers=(there_and_back,))]), radius=0.18, time_step=0.1
+    )
+    batch.begin(0, (0.0, 0.0), np.random.default_rng(0))
+    gaps, places = [], []
+    for _ in range(600):
+        batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
+        x, y, *_ = batch.of(0)[0].tolist()
+        gaps.append(math.hypot(x, y) - 0.43)
+        places.append(x)
+    assert min(gaps) > -0.01
+    assert min(places) < -2.0 and max(places) > 2.0
+
+
+def test_who_avoids_others_is_alike_in_both_environments_and_comes_back_from_a_state() -> None:
+    pytest.importorskip("pyrvo", reason="an extra")
+    assert_same_episode(POLITE, 1)
+    given: dict[str, Any] = {"world": POLITE, "physics": "kinematic"}
+    env, other = VectorNavigationEnv(2, **given), VectorNavigationEnv(2, **given)
+    env.reset(seed=0)
+    actions = np.full((2, 2), -0.5, dtype=np.float32)
+    for _ in range(15):
+        env.step(actions)
+    other.load_state_dict(env.state_dict())
+    for _ in range(15):
+        np.testing.assert_array_equal(env.step(actions)[0], other.step(actions)[0])
+        np.testing.assert_array_equal(env.walkers(1), other.walkers(1))
+
+
+def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrvo", None)
+    with pytest.raises(ImportError, match=r"behavior='orca' needs pyrvo: pip install .*\[orca\]"):
+        batch_of(POLITE)
+
+
 def test_wheels_meet_the_same_walkers_in_both_environments() -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     assert_same_episode(BUSY, 1, physics="wheels", collision_distance=0.25)
@@ -219,7 +288,7 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
         batch.begin(0, (0.0, -1.0), np.random.default_rng(0))
         rng, hits = np.random.default_rng(1), 0
         for heading in np.linspace(-3.0, 3.0, 60):
-            batch.move(np.ones(1, dtype=np.bool_))
+            batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
             motions = np.array([[0.0, -1.0, heading, 0.0, 0.0]])
             ranges = lidar.measure(*motions[0, :3], rng=rng, moving=batch.circles(0))[None]
             seen = batch.without(motions, lidar, ranges)

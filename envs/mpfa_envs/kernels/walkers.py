@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 STRAIGHT: Final = 0
 WAYPOINTS: Final = 1
+ORCA: Final = 2
+_ARRIVED: Final = 0.3
+"""Who avoids others has been at a waypoint when it was this near [m]."""
 _ROUNDING: Final = 1e-9
 """More than what rounding does to a slack [m]."""
 _NUDGE: Final = 1e-3
@@ -36,7 +39,7 @@ class WalkerArrays(NamedTuple):
     bodies: NDArray[np.float64]
     """Radius and speed [m, m/s], ``[N, most, 2]``."""
     behaviors: NDArray[np.int64]
-    """:data:`STRAIGHT` or :data:`WAYPOINTS`, ``[N, most]``."""
+    """:data:`STRAIGHT`, :data:`WAYPOINTS` or :data:`ORCA`, ``[N, most]``."""
     waypoints: NDArray[np.float64]
     """(x, y) [m], ``[N, most, most waypoints, 2]``."""
     waypoint_counts: NDArray[np.int64]
@@ -69,6 +72,8 @@ def walk(
                 across = walkers.waypoints[robot, index, target, 0] - states[robot, index, 0]
                 up = walkers.waypoints[robot, index, target, 1] - states[robot, index, 1]
                 on_its_way = across * across + up * up > way * way
+            elif walkers.behaviors[robot, index] == ORCA:
+                on_its_way = False
             else:
                 on_its_way = walkers.slacks[robot, index] - way > _ROUNDING
                 on_its_way &= way <= walkers.bodies[robot, index, 0]
@@ -86,6 +91,8 @@ def walk(
                 states[robot, index, 1] += states[robot, index, 3] * time_step
             elif walkers.behaviors[robot, index] == WAYPOINTS:
                 _turn(walkers, robot, index, time_step)
+            elif walkers.behaviors[robot, index] == ORCA:
+                _glide(walkers, rooms, robot, index, time_step)
             else:
                 _bounce(walkers, rooms, robot, index, time_step)
             circles[robot, behind + index, 0] = states[robot, index, 0]
@@ -110,6 +117,26 @@ def _turn(walkers: WalkerArrays, robot: int, index: int, time_step: float) -> No
     state[2], state[3] = speed * across / gap, speed * up / gap
     state[0] += left * across / gap
     state[1] += left * up / gap
+
+
+@njit
+def _glide(
+    walkers: WalkerArrays, rooms: BatchArrays, robot: int, index: int, time_step: float
+) -> None:
+    """Go with the velocity that was chosen, or stand where that leads into what stands."""
+    state, points = walkers.states[robot, index], walkers.waypoints[robot, index]
+    x, y = state[0] + time_step * state[2], state[1] + time_step * state[3]
+    room = clearance_at(rooms, robot, x, y)
+    # Who is too near already may leave.
+    enough = min(walkers.bodies[robot, index, 0], clearance_at(rooms, robot, state[0], state[1]))
+    if room < enough:
+        state[2], state[3] = 0.0, 0.0
+        return
+    state[0], state[1] = x, y
+    target = walkers.targets[robot, index]
+    across, up = points[target, 0] - x, points[target, 1] - y
+    if across * across + up * up < _ARRIVED * _ARRIVED:
+        walkers.targets[robot, index] = (target + 1) % walkers.waypoint_counts[robot, index]
 
 
 @njit
