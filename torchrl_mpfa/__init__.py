@@ -8,9 +8,17 @@ from torchrl_mpfa.adjustment import (
     PositiveDecay,
 )
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
-from torchrl_mpfa.learners import DDPGLearner, Learner, SACLearner, TD3Learner
+from torchrl_mpfa.learners import (
+    DDPGLearner,
+    DQNLearner,
+    Learner,
+    QLearner,
+    SACLearner,
+    TD3Learner,
+)
 from torchrl_mpfa.losses import (
     SignalDDPGLoss,
+    SignalDQNLoss,
     SignalLoss,
     SignalSACLoss,
     SignalTD3Loss,
@@ -24,6 +32,8 @@ from torchrl_mpfa.networks import (
     make_actor,
     make_critic,
     make_stochastic_actor,
+    make_value_network,
+    make_value_table,
 )
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.samplers import MixtureSampler, MPFASampler, SignalSampler, TreeSampler
@@ -51,6 +61,7 @@ __all__ = [
     "BatchFacts",
     "Counting",
     "DDPGLearner",
+    "DQNLearner",
     "DirectModule",
     "Draw",
     "EntropyFusion",
@@ -61,12 +72,14 @@ __all__ = [
     "MixtureSampler",
     "PositiveBoost",
     "PositiveDecay",
+    "QLearner",
     "SACLearner",
     "ScaledFusion",
     "ScheduledFusion",
     "Selection",
     "Signal",
     "SignalDDPGLoss",
+    "SignalDQNLoss",
     "SignalLoss",
     "SignalMemmapStorage",
     "SignalReplayBuffer",
@@ -84,6 +97,8 @@ __all__ = [
     "make_sac_loss",
     "make_stochastic_actor",
     "make_td3_loss",
+    "make_value_network",
+    "make_value_table",
     "one_batch",
     "run_updates",
     "save_atomically",

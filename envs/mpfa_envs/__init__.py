@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
+from mpfa_envs.binning import Binning
 from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.navigation import PAPER_TASK, NavigationEnv
@@ -26,6 +27,7 @@ from mpfa_envs.world_file import WorldFileError, load_world, save_world
 from mpfa_envs.worlds import World, WorldArrays
 
 if TYPE_CHECKING:
+    from mpfa_envs.discrete import WHEEL_PAIRS, DiscreteWheels
     from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
     from mpfa_envs.evaluation import evaluate, run_tasks
     from mpfa_envs.generators import (
@@ -60,9 +62,12 @@ __all__ = [
     "PAPER_TASK",
     "ROBOTS",
     "VECTOR_ENV_IDS",
+    "WHEEL_PAIRS",
     "WORLDS",
+    "Binning",
     "Box",
     "Cylinder",
+    "DiscreteWheels",
     "DistanceField",
     "EpisodeResult",
     "FreeGrid",
@@ -141,6 +146,8 @@ for _id in VECTOR_ENV_IDS:
 
 _LATER = {
     "GENERATORS": "generators",
+    "WHEEL_PAIRS": "discrete",
+    "DiscreteWheels": "discrete",
     "DistanceField": "distance",
     "FreeGrid": "distance",
     "MapMemory": "map_memory",

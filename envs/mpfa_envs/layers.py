@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from mpfa_envs.binning import Binning
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -112,9 +114,62 @@ class Scale:
         return size
 
 
-Layer = Linear | LayerNorm | ReLU | Tanh | Scale
+@dataclass(frozen=True)
+class Table:
+    """Values of the cell that an observation lies in, see :class:`~mpfa_envs.binning.Binning`."""
+
+    values: NDArray[np.float32]
+    """Shape ``[cells, size]``."""
+    groups: int
+    closeness: tuple[float, ...]
+    directions: int
+    distances: tuple[float, ...]
+    sectors: int
+    observation_size: int
+
+    @property
+    def binning(self) -> Binning:
+        """The cells."""
+        return Binning(**{field.name: getattr(self, field.name) for field in fields(self)[1:]})
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """From ``[N, observation_size]`` to ``[N, size]``."""
+        return self.values[self.binning(x)].astype(np.float64)
+
+    def output_size(self, input_size: int | None) -> int:
+        """Check the shapes, and give the number of values."""
+        binning = self.binning
+        if input_size is not None:
+            raise ValueError("a table must come first")
+        if self.values.ndim != 2 or len(self.values) != binning.cells:
+            raise ValueError(
+                f"values must have shape [{binning.cells}, size], got {self.values.shape}"
+            )
+        return int(self.values.shape[1])
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The action whose value is the greatest; of equal ones the first."""
+
+    actions: NDArray[np.float32]
+    """Shape ``[size, A]``."""
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """From ``[N, size]`` to ``[N, A]``."""
+        return self.actions[x.argmax(-1)].astype(np.float64)
+
+    def output_size(self, input_size: int | None) -> int:
+        """Check the shapes, and give the size of an action."""
+        size = len(self.actions) if input_size is None else input_size
+        if self.actions.ndim != 2 or len(self.actions) != size:
+            raise ValueError(f"actions must have shape [{size}, A], got {self.actions.shape}")
+        return int(self.actions.shape[1])
+
+
+Layer = Linear | LayerNorm | ReLU | Tanh | Scale | Table | Choice
 KINDS: Final[Mapping[str, Callable[..., Layer]]] = {
-    kind.__name__: kind for kind in (Linear, LayerNorm, ReLU, Tanh, Scale)
+    kind.__name__: kind for kind in (Linear, LayerNorm, ReLU, Tanh, Scale, Table, Choice)
 }
 """The layers that a policy may have, by name."""
 
@@ -129,11 +184,10 @@ def check_layers(layers: Sequence[Layer]) -> tuple[int, int]:
         Number of inputs of the first and of outputs of the last.
 
     Raises:
-        ValueError: If there is no linear layer, two do not fit, or a weight is not finite.
+        ValueError: If the first is neither linear nor a table, two do not fit, or a weight is not finite.
     """
-    linear = [layer for layer in layers if isinstance(layer, Linear)]
-    if not linear or not isinstance(layers[0], Linear):
-        raise ValueError("layers must begin with a linear layer")
+    if not layers or not isinstance(layers[0], Linear | Table):
+        raise ValueError("layers must begin with a linear layer or a table")
     size: int | None = None
     for number, layer in enumerate(layers):
         try:
@@ -143,7 +197,9 @@ def check_layers(layers: Sequence[Layer]) -> tuple[int, int]:
         for name, value in arrays_of(layer).items():
             if not np.isfinite(value).all():
                 raise ValueError(f"layer {number}, {type(layer).__name__}: {name} is not finite")
-    return int(linear[0].weight.shape[1]), int(size or 0)
+    first = layers[0]
+    inputs = first.observation_size if isinstance(first, Table) else first.weight.shape[1]
+    return int(inputs), int(size or 0)
 
 
 def arrays_of(layer: Layer) -> dict[str, NDArray[np.float32]]:

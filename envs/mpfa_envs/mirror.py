@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from mpfa_envs.checks import check_share
+from mpfa_envs.discrete import WheelPairs, mirrored_places
 from mpfa_envs.observation import Memory, observation_slices
 
 
@@ -18,6 +19,11 @@ class Mirror(nn.Module):
         sectors: Number of sectors of the lidar.
         memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
         history: Number of earlier scans that it senses.
+        pairs: The pairs of wheel speeds that actions choose among, one-hot, as behind
+            :class:`~mpfa_envs.DiscreteWheels`; None: actions are wheel speeds.
+
+    Raises:
+        ValueError: If a pair has no mirror image among them.
 
     Examples:
         >>> mirror = Mirror()
@@ -27,8 +33,16 @@ class Mirror(nn.Module):
 
     order: Tensor
     sign: Tensor
+    swapped: Tensor
 
-    def __init__(self, *, sectors: int = 18, memory: Memory = "none", history: int = 0) -> None:
+    def __init__(
+        self,
+        *,
+        sectors: int = 18,
+        memory: Memory = "none",
+        history: int = 0,
+        pairs: WheelPairs | None = None,
+    ) -> None:
         super().__init__()
         parts = observation_slices(sectors, memory=memory, history=history)
         size = max(part.stop for part in parts.values())
@@ -42,6 +56,8 @@ class Mirror(nn.Module):
         sign[parts["angular_speed"]] = -1.0
         if memory == "map":
             sign[parts["way_direction"].start + 1] = -1.0
+        swapped = torch.tensor([1, 0]) if pairs is None else mirrored_places(pairs)
+        self.register_buffer("swapped", swapped, persistent=False)
         self.register_buffer("order", order, persistent=False)
         self.register_buffer("sign", sign, persistent=False)
 
@@ -61,12 +77,13 @@ class Mirror(nn.Module):
         """What drives the mirrored path: the wheels change places.
 
         Args:
-            action: Actions, shape ``[..., 2]``.
+            action: Actions, shape ``[..., 2]``, or one-hot choices among ``K`` pairs,
+                ``[..., K]``.
 
         Returns:
             Their mirror images, of the same shape.
         """
-        return action.flip(-1)
+        return action.index_select(-1, self.swapped.to(action.device))
 
 
 class RandomMirror(Transform):
@@ -83,10 +100,11 @@ class RandomMirror(Transform):
         sectors: Number of sectors of the lidar.
         memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
         history: Number of earlier scans that it senses.
+        pairs: As in :class:`Mirror`.
         generator: Source of the choices; None: PyTorch's own.
 
     Raises:
-        ValueError: If chance is not in [0, 1].
+        ValueError: If chance is not in [0, 1], or a pair has no mirror image.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -108,11 +126,12 @@ class RandomMirror(Transform):
         sectors: int = 18,
         memory: Memory = "none",
         history: int = 0,
+        pairs: WheelPairs | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.chance = check_share("chance", chance)
-        self.mirror = Mirror(sectors=sectors, memory=memory, history=history)
+        self.mirror = Mirror(sectors=sectors, memory=memory, history=history, pairs=pairs)
         self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -10,6 +10,7 @@ from torchrl_mpfa.networks.stochastic import (
     sample_tanh_normal,
 )
 from torchrl_mpfa.networks.unit import UnitLinear
+from torchrl_mpfa.networks.values import make_value_network, make_value_table
 
 __all__ = [
     "ActionScale",
@@ -23,5 +24,7 @@ __all__ = [
     "make_actor",
     "make_critic",
     "make_stochastic_actor",
+    "make_value_network",
+    "make_value_table",
     "sample_tanh_normal",
 ]

@@ -1,0 +1,127 @@
+"""A few pairs of wheel speeds in place of all: for learners that value each action apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import torch
+from torch import Tensor
+from torchrl.data import Composite, OneHot
+from torchrl.envs import Transform
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
+WheelPairs = Sequence[tuple[float, float]]
+
+WHEEL_PAIRS: Final[tuple[tuple[float, float], ...]] = (
+    (1.0, 1.0),
+    (0.5, 1.0),
+    (1.0, 0.5),
+    (-0.25, 1.0),
+    (1.0, -0.25),
+    (-1.0, 1.0),
+    (1.0, -1.0),
+)
+"""Speeds of the left and the right wheel, as actions in [-1, 1]: straight on at full speed, then
+left and right in arcs that get tighter. A TurtleBot turns by 0, 0.49, 1.22 and 1.96 rad/s, at 0.5,
+0.44, 0.36 and 0.28 m/s. The mirror image of each is among them."""
+
+
+def check_pairs(pairs: WheelPairs) -> Tensor:
+    """The pairs as a tensor, shape ``[K, 2]``.
+
+    Args:
+        pairs: Two or more different actions of the two wheels, each in [-1, 1].
+
+    Returns:
+        The tensor.
+
+    Raises:
+        ValueError: If they are not.
+    """
+    found = torch.as_tensor(pairs, dtype=torch.float32)
+    if found.ndim != 2 or found.shape[1] != 2 or len(found) < 2:
+        raise ValueError(f"pairs must be two or more pairs of numbers, got {pairs!r}")
+    if not bool((found.abs() <= 1.0).all()):
+        raise ValueError(f"pairs must be in [-1, 1], got {pairs!r}")
+    if len(found.unique(dim=0)) < len(found):
+        raise ValueError(f"pairs must be different, got {pairs!r}")
+    return found
+
+
+def mirrored_places(pairs: WheelPairs) -> Tensor:
+    """Which pair is the mirror image of each: its wheels have changed places.
+
+    Args:
+        pairs: Pairs of wheel speeds.
+
+    Returns:
+        Places in ``pairs``, shape ``[K]``.
+
+    Raises:
+        ValueError: If a pair has no mirror image among them.
+
+    Examples:
+        >>> mirrored_places(WHEEL_PAIRS).tolist()
+        [0, 2, 1, 4, 3, 6, 5]
+    """
+    speeds = check_pairs(pairs)
+    same = (speeds.flip(1).unsqueeze(1) == speeds.unsqueeze(0)).all(-1)
+    alone = (~same.any(1)).nonzero().flatten().tolist()
+    if alone:
+        raise ValueError(f"pairs must hold the mirror image of each, got none of {pairs[alone[0]]}")
+    return same.long().argmax(1)
+
+
+class DiscreteWheels(Transform):
+    """Makes the action of a navigation environment a choice among pairs of wheel speeds.
+
+    The action of the transformed environment is one-hot, shape ``[..., K]``, which TorchRL's
+    ``DQNLoss`` takes as it is.
+
+    Args:
+        pairs: The pairs, as actions of the environment, in [-1, 1].
+
+    Raises:
+        ValueError: If there are fewer than two, two are the same, or one is out of its range.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from mpfa_envs import DiscreteWheels, make_navigation_env
+        >>> env = TransformedEnv(make_navigation_env("A", physics="kinematic"), DiscreteWheels())
+        >>> env.action_spec.shape, env.rollout(3)["action"].sum(-1).tolist()
+        (torch.Size([7]), [1, 1, 1])
+        >>> env.close()
+    """
+
+    pairs: Tensor
+
+    def __init__(self, pairs: WheelPairs = WHEEL_PAIRS) -> None:
+        super().__init__(in_keys=[], out_keys=[], in_keys_inv=["action"], out_keys_inv=["action"])
+        self.register_buffer("pairs", check_pairs(pairs), persistent=False)
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        """From one-hot choices, shape ``[..., K]``, to wheel speeds, shape ``[..., 2]``."""
+        return self.pairs.to(action.device)[action.long().argmax(-1)]
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Put the choice in the place of the wheel speeds.
+
+        Args:
+            input_spec: Specs of the environment.
+
+        Returns:
+            Specs with the choice.
+        """
+        action = input_spec["full_action_spec", "action"]
+        shape = (*action.shape[:-1], len(self.pairs))
+        input_spec["full_action_spec", "action"] = OneHot(
+            len(self.pairs), shape=shape, device=action.device, dtype=torch.long
+        )
+        return input_spec
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Leave what was sampled from a buffer as it is: what is stored is the choice."""
+        return tensordict

@@ -1,0 +1,133 @@
+"""DQN loss that writes the TD error of each transition."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.objectives import DQNLoss, ValueEstimators
+
+from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.priorities import td_error_priority
+from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
+
+_DISTANCES = ("l1", "l2", "smooth_l1")
+
+
+class SignalDQNLoss(DQNLoss):
+    r""":class:`~torchrl.objectives.DQNLoss` that also writes the signal of Eq. (13).
+
+    A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|`, shape ``[B]``. There is no signal
+    of Eq. (14): a choice among actions has no slope. The loss is Eq. (11),
+    :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2`.
+
+    Args:
+        value_network: From observations to ``"action_value"``, ``"chosen_action_value"`` and a
+            one-hot ``"action"``, such as :func:`~torchrl_mpfa.make_value_network` gives.
+        signals: ``["td_error"]``, or none.
+        importance: ``"critic"``: weights divided by the batch size (Eq. 11); ``"torchrl"``: by
+            their sum; ``"none"``.
+        reward_scale: Factor of the rewards in the loss; the signal is divided by it again.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``.
+        double: Whether the next action is that of the network, and not of the target network
+            (van Hasselt et al. 2016, https://arxiv.org/abs/1509.06461).
+        gamma: Discount, in [0, 1].
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from torchrl_mpfa import make_value_network
+        >>> SignalDQNLoss(make_value_network(24, 7)).double_dqn
+        True
+    """
+
+    SIGNALS: ClassVar[tuple[str, ...]] = (TD_ERROR.name,)
+
+    def __init__(
+        self,
+        value_network: TensorDictModule,
+        *,
+        signals: Sequence[str] = SIGNALS,
+        importance: str = "critic",
+        reward_scale: float = 1.0,
+        loss_function: str = "l2",
+        double: bool = True,
+        gamma: float = 0.99,
+    ) -> None:
+        check_signals(signals)
+        if importance not in ("critic", "torchrl", "none"):
+            raise ValueError(
+                f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}"
+            )
+        if loss_function not in _DISTANCES:
+            raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
+        if not 0 < reward_scale < math.inf:
+            raise ValueError(f"reward_scale must be positive and finite, got {reward_scale}")
+        check_gamma(gamma)
+        super().__init__(
+            value_network,
+            loss_function=loss_function,
+            delay_value=True,
+            double_dqn=double,
+            action_space="one-hot",
+            reduction="none",
+            use_prioritized_weights=False,
+        )
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+        self.signals, self.importance, self.reward_scale = tuple(signals), importance, reward_scale
+
+    def losses(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss; writes the signal in ``batch``.
+
+        Args:
+            batch: Transitions, batch size ``[B]``, with one-hot actions, ``[B, K]``.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        scaled = batch.select(*self.in_keys)
+        reward = ("next", self.tensor_keys.reward)
+        scaled[reward] = scaled[reward] * self.reward_scale
+        distance: Tensor = super().forward(scaled)["loss"]
+        squared = scaled[self.tensor_keys.priority].squeeze(-1)
+        if TD_ERROR.name in self.signals:
+            size = td_error_priority(squared.sqrt())
+            batch.set(TD_ERROR.key, size / self.reward_scale)
+        loss = distance
+        if self.importance != "none" and "priority_weight" in batch.keys():  # noqa: SIM118
+            weight = batch["priority_weight"].reshape(-1)
+            mean = weight.mean() if self.importance == "torchrl" else 1.0
+            loss = distance * weight / mean
+        return loss.mean(), {"td_error": squared.mean()}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss under the key ``"loss"``, as TorchRL has it.
+
+        Args:
+            tensordict: As in :meth:`losses`.
+
+        Returns:
+            A tensordict.
+        """
+        return TensorDict({"loss": self.losses(tensordict)[0]})
+
+
+def check_signals(signals: Sequence[str]) -> None:
+    """Refuse signals that a value for each action does not have.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    for name in signals:
+        if name == ACTION_GRADIENT.name:
+            raise ValueError(
+                f"signals must not have {name!r}: values of separate actions have no slope. "
+                "Leave it out, as with signals=['reward', 'td_error']"
+            )
+        if name != TD_ERROR.name:
+            raise ValueError(f"signals must be among ['td_error'], got {name!r}")

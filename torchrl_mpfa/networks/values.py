@@ -1,0 +1,134 @@
+"""Networks and tables that value each of a few actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
+
+_OUT_KEYS = ["action_value", "action", "chosen_action_value"]
+
+
+def one_hot_choice(values: Tensor) -> Tensor:
+    """The greatest of some values as a one-hot choice, integers of the same shape.
+
+    Examples:
+        >>> one_hot_choice(torch.tensor([0.5, 2.0, 1.0])).tolist()
+        [0, 1, 0]
+    """
+    return nn.functional.one_hot(values.argmax(-1), values.shape[-1])
+
+
+class ValueNetwork(nn.Module):
+    """A perceptron with an output for each action."""
+
+    def __init__(
+        self,
+        observation_size: int,
+        actions: int,
+        *,
+        width: int,
+        layers: int,
+        layer_norm: bool,
+        final_init: float | None,
+    ) -> None:
+        super().__init__()
+        sizes = observation_size, *[width] * layers
+        self.body = nn.Sequential(*hidden_layers(*sizes, layer_norm=layer_norm))
+        self.head = last_layer(width, actions, final_init)
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """From ``[..., O]`` to values, one-hot choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        return _chosen(self.head(self.body(observation)))
+
+    def layers(self) -> list[nn.Module]:
+        """All layers in their order, from observation to values."""
+        return [*self.body, self.head]
+
+
+class ValueTable(nn.Module):
+    """A table with a row of values for each cell of the observations."""
+
+    table: Tensor
+
+    def __init__(self, cell_of: Callable[[Tensor], Tensor], cells: int, actions: int) -> None:
+        super().__init__()
+        self.cell_of = cell_of
+        self.register_buffer("table", torch.zeros(cells, actions))
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """From ``[..., O]`` to values, one-hot choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        return _chosen(self.table[self.cell_of(observation)])
+
+
+def _chosen(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return values, one_hot_choice(values), values.amax(-1, keepdim=True)
+
+
+def make_value_network(
+    observation_size: int,
+    actions: int,
+    *,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
+) -> DirectModule:
+    """Network from ``"observation"`` to a value for each action, and the best one, one-hot.
+
+    Args:
+        observation_size: ``O``.
+        actions: Number of actions ``K``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers.
+        layer_norm: Normalize each hidden layer.
+        final_init: The last layer starts uniformly within this; None leaves PyTorch's start.
+
+    Returns:
+        A module for ``DQNLoss``.
+
+    Raises:
+        ValueError: If a size is not a positive integer.
+
+    Examples:
+        >>> make_value_network(24, 7).outputs({"observation": torch.rand(5, 24)})["action"].shape
+        torch.Size([5, 7])
+    """
+    check_counts(observation_size=observation_size, actions=actions, width=width, layers=layers)
+    network = ValueNetwork(
+        observation_size,
+        actions,
+        width=width,
+        layers=layers,
+        layer_norm=layer_norm,
+        final_init=final_init,
+    )
+    return DirectModule(network, in_keys=["observation"], out_keys=_OUT_KEYS)
+
+
+def make_value_table(cell_of: Callable[[Tensor], Tensor], cells: int, actions: int) -> DirectModule:
+    """Table from ``"observation"`` to a value for each action, zero at first, and the best one.
+
+    Args:
+        cell_of: From observations, shape ``[..., O]``, to integers in [0, cells), shape ``[...]``.
+        cells: Number of rows.
+        actions: Number of actions ``K``.
+
+    Returns:
+        A module for :class:`~torchrl_mpfa.QLearner`.
+
+    Raises:
+        ValueError: If a size is not a positive integer.
+
+    Examples:
+        >>> table = make_value_table(lambda seen: (seen[..., 0] > 0).long(), 2, 3)
+        >>> table.outputs({"observation": torch.rand(5, 24)})["action_value"].shape
+        torch.Size([5, 3])
+    """
+    check_counts(cells=cells, actions=actions)
+    table = ValueTable(cell_of, cells, actions)
+    return DirectModule(table, in_keys=["observation"], out_keys=_OUT_KEYS)
