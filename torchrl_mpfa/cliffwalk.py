@@ -255,7 +255,7 @@ def oracle_updates(
     *,
     features: Features = "tabular",
     threshold: float = 1e-3,
-    limit: int = 100_000,
+    limit: int = 10_000,
     seed: int = 0,
 ) -> float:
     """Updates until Q is the true one, if each is the one after which its error is the least.

@@ -184,7 +184,8 @@ def check_layers(layers: Sequence[Layer]) -> tuple[int, int]:
         Number of inputs of the first and of outputs of the last.
 
     Raises:
-        ValueError: If the first is neither linear nor a table, two do not fit, or a weight is not finite.
+        ValueError: If the first is neither linear nor a table, two do not fit, or a weight is not
+            finite.
     """
     if not layers or not isinstance(layers[0], Linear | Table):
         raise ValueError("layers must begin with a linear layer or a table")

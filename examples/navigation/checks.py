@@ -13,7 +13,7 @@ import torch
 from mpfa_envs import world_tasks
 from mpfa_envs.robot import resolve_robot
 from navigation.environments import make_training_env
-from navigation.settings import EnvironmentSettings, TrainSettings
+from navigation.settings import EnvironmentSettings, TrainSettings, is_discrete
 from navigation.worlds import is_of_a_test
 from torchrl_mpfa.methods.assembly import WORDS
 
@@ -84,7 +84,7 @@ RULES: dict[str, Rule] = {
     "method.decay_sharpness": NOT_NEGATIVE,
     "method.curiosity_scale": POSITIVE,
     "learner.name": NAME,
-    "learner.algorithm": choice("ddpg", "td3", "sac"),
+    "learner.algorithm": choice("ddpg", "td3", "sac", "dqn", "q_learning"),
     "learner.actor_lr": POSITIVE,
     "learner.critic_lr": POSITIVE,
     "learner.lr_end_factor": SHARE,
@@ -103,10 +103,13 @@ RULES: dict[str, Rule] = {
     "learner.noise_clip": NOT_NEGATIVE,
     "learner.alpha_init": POSITIVE,
     "learner.alpha_lr": POSITIVE,
+    "learner.table_lr": OPEN_SHARE,
     "curriculum.name": NAME,
     "exploration.random_steps": at_least(0),
     "exploration.sigma": NOT_NEGATIVE,
     "exploration.sigma_end": NOT_NEGATIVE,
+    "exploration.epsilon": SHARE,
+    "exploration.epsilon_end": SHARE,
     "exploration.annealing_steps": at_least(1),
     "environment.physics": choice("wheels", "kinematic"),
     "environment.max_steps": at_least(1),
@@ -188,9 +191,40 @@ def check_settings(settings: TrainSettings) -> None:
             f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "
             "got True: nothing may be chosen by the worlds of a test"
         )
-    if settings.learner.compile and settings.learner.algorithm == "sac":
-        raise ValueError("learner.compile must be false with SAC, got True")
+    if settings.learner.compile and settings.learner.algorithm not in ("ddpg", "td3"):
+        name = settings.learner.algorithm
+        name = "SAC" if name == "sac" else name
+        raise ValueError(f"learner.compile must be false with {name}, got True")
+    if is_discrete(settings.learner):
+        _check_values_alone(settings)
     _check_device(settings.device)
+
+
+def _check_values_alone(settings: TrainSettings) -> None:
+    """Refuse what a method has only where actions are numbers, or actor and critic two."""
+    method, algorithm = settings.method, settings.learner.algorithm
+    own = {"reward", "td_error", "action_gradient"}
+    for name, wrong in (
+        ("signals", any(signal not in own for signal in method.signals)),
+        (
+            "selection",
+            method.selection not in ("prioritized", "rank", "capped", "uniform", "newest"),
+        ),
+        ("candidates", method.candidates > 1),
+        ("target_average", method.target_average > 1),
+        ("loss_function", method.loss_function not in ("l2", "smooth_l1")),
+        ("curiosity", method.curiosity),
+    ):
+        if wrong:
+            raise ValueError(
+                f"method={method.name} is not for learner={algorithm}, which has neither an actor "
+                f"nor actions that are numbers: method.{name}={getattr(method, name)}"
+            )
+    if method.signals == ["action_gradient"]:
+        raise ValueError(
+            f"method.signals must hold reward or td_error with learner={algorithm}, which has no "
+            "action gradient"
+        )
 
 
 def _check_stages(settings: TrainSettings) -> None:

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
-from mpfa_envs import NavigationTorchEnv
 from navigation.checkpoints import as_arrays, as_tensors
-from navigation.environments import INFO, make_training_env
+from navigation.environments import INFO, make_training_env, vector_of
 from navigation.exploration import Explorer
 from navigation.records import EpisodeRecord
-from navigation.settings import TrainSettings
+from navigation.settings import TrainSettings, is_discrete
 
 TRANSITION = (
     "observation",
@@ -45,7 +45,7 @@ class Robots:
         self.given_up = 0
         """Episodes of the run that were under way when another stage began."""
         self._started = time.perf_counter()
-        self._env: NavigationTorchEnv | None = None
+        self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
         self._rewards = torch.zeros(self.count, dtype=torch.double)
@@ -54,11 +54,16 @@ class Robots:
         """Number of the episode that each robot is in."""
         self._begun = 0
 
-    def environment(self, world: str) -> NavigationTorchEnv:
+    def environment(self, world: str) -> EnvBase:
         """The environment of a stage, kept for as long as its world stays the same."""
         if self._env is None or world != self._world:
             self.close()
-            self._env = make_training_env(world, self.settings.environment, robots=self.count)
+            self._env = make_training_env(
+                world,
+                self.settings.environment,
+                robots=self.count,
+                discrete=is_discrete(self.settings.learner),
+            )
             self._world = world
         return self._env
 
@@ -164,7 +169,7 @@ class Robots:
         assert self._env is not None and self._state is not None
         observation: Tensor = self._state["observation"]
         return {
-            "environment": as_tensors(self._env.env.state_dict()),
+            "environment": as_tensors(vector_of(self._env).state_dict()),
             "observation": observation.clone(),
             "rewards": self._rewards.clone(),
             "steps": self._steps.clone(),
@@ -196,7 +201,7 @@ class Robots:
         env = self.environment(world)
         # A reset makes the entries that a step wants; what is in them is replaced.
         self._state = env.reset()
-        env.env.load_state_dict(as_arrays(state["environment"]))
+        vector_of(env).load_state_dict(as_arrays(state["environment"]))
         self._state["observation"] = state["observation"].clone()
         self.recall(state)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mpfa_envs import NavigationTorchEnv
+from torchrl.envs import EnvBase, TransformedEnv
+
+from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
 from mpfa_envs.robot import resolve_robot
 from navigation.settings import EnvironmentSettings
 
@@ -39,19 +41,20 @@ def collision_distance(settings: EnvironmentSettings) -> float:
 
 
 def make_training_env(
-    world: str, settings: EnvironmentSettings, *, robots: int = 1
-) -> NavigationTorchEnv:
+    world: str, settings: EnvironmentSettings, *, robots: int = 1, discrete: bool = False
+) -> EnvBase:
     """The environment to learn in.
 
     Args:
         world: Of a stage.
         settings: The environment's settings.
         robots: Number of robots.
+        discrete: Whether an action is a choice among pairs of wheel speeds.
 
     Returns:
         The environment of batch size ``[robots]``, with the entries of ``info`` that a run records.
     """
-    return NavigationTorchEnv(
+    env = NavigationTorchEnv(
         world=world,
         num_envs=robots,
         info_keys=INFO,
@@ -63,3 +66,11 @@ def make_training_env(
         episodes_per_world=settings.episodes_per_world,
         **env_arguments(settings),
     )
+    return TransformedEnv(env, DiscreteWheels()) if discrete else env
+
+
+def vector_of(env: EnvBase) -> VectorNavigationEnv:
+    """The robots in an environment of :func:`make_training_env`."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    assert isinstance(base, NavigationTorchEnv)
+    return base.env

@@ -126,7 +126,7 @@ def exported_policy(
     Returns:
         The policy, whose weights are copies.
     """
-    return Policy.from_layers(
+    return Policy(
         policy_layers(policy),
         card={
             "method": settings.method.name,

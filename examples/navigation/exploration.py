@@ -1,4 +1,4 @@
-"""How the robot acts while it learns: a policy with noise, or a stochastic one."""
+"""How the robot acts while it learns: a policy with noise, a stochastic one, or some at random."""
 
 from __future__ import annotations
 
@@ -111,6 +111,54 @@ class NoisyPolicy:
         self.shares.copy_(state_dict["shares"])
 
 
+class OftenGreedy:
+    """The best action, or with some chance, falling linearly, any of them.
+
+    With ``varied`` each episode has a share of that chance, as :class:`NoisyPolicy` of its noise.
+
+    Args:
+        policy: From observations to one-hot choices.
+        settings: The chance.
+        robots: Number of robots ``N``.
+    """
+
+    sigma = 0.0
+
+    def __init__(self, policy: DirectModule, settings: ExplorationSettings, robots: int) -> None:
+        self.policy, self.settings = policy, settings
+        self.shares = torch.ones(robots)
+        self.steps = 0
+
+    @property
+    def epsilon(self) -> float:
+        """Present chance of an episode that has all of it."""
+        done = min(self.steps / self.settings.annealing_steps, 1.0)
+        return self.settings.epsilon + (self.settings.epsilon_end - self.settings.epsilon) * done
+
+    def begin_episodes(self, begun: Tensor) -> None:
+        """Sample the share of the chance that each of these episodes has."""
+        if self.settings.varied:
+            self.shares[begun] = torch.rand(int(begun.sum()))
+
+    def act(self, observation: Tensor) -> Tensor:
+        """One-hot choices, shape ``[N, K]``."""
+        best = self.policy.outputs({"observation": observation})["action"]
+        anything = torch.randint(best.shape[1], (len(best),))
+        chosen = torch.nn.functional.one_hot(anything, best.shape[1]).to(best.device)
+        at_random = torch.rand(len(best)) < self.epsilon * self.shares
+        self.steps += len(best)
+        return torch.where(at_random.unsqueeze(1).to(best.device), chosen, best)
+
+    def state_dict(self) -> dict[str, Any]:
+        """How far the chance has fallen, and the shares of it."""
+        return {"steps": self.steps, "shares": self.shares.clone()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.steps = state_dict["steps"]
+        self.shares.copy_(state_dict["shares"])
+
+
 class RandomPolicy:
     """A stochastic policy, as SAC's is.
 
@@ -151,7 +199,7 @@ class RandomPolicy:
 def make_explorer(
     policy: DirectModule | StochasticActor, settings: ExplorationSettings, action_spec: TensorSpec
 ) -> Explorer:
-    """Noise for a policy without any, none for one that is random.
+    """Noise for a policy without any, none for one that is random, chance for one that chooses.
 
     Args:
         policy: The policy.
@@ -163,4 +211,6 @@ def make_explorer(
     """
     if isinstance(policy, StochasticActor):
         return RandomPolicy(policy, settings)
+    if "action_value" in policy.out_keys:
+        return OftenGreedy(policy, settings, action_spec.shape[0])
     return NoisyPolicy(policy, settings, action_spec)

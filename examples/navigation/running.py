@@ -11,6 +11,7 @@ from pathlib import Path
 from hydra.core.override_parser.types import Override
 
 from navigation import files
+from navigation.assembly import method_of
 from navigation.checkpoints import read_checkpoint
 from navigation.checks import check_settings
 from navigation.figures import plot_learning_curve
@@ -62,6 +63,8 @@ def start(settings: TrainSettings, folder: Path) -> int:
             # Only now: a setting that the parts refuse leaves the old run in its place.
             files.set_aside(folder)
             write_settings(settings, folder / files.SETTINGS)
+        if method_of(settings) != settings.method:
+            print(f"learner={settings.learner.name} has no action gradient: it is left out")
         return _train(training)
 
 

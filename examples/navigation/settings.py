@@ -26,7 +26,8 @@ class LearnerSettings:
 
     name: str = "ddpg"
     algorithm: str = "ddpg"
-    """``ddpg``, ``td3`` or ``sac``; ``learner=td3`` chooses it with what goes with it."""
+    """``ddpg``, ``td3``, ``sac``, ``dqn`` or ``q_learning``; ``learner=td3`` chooses it with what
+    goes with it. The last two choose among seven pairs of wheel speeds."""
     actor_lr: float = 1e-4
     """Table 1."""
     critic_lr: float = 1e-4
@@ -72,6 +73,10 @@ class LearnerSettings:
     """SAC: temperature of the entropy at the start, of rewards that are scaled."""
     alpha_lr: float = 3e-4
     """SAC: learning rate of its logarithm."""
+    double: bool = True
+    """DQN: whether the next action is that of the network, and not of the target network."""
+    table_lr: float = 0.2
+    """Q learning: learning rate of the table, falling as the others do."""
 
 
 @dataclass
@@ -109,8 +114,32 @@ class PlainSettings(LearnerSettings):
 
 
 @dataclass
+class DQNSettings(LearnerSettings):
+    """Double DQN with the critic's network and rate, of which an output is an action's value."""
+
+    name: str = "dqn"
+    algorithm: str = "dqn"
+    critic_lr: float = 3e-4
+
+
+@dataclass
+class QLearningSettings(LearnerSettings):
+    """Q learning of a table over binned sensors; of the networks' settings it has none."""
+
+    name: str = "q_learning"
+    algorithm: str = "q_learning"
+    gamma: float = 0.9
+    """With 0.99 a cell as large as a meter, which leads to itself, is worth more than it should."""
+
+
+def is_discrete(learner: LearnerSettings) -> bool:
+    """Whether the learner chooses among pairs of wheel speeds."""
+    return learner.algorithm in ("dqn", "q_learning")
+
+
+@dataclass
 class ExplorationSettings:
-    """Uniform actions at first, then Gaussian noise on the policy's."""
+    """Uniform actions at first, then Gaussian noise on the policy's, or some at random."""
 
     random_steps: int = 1_000
     """Steps of uniformly random actions."""
@@ -118,6 +147,10 @@ class ExplorationSettings:
     """Standard deviation of the noise at the start."""
     sigma_end: float = 0.2
     """Standard deviation at the end; it does not vanish, as narrow data makes DDPG forget."""
+    epsilon: float = 1.0
+    """DQN and Q learning: chance of a random action at the start."""
+    epsilon_end: float = 0.1
+    """DQN and Q learning: chance at the end."""
     annealing_steps: int = 5_000
     """Steps from one to the other."""
     varied: bool = True
@@ -353,6 +386,8 @@ GROUPS: dict[str, dict[str, Any]] = {
         "td3": TD3Settings,
         "sac": SACSettings,
         "plain": PlainSettings,
+        "dqn": DQNSettings,
+        "q_learning": QLearningSettings,
     },
     "curriculum": {name: CurriculumSettings(stages=stages) for name, stages in CURRICULA.items()},
     "tracking": {

@@ -18,16 +18,17 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from tqdm import tqdm
 
-from mpfa_envs import Policy, RandomMirror, save_policy
+from mpfa_envs import WHEEL_PAIRS, Policy, RandomMirror, save_policy
 from navigation import files
-from navigation.assembly import make_curiosity, make_learner
+from navigation.assembly import make_curiosity, make_learner, method_of
 from navigation.checkpoints import FORMAT, random_state, set_random_state
 from navigation.driving import Robots
+from navigation.environments import vector_of
 from navigation.evaluating import evaluate_policy, exported_policy
 from navigation.exploration import make_explorer
 from navigation.records import EpisodeRecord, EvaluationRecord, as_table, last_best, write_table
 from navigation.schedule import Schedule
-from navigation.settings import TrainSettings
+from navigation.settings import TrainSettings, is_discrete
 from navigation.stopping import Stop
 from navigation.tracking import Tracker
 from navigation.updates import UpdateLog
@@ -66,7 +67,8 @@ class TrainingRun:
         env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
-        self._remembered: dict[str, Any] = {"memory": env.env.memory, "history": env.env.history}
+        robots = vector_of(env)
+        self._remembered: dict[str, Any] = {"memory": robots.memory, "history": robots.history}
         capacity, scale = settings.method.capacity, settings.learner.reward_scale
         self.log = UpdateLog(capacity, reward_scale=scale)
         self._build()
@@ -89,7 +91,7 @@ class TrainingRun:
         """Make the parts that learn, and the buffer."""
         settings, spec = self.settings, self._action_spec
         sizes = self._observation_size, spec.shape[-1]
-        method, device = settings.method, settings.device
+        method, device = method_of(settings), settings.device
         generator = torch.Generator().manual_seed(settings.seed)
         self.learner = make_learner(settings.learner, method, *sizes, device=device)
         self.curiosity = make_curiosity(method, *sizes, device=device)
@@ -103,7 +105,8 @@ class TrainingRun:
         self.buffer, self.select, self.entries = replay.buffer, replay.select, replay.entries
         self.log.forget(method.capacity)
         if settings.environment.mirror:
-            self.buffer.append_transform(RandomMirror(**self._remembered))
+            pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
+            self.buffer.append_transform(RandomMirror(**self._remembered, pairs=pairs))
 
     def _begin_stage(self) -> None:
         seed = self.settings.seed * 1_000_003 + self.schedule.stage

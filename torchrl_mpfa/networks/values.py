@@ -42,7 +42,7 @@ class ValueNetwork(nn.Module):
         self.head = last_layer(width, actions, final_init)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From ``[..., O]`` to values, one-hot choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        """From ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
         return _chosen(self.head(self.body(observation)))
 
     def layers(self) -> list[nn.Module]:
@@ -61,7 +61,7 @@ class ValueTable(nn.Module):
         self.register_buffer("table", torch.zeros(cells, actions))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From ``[..., O]`` to values, one-hot choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        """From ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
         return _chosen(self.table[self.cell_of(observation)])
 
 

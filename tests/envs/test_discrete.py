@@ -1,0 +1,187 @@
+"""Choices among pairs of wheel speeds, the cells of a table, and policies made of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from mpfa_envs import (
+    WHEEL_PAIRS,
+    Binning,
+    DiscreteWheels,
+    Mirror,
+    NavigationTorchEnv,
+    Policy,
+    PolicyFileError,
+    RandomMirror,
+    load_policy,
+    observation_slices,
+    save_policy,
+)
+from mpfa_envs.discrete import mirrored_places
+from mpfa_envs.layers import Choice, Linear, Table
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_the_specs_of_the_transformed_environment_hold(num_envs):
+    env = TransformedEnv(
+        NavigationTorchEnv(num_envs=num_envs, world="B", physics="kinematic"), DiscreteWheels()
+    )
+    check_env_specs(env, seed=0)
+    batch = [] if num_envs is None else [num_envs]
+    assert [*env.action_spec.shape] == [*batch, len(WHEEL_PAIRS)]
+    assert env.rand_action()["action"].sum(-1).eq(1).all()
+    env.close()
+
+
+@pytest.mark.parametrize("place", range(len(WHEEL_PAIRS)))
+def test_a_choice_drives_as_the_wheel_speeds_that_it_stands_for(place):
+    plain, discrete = (
+        NavigationTorchEnv(num_envs=2, world="A", physics="kinematic") for _ in range(2)
+    )
+    discrete = TransformedEnv(discrete, DiscreteWheels())
+    seen = []
+    choice = torch.nn.functional.one_hot(torch.tensor([place, 0]), len(WHEEL_PAIRS))
+    speeds = torch.tensor([WHEEL_PAIRS[place], WHEEL_PAIRS[0]])
+    for env, action in ((plain, speeds), (discrete, choice)):
+        env.set_seed(5)
+        state = env.reset()
+        for _ in range(3):
+            state = env.step(state.set("action", action))["next"]
+        seen.append(state["observation"])
+        env.close()
+    assert torch.equal(*seen)
+
+
+def test_the_mirror_image_of_a_choice_is_the_choice_with_the_wheels_swapped():
+    choices = torch.eye(len(WHEEL_PAIRS), dtype=torch.long)
+    mirrored = Mirror(pairs=WHEEL_PAIRS).action(choices).argmax(-1).tolist()
+    assert [WHEEL_PAIRS[place] for place in mirrored] == [(b, a) for a, b in WHEEL_PAIRS]
+    rows = TensorDict(
+        {
+            "observation": torch.rand(7, 24),
+            "action": choices,
+            "next": {"observation": torch.rand(7, 24)},
+        },
+        [7],
+    )
+    found = RandomMirror(chance=1.0, pairs=WHEEL_PAIRS)(rows.clone())
+    assert found["action"].argmax(-1).tolist() == mirrored
+    assert found["action"].dtype == torch.long
+
+
+@pytest.mark.parametrize(
+    ("pairs", "word"),
+    [
+        ([(1.0, 1.0)], "two or more"),
+        ([(1.0, 1.0), (2.0, 1.0)], r"\[-1, 1\]"),
+        ([(1.0, math.nan), (0.0, 1.0)], r"\[-1, 1\]"),
+        ([(1.0, 1.0), (1.0, 1.0)], "different"),
+        ([1.0, 0.5], "pairs"),
+    ],
+)
+def test_pairs_that_cannot_be_are_refused(pairs, word):
+    with pytest.raises(ValueError, match=word):
+        DiscreteWheels(pairs)
+
+
+def test_pairs_without_their_mirror_images_have_no_mirror():
+    with pytest.raises(ValueError, match="mirror image"):
+        mirrored_places([(1.0, 1.0), (0.0, 1.0)])
+
+
+def test_a_cell_is_that_of_a_plain_loop():
+    binning = Binning(groups=3, closeness=(0.25, 0.6), directions=8, distances=(0.1, 0.4))
+    rng = np.random.default_rng(0)
+    seen = rng.uniform(0.0, 1.0, (200, 24)).astype(np.float32)
+    angle = rng.uniform(-math.pi, math.pi, 200)
+    parts = observation_slices()
+    seen[:, parts["goal_direction"]] = np.stack([np.cos(angle), np.sin(angle)], 1)
+    found = binning(seen)
+    for row, turn, cell in zip(seen, angle, found, strict=True):
+        places = []
+        for first in (0, 6, 12):
+            nearest = max(row[first : first + 6])
+            places.append(sum(nearest >= bound for bound in (0.25, 0.6)))
+        width = 2 * math.pi / 8
+        places.append(math.floor(turn / width + 0.5) % 8)
+        distance = row[parts["goal_distance"].start]
+        places.append(sum(distance >= bound for bound in (0.1, 0.4)))
+        expected = 0
+        for place, size in zip(places, (3, 3, 3, 8, 3), strict=True):
+            expected = expected * size + place
+        assert cell == expected
+    assert len(set(found.tolist())) > 30
+    assert binning.cells == 27 * 8 * 3 > found.max()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"groups": 0},
+        {"groups": 19},
+        {"closeness": (0.5, 0.5)},
+        {"distances": (math.nan,)},
+        {"directions": 2.5},
+        {"observation_size": 23},
+    ],
+)
+def test_bins_that_cannot_be_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Binning(**wrong)
+
+
+def table(**more):
+    binning = Binning(directions=4, **more)
+    values = np.random.default_rng(1).normal(size=(binning.cells, len(WHEEL_PAIRS)))
+    fields = {name: getattr(binning, name) for name in binning.__dataclass_fields__}
+    return Table(values.astype(np.float32), **fields)
+
+
+@pytest.mark.parametrize("kind", ["table", "linear"])
+def test_a_policy_that_chooses_is_saved_and_drives_its_best_pair(tmp_path, kind):
+    rng = np.random.default_rng(2)
+    first = table()
+    if kind == "linear":
+        weight = rng.normal(size=(len(WHEEL_PAIRS), 24)).astype(np.float32)
+        first = Linear(weight, np.zeros(len(WHEEL_PAIRS), np.float32))
+    policy = Policy([first, Choice(np.array(WHEEL_PAIRS, np.float32))])
+    again = load_policy(save_policy(policy, tmp_path))
+    assert (again.observation_size, again.action_size) == (24, 2)
+    seen = rng.uniform(-1.0, 1.0, (40, 24)).astype(np.float32)
+    values = first.values[first.binning(seen)] if kind == "table" else seen @ first.weight.T
+    expected = [WHEEL_PAIRS[place] for place in values.argmax(1)]
+    for each in (policy, again):
+        assert np.allclose(each(seen), expected)
+    assert len(set(expected)) > 3
+
+
+@pytest.mark.parametrize(
+    ("layers", "word"),
+    [
+        ([Choice(np.ones((7, 2), np.float32))], "begin"),
+        ([table(), Choice(np.ones((5, 2), np.float32))], r"\[7, A\]"),
+        ([table(), table()], "first"),
+    ],
+)
+def test_layers_that_do_not_fit_are_refused(layers, word):
+    with pytest.raises(ValueError, match=word):
+        Policy(layers)
+
+
+def test_a_file_whose_table_does_not_fit_its_bins_is_refused(tmp_path):
+    good = table()
+    file = save_policy(Policy([good]), tmp_path)
+    text = file.read_bytes()
+    object.__setattr__(good, "directions", 5)
+    with pytest.raises(ValueError, match="values must have shape"):
+        Policy([good])
+    file.write_bytes(text[: len(text) // 2])
+    with pytest.raises(PolicyFileError):
+        load_policy(file)

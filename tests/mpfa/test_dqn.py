@@ -1,0 +1,204 @@
+"""DQN and Q learning, against plain loops."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_mpfa import (
+    DQNLearner,
+    Draw,
+    Learner,
+    QLearner,
+    SignalDQNLoss,
+    make_value_network,
+    make_value_table,
+    run_updates,
+)
+from torchrl_mpfa.methods import make_replay
+
+ACTIONS, SIZE, GAMMA, SCALE = 5, 4, 0.9, 0.1
+
+
+def transitions(count=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randint(ACTIONS, (count,), generator=generator)
+    end = torch.rand(count, 1, generator=generator) < 0.3
+    return TensorDict(
+        {
+            "observation": torch.rand(count, SIZE, generator=generator),
+            "action": torch.nn.functional.one_hot(chosen, ACTIONS),
+            "priority_weight": torch.rand(count, generator=generator) + 0.1,
+            "next": {
+                "observation": torch.rand(count, SIZE, generator=generator),
+                "reward": torch.randn(count, 1, generator=generator) * 5,
+                "done": end,
+                "terminated": end,
+            },
+        },
+        [count],
+    )
+
+
+def network(seed=0):
+    torch.manual_seed(seed)
+    return make_value_network(SIZE, ACTIONS, width=8, final_init=None)
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("importance", ["critic", "torchrl", "none"])
+def test_an_update_of_dqn_is_that_of_a_plain_loop(double, importance):
+    online, target = network(0), network(0)
+    loss = SignalDQNLoss(
+        network(0), double=double, gamma=GAMMA, reward_scale=SCALE, importance=importance
+    )
+    learner = DQNLearner(loss, lr=0.01, tau=0.25)
+    optimizer = torch.optim.Adam(online.parameters(), lr=0.01)
+    for seed in range(3):
+        batch = transitions(seed=seed)
+        terms, errors = [], []
+        for row in batch:
+            value = online.module(row["observation"])[0][row["action"].argmax()]
+            after = row["next", "observation"]
+            chooser = online if double else target
+            choice = chooser.module(after)[0].argmax()
+            ahead = target.module(after)[0][choice].detach()
+            goes_on = 1.0 - float(row["next", "terminated"])
+            error = SCALE * row["next", "reward"] + GAMMA * goes_on * ahead - value
+            weight = 1.0 if importance == "none" else row["priority_weight"]
+            if importance == "torchrl":
+                weight = weight / batch["priority_weight"].mean()
+            terms.append(weight * error**2)
+            errors.append(error.abs().item() / SCALE)
+        expected = torch.stack(terms).mean()
+        optimizer.zero_grad()
+        expected.backward()
+        optimizer.step()
+        with torch.no_grad():
+            for mine, yours in zip(target.parameters(), online.parameters(), strict=True):
+                mine.mul_(0.75).add_(yours, alpha=0.25)
+        log = learner.update(batch)
+        assert log["loss_value"].item() == pytest.approx(expected.item(), rel=1e-4)
+        assert batch["signals", "td_error"].tolist() == pytest.approx(errors, rel=1e-3)
+    for mine, theirs in zip(online.parameters(), learner.policy.parameters(), strict=True):
+        assert torch.allclose(mine, theirs, atol=1e-4)
+
+
+def cell_of(observation):
+    return (observation[..., 0] * 3).long()
+
+
+@pytest.mark.parametrize("importance", [True, False])
+def test_an_update_of_the_table_is_that_of_a_plain_dict(importance):
+    learner = QLearner(
+        make_value_table(cell_of, 3, ACTIONS), lr=0.5, gamma=GAMMA, importance=importance
+    )
+    table = {(cell, action): 0.0 for cell in range(3) for action in range(ACTIONS)}
+    for seed in range(4):
+        batch, moves, errors = transitions(30, seed=seed), {}, []
+        for row in batch:
+            cell, then = int(cell_of(row["observation"])), int(cell_of(row["next", "observation"]))
+            ahead = max(table[then, action] for action in range(ACTIONS))
+            goes_on = not bool(row["next", "terminated"])
+            entry = cell, int(row["action"].argmax())
+            error = float(row["next", "reward"]) + GAMMA * ahead * goes_on - table[entry]
+            weight = float(row["priority_weight"]) if importance else 1.0
+            moves.setdefault(entry, []).append(weight * error)
+            errors.append(abs(error))
+        for entry, steps in moves.items():
+            table[entry] += 0.5 * sum(steps) / len(steps)
+        learner.update(Draw(batch))
+        assert batch["signals", "td_error"].tolist() == pytest.approx(errors, abs=1e-4)
+    for (cell, action), value in table.items():
+        assert learner.table[cell, action].item() == pytest.approx(value, abs=1e-4)
+
+
+def learners():
+    return [
+        DQNLearner(SignalDQNLoss(network()), lr=0.01),
+        QLearner(make_value_table(cell_of, 3, ACTIONS)),
+    ]
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_a_learner_goes_on_from_its_state_as_if_nothing_had_been(kind):
+    first, second = learners()[kind], learners()[kind]
+    assert isinstance(first, Learner)
+    first.anneal(0.5)
+    first.update(transitions())
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    second.anneal(0.5)
+    for each in (first, second):
+        each.update(transitions(seed=1))
+    assert first.updates == second.updates == 2
+    seen = {"observation": torch.rand(6, SIZE)}
+    values = [each.policy.outputs(seen)["action_value"] for each in (first, second)]
+    assert torch.equal(*values)
+    assert values[0].abs().max() > 0
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
+    learner = learners()[kind]
+    before = copy.deepcopy(learner.state_dict())
+    spoiled = transitions()
+    spoiled["next", "reward"][3] = torch.nan
+    with pytest.raises(ValueError, match="reward"):
+        learner.update(spoiled)
+    for wrong in ({"trains": "critic"}, {"loss_function": "pal"}):
+        with pytest.raises(ValueError, match="one network"):
+            learner.update(Draw(transitions(), **wrong))
+    with pytest.raises(ValueError, match="factor"):
+        learner.anneal(1.5)
+    with pytest.raises(ValueError, match="state_dict"):
+        learner.load_state_dict({"loss": {}, "updates": 3})
+    after = learner.state_dict()
+    assert after["updates"] == 0
+    assert all(torch.equal(before["loss"][key], after["loss"][key]) for key in before["loss"])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_a_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
+    replay = make_replay(
+        "mpfa_per", capacity=200, batch_size=32, signals=["reward", "td_error"],
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    rows = transitions(200)
+    rows["next", "reward"] = rows["action"][:, 2:3].float()
+    rows["next", "terminated"][:] = True
+    replay.buffer.extend(rows.exclude("priority_weight"))
+    learner = learners()[kind]
+    for _ in range(60):
+        run_updates(replay.buffer, learner, replay.select, updates=4)
+    found = learner.policy.outputs({"observation": torch.rand(50, SIZE)})
+    assert (found["action"].argmax(-1) == 2).all()
+    assert (found["action"].sum(-1) == 1).all()
+    assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"signals": ["action_gradient"]}, "no slope"),
+        ({"signals": ["value"]}, "signals"),
+        ({"importance": "all"}, "importance"),
+        ({"reward_scale": 0.0}, "reward_scale"),
+        ({"loss_function": "pal"}, "loss_function"),
+        ({"gamma": 1.5}, "gamma"),
+    ],
+)
+def test_the_loss_refuses_options_that_cannot_be(options, word):
+    with pytest.raises(ValueError, match=word):
+        SignalDQNLoss(network(), **options)
+
+
+def test_learners_refuse_what_is_anothers():
+    with pytest.raises(TypeError, match="SignalDQNLoss"):
+        DQNLearner(network())
+    with pytest.raises(TypeError, match="make_value_table"):
+        QLearner(network())
+    with pytest.raises(ValueError, match="lr"):
+        QLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.0)
