@@ -130,6 +130,7 @@ class QLearningSettings(LearnerSettings):
     algorithm: str = "q_learning"
     gamma: float = 0.9
     """With 0.99 a cell as large as a meter, which leads to itself, is worth more than it should."""
+    reward_scale: float = 1.0
 
 
 def is_discrete(learner: LearnerSettings) -> bool:

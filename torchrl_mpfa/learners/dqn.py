@@ -244,7 +244,8 @@ class QLearner:
         goes_on = ~batch["next", "terminated"].squeeze(-1)
         target = batch["next", "reward"].squeeze(-1) + self.gamma * ahead * goes_on
         td_error = target - table.view(-1)[entry]
-        log = {"loss_value": td_error.square().mean(), "pred_value": table.view(-1)[entry].mean()}
+        squared, value = td_error.square(), table.view(-1)[entry]
+        log = {"loss_value": squared.mean(), "td_error": squared, "pred_value": value}
         refuse_unfinished(log, batch)
         batch.set(TD_ERROR.key, td_error.abs())
         step = td_error

@@ -103,7 +103,7 @@ class SignalDQNLoss(DQNLoss):
             weight = batch["priority_weight"].reshape(-1)
             mean = weight.mean() if self.importance == "torchrl" else 1.0
             loss = distance * weight / mean
-        return loss.mean(), {"td_error": squared.mean()}
+        return loss.mean(), {"td_error": squared}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss under the key ``"loss"``, as TorchRL has it.
