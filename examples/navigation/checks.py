@@ -206,7 +206,7 @@ def _check_values_alone(settings: TrainSettings) -> None:
     own = {"reward", "td_error", "action_gradient"}
     for name, wrong in (
         ("signals", any(signal not in own for signal in method.signals)),
-        ("selection", method.selection in ("split", "halves")),
+        ("selection", method.selection in ("split", "halves", "near_policy")),
         ("candidates", method.candidates > 1),
         ("target_average", method.target_average > 1),
         ("loss_function", method.loss_function not in ("l2", "smooth_l1")),

@@ -145,9 +145,14 @@ class OftenGreedy:
         best = self.policy.outputs({"observation": observation})["action"]
         anything = torch.randint(best.shape[1], (len(best),))
         chosen = torch.nn.functional.one_hot(anything, best.shape[1]).to(best.device)
+        self._behavior = best.float().cpu(), (self.epsilon * self.shares).unsqueeze(1)
         at_random = torch.rand(len(best)) < self.epsilon * self.shares
         self.steps += len(best)
         return torch.where(at_random.unsqueeze(1).to(best.device), chosen, best)
+
+    def behavior(self) -> tuple[Tensor, Tensor]:
+        """The best choices, and the chance of another one in the place of a spread."""
+        return self._behavior
 
     def state_dict(self) -> dict[str, Any]:
         """How far the chance has fallen, and the shares of it."""

@@ -55,7 +55,9 @@ def test_a_run_goes_on_where_it_was_saved(tmp_path, learner):
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize("method", ["hvper", "la3p", "klper", "averaged_ddpg", "pal", "ddpg_radam"])
+@pytest.mark.parametrize(
+    "method", ["hvper", "la3p", "ref_er", "averaged_ddpg", "pal", "ddpg_radam"]
+)
 def test_a_method_that_needs_an_actor_is_refused_in_one_sentence(method, learner):
     with pytest.raises(ValueError, match=rf"method={method} is not for learner={learner}"):
         check_settings(tiny(method, learner=learner))
