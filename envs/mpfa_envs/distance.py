@@ -110,8 +110,12 @@ class FreeGrid:
         return number_cells(self.free)
 
     @cached_property
-    def _graph(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-        """The moves between free cells: starts, neighbors and lengths [m]."""
+    def moves(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+        """The moves between free cells, in compressed rows.
+
+        Where the moves of each of :attr:`cells` begin, ``[cells + 1]``; the numbers of the cells
+        that they lead to, and their lengths [m], ``[moves]``.
+        """
         return neighbor_lists(self.free, self._numbers, MOVES, self.resolution * STEP_SCALE)
 
     def index(self, x: float, y: float) -> tuple[int, int]:
@@ -135,19 +139,32 @@ class FreeGrid:
         """Position (x, y) of a cell's center [m]."""
         return float(self.xs[i]), float(self.ys[j])
 
-    def _first_cells(self, goal: tuple[float, float]) -> list[tuple[int, float]]:
-        """Numbers of the cells around a goal and how far they are from it [m]."""
-        i, j = self.index(*goal)
+    def cells_around(self, place: tuple[float, float]) -> list[tuple[int, float]]:
+        """Find where ways to or from a position pass.
+
+        Args:
+            place: Position (x, y) [m].
+
+        Returns:
+            Numbers of the cells around it, or of the nearest one if its own is not free, and how
+            far they are from it [m].
+
+        Raises:
+            ValueError: If no cell is free.
+        """
+        if not self.free.any():
+            raise ValueError(f"grid must have a free cell, and {self.world.name!r} has none")
+        i, j = self.index(*place)
         if not self.free[i, j]:
             gaps = np.hypot(
-                self.xs[self.cells[:, 0]] - goal[0], self.ys[self.cells[:, 1]] - goal[1]
+                self.xs[self.cells[:, 0]] - place[0], self.ys[self.cells[:, 1]] - place[1]
             )
             nearest = int(gaps.argmin())
             return [(nearest, float(gaps[nearest]))]
-        starts, neighbors, _ = self._graph
+        starts, neighbors, _ = self.moves
         number = self._numbers[i, j]
         around = [number, *neighbors[starts[number] : starts[number + 1]]]
-        return [(int(at), math.dist(self.center(*self.cells[at]), goal)) for at in around]
+        return [(int(at), math.dist(self.center(*self.cells[at]), place)) for at in around]
 
     def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
         """Measure the way between two positions.
@@ -162,7 +179,7 @@ class FreeGrid:
         if not self.free.any():
             return math.inf
         ways = self.distances(goal)
-        return min(float(ways[cell]) + gap for cell, gap in self._first_cells(start))
+        return min(float(ways[cell]) + gap for cell, gap in self.cells_around(start))
 
     def distances(self, goal: tuple[float, float]) -> NDArray[np.float64]:
         """Measure the way from every free cell to a goal.
@@ -176,14 +193,28 @@ class FreeGrid:
         Raises:
             ValueError: If no cell is free.
         """
-        if not self.free.any():
-            raise ValueError(f"grid must have a free cell, and {self.world.name!r} has none")
-        starts, neighbors, lengths = self._graph
-        first = self._first_cells(goal)
+        graph = self.graph_to(goal)
+        count = graph.shape[0] - 1
+        return np.asarray(dijkstra(graph, indices=[count]))[0, :count]
+
+    def graph_to(self, goal: tuple[float, float]) -> csr_array:
+        """Write the moves, and those from a goal to the cells around it, as a sparse matrix.
+
+        Args:
+            goal: Position (x, y) [m].
+
+        Returns:
+            Lengths [m], ``[cells + 1, cells + 1]``; the last row is the goal's.
+
+        Raises:
+            ValueError: If no cell is free.
+        """
+        first = self.cells_around(goal)
+        starts, neighbors, lengths = self.moves
         count = len(starts) - 1
         # The goal is a node of its own, the last one, from which the cells around it are reached.
         numbers, gaps = zip(*first, strict=True)
-        graph = csr_array(
+        return csr_array(
             (
                 # A gap of zero would be no edge.
                 np.concatenate((lengths, np.maximum(gaps, 1e-12))),
@@ -192,7 +223,6 @@ class FreeGrid:
             ),
             shape=(count + 1, count + 1),
         )
-        return np.asarray(dijkstra(graph, indices=[count]))[0, :count]
 
 
 def _centers(count: int, resolution: float) -> NDArray[np.float64]:

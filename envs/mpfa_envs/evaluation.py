@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from mpfa_envs.arguments import Physics
 from mpfa_envs.checks import check_count
+from mpfa_envs.planners.dynamic_window import DynamicWindow
 from mpfa_envs.policy import Policy
 from mpfa_envs.results import ENCOUNTERS, EpisodeResult, spl
 from mpfa_envs.task_sets import WorldTask, world_tasks
@@ -26,11 +28,85 @@ if TYPE_CHECKING:
     """All that a policy must be: a function from observation to action."""
 
 ENVS_AT_ONCE = 64
-"""How many episodes of a :class:`~mpfa_envs.Policy` run together by default."""
+"""How many episodes run together by default, if the policy is known to take many observations."""
+
+
+@runtime_checkable
+class Driver(Protocol):
+    """What may know more than the robot senses: it sees the environment that the robot is in."""
+
+    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+        """Get ready for an episode.
+
+        Args:
+            env: Where it has begun; ``env.worlds[robot]`` and ``env.tasks[robot]`` say which.
+            robot: Number of the robot.
+        """
+
+    def drive(
+        self,
+        env: VectorNavigationEnv,
+        robots: NDArray[np.int64],
+        observations: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Choose actions.
+
+        Args:
+            env: Where the robots are, ``env.poses``.
+            robots: Numbers of the N robots that are under way.
+            observations: What they sense, ``[N, O]``.
+
+        Returns:
+            Actions, ``[N, 2]``.
+        """
+
+
+class Blind:
+    """A policy as a :class:`Driver`: it sees the observations and nothing else.
+
+    Args:
+        policy: From observations to actions.
+        alone: Whether it takes a single observation.
+    """
+
+    def __init__(self, policy: Action, *, alone: bool = False) -> None:
+        self.policy = policy
+        self.alone = alone
+
+    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+        """Get ready for an episode, which takes nothing."""
+
+    def drive(
+        self,
+        env: VectorNavigationEnv,
+        robots: NDArray[np.int64],
+        observations: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """One action for each observation."""
+        if self.alone:
+            return np.asarray(self.policy(observations[0]), dtype=np.float32)[None]
+        actions = np.asarray(self.policy(observations), dtype=np.float32)
+        if actions.shape != (len(observations), 2):
+            raise ValueError(
+                f"policy must give actions of shape {(len(observations), 2)} for observations of "
+                f"shape {observations.shape}, got {actions.shape}; one that takes a single "
+                "observation runs with envs_at_once=1"
+            )
+        return actions
+
+
+def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
+    """A policy, or what is one already, as a :class:`Driver`.
+
+    Args:
+        policy: Either.
+        alone: Whether a policy takes a single observation.
+    """
+    return policy if isinstance(policy, Driver) else Blind(policy, alone=alone)
 
 
 def evaluate(
-    policy: Action,
+    policy: Action | Driver,
     world: str | os.PathLike[str] | World | Sequence[str | os.PathLike[str] | World] = "test",
     *,
     episodes: int | None = None,
@@ -43,8 +119,8 @@ def evaluate(
     """Drive a policy through fixed tasks; contact is the only collision.
 
     Args:
-        policy: A :class:`~mpfa_envs.Policy` or any function from observation to action, see
-            :func:`run_tasks`.
+        policy: A :class:`~mpfa_envs.Policy`, any function from observation to action, or a
+            :class:`Driver`, see :func:`run_tasks`.
         world: What :func:`~mpfa_envs.world_tasks` takes: a world, or ``"bars:test"``, the test
             worlds of a generator; or several of these.
         episodes: Number of tasks in each; None: 200 in a world, 400 in the worlds of a generator.
@@ -68,7 +144,7 @@ def evaluate(
         >>> [(result.world, result.episode) for result in results[2:4]]
         [('A', 2), ('rooms-7', 0)]
         >>> sorted(summarize(results))[:3]
-        ['collision', 'min_clearance', 'path_length']
+        ['collision', 'decision_s', 'min_clearance']
     """
     arguments = {**getattr(policy, "env_arguments", {}), **env_arguments}
     if physics is not None:
@@ -84,7 +160,7 @@ def evaluate(
 
 
 def run_tasks(
-    policy: Action,
+    policy: Action | Driver,
     tasks: Sequence[WorldTask],
     *,
     envs_at_once: int | None = None,
@@ -100,7 +176,8 @@ def run_tasks(
         tasks: Tasks with their worlds.
         envs_at_once: How many episodes run together, which changes no result of a
             :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
-            wheels; None: 64 for one, else one at a time.
+            wheels; None: 64 for one, a :class:`Driver` or a
+            :class:`~mpfa_envs.DynamicWindow`, else one at a time.
         progress: Whether to show a bar.
         on_end: Called at the end of every episode with the environment, the number of the robot,
             whose ``env.trail(robot)`` is the way that it took, and that of the task.
@@ -114,8 +191,10 @@ def run_tasks(
             observation.
     """
     if envs_at_once is None:
-        envs_at_once = ENVS_AT_ONCE if isinstance(policy, Policy) else 1
+        takes_many = isinstance(policy, (Policy, DynamicWindow, Driver))
+        envs_at_once = ENVS_AT_ONCE if takes_many else 1
     check_count("envs_at_once", envs_at_once)
+    driver = as_driver(policy, alone=envs_at_once == 1)
     results: dict[int, EpisodeResult] = {}
     arguments = {"collision_distance": "contact", **env_arguments}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
@@ -125,13 +204,11 @@ def run_tasks(
             robots = min(envs_at_once, len(numbers))
             arguments["world"] = _room_for([tasks[number].world for number in numbers])
             with closing(VectorNavigationEnv(robots, **{**arguments, **limit})) as env:
-                for robot, number, info in _drive(
-                    env, policy, tasks, deque(numbers), alone=envs_at_once == 1
-                ):
-                    results[number] = _result(tasks, number, info, robot)
+                for ended in _drive(env, driver, tasks, deque(numbers)):
+                    results[ended.number] = _result(tasks, ended)
                     advance()
                     if on_end:
-                        on_end(env, robot, number)
+                        on_end(env, ended.robot, ended.number)
     return [results[number] for number in range(len(tasks))]
 
 
@@ -150,16 +227,24 @@ def _room_for(worlds: Sequence[World]) -> World:
     return World(name="empty", size=(max(width, 10.0), max(depth, 10.0)))
 
 
+class _Ended(NamedTuple):
+    """An episode that has ended."""
+
+    robot: int
+    number: int
+    """Of the task."""
+    info: dict[str, NDArray[Any]]
+    plan_s: float
+    decision_s: float
+
+
 def _drive(
-    env: VectorNavigationEnv,
-    policy: Action,
-    tasks: Sequence[WorldTask],
-    waiting: deque[int],
-    *,
-    alone: bool,
-) -> Iterator[tuple[int, int, dict[str, Any]]]:
-    """Drive the tasks that wait; robot, number of the task and infos at the end of each."""
+    env: VectorNavigationEnv, driver: Driver, tasks: Sequence[WorldTask], waiting: deque[int]
+) -> Iterator[_Ended]:
+    """Drive the tasks that wait."""
     at_work = np.full(env.num_envs, -1)
+    planned, decided = np.zeros(env.num_envs), np.zeros(env.num_envs)
+    decisions = np.zeros(env.num_envs, dtype=np.int64)
     observations = np.empty(env.observation_space.shape or (), np.float32)
     while waiting or (at_work >= 0).any():
         begun = np.zeros(env.num_envs, dtype=np.bool_)
@@ -167,13 +252,23 @@ def _drive(
             at_work[robot], begun[robot] = waiting.popleft(), True
         if begun.any():
             observations = _begin(env, tasks, at_work, begun)
+            decided[begun], decisions[begun] = 0.0, 0
+        for robot in np.flatnonzero(begun).tolist():
+            start = time.perf_counter()
+            driver.begin(env, robot)
+            planned[robot] = time.perf_counter() - start
         running = at_work >= 0
+        robots = np.flatnonzero(running)
         actions = np.zeros((env.num_envs, 2), np.float32)
-        actions[running] = _choose(policy, observations[running], alone=alone)
+        start = time.perf_counter()
+        actions[running] = driver.drive(env, robots, observations[running])
+        decided[running] += (time.perf_counter() - start) / len(robots)
+        decisions[running] += 1
         observations, _, terminated, truncated, info = env.step(actions, only=running)
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
             number, at_work[robot] = int(at_work[robot]), -1
-            yield robot, number, info
+            mean = float(decided[robot] / decisions[robot])
+            yield _Ended(robot, number, info, float(planned[robot]), mean)
 
 
 def _begin(
@@ -198,25 +293,8 @@ def _begin(
     return observations
 
 
-def _choose(
-    policy: Action, observations: NDArray[np.float32], *, alone: bool
-) -> NDArray[np.float32]:
-    """One action for each observation."""
-    if alone:
-        return np.asarray(policy(observations[0]), dtype=np.float32)[None]
-    actions = np.asarray(policy(observations), dtype=np.float32)
-    if actions.shape != (len(observations), 2):
-        raise ValueError(
-            f"policy must give actions of shape {(len(observations), 2)} for observations of shape "
-            f"{observations.shape}, got {actions.shape}; one that takes a single observation runs "
-            "with envs_at_once=1"
-        )
-    return actions
-
-
-def _result(
-    tasks: Sequence[WorldTask], number: int, info: dict[str, NDArray[Any]], robot: int
-) -> EpisodeResult:
+def _result(tasks: Sequence[WorldTask], ended: _Ended) -> EpisodeResult:
+    robot, number, info = ended.robot, ended.number, ended.info
     world = tasks[number].world
     driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
     success = bool(info["success"][robot])
@@ -230,6 +308,8 @@ def _result(
         shortest_path=shortest,
         min_clearance=float(info["min_clearance"][robot]),
         spl=spl(success, path_length=driven, shortest_path=shortest),
+        plan_s=ended.plan_s,
+        decision_s=ended.decision_s,
         world=world.name,
         **({name: float(info[name][robot]) for name in ENCOUNTERS} if world.walkers else {}),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +36,11 @@ class EpisodeResult:
     """Least distance between the robot's rim and an obstacle, wall or walker [m]."""
     spl: float
     """Success weighted by path length, see :func:`spl`."""
+    plan_s: float = field(default=0.0, compare=False)
+    """Wall-clock time of planning before the first action [s]. Results that differ in times of the
+    machine alone are equal."""
+    decision_s: float = field(default=0.0, compare=False)
+    """Mean wall-clock time of an action [s]; its share where several robots act together."""
     world: str = ""
     """Where it was."""
     walker_distance: float | None = None
@@ -103,6 +108,8 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         "time_s": bootstrap([result.time_s for result in reached], rng),
         "path_length": bootstrap([result.path_length for result in reached], rng),
         "min_clearance": bootstrap([result.min_clearance for result in results], rng),
+        "plan_s": bootstrap([result.plan_s for result in results], rng),
+        "decision_s": bootstrap([result.decision_s for result in results], rng),
     }
     for name in ENCOUNTERS:
         values = [getattr(result, name) for result in results]

@@ -1,0 +1,138 @@
+"""A driver that knows the world: it plans a path when an episode begins, and follows it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from mpfa_envs.checks import check_positive
+from mpfa_envs.distance import FreeGrid
+from mpfa_envs.planners.pure_pursuit import PurePursuit
+from mpfa_envs.robot import TRAINING_CLEARANCE, RobotModel, resolve_robot
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.planners.search import Search
+    from mpfa_envs.shapes import Point
+    from mpfa_envs.vector import VectorNavigationEnv
+    from mpfa_envs.worlds import World
+
+_LEAST_CLEARANCE: Final = 0.02
+"""What a path keeps where there is none with the wanted clearance [m]."""
+_FINE: Final = 0.05
+"""Side of a cell of the grid that is made then [m]."""
+
+
+class MapPlanner:
+    """Plans on the known map and follows the path, a :class:`~mpfa_envs.Driver`.
+
+    It knows all obstacles of the world and where the robot is, neither of which is in the
+    observation: what it reaches is a ceiling for those that have the lidar alone.
+
+    Where no path keeps the clearance it takes one that keeps less, on finer cells, and where there
+    is none at all it drives at the goal.
+
+    Args:
+        search: Finds a path.
+        robot: What drives.
+        clearance: What a path keeps of the robot's rim from obstacles [m].
+        resolution: Side of a cell of the grid [m].
+        look_ahead: Of the :class:`~mpfa_envs.planners.PurePursuit` [m].
+        card: Plain values that say what it is.
+
+    Raises:
+        ValueError: If a length is not positive.
+
+    Examples:
+        >>> from mpfa_envs import evaluate
+        >>> from mpfa_envs.planners import MapPlanner, dijkstra_path
+        >>> planner = MapPlanner(dijkstra_path)
+        >>> [each.success for each in evaluate(planner, "D", episodes=3, physics="kinematic")]
+        [True, True, True]
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        *,
+        robot: str | RobotModel = "turtlebot2",
+        clearance: float = TRAINING_CLEARANCE,
+        resolution: float = 0.1,
+        look_ahead: float = 0.6,
+        card: dict[str, Any] | None = None,
+    ) -> None:
+        self.search = search
+        self.robot = resolve_robot(robot)
+        self.clearance = check_positive("clearance", clearance)
+        self.resolution = check_positive("resolution", resolution)
+        self.look_ahead = check_positive("look_ahead", look_ahead)
+        self.card = card or {}
+        self.env_arguments = {"robot": robot, "physics": "kinematic"}
+        """Arguments of the environments that it drives in, unless others are given."""
+        self._pursuits: dict[int, PurePursuit] = {}
+        self._grids: dict[tuple[float, float], FreeGrid] = {}
+
+    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+        """Plan the path of an episode.
+
+        Args:
+            env: Where the episode has begun.
+            robot: Number of the robot.
+        """
+        task = env.tasks[robot]
+        if task is None:
+            raise ValueError(f"robot {robot} must have begun an episode to plan for")
+        path, grid = self.plan(env.worlds[robot], task.start[:2], task.goal)
+        self._pursuits[robot] = PurePursuit(path, self.robot, grid, look_ahead=self.look_ahead)
+
+    def drive(
+        self,
+        env: VectorNavigationEnv,
+        robots: NDArray[np.int64],
+        observations: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Follow the paths.
+
+        Args:
+            env: Whose poses are read.
+            robots: Numbers of the N robots that are under way.
+            observations: What they sense, ``[N, O]``; not read.
+
+        Returns:
+            Actions, ``[N, 2]``.
+        """
+        poses = env.poses
+        actions = [self._pursuits[robot].act(*poses[robot].tolist()) for robot in robots.tolist()]
+        return np.array(actions, dtype=np.float32)
+
+    def plan(self, world: World, start: Point, goal: Point) -> tuple[list[Point], FreeGrid]:
+        """Plan a path.
+
+        Args:
+            world: The room and its obstacles.
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Positions from the start to the goal [m], and the grid that they were found on.
+        """
+        for clearance, resolution in (
+            (self.clearance, self.resolution),
+            (self.clearance, min(_FINE, self.resolution)),
+            (_LEAST_CLEARANCE, min(_FINE, self.resolution)),
+        ):
+            grid = self._grid_of(world, self.robot.radius + clearance, resolution)
+            path = self.search(grid, start, goal)
+            if path is not None:
+                return path, grid
+        return [start, goal], grid
+
+    def _grid_of(self, world: World, distance: float, resolution: float) -> FreeGrid:
+        """The grid of a world; kept for the next task, as several follow in the same world."""
+        kept = self._grids.get((distance, resolution))
+        if kept is None or kept.world is not world:
+            kept = FreeGrid(world, distance=distance, resolution=resolution)
+            self._grids[distance, resolution] = kept
+        return kept

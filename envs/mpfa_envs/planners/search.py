@@ -1,0 +1,132 @@
+"""Shortest ways on the grid of a known world, by two libraries' graph searches."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, Protocol
+
+import networkx
+import numpy as np
+from scipy.sparse.csgraph import dijkstra
+
+from mpfa_envs.distance import FreeGrid
+from mpfa_envs.kernels.grid import STEP_SCALE
+
+if TYPE_CHECKING:
+    from mpfa_envs.shapes import Point
+
+_START: Final = -1
+_GOAL: Final = -2
+"""Nodes of NetworkX's graph besides the cells."""
+
+
+class Search(Protocol):
+    """Finds a way between two positions over the free cells of a grid."""
+
+    def __call__(self, grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
+        """Find a way.
+
+        Args:
+            grid: The grid.
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Positions from the start to the goal, with centers of cells between them [m]; None if
+            there is no way.
+        """
+
+
+def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
+    """Find a shortest way with SciPy's Dijkstra, see :class:`Search`.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> from mpfa_envs.planners import dijkstra_path, path_length
+        >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
+        >>> path = dijkstra_path(grid, (0.0, 0.0), (4.0, 0.0))
+        >>> round(path_length(grid, path), 6) == round(grid.length((0.0, 0.0), (4.0, 0.0)), 6)
+        True
+    """
+    if not grid.free.any():
+        return None
+    graph = grid.graph_to(goal)
+    last = graph.shape[0] - 1
+    # From the goal, as every move leads both ways; what is before a cell is next on its way.
+    lengths, following = dijkstra(graph, indices=last, return_predecessors=True)
+    length, cell = min((lengths[cell] + gap, cell) for cell, gap in grid.cells_around(start))
+    if math.isinf(length):
+        return None
+    cells = []
+    while cell != last:
+        cells.append(cell)
+        cell = int(following[cell])
+    return [start, *centers(grid, cells), goal]
+
+
+def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
+    """Find a shortest way with NetworkX's A*, see :class:`Search`.
+
+    What is left of a way is estimated by the straight line, measured as short as moves are: it is
+    never overestimated, so that the way is a shortest one.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> from mpfa_envs.planners import astar_path
+        >>> len(astar_path(FreeGrid(WORLDS["A"], distance=0.25), (0.05, 0.05), (1.05, 0.05)))
+        10
+    """
+    if not grid.free.any():
+        return None
+    graph = _networkx_graph(grid)
+    gaps = STEP_SCALE * np.hypot(
+        grid.xs[grid.cells[:, 0]] - goal[0], grid.ys[grid.cells[:, 1]] - goal[1]
+    )
+    # The last two are those of _GOAL and _START, which are -2 and -1.
+    estimates = [*gaps.tolist(), 0.0, STEP_SCALE * math.dist(start, goal)]
+    try:
+        for node, place in ((_START, start), (_GOAL, goal)):
+            edges = ((node, cell, gap) for cell, gap in grid.cells_around(place))
+            graph.add_weighted_edges_from(edges)
+        cells = networkx.astar_path(
+            graph, _START, _GOAL, heuristic=lambda cell, _: estimates[cell]
+        )[1:-1]
+    except networkx.NetworkXNoPath:
+        return None
+    finally:
+        graph.remove_nodes_from((_START, _GOAL))
+    return [start, *centers(grid, cells), goal]
+
+
+@lru_cache(maxsize=2)
+def _networkx_graph(grid: FreeGrid) -> networkx.Graph:
+    """The free cells and the moves between them; some tens of megabytes."""
+    starts, neighbors, lengths = grid.moves
+    cells = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    once = cells < neighbors
+    graph = networkx.Graph()
+    graph.add_nodes_from(range(len(starts) - 1))
+    edges = (cells[once].tolist(), neighbors[once].tolist(), lengths[once].tolist())
+    graph.add_weighted_edges_from(zip(*edges, strict=True))
+    return graph
+
+
+def centers(grid: FreeGrid, cells: list[int]) -> list[Point]:
+    """Positions (x, y) of some free cells' centers [m]."""
+    places = grid.cells[cells]
+    return list(zip(grid.xs[places[:, 0]].tolist(), grid.ys[places[:, 1]].tolist(), strict=True))
+
+
+def path_length(grid: FreeGrid, path: list[Point]) -> float:
+    """Measure a way as :meth:`~mpfa_envs.FreeGrid.length` does.
+
+    Args:
+        grid: The grid.
+        path: Positions, as a :class:`Search` finds them [m].
+
+    Returns:
+        Length [m], with moves between cells a little shorter than their lines.
+    """
+    steps = [math.dist(one, other) for one, other in zip(path, path[1:], strict=False)]
+    return steps[0] + STEP_SCALE * sum(steps[1:-1]) + steps[-1]
