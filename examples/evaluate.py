@@ -1,14 +1,16 @@
-"""Evaluate a trained policy between fixed starts and goals, in worlds or those of generators.
+"""Evaluate a policy or a planner between fixed starts and goals, in worlds or those of generators.
 
     python examples/evaluate.py runs/demo --worlds A --episodes 100
     python examples/evaluate.py runs/demo --worlds test rooms:100-109 bars:test barn
     python examples/evaluate.py runs/demo --worlds all        all test worlds in which nothing moves
     python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
+    python examples/evaluate.py --policy dwa --worlds bars:validation    a planner in its place
 
 Prints a row for each world or generator and their total. Writes to the folder
-``evaluation-WORLDS`` in that of the run, for another file to runs/evaluation-NAME, or to --output:
+``evaluation-WORLDS`` in that of the run, for another file or a planner to runs/evaluation-NAME, or
+to --output:
 summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (a row
-an episode), settings.json (what was asked for, and the policy's card), trajectories.png (the
+an episode), settings.json (what was asked for, and a policy's card), trajectories.png (the
 ways in up to nine worlds) and episode.gif (the longest one from above).
 """
 
@@ -27,9 +29,18 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image
 
-from mpfa_envs import GENERATORS, EpisodeResult, Policy, World, load_policy, render_trajectories
+from mpfa_envs import (
+    GENERATORS,
+    PLANNERS,
+    EpisodeResult,
+    Policy,
+    World,
+    load_policy,
+    make_planner,
+    render_trajectories,
+)
 from navigation import files
-from navigation.evaluating import Drives, drive, film, summary_row
+from navigation.evaluating import Drivable, Drives, drive, film, summary_row
 from navigation.figures import tiled, write_animation
 from navigation.records import as_table, write_table
 from navigation.stopping import end_with_parent
@@ -39,15 +50,19 @@ from torchrl_mpfa.saving import write_text_atomically
 EVALUATION = "evaluation.json"
 _PICTURED = 9
 """Worlds in a picture at most."""
-_DOCUMENTED = ("success", "collision", "timeout", "spl", "time_s")
+_DOCUMENTED = (
+    *("success", "collision", "timeout", "spl", "time_s"),
+    *("path_length", "plan_s", "decision_s"),
+)
 _COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
-_SECONDS = {"time_s": "{:.1f}", "min_clearance": "{:.3f}"}
+_LENGTHS = {"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"}
 _ENCOUNTERS = {
     "walker_distance": "{:.3f}",
     "intrusion_time": "{:.1f}",
     "time_to_collision": "{:.2f}",
 }
 """What there is where people walk."""
+_MILLISECONDS = {"plan_s": "plan_ms", "decision_s": "decision_ms"}
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -55,7 +70,18 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("policy", type=Path, help="policy.npz, or the folder of a run")
+    parser.add_argument(
+        "path", type=Path, nargs="?", help="policy.npz of a trained policy, or the folder of a run"
+    )
+    parser.add_argument(
+        "--policy",
+        choices=list(PLANNERS),
+        help="a planner in its place: "
+        + "; ".join(f"{name}, {what}" for name, what in PLANNERS.items()),
+    )
+    parser.add_argument(
+        "--memory", choices=["none", "map"], default="none", help="map: dwa sees the way on its map"
+    )
     parser.add_argument(
         "--worlds",
         nargs="+",
@@ -65,26 +91,51 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--episodes", type=int, help="for each (default: 200 in a world, 400 of a generator)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the pairs (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="of pairs and ants (default: 0)")
     parser.add_argument("--output", type=Path, help="folder (default: in that of the run)")
-    parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
+    parser.add_argument(
+        "--physics",
+        choices=["wheels", "kinematic"],
+        help="default: as trained; of a planner kinematic",
+    )
     parser.add_argument("--no-pictures", action="store_true", help="write tables alone")
     options = parser.parse_args(arguments)
     for name, least in (("episodes", 1), ("seed", 0)):
         value = getattr(options, name)
         if value is not None and value < least:
             parser.error(f"--{name} must be at least {least}, got {value}")
+    if (options.path is None) == (options.policy is None):
+        parser.error("give either the path of a trained policy or --policy with a planner")
+    if options.memory != "none" and options.policy != "dwa":
+        parser.error(f"--memory {options.memory} is for --policy dwa alone")
     try:
         options.names = parse_worlds(options.worlds)
-        options.loaded = load_policy(options.policy)
+        options.loaded = load_driver(options)
     except (ValueError, OSError) as error:
         parser.error(str(error))
     return options
 
 
-def output_folder(policy: Path, words: Sequence[str]) -> Path:
+def load_driver(options: argparse.Namespace) -> Drivable:
+    """The policy or the planner that the command line names."""
+    if options.policy is None:
+        return load_policy(options.path)
+    return make_planner(options.policy, memory=options.memory, seed=options.seed)
+
+
+def name_of(options: argparse.Namespace) -> str:
+    """What is evaluated: the path of a policy, or a planner and what it remembers."""
+    if options.policy is None:
+        return str(options.path)
+    return str(options.policy) if options.memory == "none" else f"{options.policy}-map"
+
+
+def output_folder(options: argparse.Namespace) -> Path:
     """Where results go unless the command line says: each choice of worlds has its own folder."""
-    name = f"evaluation-{worlds_label(words)}"
+    name = f"evaluation-{worlds_label(options.worlds)}"
+    policy = options.path
+    if policy is None:
+        return Path("runs") / f"evaluation-{name_of(options)}" / name
     if policy.is_dir():
         return policy / name
     if policy.name == files.POLICY:
@@ -95,19 +146,21 @@ def output_folder(policy: Path, words: Sequence[str]) -> Path:
 def printed(summary: pd.DataFrame) -> str:
     """The table on the screen: estimates, and the interval of success."""
     table = summary[["world", "episodes"]].copy()
-    for name, form in {**_COLUMNS, **_SECONDS, **_ENCOUNTERS}.items():
+    for name, form in {**_COLUMNS, **_LENGTHS, **_ENCOUNTERS}.items():
         if name in summary:
             table[name] = summary[name].map(form.format).where(summary[name].notna(), "")
+    for name, shown in _MILLISECONDS.items():
+        table[shown] = (1e3 * summary[name]).map("{:.2f}".format)
     ends = zip(summary["success_low"], summary["success_high"], strict=True)
     table.insert(3, "95 %", [f"[{low:.1%}, {high:.1%}]" for low, high in ends])
     return table.to_string(index=False)
 
 
-def write_pictures(policy: Policy, driven: Sequence[Drives], folder: Path, **how: Any) -> None:
+def write_pictures(policy: Drivable, driven: Sequence[Drives], folder: Path, **how: Any) -> None:
     """Nine worlds with the ways in them, and one episode as an animation.
 
     Args:
-        policy: The policy.
+        policy: The policy, or a planner.
         driven: What it did, one for each row of the table.
         folder: Where the pictures go.
         **how: Passed to :func:`navigation.evaluating.film`.
@@ -187,8 +240,8 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     """
     end_with_parent()
     options = parse(arguments)
-    policy: Policy = options.loaded
-    folder = options.output or output_folder(options.policy, options.worlds)
+    policy: Drivable = options.loaded
+    folder = options.output or output_folder(options)
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": options.physics}
     results: list[EpisodeResult] = []
     driven: list[Drives] = []
@@ -209,11 +262,14 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
-        file = options.policy / files.POLICY if options.policy.is_dir() else options.policy
-        document = {"words": options.worlds, **asked, "card": policy.card}
-        document["sha256"] = files.digest(file)
+        document: dict[str, Any] = {"words": options.worlds, **asked}
+        if isinstance(policy, Policy):
+            file = options.path / files.POLICY if options.path.is_dir() else options.path
+            document |= {"card": policy.card, "sha256": files.digest(file)}
+        else:
+            document |= {"policy": options.policy, "memory": options.memory}
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
-    print(f"\n{options.policy}\n{printed(summary)}")
+    print(f"\n{name_of(options)}\n{printed(summary)}")
     print(f"written: {folder}")
     return summary
 

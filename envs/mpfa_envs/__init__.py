@@ -29,7 +29,7 @@ from mpfa_envs.worlds import World, WorldArrays
 if TYPE_CHECKING:
     from mpfa_envs.discrete import WHEEL_PAIRS, DiscreteWheels
     from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
-    from mpfa_envs.evaluation import evaluate, run_tasks
+    from mpfa_envs.evaluation import Driver, evaluate, run_tasks
     from mpfa_envs.generators import (
         GENERATORS,
         generate_world,
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         world_seed,
     )
     from mpfa_envs.mirror import Mirror, RandomMirror
+    from mpfa_envs.planners import PLANNERS, DynamicWindow, MapPlanner, make_planner
     from mpfa_envs.task_sets import WorldTask, world_tasks
     from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
     from mpfa_envs.vector import VectorNavigationEnv
@@ -60,6 +61,7 @@ __all__ = [
     "INFO_TYPES",
     "OBSERVATION",
     "PAPER_TASK",
+    "PLANNERS",
     "ROBOTS",
     "VECTOR_ENV_IDS",
     "WHEEL_PAIRS",
@@ -69,11 +71,14 @@ __all__ = [
     "Cylinder",
     "DiscreteWheels",
     "DistanceField",
+    "Driver",
+    "DynamicWindow",
     "EpisodeResult",
     "FreeGrid",
     "Interval",
     "Lidar",
     "MapMemory",
+    "MapPlanner",
     "Mirror",
     "NavigationEnv",
     "NavigationTorchEnv",
@@ -101,6 +106,7 @@ __all__ = [
     "load_policy",
     "load_world",
     "make_navigation_env",
+    "make_planner",
     "navigation_reward",
     "observation_slices",
     "render_trajectories",
@@ -148,9 +154,13 @@ _LATER = {
     "GENERATORS": "generators",
     "WHEEL_PAIRS": "discrete",
     "DiscreteWheels": "discrete",
+    "PLANNERS": "planners",
     "DistanceField": "distance",
+    "Driver": "evaluation",
+    "DynamicWindow": "planners",
     "FreeGrid": "distance",
     "MapMemory": "map_memory",
+    "MapPlanner": "planners",
     "Mirror": "mirror",
     "NavigationTorchEnv": "torchrl_env",
     "RandomMirror": "mirror",
@@ -160,6 +170,7 @@ _LATER = {
     "generate_world": "generators",
     "generator_tasks": "generators",
     "make_navigation_env": "torchrl_env",
+    "make_planner": "planners",
     "run_tasks": "evaluation",
     "sample_task_on_grid": "distance",
     "split_worlds": "generators",

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from tensordict.nn import TensorDictModule
 
 from mpfa_envs import (
+    DynamicWindow,
     EpisodeResult,
-    NavigationEnv,
+    MapPlanner,
     Policy,
     VectorNavigationEnv,
     WorldTask,
@@ -23,6 +25,7 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.evaluation import as_driver
 from navigation.assembly import policy_layers
 from navigation.environments import env_arguments
 from navigation.records import EvaluationRecord
@@ -30,6 +33,10 @@ from navigation.settings import TrainSettings
 
 _SEED = 1
 """Of the pairs of start and goal: others than those of ``evaluate.py``."""
+
+
+Drivable = Policy | MapPlanner | DynamicWindow
+"""What drives, and knows by ``env_arguments`` what it must sense."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ class Drives:
 
 
 def drive(
-    policy: Policy,
+    policy: Drivable,
     world: str,
     *,
     episodes: int | None,
@@ -60,7 +67,7 @@ def drive(
     As :func:`mpfa_envs.evaluate`, and the ways are kept.
 
     Args:
-        policy: The policy.
+        policy: The policy, or a planner.
         world: What :func:`mpfa_envs.world_tasks` takes.
         episodes: Number of tasks; None: as many as there usually are.
         seed: Seed of the tasks in a world.
@@ -84,7 +91,7 @@ def drive(
 
 
 def film(
-    policy: Policy, episode: WorldTask, *, physics: str | None, seed: int = 0
+    policy: Drivable, episode: WorldTask, *, physics: str | None, seed: int = 0
 ) -> list[NDArray[np.uint8]]:
     """Pictures of an episode, each of shape ``[height, width, 3]``."""
     arguments = {**policy.env_arguments, "collision_distance": "contact", "world": episode.world}
@@ -93,14 +100,18 @@ def film(
     if episode.max_steps is not None:
         arguments["max_steps"] = episode.max_steps
     frames: list[Any] = []
-    with closing(NavigationEnv(**arguments, render_mode="rgb_array")) as env:
-        observation, _ = env.reset(seed=seed, options=episode.task._asdict())
+    driver = as_driver(policy)
+    arguments |= {"render_mode": "rgb_array", "autoreset_mode": AutoresetMode.DISABLED}
+    with closing(VectorNavigationEnv(1, **arguments)) as env:
+        observations, _ = env.reset(seed=[seed], options={"tasks": [episode.task]})
+        driver.begin(env, 0)
         ended = False
         while not ended:
-            frames.append(env.render())
-            observation, _, terminated, truncated, _ = env.step(policy(observation))
-            ended = terminated or truncated
-        frames.append(env.render())
+            frames += env.render() or ()
+            actions = driver.drive(env, np.arange(1), observations)
+            observations, _, terminated, truncated, _ = env.step(actions)
+            ended = bool(terminated[0] or truncated[0])
+        frames += env.render() or ()
     return frames
 
 

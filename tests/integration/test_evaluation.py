@@ -53,6 +53,57 @@ def test_the_script_writes_tables_and_pictures(
     assert f"written: {folder}" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "pictures"),
+    [
+        (["astar"], "astar", ["trajectories.png", "episode.gif"]),
+        (["dwa", "--memory", "map", "--no-pictures"], "dwa-map", []),
+    ],
+    ids=["astar", "dwa"],
+)
+def test_a_planner_has_the_tables_and_pictures_of_a_policy(
+    words: list[str],
+    name: str,
+    pictures: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    summary = evaluate.main(["--policy", *words, "--worlds", "A", "B", "--episodes", "2"])
+    folder = Path("runs") / f"evaluation-{name}" / "evaluation-A+B"
+    assert list(summary["world"]) == ["A", "B", "total"]
+    assert list(summary["success"]) == [1.0, 1.0, 1.0]
+    found = json.loads((folder / "evaluation.json").read_text())
+    assert found["worlds"]["B"]["success"] == 1.0
+    assert found["path_length"] > 1.0 and found["decision_s"] > 0.0
+    assert (found["plan_s"] > 1e-4) == (name == "astar")
+    assert len(read_table(folder / "episodes.csv")) == 4
+    settings = json.loads((folder / "settings.json").read_text())
+    assert settings["policy"] == words[0]
+    assert settings["memory"] == ("none" if name == "astar" else "map")
+    assert {path.name for path in folder.iterdir()} >= {*pictures, "summary.csv"}
+    shown = capsys.readouterr().out
+    assert f"\n{name}\n" in shown and "plan_ms" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give either the path of a trained policy or --policy"),
+        (["runs/demo", "--policy", "dwa"], "give either the path of a trained policy or --policy"),
+        (["--policy", "astar", "--memory", "map"], "--memory map is for --policy dwa alone"),
+        (["--policy", "dwb"], "invalid choice: 'dwb'"),
+    ],
+)
+def test_a_command_line_names_a_policy_or_a_planner(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        evaluate.main(arguments)
+    assert message in capsys.readouterr().err
+
+
 def test_several_worlds_have_a_row_each_and_a_total(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

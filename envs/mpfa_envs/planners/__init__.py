@@ -1,3 +1,81 @@
 """Classic drivers beside the learned ones: planners on the known map, and the dynamic window."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+from mpfa_envs.checks import did_you_mean
+from mpfa_envs.observation import Memory
+from mpfa_envs.planners.ant_colony import AntColony
+from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
+from mpfa_envs.planners.map_planner import MapPlanner
+from mpfa_envs.planners.pure_pursuit import PurePursuit
+from mpfa_envs.planners.search import Search, astar_path, dijkstra_path, path_length
+from mpfa_envs.robot import RobotModel
+
+__all__ = [
+    "PLANNERS",
+    "AntColony",
+    "DynamicWindow",
+    "MapPlanner",
+    "PurePursuit",
+    "Search",
+    "WindowScore",
+    "astar_path",
+    "dijkstra_path",
+    "make_planner",
+    "path_length",
+]
+
+PLANNERS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "astar": "A* on the known map, followed by pure pursuit",
+        "dijkstra": "Dijkstra on the known map, followed by pure pursuit",
+        "ant_colony": "an ant colony on the known map, followed by pure pursuit",
+        "dwa": "the dynamic window approach, which sees the observation alone",
+    }
+)
+"""What each of the planners is, by name."""
+_COARSE: Final = 0.2
+"""Side of the ants' cells [m]: a walk over twice as many steps tells them little more."""
+
+
+def make_planner(
+    name: str,
+    *,
+    robot: str | RobotModel = "turtlebot2",
+    memory: Memory = "none",
+    seed: int = 0,
+) -> MapPlanner | DynamicWindow:
+    """Make a planner, which :func:`~mpfa_envs.evaluate` drives as it does a trained policy.
+
+    Args:
+        name: One of :data:`PLANNERS`.
+        robot: What drives.
+        memory: Of the dynamic window: whether it sees the way on the robot's map.
+        seed: Of the ant colony.
+
+    Returns:
+        The planner.
+
+    Raises:
+        ValueError: If there is no such planner, or it has no use for a memory.
+
+    Examples:
+        >>> from mpfa_envs import evaluate, make_planner
+        >>> planner = make_planner("astar")
+        >>> [each.success for each in evaluate(planner, "B", episodes=2, physics="kinematic")]
+        [True, True]
+    """
+    if name not in PLANNERS:
+        hint = f" ({question})" if (question := did_you_mean(name, PLANNERS)) else ""
+        raise ValueError(f"name must be one of {sorted(PLANNERS)}, got {name!r}{hint}")
+    if name == "dwa":
+        return DynamicWindow(robot=robot, memory=memory)
+    if memory != "none":
+        raise ValueError(f"memory must be 'none' for {name}, which knows the map, got {memory!r}")
+    if name == "ant_colony":
+        return MapPlanner(AntColony(seed=seed), robot=robot, resolution=_COARSE)
+    return MapPlanner(astar_path if name == "astar" else dijkstra_path, robot=robot)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _STEP: Final = 0.1
 """Distance of the places on an arc that are looked at [m]."""
 _WAY: Final = 1.0
-"""How far along its direction a way is followed at most [m]: no more than its direction is known."""
+"""How far away a way is followed at most [m]: its direction is known for little more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +136,7 @@ class DynamicWindow:
             "memory": memory,
             "closeness_distance": self.closeness_distance,
         }
-        self.card: dict[str, Any] = {}
+        """Arguments of the environments that it drives in, unless others are given."""
 
     def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Choose wheel speeds.
@@ -150,13 +150,13 @@ class DynamicWindow:
         Raises:
             ValueError: If the observations have another size.
         """
-        observation = np.asarray(observation, dtype=np.float64)
+        observation = np.asarray(observation, dtype=np.float32)
         if observation.ndim == 0 or observation.shape[-1] != self.observation_size:
             raise ValueError(
                 f"observation must have shape [..., {self.observation_size}], "
                 f"got {observation.shape}"
             )
-        rows = observation.reshape(-1, self.observation_size)
+        rows = observation.astype(np.float64).reshape(-1, self.observation_size)
         chosen = np.array([self._best(row) for row in rows], dtype=np.int64)
         slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
         actions = (2.0 * (self.pairs[chosen] - slow) / (fast - slow) - 1.0).astype(np.float32)

@@ -40,7 +40,6 @@ class MapPlanner:
         clearance: What a path keeps of the robot's rim from obstacles [m].
         resolution: Side of a cell of the grid [m].
         look_ahead: Of the :class:`~mpfa_envs.planners.PurePursuit` [m].
-        card: Plain values that say what it is.
 
     Raises:
         ValueError: If a length is not positive.
@@ -61,15 +60,13 @@ class MapPlanner:
         clearance: float = TRAINING_CLEARANCE,
         resolution: float = 0.1,
         look_ahead: float = 0.6,
-        card: dict[str, Any] | None = None,
     ) -> None:
         self.search = search
         self.robot = resolve_robot(robot)
         self.clearance = check_positive("clearance", clearance)
         self.resolution = check_positive("resolution", resolution)
         self.look_ahead = check_positive("look_ahead", look_ahead)
-        self.card = card or {}
-        self.env_arguments = {"robot": robot, "physics": "kinematic"}
+        self.env_arguments: dict[str, Any] = {"robot": robot, "physics": "kinematic"}
         """Arguments of the environments that it drives in, unless others are given."""
         self._pursuits: dict[int, PurePursuit] = {}
         self._grids: dict[tuple[float, float], FreeGrid] = {}

@@ -126,9 +126,7 @@ class PurePursuit:
                 break
         return tuple(candidates[int((rooms >= least).argmax())].tolist())
 
-    def _line_clearances(
-        self, x: float, y: float, to: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def _line_clearances(self, x: float, y: float, to: NDArray[np.float64]) -> NDArray[np.float32]:
         """Least clearance on the straight line to each point [m], ``[points]``."""
         shares = np.linspace(0.0, 1.0, 1 + math.ceil(self.look_ahead / _SPACING))[1:, None]
         places = (x + shares * (to[:, 0] - x), y + shares * (to[:, 1] - y))
@@ -154,9 +152,7 @@ class PurePursuit:
         off = np.abs(self._curvatures - wanted)
         return float(self._curvatures[np.lexsort((off, -steps))[0]])
 
-    def _clearances(
-        self, x: NDArray[np.float64], y: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def _clearances(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float32]:
         """Clearances of the cells at some places [m], of any shape."""
         grid = self.grid
         columns, rows = (

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, Protocol
 
-import networkx
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,6 +14,8 @@ from mpfa_envs.distance import FreeGrid
 from mpfa_envs.kernels.grid import STEP_SCALE
 
 if TYPE_CHECKING:
+    import networkx
+
     from mpfa_envs.shapes import Point
 
 _START: Final = -1
@@ -54,14 +56,14 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
     graph = grid.graph_to(goal)
     last = graph.shape[0] - 1
     # From the goal, as every move leads both ways; what is before a cell is next on its way.
-    lengths, following = dijkstra(graph, indices=last, return_predecessors=True)
-    length, cell = min((lengths[cell] + gap, cell) for cell, gap in grid.cells_around(start))
+    lengths, following = dijkstra(graph, indices=[last], return_predecessors=True)
+    length, cell = min((lengths[0, cell] + gap, cell) for cell, gap in grid.cells_around(start))
     if math.isinf(length):
         return None
     cells = []
     while cell != last:
         cells.append(cell)
-        cell = int(following[cell])
+        cell = int(following[0, cell])
     return [start, *centers(grid, cells), goal]
 
 
@@ -73,12 +75,18 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
 
     Examples:
         >>> from mpfa_envs import WORLDS, FreeGrid
-        >>> from mpfa_envs.planners import astar_path
-        >>> len(astar_path(FreeGrid(WORLDS["A"], distance=0.25), (0.05, 0.05), (1.05, 0.05)))
-        10
+        >>> from mpfa_envs.planners import astar_path, path_length
+        >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
+        >>> path = astar_path(grid, (0.0, 0.0), (4.0, 0.0))
+        >>> round(path_length(grid, path), 6) == round(grid.length((0.0, 0.0), (4.0, 0.0)), 6)
+        True
     """
     if not grid.free.any():
         return None
+    # Imported here because it takes long, and whoever evaluates a policy does not need it.
+    from networkx import NetworkXNoPath
+    from networkx import astar_path as search
+
     graph = _networkx_graph(grid)
     gaps = STEP_SCALE * np.hypot(
         grid.xs[grid.cells[:, 0]] - goal[0], grid.ys[grid.cells[:, 1]] - goal[1]
@@ -89,10 +97,8 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
         for node, place in ((_START, start), (_GOAL, goal)):
             edges = ((node, cell, gap) for cell, gap in grid.cells_around(place))
             graph.add_weighted_edges_from(edges)
-        cells = networkx.astar_path(
-            graph, _START, _GOAL, heuristic=lambda cell, _: estimates[cell]
-        )[1:-1]
-    except networkx.NetworkXNoPath:
+        cells = search(graph, _START, _GOAL, heuristic=lambda cell, _: estimates[cell])[1:-1]
+    except NetworkXNoPath:
         return None
     finally:
         graph.remove_nodes_from((_START, _GOAL))
@@ -102,10 +108,12 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
 @lru_cache(maxsize=2)
 def _networkx_graph(grid: FreeGrid) -> networkx.Graph:
     """The free cells and the moves between them; some tens of megabytes."""
+    from networkx import Graph
+
     starts, neighbors, lengths = grid.moves
     cells = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     once = cells < neighbors
-    graph = networkx.Graph()
+    graph = Graph()
     graph.add_nodes_from(range(len(starts) - 1))
     edges = (cells[once].tolist(), neighbors[once].tolist(), lengths[once].tolist())
     graph.add_weighted_edges_from(zip(*edges, strict=True))
@@ -128,5 +136,5 @@ def path_length(grid: FreeGrid, path: list[Point]) -> float:
     Returns:
         Length [m], with moves between cells a little shorter than their lines.
     """
-    steps = [math.dist(one, other) for one, other in zip(path, path[1:], strict=False)]
+    steps = [math.dist(one, other) for one, other in pairwise(path)]
     return steps[0] + STEP_SCALE * sum(steps[1:-1]) + steps[-1]

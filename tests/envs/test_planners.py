@@ -1,0 +1,271 @@
+"""Planners on the known map: lengths against the grid's own, and followers that arrive."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    WORLDS,
+    Box,
+    FreeGrid,
+    MapPlanner,
+    NavigationEnv,
+    VectorNavigationEnv,
+    World,
+    evaluate,
+    make_planner,
+    run_tasks,
+    world_tasks,
+)
+from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.evaluation import as_driver
+from mpfa_envs.planners import (
+    AntColony,
+    PurePursuit,
+    Search,
+    astar_path,
+    dijkstra_path,
+    path_length,
+)
+from mpfa_envs.robot import ROBOTS
+
+SEARCHES = {"astar": astar_path, "dijkstra": dijkstra_path}
+# A wall from side to side: nothing gets through.
+DIVIDED = World(name="divided", size=(4.0, 4.0), boxes=(Box(-0.1, -2.0, 0.1, 2.0),))
+FULL = World(name="full", size=(1.0, 1.0), boxes=(Box(-0.5, -0.5, 0.5, 0.5),))
+TURTLEBOT = ROBOTS["turtlebot2"]
+
+
+def places(grid: FreeGrid, count: int, seed: int = 0) -> list[tuple[float, float]]:
+    """Positions in and around free cells."""
+    rng = np.random.default_rng(seed)
+    cells = grid.cells[rng.integers(len(grid.cells), size=count)]
+    off = grid.resolution * (rng.random((count, 2)) - 0.5)
+    return [
+        (float(grid.xs[i] + across), float(grid.ys[j] + up))
+        for (i, j), (across, up) in zip(cells, off, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("world", ["D", "bars-3", "mazes-3"])
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_path_is_as_long_as_the_way_of_the_grid(name: str, world: str) -> None:
+    room = resolve_world(world)
+    grid = FreeGrid(room, distance=0.25, resolution=0.2)
+    ends = places(grid, 12)
+    for start, goal in zip(ends[:6], ends[6:], strict=True):
+        path = SEARCHES[name](grid, start, goal)
+        assert path is not None and path[0] == start and path[-1] == goal
+        assert path_length(grid, path) == pytest.approx(grid.length(start, goal), abs=1e-9)
+        for x, y in path[1:-1]:
+            assert room.clearance(x, y) >= 0.25 - 1e-6
+
+
+def test_a_path_goes_from_each_cell_to_a_neighbor() -> None:
+    grid = FreeGrid(WORLDS["D"], distance=0.25)
+    start, goal = (-4.0, -4.0), (4.0, 4.0)
+    starts, neighbors, _ = grid.moves
+    number = {tuple(cell): at for at, cell in enumerate(grid.cells.tolist())}
+    for search in (astar_path, dijkstra_path, AntColony(ants=4, iterations=2)):
+        path = search(grid, start, goal)
+        assert path is not None
+        cells = [number[grid.index(*place)] for place in path[1:-1]]
+        for cell, following in pairwise(cells):
+            assert following in neighbors[starts[cell] : starts[cell + 1]]
+
+
+def test_a_search_leaves_the_graph_as_it_was() -> None:
+    grid = FreeGrid(WORLDS["B"], distance=0.25, resolution=0.25)
+    first = astar_path(grid, (0.0, 0.0), (4.0, 0.0))
+    astar_path(grid, (-4.0, 0.0), (0.0, -4.0))
+    assert astar_path(grid, (0.0, 0.0), (4.0, 0.0)) == first
+
+
+@pytest.mark.parametrize("world", ["A", "B", "D"])
+def test_ants_find_a_way_within_a_tenth_of_the_shortest(world: str) -> None:
+    grid = FreeGrid(WORLDS[world], distance=0.25, resolution=0.25)
+    ends = places(grid, 6, seed=1)
+    for start, goal in zip(ends[:3], ends[3:], strict=True):
+        path = AntColony(iterations=20)(grid, start, goal)
+        assert path is not None
+        # From the nearest cell the way may be longer by the gaps, which the shortest avoids.
+        assert path_length(grid, path) <= 1.1 * grid.length(start, goal) + grid.resolution
+
+
+def test_ants_learn_from_one_another() -> None:
+    grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
+    ends = (-4.0, -4.0), (4.0, 4.0)
+    lengths = {}
+    # As many walks, with and without pheromone that remembers.
+    for evaporation in (0.0, 0.2):
+        paths = [
+            AntColony(ants=6, iterations=12, evaporation=evaporation, seed=seed)(grid, *ends)
+            for seed in range(4)
+        ]
+        lengths[evaporation] = np.mean([path_length(grid, path or []) for path in paths])
+    assert lengths[0.2] < lengths[0.0]
+
+
+def test_ants_of_a_seed_find_one_way_and_those_of_another_another() -> None:
+    grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
+    first, again, other = (
+        AntColony(ants=4, iterations=2, seed=seed)(grid, (-4.0, -4.0), (4.0, 4.0))
+        for seed in (0, 0, 1)
+    )
+    assert first == again != other
+
+
+def test_ants_stop_after_the_iteration_in_which_time_is_up() -> None:
+    grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
+    ends = (-4.0, -4.0), (4.0, 4.0)
+    hurried = AntColony(iterations=50, time_limit=1e-9)(grid, *ends)
+    assert hurried == AntColony(iterations=1)(grid, *ends)
+
+
+@pytest.mark.parametrize("search", [astar_path, dijkstra_path, AntColony(ants=3, iterations=2)])
+def test_without_a_way_there_is_no_path(search: Search) -> None:
+    divided = FreeGrid(DIVIDED, distance=0.25)
+    assert search(divided, (-1.0, 0.0), (1.0, 0.0)) is None
+    assert search(FreeGrid(FULL, distance=0.25), (0.0, 0.0), (0.1, 0.0)) is None
+
+
+@pytest.mark.parametrize("search", [astar_path, dijkstra_path, AntColony(ants=3, iterations=2)])
+def test_a_goal_in_the_cell_of_the_start_has_a_path(search: Search) -> None:
+    path = search(FreeGrid(WORLDS["A"], distance=0.25), (0.01, 0.02), (0.04, 0.03))
+    assert path is not None
+    assert (path[0], path[-1]) == ((0.01, 0.02), (0.04, 0.03))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"ants": 0}, "ants must be a positive integer, got 0"),
+        ({"evaporation": 1.5}, r"evaporation must be in \[0, 1\], got 1\.5"),
+        ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+        ({"time_limit": 0.0}, r"time_limit must be positive, got 0\.0"),
+    ],
+)
+def test_a_colony_that_cannot_be_is_refused(arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        AntColony(**arguments)  # type: ignore[arg-type]
+
+
+def test_pursuit_drives_on_the_arc_to_the_point_ahead() -> None:
+    grid = FreeGrid(WORLDS["A"], distance=0.25)
+    # Ahead by the look-ahead distance, on a circle of 1.5 m to the left.
+    angle = 2.0 * math.asin(0.6 / 2.0 / 1.5)
+    point = (1.5 * math.sin(angle), 1.5 * (1.0 - math.cos(angle)))
+    pursuit = PurePursuit([point, point], TURTLEBOT, grid, look_ahead=0.61)
+    left, right = TURTLEBOT.wheel_speeds(np.array(pursuit.act(0.0, 0.0, 0.0), np.float32))
+    radius = 0.5 * TURTLEBOT.wheel_base * (right + left) / (right - left)
+    # It is the nearest of the arcs that it looks at.
+    assert 1.0 / radius == pytest.approx(1.0 / 1.5, abs=0.2)
+    assert right == pytest.approx(TURTLEBOT.max_wheel_speed)
+
+
+def test_pursuit_turns_from_a_wall_that_its_arc_would_meet() -> None:
+    wall = World(name="wall", boxes=(Box(-0.5, 0.25, 3.0, 0.5),))
+    grid = FreeGrid(wall, distance=0.2, resolution=0.05)
+    # The path leads into the wall on the left, which no planner would let it.
+    pursuit = PurePursuit([(0.0, 0.0), (0.5, 0.4)], TURTLEBOT, grid)
+    x, y, heading = 0.0, 0.0, 0.0
+    with NavigationEnv(world=wall, physics="kinematic", collision_distance="contact") as env:
+        env.reset(options={"start": (x, y, heading), "goal": (4.0, 0.0)})
+        for _ in range(4):
+            *_, info = env.step(np.array(pursuit.act(x, y, heading), np.float32))
+            x, y, heading = info["x"], info["y"], info["heading"]
+    assert not info["collision"] and info["min_clearance"] > 0.0
+
+
+@pytest.mark.parametrize("name", ["dijkstra", "astar", "ant_colony"])
+def test_the_followers_reach_the_goals_of_map_d(name: str) -> None:
+    episodes = 5 if name == "ant_colony" else 20
+    results = evaluate(make_planner(name), "D", episodes=episodes, seed=3)
+    assert all(result.success for result in results)
+    # Robots start in any direction: what they drive to turn is in it.
+    assert np.mean([result.spl for result in results]) > 0.85
+    assert all(result.plan_s > 0.0 and result.decision_s > 0.0 for result in results)
+
+
+def test_the_follower_reaches_goals_on_wheels() -> None:
+    pytest.importorskip("pybullet")
+    results = evaluate(make_planner("dijkstra"), "D", episodes=4, physics="wheels")
+    assert sum(result.success for result in results) >= 3
+
+
+def test_paths_do_not_depend_on_how_many_robots_drive_at_once() -> None:
+    tasks = world_tasks("D", episodes=4) + world_tasks("B", episodes=3)
+    arguments = {"physics": "kinematic", "max_steps": 150}
+    alone, together = (
+        run_tasks(make_planner("dijkstra"), tasks, envs_at_once=count, **arguments)
+        for count in (1, 5)
+    )
+    assert alone == together
+
+
+def test_a_planner_keeps_less_where_nothing_keeps_its_clearance() -> None:
+    # A gap of 0.46 m: room for the robot, 0.36 m across, and not for its clearance.
+    gap = World(
+        name="gap", size=(4.0, 4.0), boxes=(Box(-0.1, 0.23, 0.1, 2.0), Box(-0.1, -2.0, 0.1, -0.23))
+    )
+    path, grid = MapPlanner(dijkstra_path).plan(gap, (-1.0, 0.0), (1.0, 0.0))
+    assert len(path) > 2
+    assert grid.distance < 0.25
+    # Where there is no way at all it tries its luck.
+    straight, _ = MapPlanner(dijkstra_path).plan(DIVIDED, (-1.0, 0.0), (1.0, 0.0))
+    assert straight == [(-1.0, 0.0), (1.0, 0.0)]
+
+
+def test_a_driver_is_told_of_each_episode_with_its_world_and_task() -> None:
+    begun: list[tuple[str, tuple[float, float]]] = []
+
+    class Told:
+        def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+            task = env.tasks[robot]
+            assert task is not None
+            assert env.poses[robot] == pytest.approx(task.start)
+            begun.append((env.worlds[robot].name, task.goal))
+
+        def drive(
+            self, env: VectorNavigationEnv, robots: np.ndarray, observations: np.ndarray
+        ) -> np.ndarray:
+            assert len(robots) == len(observations)
+            return np.ones((len(robots), 2), np.float32)
+
+    tasks = world_tasks("A", episodes=3) + world_tasks("B", episodes=2)
+    run_tasks(Told(), tasks, envs_at_once=2, physics="kinematic", max_steps=10)
+    assert sorted(begun) == sorted((each.world.name, each.task.goal) for each in tasks)
+
+
+def test_a_policy_is_a_driver_that_sees_the_observation_alone() -> None:
+    seen: list[object] = []
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        seen.append(observation)
+        return np.zeros((*observation.shape[:-1], 2))
+
+    observations = np.zeros((3, 24), np.float32)
+    driver = as_driver(policy)
+    driver.begin(None, 0)  # type: ignore[arg-type]
+    actions = driver.drive(None, np.arange(3), observations)  # type: ignore[arg-type]
+    assert actions.shape == (3, 2) and seen[0] is observations
+    assert as_driver(driver) is driver
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("djikstra", {}, "name must be one of .*got 'djikstra' .did you mean 'dijkstra'"),
+        ("astar", {"memory": "map"}, "memory must be 'none' for astar.*got 'map'"),
+        ("dwa", {"robot": "burgr"}, "robot must be .*did you mean 'burger'"),
+    ],
+)
+def test_a_planner_that_there_is_not_is_refused(
+    name: str, arguments: dict[str, str], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_planner(name, **arguments)  # type: ignore[arg-type]

@@ -1,0 +1,217 @@
+"""The dynamic window: what it sees, what it may choose, and how far that gets."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    Box,
+    Driver,
+    DynamicWindow,
+    NavigationEnv,
+    World,
+    evaluate,
+    observation_slices,
+)
+from mpfa_envs.planners import WindowScore
+from mpfa_envs.robot import ROBOTS
+
+TURTLEBOT = ROBOTS["turtlebot2"]
+PARTS = observation_slices()
+
+
+def observation(
+    *, goal: tuple[float, float] = (3.0, 0.0), left: float = 0.3, right: float = 0.3
+) -> np.ndarray:
+    """What a robot in the open senses that drives with some wheel speeds [m/s]."""
+    seen = np.zeros(24, np.float32)
+    seen[PARTS["lidar"]] = 0.25 / 10.0
+    distance = math.hypot(*goal)
+    seen[PARTS["goal_direction"]] = goal[0] / distance, goal[1] / distance
+    seen[PARTS["goal_distance"]] = distance / 10.0
+    seen[PARTS["linear_speed"]] = 0.5 * (left + right) / TURTLEBOT.max_wheel_speed
+    turn = (right - left) / TURTLEBOT.wheel_base
+    seen[PARTS["angular_speed"]] = turn / TURTLEBOT.max_angular_speed
+    return seen
+
+
+def with_wall_ahead(seen: np.ndarray, distance: float) -> np.ndarray:
+    """The same with a wall across the way, at a distance from the robot's center [m]."""
+    angles = np.pi * (0.5 - (np.arange(18) + 0.5) / 18)
+    ranges = np.minimum(distance / np.maximum(np.cos(angles), 1e-9), 10.0)
+    seen = seen.copy()
+    seen[PARTS["lidar"]] = 0.25 / np.maximum(ranges, 0.25)
+    return seen
+
+
+def speeds(action: np.ndarray) -> tuple[float, float]:
+    return TURTLEBOT.wheel_speeds(action)
+
+
+def test_arcs_are_those_that_the_robot_drives() -> None:
+    window = DynamicWindow(samples=4)
+    with NavigationEnv(world="A", physics="kinematic", time_step=0.1, action_repeat=1) as env:
+        for pair, arc in zip(window.pairs, window.arcs, strict=True):
+            env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (4.0, 4.0)})
+            action = (2.0 * (pair - 0.05) / 0.45 - 1.0).astype(np.float32)
+            driven = []
+            steps = round(float(window.length / pair.mean() / 0.1)) + 2
+            for _ in range(min(steps, 60)):
+                *_, info = env.step(action)
+                driven.append((info["x"], info["y"]))
+            gaps = np.linalg.norm(np.array(driven)[None] - arc[:, None], axis=2).min(axis=1)
+            # No farther from the path driven than half of what is driven in a step.
+            assert gaps[: len(arc) // 2].max() < 0.03
+
+
+def test_wheel_speeds_stay_in_the_window_and_in_what_the_robot_can() -> None:
+    window = DynamicWindow(acceleration=0.5, decision=0.2)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        left, right = rng.uniform(0.05, 0.5, 2)
+        goal = tuple(rng.uniform(-3.0, 3.0, 2))
+        chosen = speeds(window(observation(goal=goal, left=left, right=right)))
+        assert np.abs(np.array(chosen) - (left, right)).max() <= 0.1 + 1e-5
+        assert min(chosen) >= 0.05 - 1e-6 and max(chosen) <= 0.5 + 1e-6
+
+
+def test_in_the_open_it_drives_straight_at_the_goal_and_turns_to_one_beside_it() -> None:
+    window = DynamicWindow()
+    left, right = speeds(window(observation(goal=(3.0, 0.0), left=0.5, right=0.5)))
+    assert left == right == pytest.approx(0.5)
+    left, right = speeds(window(observation(goal=(1.0, 2.0))))
+    assert right > left
+    left, right = speeds(window(observation(goal=(1.0, -2.0))))
+    assert left > right
+
+
+def test_it_turns_from_a_wall_that_hides_the_goal() -> None:
+    window = DynamicWindow()
+    ahead = observation(goal=(3.0, 0.3))
+    left, right = speeds(window(with_wall_ahead(ahead, 0.6)))
+    assert abs(right - left) > 0.1
+
+
+def test_without_a_free_arc_it_takes_the_one_that_gets_farthest() -> None:
+    window = DynamicWindow()
+    seen = observation()
+    # Posts all around at 0.35 m: only how far an arc gets tells them apart.
+    seen[PARTS["lidar"]] = 0.25 / 0.35
+    left, right = speeds(window(seen))
+    arcs = {tuple(pair): arc for pair, arc in zip(window.pairs.round(6), window.arcs, strict=True)}
+    angles = np.pi * (0.5 - (np.arange(18) + 0.5) / 18)
+    posts = 0.35 * np.stack((np.cos(angles), np.sin(angles)), axis=1)
+
+    def steps_free(arc: np.ndarray) -> int:
+        for step, place in enumerate(arc):
+            if np.linalg.norm(posts - place, axis=1).min() - 0.18 < WindowScore().least:
+                return step
+        return len(arc)
+
+    reachable = [pair for pair in arcs if np.abs(np.array(pair) - 0.3).max() <= 0.2 + 1e-9]
+    most = max(steps_free(arcs[pair]) for pair in reachable)
+    chosen = min(reachable, key=lambda pair: math.dist(pair, (left, right)))
+    assert most < len(window.arcs[0])
+    assert steps_free(arcs[chosen]) == most
+
+
+def test_each_choice_depends_on_its_own_observation_alone() -> None:
+    window = DynamicWindow()
+    rng = np.random.default_rng(1)
+    seen = [
+        with_wall_ahead(observation(goal=tuple(rng.uniform(-3, 3, 2))), rng.uniform(0.4, 3.0))
+        for _ in range(8)
+    ]
+    together = window(np.array(seen))
+    assert together.shape == (8, 2) and together.dtype == np.float32
+    for row, action in zip(seen, together, strict=True):
+        assert np.array_equal(window(row), action)
+    assert np.array_equal(window(np.array(seen)[::-1]), together[::-1])
+
+
+def test_it_sees_the_observation_and_nothing_else() -> None:
+    # run_tasks hands the environment to drivers alone.
+    assert not isinstance(DynamicWindow(), Driver)
+    seen: list[np.ndarray] = []
+    chosen: list[np.ndarray] = []
+    window = DynamicWindow()
+
+    def recorded(observation: np.ndarray) -> np.ndarray:
+        seen.append(observation.copy())
+        chosen.append(window(observation))
+        return chosen[-1]
+
+    evaluate(recorded, ["D", "B"], episodes=2, physics="kinematic")
+    assert len(seen) > 50
+    # Without worlds, in another order, after nothing.
+    order = np.random.default_rng(0).permutation(len(seen))
+    assert np.array_equal(DynamicWindow()(np.array(seen)[order]), np.array(chosen)[order])
+
+
+def test_with_a_map_it_follows_the_way_and_not_the_goal() -> None:
+    window = DynamicWindow(memory="map")
+    seen = np.append(observation(goal=(2.0, 2.0)), [0.6, -0.8, 0.5]).astype(np.float32)
+    left, right = speeds(window(seen))
+    assert left > right
+
+
+def test_a_decision_takes_less_than_two_milliseconds() -> None:
+    window = DynamicWindow()
+    seen = with_wall_ahead(observation(), 1.0)
+    times = []
+    for _ in range(30):
+        start = time.process_time()
+        window(seen)
+        times.append(time.process_time() - start)
+    assert sorted(times)[len(times) // 2] < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("world", "least"), [("A", 15), ("validation", 10)], ids=["A", "validation"]
+)
+def test_it_reaches_most_goals(world: str, least: int) -> None:
+    results = evaluate(DynamicWindow(), world, episodes=15, seed=5)
+    assert sum(result.success for result in results) >= least
+
+
+def test_a_map_leads_it_out_of_a_pocket() -> None:
+    walls = (Box(1.0, -1.2, 1.2, 1.2), Box(-0.8, 1.0, 1.2, 1.2), Box(-0.8, -1.2, 1.2, -1.0))
+    pocket = World(name="pocket", boxes=walls)
+    success = {}
+    for memory in ("none", "map"):
+        window = DynamicWindow(memory=memory)
+        with NavigationEnv(
+            world=pocket,
+            physics="kinematic",
+            memory=memory,
+            collision_distance="contact",
+        ) as env:
+            seen, info = env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
+            ended = False
+            while not ended:
+                seen, _, terminated, truncated, info = env.step(window(seen))
+                ended = terminated or truncated
+        success[memory] = info["success"]
+    assert success == {"none": False, "map": True}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"samples": 1}, "samples must be an integer of at least 2, got 1"),
+        ({"length": 0.0}, r"length must be positive, got 0\.0"),
+        ({"acceleration": -1.0}, r"acceleration must be positive, got -1\.0"),
+    ],
+)
+def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DynamicWindow(**arguments)  # type: ignore[arg-type]
+
+
+def test_observations_of_another_size_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"shape \[..., 24\], got \(27,\)"):
+        DynamicWindow()(np.zeros(27, np.float32))
