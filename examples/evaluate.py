@@ -62,7 +62,7 @@ _ENCOUNTERS = {
     "time_to_collision": "{:.2f}",
 }
 """What there is where people walk."""
-_MILLISECONDS = {"plan_s": "plan_ms", "decision_s": "decision_ms"}
+_MILLISECONDS = {"plan_s": "{:.2f}", "decision_s": "{:.2f}"}
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -146,11 +146,11 @@ def output_folder(options: argparse.Namespace) -> Path:
 def printed(summary: pd.DataFrame) -> str:
     """The table on the screen: estimates, and the interval of success."""
     table = summary[["world", "episodes"]].copy()
-    for name, form in {**_COLUMNS, **_LENGTHS, **_ENCOUNTERS}.items():
+    for name, form in {**_COLUMNS, **_LENGTHS, **_MILLISECONDS, **_ENCOUNTERS}.items():
         if name in summary:
-            table[name] = summary[name].map(form.format).where(summary[name].notna(), "")
-    for name, shown in _MILLISECONDS.items():
-        table[shown] = (1e3 * summary[name]).map("{:.2f}".format)
+            shown, scale = (name, 1.0) if name not in _MILLISECONDS else (f"{name[:-2]}_ms", 1e3)
+            values = (scale * summary[name]).map(form.format)
+            table[shown] = values.where(summary[name].notna(), "")
     ends = zip(summary["success_low"], summary["success_high"], strict=True)
     table.insert(3, "95 %", [f"[{low:.1%}, {high:.1%}]" for low, high in ends])
     return table.to_string(index=False)
