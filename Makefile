@@ -17,7 +17,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo train test check lint types doctest format bench wheel-test clean
+.PHONY: help demo train paper test check lint types doctest format bench wheel-test clean
 
 PYTHON ?=
 TORCH_INSTALL_ARGS ?=
@@ -63,6 +63,9 @@ demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute and drive through rooms 
 
 train: $(STAMP) ## Train in rooms that are new each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
 	$(BIN)/python examples/train.py regime=$(REGIME) learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
+
+paper: $(STAMP) ## Make the paper's figures and tables of the runs in runs/paper, and name those that are missing
+	$(BIN)/python examples/report.py runs/paper --paper $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)

@@ -3,12 +3,18 @@
     python examples/report.py runs/compare
     python examples/report.py runs/compare runs/more           the runs of both, together
     python examples/report.py docs/results --output runs/results
+    python examples/report.py runs/paper --paper          the paper's figures and tables
 
 Writes ``tables.md``, ``training.png`` (success and average reward over episodes and steps) and
 ``evaluations.png`` (greedy success in the validation world over steps). The arms of a study
 (``compare.py --arm``) have rows and lines of their own, what was driven in other physics has tables
 of its own. What varies is the run, not the episode: intervals are for other runs, or for other runs
 and pairs of start and goal, and tests compare the means of runs (``navigation/intervals.py``).
+
+With ``--paper`` it makes, of what runs there are, ``paper.md`` with Tables 2 to 4 beside the
+paper's numbers, ``figure_3.png``, ``figure_5.png``, ``figure_8.png`` to ``figure_11.png``,
+``figure_13.png``, and ``claims.png`` with what Section 2.4 says of PER. Runs that are missing are
+named, with the command that makes them.
 """
 
 from __future__ import annotations
@@ -22,6 +28,9 @@ import pandas as pd
 
 from navigation import files
 from navigation.figures import Runs, plot_evaluations, plot_training
+from navigation.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
+from navigation.paper_figures import plot_paper
+from navigation.paper_tables import paper_tables
 from navigation.records import read_table
 from navigation.studies import run_name
 from navigation.tables import (
@@ -76,6 +85,40 @@ def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
     return found
 
 
+def write_paper(folder: Path, output: Path, *, seeds: int) -> int:
+    """Make the paper's tables and figures of the runs that there are, and name the others.
+
+    Args:
+        folder: Of the study of all methods; that of Fig. 5 is in it.
+        output: Where they go.
+        seeds: Runs of each method that there should be.
+
+    Returns:
+        Exit status: 1 if there are no runs at all.
+    """
+    wanted = studies(folder, seeds=seeds)
+    trained, updates, tested = (
+        read_runs(wanted, find)
+        for find in (
+            lambda path: path / files.EPISODES,
+            lambda path: path / files.UPDATES,
+            evaluation_of,
+        )
+    )
+    absent = missing_lines(wanted)
+    text = paper_tables(trained, tested)
+    if absent:
+        text += f"\n\n## Missing\n\n{absent}"
+    print(text)
+    if not trained:
+        return 1
+    output.mkdir(parents=True, exist_ok=True)
+    write_text_atomically(text + "\n", output / "paper.md")
+    for path in plot_paper(trained, updates, output):
+        print(f"written: {path}")
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Read the rows, write tables and figures.
 
@@ -90,8 +133,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
     parser.add_argument("--output", type=Path, help="folder (default: that of the first study)")
+    parser.add_argument("--paper", action="store_true", help="the paper's figures and tables")
+    parser.add_argument(
+        "--seeds", type=int, default=RUNS, help=f"runs that --paper wants (default: {RUNS})"
+    )
     options = parser.parse_args(arguments)
     output = options.output or options.folders[0]
+    if options.seeds < 1:
+        parser.error(f"--seeds must be at least 1, got {options.seeds}")
+    if options.paper:
+        if len(options.folders) > 1:
+            parser.error(f"--paper takes one folder, got {len(options.folders)}")
+        return write_paper(options.folders[0], output, seeds=options.seeds)
     rows = read_studies(options.folders)
     if not len(rows):
         folders = ", ".join(str(folder) for folder in options.folders)

@@ -25,7 +25,7 @@ def plot_learning_curve(episodes: pd.DataFrame, path: Path, *, window: int = 20)
         path: The PNG file.
         window: Episodes of the running mean.
     """
-    figure, axes = _pyplot().subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
+    figure, axes = pyplot().subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
     number = np.arange(1, len(episodes) + 1)
     worlds = episodes["world"].to_numpy()
     labels = {"success": "success rate", "average_reward": "average reward per step"}
@@ -37,7 +37,7 @@ def plot_learning_curve(episodes: pd.DataFrame, path: Path, *, window: int = 20)
             axis.axvline(change + 1.5, color="0.5", linestyle=":")
     axes[0].set_title(f"mean of {window} episodes; dots are single ones")
     axes[1].set_xlabel("episode")
-    _finish(figure, axes, path)
+    finish(figure, axes, path)
 
 
 def plot_training(runs: Runs, path: Path, *, window: int = 20) -> None:
@@ -48,7 +48,7 @@ def plot_training(runs: Runs, path: Path, *, window: int = 20) -> None:
         path: The PNG file.
         window: Episodes of the running mean.
     """
-    figure, axes = _pyplot().subplots(2, 2, figsize=(10, 6), sharey="row", layout="constrained")
+    figure, axes = pyplot().subplots(2, 2, figsize=(10, 6), sharey="row", layout="constrained")
     labels = {"success": "success rate", "average_reward": "average reward per step"}
     for place, (arm, tables) in enumerate(runs.items()):
         for number, table in enumerate(tables.values()):
@@ -56,13 +56,13 @@ def plot_training(runs: Runs, path: Path, *, window: int = 20) -> None:
                 values = running_mean(table[name], window)
                 for column, x in enumerate((np.arange(1, len(table) + 1), table["total_steps"])):
                     label = arm if number == 0 else None
-                    axes[line, column].plot(x, values, **_look(place), alpha=0.6, lw=1, label=label)
+                    axes[line, column].plot(x, values, **look(place), alpha=0.6, lw=1, label=label)
     for line, title in enumerate(labels.values()):
         axes[line, 0].set_ylabel(f"{title}, mean of {window}")
     axes[1, 0].set_xlabel("episode")
     axes[1, 1].set_xlabel("step")
     axes[0, 1].legend()
-    _finish(figure, axes.flat, path)
+    finish(figure, axes.flat, path)
 
 
 def plot_evaluations(runs: Runs, path: Path) -> None:
@@ -72,20 +72,20 @@ def plot_evaluations(runs: Runs, path: Path) -> None:
         runs: Tables with a row for each evaluation.
         path: The PNG file.
     """
-    figure, axis = _pyplot().subplots(figsize=(7, 4), layout="constrained")
+    figure, axis = pyplot().subplots(figsize=(7, 4), layout="constrained")
     for place, (arm, tables) in enumerate(runs.items()):
         for number, table in enumerate(tables.values()):
             axis.plot(
                 table["total_steps"],
                 table["success"],
-                **_look(place),
+                **look(place),
                 alpha=0.7,
                 marker=".",
                 label=arm if number == 0 else None,
             )
     axis.set(xlabel="step", ylabel="greedy success in the validation world", ylim=(-0.02, 1.02))
     axis.legend()
-    _finish(figure, [axis], path)
+    finish(figure, [axis], path)
 
 
 def write_animation(frames: Sequence[NDArray[np.uint8]], path: Path) -> None:
@@ -131,12 +131,13 @@ def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:
     return values.astype(float).rolling(window, min_periods=1).mean().to_numpy()
 
 
-def _look(place: int) -> dict[str, str]:
+def look(place: int) -> dict[str, str]:
     """Color of an arm's lines, and another dash once all ten colors are taken."""
     return {"color": f"C{place % 10}", "linestyle": ("-", "--", ":", "-.")[place // 10 % 4]}
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Matplotlib's pyplot, which draws to files alone; imported where a figure is made."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -145,9 +146,10 @@ def _pyplot() -> Any:
     return pyplot
 
 
-def _finish(figure: Any, axes: Iterable[Any], path: Path) -> None:
+def finish(figure: Any, axes: Iterable[Any], path: Path) -> None:
+    """Give the axes of a figure their grids, and write it to a file."""
     for axis in axes:
         axis.grid(alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
-    _pyplot().close(figure)
+    pyplot().close(figure)
