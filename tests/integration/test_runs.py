@@ -65,7 +65,7 @@ def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
     assert (status["unit"], status["done"], status["total"]) == ("episode", 3, 3)
     assert {path.name for path in tmp_path.iterdir()} == {
         *(files.CHECKPOINT, files.POLICY, files.SETTINGS, files.EPISODES, files.CURVE),
-        *(files.STATUS, ".lock"),
+        *(files.STATUS, files.UPDATES, ".lock"),
     }
 
 
