@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from mpfa_envs.arguments import PAPER_TASK
 from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
 from mpfa_envs.binning import Binning
 from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.lidar import Lidar
-from mpfa_envs.navigation import PAPER_TASK, NavigationEnv
+from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
 from mpfa_envs.path import PathPlanner
 from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, Literal, get_args
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from gymnasium.spaces import Box as BoxSpace
@@ -20,6 +21,20 @@ Physics = Literal["kinematic", "wheels"]
 """How the robot moves."""
 Progress = Literal["straight_line", "shortest_path", "none"]
 """What the reward's progress is measured along."""
+
+PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "action_repeat": 1,
+        "progress_scale": 15.0,
+        "collision_distance": 0.35,
+        "closeness_distance": 0.35,
+        "detour_chance": 0.0,
+    }
+)
+"""Arguments of :class:`~mpfa_envs.NavigationEnv` for the paper's task, for its TurtleBot2.
+
+The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
+"""
 
 
 class TaskArguments:

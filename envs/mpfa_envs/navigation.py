@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import gymnasium
@@ -17,7 +16,7 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
 from mpfa_envs.episodes import distance_field
-from mpfa_envs.observation import Memory, add_history, observe
+from mpfa_envs.observation import INFO_TYPES, Memory, add_history, observe
 from mpfa_envs.path import shortest_length
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
@@ -36,21 +35,6 @@ if TYPE_CHECKING:
     from mpfa_envs.map_memory import MapMemory
     from mpfa_envs.walker_batch import WalkerBatch
     from mpfa_envs.worlds import World
-
-PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
-    {
-        "action_repeat": 1,
-        "progress_scale": 15.0,
-        "collision_distance": 0.35,
-        "closeness_distance": 0.35,
-        "detour_chance": 0.0,
-    }
-)
-"""Arguments of :class:`NavigationEnv` for the paper's task, with its robot, the TurtleBot2.
-
-The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
-"""
-
 
 _ALONE: Final = np.ones(1, dtype=np.bool_)
 _NOBODY: Final = np.zeros((0, 5))
@@ -431,27 +415,17 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self, success: bool, collision: bool, timeout: bool, terms: RewardTerms
     ) -> dict[str, Any]:
         """Build the info dictionary; its keys are those of :data:`INFO_TYPES`."""
-        motion = self._motion
-        return {
-            "success": success,
-            "collision": collision,
-            "timeout": timeout,
-            "reward_goal": terms.goal,
-            "reward_collision": terms.collision,
-            "reward_progress": terms.progress,
-            "reward_other": terms.other,
-            "sim_time": self._steps * self.time_step,
-            "path_length": self._path_length,
-            "shortest_path": self._shortest_path,
-            "min_clearance": self._min_clearance,
-            "distance": self._distance,
-            "x": motion.x,
-            "y": motion.y,
-            "heading": motion.heading,
-            "walker_distance": float(self._encounters[0, 0]),
-            "intrusion_time": float(self._encounters[1, 0]),
-            "time_to_collision": float(self._encounters[2, 0]),
-        }
+        numbers = (
+            *terms,
+            self._steps * self.time_step,
+            self._path_length,
+            self._shortest_path,
+            self._min_clearance,
+            self._distance,
+            *self._motion[:3],
+            *self._encounters[:, 0].tolist(),
+        )
+        return dict(zip(INFO_TYPES, (success, collision, timeout, *numbers), strict=True))
 
     def check_task(self, options: dict[str, Any]) -> Task:
         """Read a task from the options of a reset.

@@ -307,6 +307,31 @@ class RobotBatch:
             self.observations,
         )
 
+    def trail(self, index: int) -> list[tuple[float, float]]:
+        """Positions (x, y) of a robot's episode so far [m]."""
+        rows = self.trails[index, : self.episodes.steps[index] + 1]
+        return [(x, y) for x, y in rows.tolist()]
+
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """A picture of each robot's room from above, ``[480, 480, 3]``."""
+        # Imported here because training does not render.
+        from mpfa_envs.render import render_scene
+
+        return tuple(
+            render_scene(
+                self.worlds[index],
+                robot=self._rules.robot,
+                pose=(x, y, heading),
+                goal=tuple(self.episodes.goals[index].tolist()),
+                goal_radius=self._rules.goal_radius,
+                trail=self.trail(index),
+                rays=(self._lidar.angles, self.ranges[index]),
+                sketch=None if self.memory is None else self.memory.sketch(index, x, y),
+                walkers=self.walkers.of(index),
+            )
+            for index, (x, y, heading) in enumerate(self.episodes.motions[:, :3].tolist())
+        )
+
     def _lengthen_trails(self, steps: int) -> None:
         """Make room for so many time steps."""
         if steps >= self.trails.shape[1]:

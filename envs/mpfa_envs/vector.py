@@ -249,8 +249,7 @@ class VectorNavigationEnv(
         Args:
             index: Number of the robot.
         """
-        rows = self._batch.trails[index, : self._batch.episodes.steps[index] + 1]
-        return [(x, y) for x, y in rows.tolist()]
+        return self._batch.trail(index)
 
     def walkers(self, index: int) -> NDArray[np.float64]:
         """The walkers around a robot: (x, y), their speeds in both directions, and their radii.
@@ -441,29 +440,8 @@ class VectorNavigationEnv(
             return None
         if not self._begun:
             raise ResetNeeded("there is nothing to render: call reset() before render()")
-        # Imported here because training does not render.
-        from mpfa_envs.render import render_scene
-
-        memory = self._batch.memory
-        return tuple(
-            render_scene(
-                self._batch.worlds[index],
-                robot=self.robot,
-                pose=(x, y, heading),
-                goal=tuple(self._batch.episodes.goals[index].tolist()),
-                goal_radius=self.goal_radius,
-                trail=self.trail(index),
-                rays=(self.lidar.angles, self._batch.ranges[index]),
-                sketch=None if memory is None else memory.sketch(index, x, y),
-                walkers=self.walkers(index),
-            )
-            for index, (x, y, heading) in enumerate(self.poses.tolist())
-        )
+        return self._batch.render()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Release the physics server.
-
-        Args:
-            **kwargs: None are used.
-        """
+        """Release the physics server; keyword arguments are not used."""
         self._batch.drives.close()
