@@ -148,6 +148,10 @@ def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
     spoiled["next", "reward"][3] = torch.nan
     with pytest.raises(ValueError, match="reward"):
         learner.update(spoiled)
+    spoiled = transitions()
+    spoiled["priority_weight"][2] = torch.nan
+    with pytest.raises(ValueError, match=r"nan in 'priority_weight', row 2"):
+        learner.update(spoiled)
     for wrong in ({"trains": "critic"}, {"loss_function": "pal"}):
         with pytest.raises(ValueError, match="one network"):
             learner.update(Draw(transitions(), **wrong))
@@ -155,9 +159,39 @@ def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
         learner.anneal(1.5)
     with pytest.raises(ValueError, match="state_dict"):
         learner.load_state_dict({"loss": {}, "updates": 3})
+    other = learners()[kind]
+    other.update(transitions())
+    with pytest.raises(ValueError, match=r"state_dict.*updates"):
+        learner.load_state_dict({**other.state_dict(), "updates": -1})
     after = learner.state_dict()
     assert after["updates"] == 0
     assert all(torch.equal(before["loss"][key], after["loss"][key]) for key in before["loss"])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
+    learner = learners()[kind]
+    learner.update(transitions(seed=5))  # Values that are not zero.
+    batch = transitions()
+    batch["steps_to_next_obs"] = torch.arange(1, 13).reshape(-1, 1)
+    targets = learner.loss.target_value_network_params if kind == 0 else None
+    seen = {"observation": batch["next", "observation"]}
+    with torch.no_grad():
+        best = learner.policy.outputs(seen)["action"]
+        if targets is None:
+            ahead = learner.policy.outputs(seen)["action_value"]
+        else:
+            with targets.to_module(learner.loss.value_network):
+                ahead = learner.loss.value_network.outputs(seen)["action_value"]
+        here = learner.policy.outputs({"observation": batch["observation"]})["action_value"]
+    expected = []
+    for row in range(12):
+        value = float(here[row][batch["action"][row].argmax()])
+        goes_on = not bool(batch["next", "terminated"][row])
+        bootstrap = float(ahead[row][best[row].argmax()]) * 0.99 ** (row + 1) * goes_on
+        expected.append(abs(float(batch["next", "reward"][row]) + bootstrap - value))
+    learner.update(batch)
+    assert batch["signals", "td_error"].tolist() == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("kind", [0, 1])

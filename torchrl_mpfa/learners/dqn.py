@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.learners.base import OptimizerName, check_rate, make_optimizer
-from torchrl_mpfa.learners.states import check_state, refuse_unfinished
+from torchrl_mpfa.learners.states import check_state, check_updates, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.refusals import check_gamma
@@ -242,15 +242,17 @@ class QLearner:
         entry = cell_of(batch["observation"]) * table.shape[1] + batch["action"].argmax(-1)
         ahead = table[cell_of(batch["next", "observation"])].amax(-1)
         goes_on = ~batch["next", "terminated"].squeeze(-1)
-        target = batch["next", "reward"].squeeze(-1) + self.gamma * ahead * goes_on
+        steps = batch.get("steps_to_next_obs", None)
+        discount = self.gamma ** (1 if steps is None else steps.reshape(-1))
+        target = batch["next", "reward"].squeeze(-1) + discount * ahead * goes_on
         td_error = target - table.view(-1)[entry]
         squared, value = td_error.square(), table.view(-1)[entry]
         log = {"loss_value": squared.mean(), "td_error": squared, "pred_value": value}
-        refuse_unfinished(log, batch)
-        batch.set(TD_ERROR.key, td_error.abs())
         step = td_error
         if self.importance and "priority_weight" in batch.keys():  # noqa: SIM118
             step = td_error * batch["priority_weight"].reshape(-1)
+        refuse_unfinished({**log, "loss_step": step}, batch)
+        batch.set(TD_ERROR.key, td_error.abs())
         total = torch.zeros(table.numel()).index_add_(0, entry, step)
         count = torch.bincount(entry, minlength=table.numel()).clamp_min(1)
         table.view(-1).add_(total / count, alpha=self._rate)
@@ -293,5 +295,6 @@ class QLearner:
             )
         if not bool(given.isfinite().all()):
             raise ValueError("state_dict['loss']['table'] must be finite")
+        check_updates(state_dict.get("updates"))
         self.table.copy_(given)
         self.updates = state_dict["updates"]

@@ -73,10 +73,18 @@ def check_state(given: Any, own: Mapping[str, Any], optimizer: torch.optim.Optim
     _check_keys("state_dict['loss']", given["loss"], own["loss"])
     for name, value in own["loss"].items():
         _check_entry(f"state_dict['loss'][{name!r}]", given["loss"][name], value)
-    updates = given["updates"]
+    check_updates(given["updates"])
+    _check_optimizer(given["optimizer"], own["optimizer"], optimizer)
+
+
+def check_updates(updates: Any) -> None:
+    """Refuse what is no number of updates.
+
+    Raises:
+        ValueError: If it is not an integer, or negative.
+    """
     if isinstance(updates, bool) or not isinstance(updates, int) or updates < 0:
         raise ValueError(f"state_dict['updates'] must be a count, got {updates!r}")
-    _check_optimizer(given["optimizer"], own["optimizer"], optimizer)
 
 
 def _check_keys(name: str, given: Any, own: Mapping[Any, Any]) -> None:
