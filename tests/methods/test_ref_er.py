@@ -7,7 +7,14 @@ import torch
 
 from tests.methods.replays import make_buffer, make_transitions, seeded
 from tests.mpfa.test_updates import ACTION, OBSERVATION, make_learner, make_rows
-from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss, make_td3_loss
+from torchrl_mpfa import (
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_td3_loss,
+)
 from torchrl_mpfa.learners.gradients import Gradients
 from torchrl_mpfa.losses.trust import Trust, trusted_loss
 from torchrl_mpfa.methods import (
@@ -79,6 +86,38 @@ def test_far_transitions_have_no_weight_and_near_ones_have_all_of_it():
     assert draw.batch["priority_weight"].equal((~far).float())
     assert draw.batch["policy_weight"].equal((~far).float())  # beta is 1 at first.
     assert draw.batch["behavior_weight"].abs().max() == 0
+
+
+@pytest.mark.parametrize("batches", [0, 4_000_000])
+def test_near_is_what_is_within_the_limit_on_both_sides_by_a_spread_of_a_fifth_at_least(batches):
+    learner = make_learner(**loss_options("ref_er"))
+    rows = make_rows(COUNT)
+    rows["action"], rows["behavior_mean"] = (random_actions(seed).float() for seed in (1, 2))
+    rows["behavior_sigma"] = torch.rand(COUNT, 1, generator=seeded(3))
+    assert (rows["behavior_sigma"] < 0.2).any()
+    replay = make_ref_er(learner, rows)
+    replay.buffer.sampler.batches = batches
+    (draw,) = replay.select(replay.buffer)
+    batch, limit, far = draw.batch, 1 + 4 / (1 + 5e-7 * batches), set()
+    with torch.no_grad():
+        now = learner.policy(batch.select("observation"))["action"]
+    stored = rows["behavior_sigma"][batch["index"], 0].tolist()
+    for row, sigma in enumerate(stored):
+        spread = max(sigma, 0.2)
+        action, mean = batch["action"][row].tolist(), batch["behavior_mean"][row].tolist()
+        ratio = density(action, now[row].tolist(), spread) / density(action, mean, spread)
+        assert float(batch["priority_weight"][row]) == (1 / limit < ratio < limit)
+        far |= {"low"} if ratio <= 1 / limit else {"high"} if ratio >= limit else {"near"}
+        assert float(batch["behavior_sigma"][row]) == pytest.approx(spread)
+    assert far == {"low", "high", "near"}
+
+
+def test_how_fast_the_weight_moves_goes_by_the_slots_and_not_by_what_is_in_them():
+    learner = make_learner(**loss_options("ref_er"))
+    replay = make_replay("ref_er", capacity=10 * COUNT, batch_size=50, policy=learner.policy)
+    replay.buffer.extend(rows_near_and_far(learner, 1.0))
+    list(replay.select(replay.buffer))
+    assert replay.buffer.sampler.policy_weight == pytest.approx(1 - 0.1 * 50 / (10 * COUNT))
 
 
 def test_what_is_far_teaches_neither_critic_nor_actor():
@@ -177,6 +216,27 @@ def test_the_compiled_update_has_the_gradients_of_the_losses(name):
     del rows["policy_weight"]
     free, _ = loss._actors_part(rows)
     assert not torch.isclose(free["loss_actor"], expected["loss_actor"])
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+def test_sac_is_held_and_set_free_as_well():
+    torch.manual_seed(0)
+    loss = make_sac_loss(
+        make_stochastic_actor(OBSERVATION, ACTION, width=8),
+        make_critic(OBSERVATION, ACTION, width=8),
+        signals=[],
+    )
+    rows, found = make_rows(20), []
+    rows["behavior_mean"] = torch.full((20, ACTION), 5.0)
+    rows["behavior_sigma"] = torch.ones(20, 1)
+    for policy, behavior in ((1.0, 0.0), (0.25, 0.0), (0.0, 1.0)):
+        rows["policy_weight"] = torch.full((20,), policy)
+        rows["behavior_weight"] = torch.full((20,), behavior)
+        torch.manual_seed(1)
+        found.append(float(loss.actor_loss(rows)[0].detach()))
+    assert found[1] == pytest.approx(0.25 * found[0], rel=1e-5)
+    # From actions in [-1, 1] it is 4 to 6 to the mean of the behavior.
+    assert ACTION * 4**2 / 2 < found[2] < ACTION * 6**2 / 2
 
 
 @pytest.mark.parametrize("way", ["state", "folder"])

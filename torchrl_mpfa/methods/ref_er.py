@@ -210,7 +210,9 @@ class RememberForget:
             weight,
             far=1.0 - float(near.mean()),
             allowed=self.far_share,
-            rate=min(_RATE * len(batch) / len(buffer), 1.0),
+            # By the slots and not what is in them, as in the authors' code: few transitions at the
+            # start do not make it faster.
+            rate=min(_RATE * len(batch) / buffer.storage.max_size, 1.0),
         )
         sampler.batches += 1
         yield Draw(batch)
