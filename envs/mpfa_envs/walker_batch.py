@@ -194,7 +194,8 @@ class WalkerBatch:
             Its arrays.
 
         Raises:
-            ValueError: If something is missing or of another shape.
+            ValueError: If something is missing or of another shape, or leads to a waypoint that
+                there is not.
         """
         most = np.shape(state.get("states", ()))[1:2]
         need = max((len(world.walkers) for world in worlds), default=0)
@@ -204,7 +205,16 @@ class WalkerBatch:
             "states": np.zeros((len(worlds), *most, 4)),
             "targets": np.zeros((len(worlds), *most), dtype=np.int64),
         }
-        return {name: read_array(state, name, like) for name, like in likes.items()}
+        found = {name: read_array(state, name, like) for name, like in likes.items()}
+        for world, targets in zip(worlds, found["targets"], strict=True):
+            for walker, target in zip(world.walkers, targets.tolist(), strict=False):
+                # The compiled loops do not look where an array ends.
+                if not 0 <= target < max(len(walker.waypoints), 1):
+                    raise ValueError(
+                        f"targets of the state must be numbers of waypoints, got {target} for "
+                        f"{walker}"
+                    )
+        return found
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Put the walkers of all worlds where :meth:`read` says that they are."""

@@ -22,6 +22,8 @@ PERSONAL_SPACE: Final = 0.5
 """A robot that comes nearer to a walker, rim to rim, is in its personal space [m]."""
 FAR: Final = 10.0
 """A walker that is farther from a robot than this does not count [m]."""
+_SHORTEST_LEG: Final = 1e-3
+"""No two waypoints in a row are nearer: a step would lead around them countless times [m]."""
 HORIZON: Final = 10.0
 """No collision that lies farther ahead is looked for [s]."""
 
@@ -85,8 +87,10 @@ class Walker:
         # The dataclass is frozen; nobody has seen the walker yet.
         object.__setattr__(self, "waypoints", points)
         for one, other in self.legs:
-            if one == other:
-                raise ValueError(f"waypoints must differ from the ones before them, got {one}")
+            if math.dist(one, other) < _SHORTEST_LEG:
+                raise ValueError(
+                    f"waypoints must differ from the ones before them, got {one} and {other}"
+                )
 
     @property
     def legs(self) -> tuple[tuple[Point, Point], ...]:

@@ -58,6 +58,10 @@ def test_a_bad_walker_in_a_file_is_named_with_its_line(
             r"waypoints must differ from the ones before them, got \(0.0, 0.0\)",
         ),
         (
+            lambda: Walker(behavior="waypoints", waypoints=((0, 0), (1e-9, 0))),
+            r"waypoints must differ from the ones before them, got \(0.0, 0.0\) and \(1e-09, 0.0\)",
+        ),
+        (
             lambda: Walker(behavior="waypoints", waypoints=((0, 0), (math.inf, 0))),
             "waypoints must be finite",
         ),

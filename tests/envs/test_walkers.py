@@ -320,8 +320,12 @@ def test_what_follows_a_saved_state_is_the_same_to_the_bit() -> None:
     drive(other, 0, 5)
     other.load_state_dict(state)
     assert drive(other, 30, 80) == expected
-    del state["batch"]["walkers"]["states"]
     before = other.walkers(0)
+    targets = state["batch"]["walkers"]["targets"]
+    targets[targets > 0] = 3  # A round of three ends at 2.
+    with pytest.raises(ValueError, match="targets of the state must be numbers"):
+        other.load_state_dict(state)
+    del state["batch"]["walkers"]["states"]
     with pytest.raises(ValueError, match="states of the state must have rows for 6 walkers"):
         other.load_state_dict(state)
     np.testing.assert_array_equal(other.walkers(0), before)
