@@ -88,3 +88,10 @@ def test_what_is_learned_from_is_younger_than_by_uniform_replay():
 def test_a_rate_that_is_no_share_is_refused(rate):
     with pytest.raises(ValueError, match="rate must be"):
         GeometricSampler(rate=rate)
+
+
+def test_what_was_not_stored_is_not_the_newest():
+    sampler = GeometricSampler(rate=0.5)
+    sampler.extend(torch.tensor([3, 4, -1]))  # TorchRL's writers mark it so.
+    sampler.add(torch.tensor(-1))
+    assert sampler.newest == [4]

@@ -9,7 +9,7 @@ from torchrl_mpfa import SignalTensorStorage
 from torchrl_mpfa.methods import Reliability, make_replay, reliability
 from torchrl_mpfa.testing import check_adjustment
 
-OMEGA, ALPHA, EPS = 0.3, 0.6, 0.05
+OMEGA, ALPHA, EPS = 0.3, 0.8, 0.05
 
 
 def by_hand(errors, episodes, times):

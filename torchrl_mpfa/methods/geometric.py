@@ -1,8 +1,8 @@
 r"""Replay by age: the older a transition, the less often, by a truncated geometric law.
 
-After "When does non-uniform replay matter" (2026), https://arxiv.org/abs/2605.10236. **A
-reconstruction**: that sampling follows a truncated geometric distribution of the age is said by its
-abstract; the form of the law and its rate are our reading:
+After Korniak et al. (2026), "When does non-uniform replay matter in reinforcement learning?",
+https://arxiv.org/abs/2605.10236. **A reconstruction**: that replay by a truncated geometric law
+prefers what is recent is said by its abstract; the form of the law and its rate are our reading:
 
 .. math::
 

@@ -1,8 +1,9 @@
 r"""ReaPER: errors count for more where the rest of their episode is well foreseen.
 
-"Reliability-adjusted prioritized experience replay" (2025). **A reconstruction**: its formula
-could be read in a garbled form only. The target of a transition is made of what comes after it:
-where the later TD errors of its episode are large, its own error says little.
+Pleiss et al. (2025), "Reliability-adjusted prioritized experience replay",
+https://arxiv.org/abs/2506.18482. **A reconstruction**, from descriptions of it: episodes that still
+run count as if they had ended, which the paper does not do. The target of a transition is made of
+what comes after it: where the later TD errors of its episode are large, its own error says little.
 
 .. math::
 
