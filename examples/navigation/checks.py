@@ -124,6 +124,11 @@ RULES: dict[str, Rule] = {
     "environment.episodes_per_world": at_least(1),
     "evaluation.every": at_least(0),
     "evaluation.episodes": at_least(1),
+    "assessment.episodes": at_least(0),
+    "assessment.early_episodes": at_least(1),
+    "assessment.early_share": SHARE,
+    "assessment.best_factor": SHARE,
+    "assessment.by": choice("outcome", "return"),
     "tracking.mode": choice("offline", "online", "off"),
     "tracking.log_every": at_least(1),
 }
@@ -191,6 +196,8 @@ def check_settings(settings: TrainSettings) -> None:
             f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "
             "got True: nothing may be chosen by the worlds of a test"
         )
+    if settings.assessment.episodes:
+        _check_one_rule(settings)
     if settings.learner.compile and settings.learner.algorithm not in ("ddpg", "td3"):
         name = settings.learner.algorithm
         name = "SAC" if name == "sac" else name
@@ -198,6 +205,19 @@ def check_settings(settings: TrainSettings) -> None:
     if is_discrete(settings.learner):
         _check_values_alone(settings)
     _check_device(settings.device)
+
+
+def _check_one_rule(settings: TrainSettings) -> None:
+    """Refuse a second rule of when updates are made, or of which policy is the run's."""
+    for name, value, only in (
+        ("method.update_block", settings.method.update_block, 1),
+        ("evaluation.choose", settings.evaluation.choose, False),
+    ):
+        if value != only:
+            raise ValueError(
+                f"{name} must be {str(only).lower()} with assessment.episodes="
+                f"{settings.assessment.episodes}, got {value}: two rules would decide the same"
+            )
 
 
 def _check_values_alone(settings: TrainSettings) -> None:

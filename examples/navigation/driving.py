@@ -52,6 +52,8 @@ class Robots:
         self._steps = torch.zeros(self.count, dtype=torch.long)
         self._numbers = torch.zeros(self.count, 1, dtype=torch.long)
         """Number of the episode that each robot is in."""
+        self.ended: list[int] = []
+        """Numbers of the episodes that ended with the last action."""
         self._begun = 0
 
     def environment(self, world: str) -> EnvBase:
@@ -90,6 +92,11 @@ class Robots:
         self._begun += count
         explorer.begin_episodes(begun)
 
+    @property
+    def next_episode(self) -> int:
+        """Number of the first episode in which no action has been taken yet."""
+        return self._begun - int((self._steps == 0).sum())
+
     def drive(
         self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[str] = ()
     ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
@@ -117,7 +124,8 @@ class Robots:
         self._steps += 1
         done = after["done"].squeeze(-1)
         records: list[EpisodeRecord] = []
-        if done.any():
+        self.ended = self._numbers[done, 0].tolist()
+        if self.ended:
             for robot in done.nonzero().squeeze(-1).tolist():
                 number, total = episode + len(records), actions + self.count
                 records.append(self._record(after, robot, episode=number, total_steps=total))

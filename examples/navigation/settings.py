@@ -17,6 +17,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
+from navigation.assessment import AssessmentSettings
 from torchrl_mpfa.methods import METHODS, Method
 
 
@@ -348,6 +349,7 @@ class TrainSettings:
     exploration: ExplorationSettings = field(default_factory=ExplorationSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    assessment: AssessmentSettings = field(default_factory=AssessmentSettings)
 
 
 REGIMES: dict[str, dict[str, Any]] = {

@@ -13,7 +13,7 @@ import torch
 import wandb
 from tensordict import TensorDictBase
 
-from navigation.records import EpisodeRecord, EvaluationRecord
+from navigation.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
 from navigation.settings import TrainSettings
 from torchrl_mpfa import SignalReplayBuffer
 
@@ -67,6 +67,12 @@ class Tracker:
         """Log an evaluation."""
         rates = ("success", "collision", "timeout", "spl")
         entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
+        self._log(entries, record.total_steps)
+
+    def log_assessment(self, record: AssessmentRecord) -> None:
+        """Log an assessment."""
+        names = ("episodes", "least", "kept")
+        entries = {f"assessment/{name}": float(getattr(record, name)) for name in names}
         self._log(entries, record.total_steps)
 
     def log_update(

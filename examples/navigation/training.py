@@ -21,12 +21,20 @@ from tqdm import tqdm
 from mpfa_envs import WHEEL_PAIRS, Policy, RandomMirror, save_policy
 from navigation import files
 from navigation.assembly import make_curiosity, make_learner, method_of
+from navigation.assessment import Assessment
 from navigation.checkpoints import FORMAT, random_state, set_random_state
 from navigation.driving import Robots
 from navigation.environments import vector_of
 from navigation.evaluating import evaluate_policy, exported_policy
 from navigation.exploration import make_explorer
-from navigation.records import EpisodeRecord, EvaluationRecord, as_table, last_best, write_table
+from navigation.records import (
+    AssessmentRecord,
+    EpisodeRecord,
+    EvaluationRecord,
+    as_table,
+    last_best,
+    write_table,
+)
 from navigation.schedule import Schedule
 from navigation.settings import TrainSettings, is_discrete
 from navigation.stopping import Stop
@@ -77,6 +85,7 @@ class TrainingRun:
         """Iterations whose updates are still to be made."""
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
+        self.assessments: list[AssessmentRecord] = []
         self._bonus: dict[str, Tensor] = {}
         self._best: TensorDictModule | None = None
         """The policy that did best in the evaluations."""
@@ -104,6 +113,8 @@ class TrainingRun:
         )
         self.buffer, self.select, self.entries = replay.buffer, replay.select, replay.entries
         self.log.forget(method.capacity)
+        wanted = settings.assessment
+        self.assessment = Assessment(wanted) if wanted.episodes else None
         if settings.environment.mirror:
             pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
             self.buffer.append_transform(RandomMirror(**self._remembered, pairs=pairs))
@@ -113,6 +124,9 @@ class TrainingRun:
         # However many random numbers the parts were made of, the robots explore alike.
         torch.manual_seed(seed)
         self.robots.begin(self.schedule.world, self.explorer, seed=seed)
+        if self.assessment is not None:
+            self.assessment.begin_stage()
+        self._hold()
 
     # Iterations ------------------------------------------------------------------------------
 
@@ -170,8 +184,10 @@ class TrainingRun:
         self.log.wrote(self.buffer.extend(rows), rows["next", "reward"])
         self.records += records
         self.schedule.count(actions=len(rows), episodes=len(records))
+        self._assess(records)
         if len(self.buffer) >= (self.buffer.batch_size or 0):
             self._update(before)
+        self._hold()
         if self._crossed(self.settings.tracking.log_every, before):
             self.log.add(self.actions, episode=self.schedule.episodes, buffer=self.buffer)
         for record in records:
@@ -197,10 +213,36 @@ class TrainingRun:
         """Whether a multiple of so many actions lies between those before and those now."""
         return every > 0 and before // every != self.actions // every
 
+    def _hold(self) -> None:
+        """Have whole episodes assess the policy as it is, from when it is what acts."""
+        assessment, schedule = self.assessment, self.schedule
+        acts = self.actions >= self.settings.exploration.random_steps
+        if assessment is not None and assessment.over and acts:
+            assessment.begin(
+                self.robots.next_episode,
+                late=schedule.fraction >= self.settings.assessment.early_share,
+                at=(schedule.episodes, schedule.actions),
+            )
+
+    def _assess(self, records: list[EpisodeRecord]) -> None:
+        """Score the episodes that ended, and keep the policy if all of them have ended well."""
+        assessment = self.assessment
+        if assessment is None or assessment.over:
+            return
+        for number, record in zip(self.robots.ended, records, strict=True):
+            assessment.take(number, assessment.score(record))
+        if assessment.over:
+            found = assessment.conclude(
+                self.learner.policy, total_steps=self.actions, episode=self.schedule.episodes
+            )
+            self.assessments.append(found)
+            self.tracker.log_assessment(found)
+
     def _update(self, before: int) -> None:
-        """The updates that are due: those of this iteration, or all since the last block."""
+        """The updates that are due: of this iteration, or all since the policy was held."""
         self._waiting += 1
-        if not self._crossed(self.settings.method.update_block, before):
+        block, assessment = self.settings.method.update_block, self.assessment
+        if not (self._crossed(block, before) if assessment is None else assessment.over):
             return
         begun = self.actions - self._waiting * self.settings.robots
         for _ in range(self._waiting):
@@ -229,9 +271,11 @@ class TrainingRun:
         return draw
 
     def _evaluate(self) -> None:
+        kept = None if self.assessment is None else self.assessment.kept
+        policy = self.learner.policy if kept is None else kept
         found = evaluate_policy(
             self.settings,
-            self.learner.policy,
+            policy,
             total_steps=self.actions,
             episode=self.schedule.episodes,
             trained_for=self.robots.elapsed(),
@@ -239,7 +283,7 @@ class TrainingRun:
         # The clock of the run shows how long it trains.
         self.robots.seconds -= found.seconds
         if found.is_best(self.evaluations):
-            self._best = copy.deepcopy(self.learner.policy)
+            self._best = copy.deepcopy(policy)
         self.evaluations.append(found)
         self.tracker.log_evaluation(found)
 
@@ -306,6 +350,8 @@ class TrainingRun:
             "best": None if self._best is None else dict(self._best.state_dict()),
             "records": [asdict(record) for record in self.records],
             "evaluations": [asdict(record) for record in self.evaluations],
+            "assessments": [asdict(record) for record in self.assessments],
+            "assessment": None if self.assessment is None else self.assessment.state_dict(),
             "log": self.log.state_dict(),
         }
         save_atomically(state, self.folder / files.CHECKPOINT)
@@ -314,14 +360,19 @@ class TrainingRun:
         if self.evaluations:
             table = as_table(self.evaluations, EvaluationRecord)
             write_table(table, self.folder / files.EVALUATIONS)
+        if self.assessments:
+            table = as_table(self.assessments, AssessmentRecord)
+            write_table(table, self.folder / files.ASSESSMENTS)
         write_table(self.log.table(), self.folder / files.UPDATES)
 
     def _exported(self) -> Policy:
-        """The policy of the run: the last one, or that which did best in its evaluations."""
+        """The policy of the run: the last one, that which did best, or that which was kept."""
         policy, episodes, steps = self.learner.policy, self.schedule.episodes, self.actions
         if self.settings.evaluation.choose and self._best is not None:
             record = last_best(self.evaluations)
             policy, episodes, steps = self._best, record.episode, record.total_steps
+        if self.assessment is not None and self.assessment.kept is not None:
+            policy, (episodes, steps) = self.assessment.kept, self.assessment.kept_at
         return exported_policy(policy, self.settings, episodes=episodes, steps=steps)
 
     def _load(self, state: dict[str, Any]) -> None:
@@ -338,6 +389,9 @@ class TrainingRun:
             self._best.load_state_dict(state["best"])
         self.records = [EpisodeRecord(**record) for record in state["records"]]
         self.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
+        if self.assessment is not None:
+            self.assessments = [AssessmentRecord(**record) for record in state["assessments"]]
+            self.assessment.load_state_dict(state["assessment"], self.learner.policy)
         if "log" in state:  # A checkpoint may be older than the rows.
             self.log.load_state_dict(state["log"])
         set_random_state(self.settings.device, state["random"])

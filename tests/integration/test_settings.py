@@ -147,6 +147,16 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
         ("updates=0", "updates must be at least 1, got 0"),
         ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
+        ("assessment.episodes=-1", "assessment.episodes must be at least 0, got -1"),
+        ("assessment.by=spl", "assessment.by must be one of outcome, return, got 'spl'"),
+        (
+            "assessment.episodes=20 method=rud",
+            "method.update_block must be 1 with assessment.episodes=20, got 1000: two rules",
+        ),
+        (
+            "assessment.episodes=20 evaluation.choose=true evaluation.every=9",
+            "evaluation.choose must be false with assessment.episodes=20, got True",
+        ),
         ("environment.progress=none-at-all", "environment.progress must be one of straight_line"),
         ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
         ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
