@@ -1,0 +1,71 @@
+"""What the library of ORCA is told: the robot as it moves, and all that stands."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mpfa_envs import Box, Cylinder, Polygon, Walker, World
+from mpfa_envs.orca import OrcaRoom, _outlines
+
+pytest.importorskip("pyrvo", reason="an extra")
+AVOIDER = Walker(behavior="orca", waypoints=((-3.0, 1.5), (3.0, 1.5)), speed=1.0)
+TRIANGLE = ((0.5, -0.5), (1.5, 0.0), (0.5, 0.5))
+
+
+def chosen(world: World, walker: tuple[float, float], robot: tuple[float, ...]) -> np.ndarray:
+    """The velocity that a walker chooses on its way to (3, 1.5), which it moves with now."""
+    speed = np.array([3.0, 1.5]) - walker
+    states = np.array([[*walker, *(speed / np.hypot(*speed))]])
+    room = OrcaRoom(world, radius=0.18, time_step=0.1)
+    room.choose(np.array(robot), states, np.ones(1, dtype=np.int64))
+    return states[0, 2:]
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [
+        {"boxes": (Box(0.5, -0.5, 1.5, 0.5),)},
+        {"cylinders": (Cylinder(1.0, 0.0, 0.5),)},
+        {"polygons": (Polygon(TRIANGLE),)},
+    ],
+    ids=lambda shapes: next(iter(shapes)),
+)
+def test_a_walker_keeps_off_each_kind_of_obstacle(shapes: dict[str, tuple[object, ...]]) -> None:
+    far = (-4.0, -4.0, 0.0, 0.0, 0.0)
+    free = chosen(World(name="free", walkers=(AVOIDER,)), (0.1, 0.0), far)
+    np.testing.assert_allclose(free, np.array([2.9, 1.5]) / math.hypot(2.9, 1.5), atol=1e-5)
+    world = World(name="full", walkers=(AVOIDER,), **shapes)  # type: ignore[arg-type]
+    across, _ = chosen(world, (0.1, 0.0), far)
+    # For a second it would not touch what stands 0.15 m from its rim.
+    assert across < 0.6 * free[0]
+
+
+def test_what_stands_is_on_the_left_of_its_edges_and_the_room_on_the_right_of_the_walls() -> None:
+    world = World(
+        name="full",
+        boxes=(Box(0.5, -0.5, 1.5, 0.5),),
+        cylinders=(Cylinder(-1.0, 0.0, 0.5),),
+        polygons=(Polygon(((-3.0, 1.5), (-1.5, 2.0), (-3.0, 3.0))),),
+    )
+    walls, *others = (np.array(outline) for outline in _outlines(world))
+
+    def signed_area(corners: np.ndarray) -> float:
+        following = np.roll(corners, -1, axis=0)
+        return float(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0])) / 2
+
+    assert signed_area(walls) == pytest.approx(-100.0)
+    box, cylinder, polygon = map(signed_area, others)
+    assert (box, polygon) == pytest.approx((1.0, 1.125))
+    assert math.pi * 0.25 < cylinder < 1.05 * math.pi * 0.25
+
+
+def test_a_robot_that_comes_is_avoided_and_one_that_leaves_is_not() -> None:
+    world = World(name="free", walkers=(AVOIDER,))
+    wanted = np.array([1.0, 0.0])
+    for heading, avoided in ((math.pi, True), (0.0, False)):
+        robot = (2.0, 1.6, heading, 1.0, 0.0)
+        found = chosen(world, (0.0, 1.5), robot)
+        assert (np.hypot(*(found - wanted)) > 0.05) == avoided

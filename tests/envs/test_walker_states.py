@@ -1,0 +1,56 @@
+"""Walkers that are put somewhere else: what was known of where they were must not count."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpfa_envs import Lidar, Walker, World
+from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.world_batch import WorldBatch
+
+HALL = World(name="hall", size=(40.0, 40.0), walkers=(Walker(speed=1.0),))
+
+
+def batch_with(state: list[float]) -> dict[str, np.ndarray]:
+    """The state of a batch whose only walker is somewhere (x, y) and goes somewhere."""
+    return {"states": np.array([[state]]), "targets": np.zeros((1, 1), dtype=np.int64)}
+
+
+@pytest.mark.parametrize("way", ["load", "begin"])
+def test_the_room_that_a_walker_had_does_not_lead_it_through_a_wall_elsewhere(way: str) -> None:
+    batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
+    batch.begin(0, (15.0, 15.0), np.random.default_rng(0))
+    middle = batch.read(batch_with([0.0, 0.0, 1.0, 0.0]), [HALL])
+    batch.load(middle)
+    everyone, nobody = np.ones(1, dtype=np.bool_), np.zeros((1, 5))
+    for _ in range(5):  # Now it knows that nothing is near.
+        batch.move(everyone, nobody)
+    if way == "load":
+        batch.load(batch.read(batch_with([19.5, 0.0, 1.0, 0.0]), [HALL]))
+    else:
+        batch._worlds[0] = World(name="cell", size=(2.0, 2.0), walkers=HALL.walkers)
+        batch.begin(0, (0.5, 0.5), np.random.default_rng(0))
+    world = batch._worlds[0]
+    for _ in range(30):
+        batch.move(everyone, nobody)
+        assert world.clearances(batch.of(0)[:, :2])[0] >= 0.25 - 1e-9
+
+
+def test_a_map_is_shown_no_walker_by_a_noisy_lidar_either() -> None:
+    world = World(name="two", walkers=(Walker(radius=0.4), Walker(radius=0.4)))
+    batch = WalkerBatch(WorldBatch([world]), radius=0.18, time_step=0.1)
+    batch.load(batch.read(
+        {"states": np.array([[[2.0, 0.5, 0.3, 0.0], [1.5, -1.0, 0.3, 0.0]]]),
+         "targets": np.zeros((1, 2), dtype=np.int64)}, [world],
+    ))  # fmt: skip
+    lidar, rng, seen, met = Lidar(world, noise=0.1), np.random.default_rng(0), 0, 0
+    pose, motions, circles = (0.0, 0.0, 0.0), np.zeros((1, 5)), batch.circles(0)
+    hits = lidar.cast(*pose, moving=circles) < lidar.cast(*pose)
+    for _ in range(50):
+        ranges = lidar.measure(*pose, rng=rng, moving=circles)[None]
+        left = batch.without(motions, lidar, ranges)
+        seen += int((left[0, hits] < lidar.max_range).sum())
+        met += int(hits.sum())
+    assert met > 300
+    assert seen < 0.02 * met  # A thousandth is beyond three deviations.
