@@ -224,12 +224,14 @@ def _check_values_alone(settings: TrainSettings) -> None:
     """Refuse what a method has only where actions are numbers, or actor and critic two."""
     method, algorithm = settings.method, settings.learner.algorithm
     own = {"reward", "td_error", "action_gradient"}
+    # A table has no loss that could bend.
+    distances = ("l2", "smooth_l1") if algorithm == "dqn" else ("l2",)
     for name, wrong in (
         ("signals", any(signal not in own for signal in method.signals)),
         ("selection", method.selection in ("split", "halves", "near_policy")),
         ("candidates", method.candidates > 1),
         ("target_average", method.target_average > 1),
-        ("loss_function", method.loss_function not in ("l2", "smooth_l1")),
+        ("loss_function", method.loss_function not in distances),
         ("curiosity", method.curiosity),
     ):
         if wrong:
@@ -237,6 +239,11 @@ def _check_values_alone(settings: TrainSettings) -> None:
                 f"method={method.name} is not for learner={algorithm}, which has neither an actor "
                 f"nor actions that are numbers: method.{name}={getattr(method, name)}"
             )
+    if algorithm == "q_learning" and settings.learner.reward_scale != 1:
+        raise ValueError(
+            "learner.reward_scale must be 1 with q_learning, whose table is in units of the "
+            f"reward, got {settings.learner.reward_scale}"
+        )
     if method.signals == ["action_gradient"]:
         raise ValueError(
             f"method.signals must hold reward or td_error with learner={algorithm}, which has no "

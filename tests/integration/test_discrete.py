@@ -63,6 +63,16 @@ def test_a_method_that_needs_an_actor_is_refused_in_one_sentence(method, learner
         check_settings(tiny(method, learner=learner))
 
 
+def test_a_loss_that_bends_is_refused_where_there_is_no_loss():
+    check_settings(tiny("lap", learner="dqn"))
+    with pytest.raises(ValueError, match="method=lap is not for learner=q_learning"):
+        check_settings(tiny("lap", learner="q_learning"))
+    settings = tiny("per", learner="q_learning")
+    settings.learner.reward_scale = 0.1
+    with pytest.raises(ValueError, match=r"learner\.reward_scale must be 1 with q_learning.*0\.1"):
+        check_settings(settings)
+
+
 def test_the_action_gradient_alone_is_refused_and_so_is_a_program():
     settings = tiny("per", learner="dqn")
     settings.method.signals = ["action_gradient"]

@@ -87,6 +87,33 @@ def test_an_update_of_dqn_is_that_of_a_plain_loop(double, importance):
         assert torch.allclose(mine, theirs, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("bend", [None, 2.5])
+def test_the_huber_loss_bends_in_units_of_the_reward_or_where_the_batch_says(bend):
+    batch = transitions()
+    batch["next", "reward"] *= 0.5
+    squares = batch.clone()
+    if bend is not None:
+        batch["bend"] = torch.full((12,), bend)
+    torch.manual_seed(0)
+    losses = {
+        name: SignalDQNLoss(
+            network(), loss_function=name, reward_scale=0.5, importance="none", gamma=GAMMA
+        )
+        for name in ("l2", "smooth_l1")
+    }
+    losses["l2"].losses(squares)
+    unit = 0.5 * (bend or 1.0)
+    expected = [
+        0.5 * size**2 if size < unit else unit * (size - 0.5 * unit)
+        for size in (0.5 * squares["signals", "td_error"]).tolist()
+    ]
+    assert min(expected) < 0.5 * unit**2 < max(expected)
+    found, _ = losses["smooth_l1"].losses(batch)
+    assert float(found.detach()) == pytest.approx(sum(expected) / 12, rel=1e-4)
+    torch.testing.assert_close(batch["signals", "td_error"], squares["signals", "td_error"])
+
+
 def cell_of(observation):
     return (observation[..., 0] * 3).long()
 

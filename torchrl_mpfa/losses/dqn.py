@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
+from torchrl_mpfa.losses.functional import distance
 from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
@@ -32,7 +34,8 @@ class SignalDQNLoss(DQNLoss):
         importance: ``"critic"``: weights divided by the batch size (Eq. 11); ``"torchrl"``: by
             their sum; ``"none"``.
         reward_scale: Factor of the rewards in the loss; the signal is divided by it again.
-        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``.
+        loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, which bends at an error of one in
+            units of the environment's reward, or at ``"bend"`` where a batch has it.
         double: Whether the next action is that of the network, and not of the target network
             (van Hasselt et al. 2016, https://arxiv.org/abs/1509.06461).
         gamma: Discount, in [0, 1].
@@ -71,7 +74,8 @@ class SignalDQNLoss(DQNLoss):
         check_gamma(gamma)
         super().__init__(
             value_network,
-            loss_function=loss_function,
+            # Of which the bent distance is made, in the units of the reward.
+            loss_function="l1" if loss_function == "smooth_l1" else loss_function,
             delay_value=True,
             double_dqn=double,
             action_space="one-hot",
@@ -80,6 +84,7 @@ class SignalDQNLoss(DQNLoss):
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.signals, self.importance, self.reward_scale = tuple(signals), importance, reward_scale
+        self._bends = loss_function == "smooth_l1"
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss; writes the signal in ``batch``.
@@ -95,17 +100,20 @@ class SignalDQNLoss(DQNLoss):
         scaled = batch.select(*self.in_keys, steps, strict=False)
         reward = ("next", self.tensor_keys.reward)
         scaled[reward] = scaled[reward] * self.reward_scale
-        distance: Tensor = super().forward(scaled)["loss"]
+        each: Tensor = super().forward(scaled)["loss"]
+        if self._bends:
+            bend = batch.get("bend", None)
+            unit = self.reward_scale * (1.0 if bend is None else bend.reshape(-1))
+            each = distance(each, torch.zeros_like(each), "smooth_l1", unit=unit)
         squared = scaled[self.tensor_keys.priority].squeeze(-1)
         if TD_ERROR.name in self.signals:
             size = td_error_priority(squared.sqrt())
             batch.set(TD_ERROR.key, size / self.reward_scale)
-        loss = distance
         if self.importance != "none" and "priority_weight" in batch.keys():  # noqa: SIM118
             weight = batch["priority_weight"].reshape(-1)
             mean = weight.mean() if self.importance == "torchrl" else 1.0
-            loss = distance * weight / mean
-        return loss.mean(), {"td_error": squared}
+            each = each * weight / mean
+        return each.mean(), {"td_error": squared}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss under the key ``"loss"``, as TorchRL has it.
