@@ -9,6 +9,8 @@ import pytest
 
 from mpfa_envs import Box, Cylinder, Polygon, Walker, World
 from mpfa_envs.orca import OrcaRoom, _outlines
+from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.world_batch import WorldBatch
 
 pytest.importorskip("pyrvo", reason="an extra")
 AVOIDER = Walker(behavior="orca", waypoints=((-3.0, 1.5), (3.0, 1.5)), speed=1.0)
@@ -69,3 +71,26 @@ def test_a_robot_that_comes_is_avoided_and_one_that_leaves_is_not() -> None:
         robot = (2.0, 1.6, heading, 1.0, 0.0)
         found = chosen(world, (0.0, 1.5), robot)
         assert (np.hypot(*(found - wanted)) > 0.05) == avoided
+
+
+def test_a_velocity_that_leads_into_a_wall_is_not_driven_and_one_that_leads_off_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    velocity = [0.0, 0.0]
+
+    def choose(self: OrcaRoom, motion: object, states: np.ndarray, targets: object) -> None:
+        states[0, 2:] = velocity
+
+    monkeypatch.setattr(OrcaRoom, "choose", choose)
+    worlds = WorldBatch([World(name="free", walkers=(AVOIDER,))])
+    batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
+    batch.begin(0, (0.0, 0.0), np.random.default_rng(0))
+    targets = np.ones((1, 1), dtype=np.int64)
+    # The wall is at 5 m, and the walker's radius 0.25 m.
+    for x, speed, moves in ((4.7, 1.0, False), (4.6, 1.0, True), (4.9, -1.0, True)):
+        state = {"states": np.array([[[x, 0.0, speed, 0.0]]]), "targets": targets}
+        batch.load(batch.read(state, list(worlds)))
+        velocity[0] = speed
+        batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
+        expected = (x + 0.1 * speed, speed) if moves else (x, 0.0)
+        assert batch.of(0)[0, [0, 2]] == pytest.approx(expected)

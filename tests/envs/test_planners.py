@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,6 +112,23 @@ def test_ants_learn_from_one_another() -> None:
     assert lengths[0.2] < lengths[0.0]
 
 
+def test_a_way_of_the_ants_has_no_loop_and_is_the_best_of_all_iterations() -> None:
+    grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
+    starts, neighbors, _ = grid.moves
+    number = {tuple(cell): at for at, cell in enumerate(grid.cells.tolist())}
+    lengths = []
+    for iterations in range(1, 6):  # The first ones are the same each time.
+        colony = AntColony(ants=2, iterations=iterations, greed=0.3)
+        path = colony(grid, (-4.0, -4.0), (4.0, 4.0))
+        assert path is not None
+        lengths.append(path_length(grid, path))
+        cells = [number[grid.index(*place)] for place in path[1:-1]]
+        for at, cell in enumerate(cells):
+            around = set(neighbors[starts[cell] : starts[cell + 1]].tolist())
+            assert not around & set(cells[at + 2 :])
+    assert lengths == sorted(lengths, reverse=True)
+
+
 def test_ants_of_a_seed_find_one_way_and_those_of_another_another() -> None:
     grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
     first, again, other = (
@@ -167,6 +186,16 @@ def test_pursuit_drives_on_the_arc_to_the_point_ahead() -> None:
     assert right == pytest.approx(TURTLEBOT.max_wheel_speed)
 
 
+def test_pursuit_goes_on_turning_the_way_that_it_turned_to_a_point_behind() -> None:
+    grid = FreeGrid(WORLDS["A"], distance=0.25)
+    for side in (1.0, -1.0):
+        pursuit = PurePursuit([(0.0, 0.0), (-3.0, side * 1e-3)], TURTLEBOT, grid)
+        # It overshoots the direction opposite to the point: still the same way round.
+        for heading in (0.0, -side * 0.3, side * 0.3, -side * 0.1):
+            left, right = pursuit.act(0.0, 0.0, heading)
+            assert (right > left) == (side > 0)
+
+
 def test_pursuit_turns_from_a_wall_that_its_arc_would_meet() -> None:
     wall = World(name="wall", boxes=(Box(-0.5, 0.25, 3.0, 0.5),))
     grid = FreeGrid(wall, distance=0.2, resolution=0.05)
@@ -218,6 +247,30 @@ def test_a_planner_keeps_less_where_nothing_keeps_its_clearance() -> None:
     # Where there is no way at all it tries its luck.
     straight, _ = MapPlanner(dijkstra_path).plan(DIVIDED, (-1.0, 0.0), (1.0, 0.0))
     assert straight == [(-1.0, 0.0), (1.0, 0.0)]
+
+
+def test_a_planner_plans_in_the_world_that_it_is_in() -> None:
+    planner = MapPlanner(dijkstra_path)
+    ends = (-4.0, -4.0), (4.0, 4.0)
+    planner.plan(WORLDS["A"], *ends)
+    path, grid = planner.plan(WORLDS["D"], *ends)
+    assert grid.world is WORLDS["D"]
+    assert path == MapPlanner(dijkstra_path).plan(WORLDS["D"], *ends)[0]
+
+
+def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = itertools.count()
+    monkeypatch.setattr("mpfa_envs.evaluation.time", SimpleNamespace(perf_counter=ticks.__next__))
+    results = run_tasks(
+        as_driver(lambda seen: np.ones((len(seen), 2))),
+        world_tasks("A", episodes=4),
+        envs_at_once=4,
+        physics="kinematic",
+        max_steps=1,
+        action_repeat=1,
+    )
+    # A tick each for planning, and one for the action of all four.
+    assert [(result.plan_s, result.decision_s) for result in results] == [(1.0, 0.25)] * 4
 
 
 def test_a_driver_is_told_of_each_episode_with_its_world_and_task() -> None:
