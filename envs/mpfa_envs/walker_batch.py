@@ -194,8 +194,8 @@ class WalkerBatch:
             Its arrays.
 
         Raises:
-            ValueError: If something is missing or of another shape, or leads to a waypoint that
-                there is not.
+            ValueError: If something is missing, of another shape or not finite, or leads to a
+                waypoint that there is not.
         """
         most = np.shape(state.get("states", ()))[1:2]
         need = max((len(world.walkers) for world in worlds), default=0)
@@ -206,6 +206,8 @@ class WalkerBatch:
             "targets": np.zeros((len(worlds), *most), dtype=np.int64),
         }
         found = {name: read_array(state, name, like) for name, like in likes.items()}
+        if not np.isfinite(found["states"]).all():
+            raise ValueError("states of the state must be finite numbers")
         for world, targets in zip(worlds, found["targets"], strict=True):
             for walker, target in zip(world.walkers, targets.tolist(), strict=False):
                 # The compiled loops do not look where an array ends.

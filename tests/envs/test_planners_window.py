@@ -215,3 +215,17 @@ def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, float], mes
 def test_observations_of_another_size_are_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \[..., 24\], got \(27,\)"):
         DynamicWindow()(np.zeros(27, np.float32))
+
+
+def test_observations_that_are_no_numbers_are_refused() -> None:
+    seen = observation()
+    seen[3] = np.nan
+    with pytest.raises(ValueError, match="observation must be finite"):
+        DynamicWindow()(seen)
+
+
+def test_with_few_speeds_and_slow_wheels_the_nearest_speeds_are_kept() -> None:
+    # The speeds of a wheel are 0.05, 0.2, 0.35 and 0.5 m/s, and none is within 0.02 m/s of it.
+    window = DynamicWindow(samples=4, acceleration=0.1)
+    chosen = speeds(window(observation(goal=(0.0, 3.0), left=0.3, right=0.25)))
+    assert chosen == pytest.approx((0.35, 0.2))

@@ -148,7 +148,7 @@ class DynamicWindow:
             Actions, shape ``[..., 2]``.
 
         Raises:
-            ValueError: If the observations have another size.
+            ValueError: If the observations have another size, or are not finite.
         """
         observation = np.asarray(observation, dtype=np.float32)
         if observation.ndim == 0 or observation.shape[-1] != self.observation_size:
@@ -156,6 +156,8 @@ class DynamicWindow:
                 f"observation must have shape [..., {self.observation_size}], "
                 f"got {observation.shape}"
             )
+        if not np.isfinite(observation).all():
+            raise ValueError("observation must be finite, got NaN or infinity in it")
         rows = observation.astype(np.float64).reshape(-1, self.observation_size)
         chosen = np.array([self._best(row) for row in rows], dtype=np.int64)
         slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
@@ -188,7 +190,9 @@ class DynamicWindow:
         now = np.concatenate((speed - across, speed + across))
         # A wheel that slips, or stands as in the beginning, has speeds that cannot be asked for.
         now = np.clip(now, robot.min_wheel_speed, robot.max_wheel_speed)
-        return np.flatnonzero((np.abs(self.pairs - now) <= self.change + 1e-9).all(axis=1))
+        changes = np.abs(self.pairs - now).max(axis=1)
+        # Where so few speeds are looked at that none is near enough, the nearest.
+        return np.flatnonzero(changes <= max(self.change, changes.min()) + 1e-9)
 
     def _rim_clearances(
         self, row: NDArray[np.float64], arcs: NDArray[np.float64]
