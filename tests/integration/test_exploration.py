@@ -6,9 +6,9 @@ import pytest
 import torch
 from torchrl.data import Bounded
 
-from navigation.exploration import NoisyPolicy, RandomPolicy, make_explorer
+from navigation.exploration import NoisyPolicy, OftenGreedy, RandomPolicy, make_explorer
 from navigation.settings import ExplorationSettings
-from torchrl_mpfa import make_actor, make_stochastic_actor
+from torchrl_mpfa import make_actor, make_stochastic_actor, make_value_network
 
 SPEC = Bounded(low=-1.0, high=1.0, shape=(3, 2))
 OBSERVATION = torch.linspace(-1, 1, 5).expand(3, -1)
@@ -70,3 +70,32 @@ def test_a_policy_that_is_random_by_itself_gets_no_noise() -> None:
 
 def test_a_deterministic_policy_gets_noise() -> None:
     assert isinstance(make_explorer(make_actor(5, 2), ExplorationSettings(), SPEC), NoisyPolicy)
+
+
+def test_a_choice_at_random_becomes_as_rare_as_it_is_told_and_each_robot_has_its_share() -> None:
+    torch.manual_seed(0)
+    settings = ExplorationSettings(epsilon=0.8, epsilon_end=0.2, annealing_steps=600, varied=False)
+    explorer = OftenGreedy(make_value_network(5, 4, width=8), settings, 3)
+    best = explorer.policy.outputs({"observation": OBSERVATION})["action"]
+    for expected in (0.8, 0.5, 0.2, 0.2):
+        assert explorer.epsilon == pytest.approx(expected)
+        for _ in range(100):
+            explorer.act(OBSERVATION)
+    explorer.shares = torch.tensor([0.0, 0.5, 1.0])
+    others = torch.stack([(explorer.act(OBSERVATION) != best).any(1) for _ in range(2000)])
+    # One in four of what is chosen at random is the best.
+    torch.testing.assert_close(
+        others.float().mean(0), 0.75 * 0.2 * explorer.shares, rtol=0.0, atol=0.02
+    )
+
+
+def test_the_behavior_is_the_action_without_noise_and_the_noise_that_the_episode_has() -> None:
+    settings = ExplorationSettings(sigma=0.4, sigma_end=0.4)
+    explorer = NoisyPolicy(make_actor(5, 2), settings, SPEC)
+    explorer.shares = torch.tensor([[0.0], [0.5], [1.0]])
+    with torch.no_grad():
+        expected = explorer.policy.outputs({"observation": OBSERVATION})["action"]
+        explorer.act(OBSERVATION)
+    mean, sigma = explorer.behavior()
+    torch.testing.assert_close(mean, expected)
+    torch.testing.assert_close(sigma, torch.tensor([[0.0], [0.2], [0.4]]))

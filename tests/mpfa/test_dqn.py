@@ -184,6 +184,9 @@ def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
             learner.update(Draw(transitions(), **wrong))
     with pytest.raises(ValueError, match="factor"):
         learner.anneal(1.5)
+    for missing in ("action", ("next", "terminated")):
+        with pytest.raises(KeyError, match=r"action|terminated"):
+            learner.update(transitions().exclude(missing, ("next", "done")))
     with pytest.raises(ValueError, match="state_dict"):
         learner.load_state_dict({"loss": {}, "updates": 3})
     other = learners()[kind]
@@ -263,3 +266,13 @@ def test_learners_refuse_what_is_anothers():
         QLearner(network())
     with pytest.raises(ValueError, match="lr"):
         QLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.0)
+
+
+def test_the_rate_of_a_table_is_the_fraction_that_it_is_told():
+    learner = QLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
+    row = transitions(1).exclude("priority_weight")
+    row["next", "reward"][:], row["next", "terminated"][:] = 8.0, True
+    for fraction, expected in ((1.0, 4.0), (0.25, 4.0 + 0.125 * 4.0), (0.0, 4.5)):
+        learner.anneal(fraction)
+        learner.update(row)
+        assert float(learner.table.sum()) == pytest.approx(expected)

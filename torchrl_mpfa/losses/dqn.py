@@ -95,9 +95,11 @@ class SignalDQNLoss(DQNLoss):
         Returns:
             The loss, and detached values for the log.
         """
+        scaled = batch.select(*self.in_keys)
         # Transitions of several steps say of how many: the bootstrap is discounted by all of them.
         steps = self.value_estimator.tensor_keys.steps_to_next_obs
-        scaled = batch.select(*self.in_keys, steps, strict=False)
+        if (count := batch.get(steps, None)) is not None:
+            scaled[steps] = count
         reward = ("next", self.tensor_keys.reward)
         scaled[reward] = scaled[reward] * self.reward_scale
         each: Tensor = super().forward(scaled)["loss"]
