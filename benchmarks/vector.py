@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from benchmarks.timing import Call, Entry, entry, take_turns
-from mpfa_envs import Box, Cylinder, VectorNavigationEnv, World
+from mpfa_envs import Box, Cylinder, VectorNavigationEnv, Walker, World
 
 ROBOTS = 64
 _CIRCLE = (-1.0, 1.0)
 """Slowest left and fastest right wheel: a circle of 0.3 m."""
+_WALKERS = (Walker(radius=0.25, speed=0.2),) * 6
+_BESIDE_KINEMATIC = ("vector_map", "vector_walkers", "vector_cylinders")
+"""Entries with a ratio to ``vector_kinematic``."""
 
 
 def cluttered(name: str, seed: int, *, boxes: int = 0, cylinders: int = 0, size: float) -> World:
@@ -85,20 +89,22 @@ def _torchrl_stepper(world: World) -> Call:
 
 
 def measure(*, quick: bool) -> list[Entry]:
-    """Measure kinematic robots among 30 obstacles, with a map, among 300 cylinders, and wheels.
+    """Measure kinematic robots among 30 obstacles, walkers, or 300 cylinders, a map, and wheels.
 
     Args:
         quick: Fewer and shorter rounds.
 
     Returns:
-        Rates, that of TorchRL's environment among them; the ratios of ``vector_map`` and
-        ``vector_cylinders`` are their times over that of ``vector_kinematic``.
+        Rates, that of TorchRL's environment among them; the ratios of ``vector_map``,
+        ``vector_walkers`` and ``vector_cylinders`` are their times over that of
+        ``vector_kinematic``.
     """
     sparse = cluttered("thirty", 1, boxes=20, cylinders=10, size=14.0)
     dense = cluttered("three hundred", 2, cylinders=300, size=20.0)
     calls: dict[str, Callable[[], object]] = {
         "vector_kinematic": _stepper(sparse),
         "vector_map": _stepper(sparse, memory="map"),
+        "vector_walkers": _stepper(replace(sparse, walkers=_WALKERS)),
         "vector_cylinders": _stepper(dense),
         "vector_wheels": _stepper(sparse, physics="wheels", robots=16),
     }
@@ -114,7 +120,7 @@ def measure(*, quick: bool) -> list[Entry]:
             ratio=timings[name].ratio(timings["vector_kinematic"]),
             baseline="vector_kinematic",
         )
-        if name in ("vector_map", "vector_cylinders")
+        if name in _BESIDE_KINEMATIC
         else entry(name, rate, "steps/s")
         for name, rate in rates.items()
     ]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks import method_steps, replay, run, timing, training
+from benchmarks import method_steps, replay, run, timing, training, vector
 from benchmarks.timing import Entry, Timing, entry
+from torchrl_mpfa.methods import METHODS
 
 
 def check_schema(entries: Sequence[Entry]) -> None:
@@ -141,3 +144,28 @@ def test_a_step_of_each_method_is_compared_with_uniform_ddpg() -> None:
     assert names[0] == "step_ddpg"
     assert found[0]["ratio"] == pytest.approx(1.0)
     assert {"step_mpfa_per", "step_la3p"} <= set(names)
+
+
+@pytest.mark.parametrize("name", ["ref_er", "reaper", "uniform_halves", "geometric"])
+def test_a_step_is_made_of_methods_that_store_or_choose_in_a_way_of_their_own(name: str) -> None:
+    step = method_steps.make_step(replace(METHODS[name]))
+    for _ in range(2):
+        step()
+
+
+def test_robots_among_walkers_are_compared_with_robots_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seconds = {"vector_kinematic": 2.0, "vector_walkers": 3.0}
+
+    def turns(calls: dict[str, Callable[[], object]], **named: object) -> dict[str, Timing]:
+        observations: Any = calls["vector_walkers"]()
+        assert observations[0].shape[0] == vector.ROBOTS
+        return {name: Timing((seconds.get(name, 4.0),)) for name in calls}
+
+    monkeypatch.setattr(vector, "take_turns", turns)
+    found = {each["name"]: each for each in vector.measure(quick=True)}
+    check_schema(list(found.values()))
+    assert found["vector_walkers"]["ratio"] == pytest.approx(1.5)
+    assert found["vector_walkers"]["value"] == pytest.approx(vector.ROBOTS / 3.0)
+    assert found["vector_kinematic"]["ratio"] is None

@@ -37,6 +37,8 @@ _SLACK: Final = 0.02
 """How much farther from an obstacle than its radius a walker starts [m]."""
 _SAMPLES: Final = 256
 """Places that are sampled at once."""
+_FEW: Final = 16
+"""Those of them that are looked at first."""
 _ROUNDS: Final = 20
 _MARGIN: Final = 0.05
 """A ray that ends this near to a walker, and three deviations of its noise, met it [m]."""
@@ -291,14 +293,14 @@ def start_walkers(
     targets = np.zeros(len(world.walkers), dtype=np.int64)
     taken = [(*start, _START)]
     for number, walker in enumerate(world.walkers):
-        sample = _sample_free if walker.behavior == "straight" else _sample_round
-        places, nexts, headings = sample(world, walker, rng)
-        # How far each place is from what is taken; the first that is far enough, or the farthest.
-        gaps = np.min(
-            [np.hypot(places[:, 0] - x, places[:, 1] - y) - reach for x, y, reach in taken], axis=0
-        )
-        enough = gaps >= walker.radius
-        chosen = int(np.argmax(enough)) if enough.any() else int(np.argmax(gaps))
+        sample = _sample_room if walker.behavior == "straight" else _sample_round
+        for _ in range(_ROUNDS):
+            places, nexts, headings = sample(world, walker, rng)
+            chosen = _choose(world, walker, places, taken)
+            if chosen is not None:
+                break
+        else:
+            raise ValueError(f"world {world.name!r} has no place for {walker}")
         x, y = places[chosen].tolist()
         heading = float(headings[chosen])
         states[number] = x, y, walker.speed * math.cos(heading), walker.speed * math.sin(heading)
@@ -307,18 +309,33 @@ def start_walkers(
     return states, targets
 
 
-def _sample_free(
+def _choose(
+    world: World,
+    walker: Walker,
+    places: NDArray[np.float64],
+    taken: list[tuple[float, float, float]],
+) -> int | None:
+    """Number of the first free place that is far enough from what is taken, or of the farthest."""
+    # One of the first will nearly always do, and to look at all takes ten times as long.
+    for few in (places[:_FEW], places):
+        gaps = np.min([np.hypot(few[:, 0] - x, few[:, 1] - y) - reach for x, y, reach in taken], 0)
+        free = np.ones(len(few), dtype=np.bool_)
+        if walker.behavior == "straight":  # A round is free, which the world has checked.
+            free = world.clearances(few) >= walker.radius + _SLACK
+        enough = free & (gaps >= walker.radius)
+        if enough.any():
+            return int(np.argmax(enough))
+    return int(np.argmax(np.where(free, gaps, -np.inf))) if free.any() else None
+
+
+def _sample_room(
     world: World, walker: Walker, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Places anywhere in the room with a direction each: (x, y), 0 and heading."""
     half = np.array(world.size) / 2 - walker.radius
-    for _ in range(_ROUNDS):
-        places = rng.uniform(-half, half, (_SAMPLES, 2))
-        headings = rng.uniform(-math.pi, math.pi, _SAMPLES)
-        free = world.clearances(places) >= walker.radius + _SLACK
-        if free.any():
-            return places[free], np.zeros(int(free.sum()), dtype=np.int64), headings[free]
-    raise ValueError(f"world {world.name!r} has no place for {walker}")
+    places = rng.uniform(-half, half, (_SAMPLES, 2))
+    headings = rng.uniform(-math.pi, math.pi, _SAMPLES)
+    return places, np.zeros(_SAMPLES, dtype=np.int64), headings
 
 
 def _sample_round(
