@@ -21,6 +21,7 @@ from mpfa_envs import (
     GENERATORS,
     DistanceField,
     FreeGrid,
+    NavigationEnv,
     PathPlanner,
     World,
     barn_world,
@@ -134,7 +135,7 @@ def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
 
 
 def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any, Any]:
-    """Render worlds, four in a row.
+    """Render worlds, four in a row, with their walkers at the start of an episode.
 
     Args:
         worlds: The worlds.
@@ -145,7 +146,11 @@ def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any
     """
     tiles = []
     for world in worlds:
-        picture = render_trajectories(world, [], [], [], title=world.name, size=side)
+        env = NavigationEnv(world=world, physics="kinematic")
+        env.reset(seed=0)
+        picture = render_trajectories(
+            world, [], [], [], title=world.name, walkers=env.walkers, size=side
+        )
         tile = np.full((side + 40, side + 12, 3), 255, dtype=np.uint8)
         left = (tile.shape[1] - picture.shape[1]) // 2
         tile[: picture.shape[0], left : left + picture.shape[1]] = picture
@@ -154,18 +159,21 @@ def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any
     return np.concatenate(rows)
 
 
-def save_pictures(folder: Path) -> None:
+def save_pictures(folder: Path, names: Sequence[str] = ()) -> None:
     """Write ``generator-NAME.png`` for each generator, and ``barn.png``.
 
     Args:
         folder: Where to.
+        names: Generators; none: all of them, and BARN.
     """
     from PIL import Image
 
-    for name in GENERATORS:
+    for name in names or GENERATORS:
         steps = [round(step / 11, 2) for step in range(12)]
         worlds = [generate_world(name, seed, difficulty=step) for seed, step in enumerate(steps)]
         Image.fromarray(render_twelve(worlds)).quantize(64).save(folder / f"generator-{name}.png")
+    if names:
+        return
     worlds = [barn_world(index) for index in range(8, 20)]
     Image.fromarray(render_twelve(worlds)).quantize(64).save(folder / "barn.png")
 
@@ -174,9 +182,10 @@ def main() -> None:
     """Print the table, or write the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pictures", type=Path, help="render the worlds into this folder instead")
+    parser.add_argument("--names", nargs="+", choices=GENERATORS, default=[], help="of these alone")
     arguments = parser.parse_args()
     if arguments.pictures:
-        save_pictures(arguments.pictures)
+        save_pictures(arguments.pictures, arguments.names)
         return
     milliseconds = {
         found["name"]: found["value"] for found in measure(quick=False, names=list(GENERATORS))

@@ -285,6 +285,7 @@ def render_trajectories(
     outcomes: Sequence[Outcome],
     *,
     title: str = "",
+    walkers: NDArray[np.float64] | None = None,
     size: int = 480,
 ) -> NDArray[np.uint8]:
     """Render the paths of many episodes into one picture of their world.
@@ -298,6 +299,7 @@ def render_trajectories(
         goals: Goal of each episode (x, y) [m].
         outcomes: ``"success"``, ``"collision"`` or ``"timeout"`` for each episode.
         title: What to write in the strip.
+        walkers: Where walkers are at one moment, as in :func:`render_scene`.
         size: Longer side of the picture without the strip [px].
 
     Returns:
@@ -326,6 +328,8 @@ def render_trajectories(
     ways = [[(float(x), float(y)) for x, y in trajectory] for trajectory in trajectories]
     # Successes first: they are many, and the failures above them are what one looks for.
     order = sorted(range(len(ways)), key=lambda i: outcomes[i] != "success")
+    for walker in () if walkers is None else walkers.tolist():
+        canvas.walker(walker)
     for i in order:
         with_color = OUTCOMES[outcomes[i]]
         with canvas.layer():

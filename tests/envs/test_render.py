@@ -51,6 +51,13 @@ def test_trajectories_have_the_color_of_their_outcome() -> None:
     np.testing.assert_allclose(pixel(picture, 2.5, -2.97), OUTCOMES["collision"][:3], atol=90)
 
 
+def test_walkers_are_shown_where_they_are_beside_the_ways() -> None:
+    walkers = np.array([[1.0, 2.0, 0.3, 0.0, 0.25]])
+    empty, walked = (render_trajectories("A", [], [], [], walkers=each) for each in (None, walkers))
+    assert pixel(walked, 1.0, 1.85) != pixel(empty, 1.0, 1.85)
+    assert pixel(walked, -1.0, 2.0) == pixel(empty, -1.0, 2.0)
+
+
 def test_a_long_room_gives_a_long_picture() -> None:
     world = World(name="hall", size=(9.6, 4.6))
     assert render_trajectories(world, [], [], [], size=200).shape == (128, 200, 3)
