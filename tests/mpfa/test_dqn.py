@@ -186,7 +186,7 @@ def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
         learner.anneal(1.5)
     for missing in ("action", ("next", "terminated")):
         with pytest.raises(KeyError, match=r"action|terminated"):
-            learner.update(transitions().exclude(missing, ("next", "done")))
+            learner.update(transitions().exclude(missing))
     with pytest.raises(ValueError, match="state_dict"):
         learner.load_state_dict({"loss": {}, "updates": 3})
     other = learners()[kind]
