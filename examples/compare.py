@@ -35,7 +35,7 @@ from navigation.arms import check_free, parse_arms
 from navigation.processes import Child
 from navigation.settings import GROUPS, register
 from navigation.stopping import Stop
-from navigation.studies import Evaluation, Job, collect, other_than_asked
+from navigation.studies import TESTED, Evaluation, Job, Study, collect, other_than_asked
 from navigation.worlds import parse_worlds
 from torchrl_mpfa.spelling import unknown
 
@@ -53,8 +53,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--folder", type=Path, default=Path("runs/compare"))
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
-    parser.add_argument("--worlds", nargs="+", default=["test"], help="(default: test)")
-    parser.add_argument("--episodes", type=int, default=200, help="for each (default: 200)")
+    parser.add_argument("--worlds", nargs="+", default=TESTED.words, help="(default: test)")
+    parser.add_argument(
+        "--episodes", type=int, default=TESTED.episodes, help="for each (default: 200)"
+    )
     parser.add_argument("--physics", choices=["wheels", "kinematic"], help="default: as trained")
     parser.add_argument(
         "--arm",
@@ -188,15 +190,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = parse(arguments)
     register()
-    wanted = Evaluation(tuple(options.worlds), options.episodes, options.physics)
-    jobs = [
-        Job(learner, method, seed, options.folder, arm)
-        # Seeds outside: a study that is cut short has as much of each method.
-        for seed in options.seeds
-        for learner in options.learners
-        for method in options.methods
-        for arm in options.arms
-    ]
+    study = Study(
+        options.folder,
+        tuple(options.methods),
+        tuple(options.overrides),
+        options.seeds,
+        tuple(options.learners),
+        tuple(options.arms),
+        Evaluation(tuple(options.worlds), options.episodes, options.physics),
+    )
+    jobs, wanted = study.jobs, study.evaluation
     try:
         with files.lock(options.folder):
             others = other_than_asked(jobs, options.overrides)

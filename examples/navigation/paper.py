@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,11 +12,10 @@ from navigation import files
 from navigation.arms import Arm
 from navigation.figures import Runs
 from navigation.records import read_table
-from navigation.studies import Job
+from navigation.studies import Job, Study
 
 RUNS = 10
 """Experiments that each curve of the paper is the mean of."""
-LEARNER = "ddpg"
 PHI = "phi"
 """Folder of the study of Fig. 5, in that of the others."""
 
@@ -94,38 +91,6 @@ CLAIMS = ("uniform", "per", "mpfa_per")
 """Those by which Section 2.4's claims on PER are looked at."""
 
 
-@dataclass(frozen=True)
-class Study:
-    """Runs that one command of ``compare.py`` makes."""
-
-    folder: Path
-    methods: tuple[str, ...]
-    settings: tuple[str, ...]
-    arms: Mapping[str, str]
-    """Settings by the name of their arm; ``{"": ""}``: it has none."""
-    seeds: int
-
-    @property
-    def command(self) -> str:
-        """What makes the runs, and leaves alone those that are made."""
-        arms = [f"--arm={name}:{settings}" for name, settings in self.arms.items() if name]
-        seeds = [str(seed) for seed in range(self.seeds)]
-        words = ["python", "examples/compare.py", "--folder", str(self.folder), *arms]
-        words += ["--methods", *self.methods, "--seeds", *seeds, "--", *self.settings]
-        return shlex.join(words)
-
-    def runs(self) -> dict[str, list[Job]]:
-        """Those that it is to have, by arm, or by method if it has no arms."""
-        return {
-            arm or method: [
-                Job(LEARNER, method, seed, self.folder, Arm(arm, (settings,) if arm else ()))
-                for seed in range(self.seeds)
-            ]
-            for method in self.methods
-            for arm, settings in self.arms.items()
-        }
-
-
 def studies(folder: Path, *, seeds: int = RUNS) -> tuple[Study, Study]:
     """The study of all figures and tables but Fig. 5, and that of Fig. 5.
 
@@ -142,10 +107,11 @@ def studies(folder: Path, *, seeds: int = RUNS) -> tuple[Study, Study]:
 --arm=phi3:method.boost_factor=3 --arm=phi4:method.boost_factor=4 --methods mpfa_per --seeds 0 \
 -- regime=paper curriculum=A'
     """
-    arms = {f"phi{phi}": f"method.boost_factor={phi}" for phi in PHIS}
+    of_all = range(seeds)
+    arms = tuple(Arm(f"phi{phi}", (f"method.boost_factor={phi}",)) for phi in PHIS)
     return (
-        Study(folder, tuple(NAMES), ("regime=paper",), {"": ""}, seeds),
-        Study(folder / PHI, ("mpfa_per",), ("regime=paper", "curriculum=A"), arms, seeds),
+        Study(folder, tuple(NAMES), ("regime=paper",), of_all),
+        Study(folder / PHI, ("mpfa_per",), ("regime=paper", "curriculum=A"), of_all, arms=arms),
     )
 
 

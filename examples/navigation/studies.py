@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -45,6 +46,10 @@ class Evaluation:
         """Folder of the results, in that of a run."""
         physics = f"-{self.physics}" if self.physics else ""
         return f"evaluation-{worlds_label(self.words)}{physics}"
+
+
+TESTED = Evaluation(("test",), 200)
+"""What ``compare.py`` asks for unless its command line says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,66 @@ class Job:
             for name, value in wanted.items()
             if name not in free and had[name] != value
         ]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs that one command of ``compare.py`` makes: each learner, method, arm and seed."""
+
+    folder: Path
+    methods: tuple[str, ...]
+    settings: tuple[str, ...]
+    """As on the command line of ``train.py``."""
+    seeds: Sequence[int]
+    learners: tuple[str, ...] = ("ddpg",)
+    arms: tuple[Arm, ...] = (PLAIN,)
+    evaluation: Evaluation = TESTED
+
+    @property
+    def arguments(self) -> list[str]:
+        """The command line of ``compare.py``; what it has by default is left out."""
+        words = ["--folder", str(self.folder)]
+        words += [f"--arm={arm.name}:{','.join(arm.settings)}" for arm in self.arms if arm.name]
+        if self.learners != ("ddpg",):
+            words += ["--learners", *self.learners]
+        words += ["--methods", *self.methods, "--seeds", *map(str, self.seeds)]
+        if self.evaluation != TESTED:
+            words += ["--worlds", *self.evaluation.words]
+            words += ["--episodes", str(self.evaluation.episodes)]
+        if self.evaluation.physics is not None:
+            words += ["--physics", self.evaluation.physics]
+        return [*words, "--", *self.settings]
+
+    @property
+    def command(self) -> str:
+        """What makes the runs, and leaves alone those that are made.
+
+        Examples:
+            >>> one = Study(Path("runs/x"), ("per",), ("robots=4",), range(2), arms=(Arm("a"),))
+            >>> one.command
+            'python examples/compare.py --folder runs/x --arm=a: --methods per --seeds 0 1 -- \
+robots=4'
+        """
+        return shlex.join(["python", "examples/compare.py", *self.arguments])
+
+    @property
+    def jobs(self) -> list[Job]:
+        """Its runs, in the order in which they are made."""
+        return [
+            Job(learner, method, seed, self.folder, arm)
+            # Seeds outside: a study that is cut short has as much of each method.
+            for seed in self.seeds
+            for learner in self.learners
+            for method in self.methods
+            for arm in self.arms
+        ]
+
+    def runs(self) -> dict[str, list[Job]]:
+        """Its runs by arm, or by method if it has no arms."""
+        found: dict[str, list[Job]] = {}
+        for job in self.jobs:
+            found.setdefault(job.arm.name or job.method, []).append(job)
+        return found
 
 
 def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job, list[str]]:

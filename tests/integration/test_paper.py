@@ -160,4 +160,4 @@ def test_the_claims_have_a_line_for_each_method_where_its_values_are(tmp_path: P
 
 
 def test_the_phis_of_the_figure_are_the_arms() -> None:
-    assert [f"phi{phi}" for phi in PHIS] == list(studies(Path("x"))[1].arms)
+    assert [f"phi{phi}" for phi in PHIS] == [arm.name for arm in studies(Path("x"))[1].arms]

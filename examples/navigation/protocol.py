@@ -1,0 +1,293 @@
+"""The study as data: tables A to F, each a question, its runs, and what is compared in it.
+
+Arms that two tables have in common are trained once: runs with the same task and settings have one
+folder, whatever table asks for them. Settings were chosen with seeds from 1000 on and validation
+worlds alone; the seeds of the tables begin at :data:`FIRST_SEED`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from navigation.arms import Arm
+from navigation.paper import NAMES, studies
+from navigation.studies import Evaluation, Job, Study
+from torchrl_mpfa.methods import METHODS
+from torchrl_mpfa.methods.catalogue import ALIASES
+
+FIRST_SEED = 100
+ACTIONS = 24_000
+COMMON = (
+    "regime=rooms",
+    "learner.tau=0.01",
+    "learner.gamma=0.97",
+    "learner.compile=true",
+    "tracking=off",
+    "evaluation.every=2000",
+    "evaluation.episodes=40",
+    f"curriculum.stages=[{{world: mixed, actions: {ACTIONS}}}]",
+)
+"""Settings of all tables but A and F."""
+SPARSE = (
+    *COMMON,
+    "updates=2",
+    "environment.progress=none",
+    "environment.max_goal_distance=6",
+    "environment.detour_chance=0",
+)
+"""The goal and the collision alone are rewarded."""
+DENSE = (*COMMON, "updates=2")
+"""Rewards and distances of the regime."""
+VOLUMES = {
+    8: ("robots=32", "updates=1"),
+    32: ("robots=16", "updates=2"),
+    128: ("robots=16", "updates=8"),
+    256: ("robots=16", "updates=16"),
+}
+"""Settings by replay volume: transitions that are learned from for each action, of 256 an update.
+
+:data:`SPARSE` and :data:`DENSE` have 32.
+"""
+GENERATORS = ("rooms", "clutter", "bars", "fields", "halls", "mazes")
+TEST = Evaluation(tuple(f"{name}:test" for name in GENERATORS), 50, "wheels")
+"""What last policies are asked to do."""
+
+KEY = ("uniform", "per", "mpfa_per", "mpf_per", "mpfa_plus", "lap", "la3p", "uniform_halves")
+OF_VOLUMES = ("uniform", "per", "mpfa_per", "mpfa_plus", "lap", "geometric")
+EVERY = tuple(name for name in METHODS if name not in ALIASES.values())
+"""Every method of the catalogue by the name that fits all learners."""
+
+PAPER = ("regime=paper", "robots=16", "updates=16", "learner.compile=true", "tracking=off")
+"""The paper's task with the same replay volume and sixteen robots in the place of one."""
+LETTER = Arm(
+    "letter",
+    ("environment.mirror=false", "environment.clearance=0.17", "exploration.varied=false"),
+)
+"""With ``learner=plain`` the paper to the letter: 0.35 m from the robot's center is a collision."""
+ONE_ROBOT = Arm("one_robot", ("robots=1", "updates=1"))
+UNSEEN = Evaluation(("rooms:100-109", "bars:test"), 40)
+"""Where the policies of table A are tested beside the test world."""
+
+PARTS = (
+    Arm("reward", ("method.signals=[reward]",)),
+    Arm("td_error", ("method.signals=[td_error]",)),
+    Arm("gradient", ("method.signals=[action_gradient]",)),
+    Arm("reward+td_error", ("method.signals=[reward,td_error]",)),
+    Arm("reward+gradient", ("method.signals=[reward,action_gradient]",)),
+    Arm("td_error+gradient", ("method.signals=[td_error,action_gradient]",)),
+    Arm("equal_weights", ("method.fusion=fixed",)),
+    Arm("equal_shares", ("method.fusion=scaled",)),
+    Arm("no_boost", ("method.boost=false",)),
+    Arm("no_decay", ("method.decay=false",)),
+    Arm("phi2", ("method.boost_factor=2",)),
+    Arm("phi4", ("method.boost_factor=4",)),
+    Arm("alpha0.4", ("method.alpha=0.4",)),
+    Arm("alpha0.8", ("method.alpha=0.8",)),
+    Arm("beta1", ("method.beta=1",)),
+    # Readings: the population of Eqs. 16-17, what is positive in Eqs. 17 and 22-24, the 1 of
+    # Eq. 22, and j of Eq. 23.
+    Arm("eq16_batch", ("method.population=batch",)),
+    Arm("eq17_mean", ("method.positive_above=mean",)),
+    Arm("eq22_cap", ("method.boost_bound=cap",)),
+    Arm("eq22_none", ("method.boost_bound=none",)),
+    Arm("eq23_rank", ("method.decay_position=rank",)),
+    Arm("eq23_count", ("method.decay_position=count",)),
+)
+"""MPFA-PER with one thing changed."""
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Comparisons that are corrected for each other."""
+
+    name: str
+    pairs: tuple[Pair, ...]
+    """Labels of two arms each: the first less the second."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A question, and the runs that answer it."""
+
+    name: str
+    question: str
+    studies: tuple[Study, ...]
+    families: tuple[Family, ...]
+
+
+def label_of(job: Job, root: Path) -> str:
+    """What the arm of a run is called in the study: its folder, learner, method and arm.
+
+    Args:
+        job: The run.
+        root: Folder of the study.
+
+    Examples:
+        >>> label_of(Job("td3", "per", 100, Path("runs/study/sparse")), Path("runs/study"))
+        'sparse/td3/per'
+    """
+    folder = job.folder.relative_to(root).as_posix()
+    return "/".join(part for part in (folder, job.learner, job.method, job.arm.name) if part)
+
+
+def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
+    """The tables, in the order in which they are run.
+
+    Args:
+        root: Folder of the study.
+        most: Runs of each arm at most; None: all that are wanted.
+
+    Returns:
+        Tables by name.
+
+    Raises:
+        ValueError: If ``most`` is below 1.
+
+    Examples:
+        >>> [len(table.studies) for table in tables(Path("runs/study")).values()]
+        [2, 4, 2, 7, 1]
+    """
+    if most is not None and most < 1:
+        raise ValueError(f"most must be at least 1, got {most}")
+    made = (_table_c(root), _table_d(root), _table_e(root), _table_a(root), _table_b(root))
+    return {table.name: _at_most(table, most) for table in made}
+
+
+def _at_most(table: Table, most: int | None) -> Table:
+    return replace(
+        table, studies=tuple(replace(each, seeds=each.seeds[:most]) for each in table.studies)
+    )
+
+
+def _seeds(number: int) -> range:
+    return range(FIRST_SEED, FIRST_SEED + number)
+
+
+def _pairs(prefix: str, *pairs: str, suffix: str = "") -> tuple[Pair, ...]:
+    """Labels out of ``"per-uniform"`` and the like."""
+    named = (pair.split("-") for pair in pairs)
+    return tuple((f"{prefix}/{a}{suffix}", f"{prefix}/{b}{suffix}") for a, b in named)
+
+
+_FIVE = (
+    "per-uniform",
+    "mpfa_per-uniform",
+    "mpfa_per-per",
+    "mpfa_plus-per",
+    "mpfa_plus-mpfa_per",
+)
+_SIX = (*_FIVE, "mpf_per-per")
+_CONTROLS = ("mpfa_plus-uniform", "lap-uniform", "la3p-uniform_halves")
+
+
+def _table_c(root: Path) -> Table:
+    folder, seeds = root / "sparse", _seeds(20)
+    others = [name for name in EVERY if name not in ("uniform", "per")]
+    planned = {tuple(pair.split("-")) for pair in _SIX}
+    secondary = [
+        f"{a}-{b}"
+        for b in ("uniform", "per")
+        for a in others
+        # What is a primary comparison, or its reverse, is none of these.
+        if not {(a, b), (b, a)} & planned
+    ]
+    return Table(
+        "C",
+        "Sparse reward: does any priority learn faster than uniform replay, and MPFA-PER than PER?",
+        (
+            Study(folder, EVERY, SPARSE, seeds, ("td3",), evaluation=TEST),
+            Study(folder, KEY, SPARSE, seeds, ("ddpg",), evaluation=TEST),
+        ),
+        (
+            Family("primary, TD3", _pairs("sparse/td3", *_SIX)),
+            Family("secondary, TD3", _pairs("sparse/td3", *secondary, "la3p-uniform_halves")),
+            Family("secondary, DDPG", _pairs("sparse/ddpg", *_SIX, *_CONTROLS)),
+        ),
+    )
+
+
+def _table_d(root: Path) -> Table:
+    arms = {v: Arm(f"v{v}", settings) for v, settings in VOLUMES.items() if v != 32}
+    sparse, dense = root / "sparse", root / "dense"
+    pairs = (*_FIVE, "mpfa_plus-uniform", "lap-uniform", "geometric-uniform")
+    wanted = [("sparse", volume) for volume in VOLUMES] + [("dense", 32), ("dense", 256)]
+    return Table(
+        "D",
+        "Replay volume: how often must transitions be replayed for priorities to pay?",
+        (
+            Study(sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), evaluation=TEST),
+            Study(sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), tuple(arms.values()), TEST),
+            Study(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), evaluation=TEST),
+            Study(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), (arms[256],), TEST),
+        ),
+        tuple(
+            Family(
+                f"{reward}, volume {volume}",
+                _pairs(
+                    f"{reward}/td3", *pairs, suffix="" if volume == 32 else f"/{arms[volume].name}"
+                ),
+            )
+            for reward, volume in wanted
+        ),
+    )
+
+
+def _table_e(root: Path) -> Table:
+    folder, seeds = root / "sparse", _seeds(20)
+    whole = "sparse/td3/mpfa_per"
+    methods = ("mpfa_per", "mpf_per", "mpfa_adaptive")
+    others = [f"{whole}/{arm.name}" for arm in PARTS]
+    others += [f"sparse/td3/{name}" for name in methods[1:]]
+    return Table(
+        "E",
+        "Which part of MPFA-PER does it?",
+        (
+            Study(folder, methods, SPARSE, seeds, ("td3",), evaluation=TEST),
+            Study(folder, ("mpfa_per",), SPARSE, seeds, ("td3",), PARTS, TEST),
+        ),
+        (Family("changed - MPFA-PER", tuple((other, whole) for other in others)),),
+    )
+
+
+def _table_a(root: Path) -> Table:
+    folder = root / "paper"
+    first = ("mpfa_per", "per", "uniform")
+    others = tuple(name for name in NAMES if name not in first)
+    _, phi = studies(folder, seeds=10)
+    phi = replace(phi, settings=(*PAPER, *phi.settings[1:]), seeds=_seeds(10))
+    tested = (
+        Study(folder, first, PAPER, _seeds(10)),
+        Study(folder, others, PAPER, _seeds(5)),
+        Study(folder, first, PAPER, _seeds(10), ("plain",), (LETTER,)),
+    )
+    unseen = tuple(replace(study, evaluation=UNSEEN) for study in tested)
+    ours = [f"mpfa_per-{name}" for name in NAMES if name != "mpfa_per"]
+    phis = "paper/phi/ddpg/mpfa_per"
+    return Table(
+        "A",
+        "The paper's own task: are its tables confirmed?",
+        (*tested, Study(folder, ("mpfa_per",), PAPER, _seeds(3), arms=(ONE_ROBOT,)), phi, *unseen),
+        (
+            Family("primary, DDPG", _pairs("paper/ddpg", *ours, "per-uniform")),
+            Family("to the letter", _pairs("paper/plain", *_FIVE[:3], suffix=f"/{LETTER.name}")),
+            Family("phi", tuple((f"{phis}/phi3", f"{phis}/phi{other}") for other in (2, 4))),
+            Family(
+                "one robot", ((f"paper/ddpg/mpfa_per/{ONE_ROBOT.name}", "paper/ddpg/mpfa_per"),)
+            ),
+        ),
+    )
+
+
+def _table_b(root: Path) -> Table:
+    learners = ("td3", "ddpg")
+    return Table(
+        "B",
+        "Dense reward: does any priority help where every step is rewarded, and does any harm?",
+        (Study(root / "dense", KEY, DENSE, _seeds(10), learners, evaluation=TEST),),
+        tuple(
+            Family(name.upper(), _pairs(f"dense/{name}", *_SIX, *_CONTROLS)) for name in learners
+        ),
+    )

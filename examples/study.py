@@ -1,0 +1,111 @@
+"""Train and evaluate the runs of the study, table by table; it goes on where it was stopped.
+
+    python examples/study.py --list                   each table: its question, runs, commands
+    python examples/study.py                          all of them
+    python examples/study.py C D --jobs 4             two tables, four runs at a time
+    python examples/study.py --seeds 3                three runs of each arm first
+
+Every run is one of ``compare.py``, by the commands that ``--list`` shows. What is trained and
+evaluated is left alone; Ctrl-C saves what is under way, and the same command goes on. Tables A to
+F are in ``navigation/protocol.py``, with a folder for each task in ``--folder``. The checkpoint of
+a run that is done is removed: thousands of them take tens of gigabytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import compare
+from navigation.protocol import Table, tables
+from navigation.remaining import counts, free_checkpoints, hours_left
+
+ROOT = Path("runs/study")
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = list(tables(ROOT))
+    parser.add_argument(
+        "tables", nargs="*", metavar="TABLE", help=f"of {', '.join(names)} (default: all)"
+    )
+    parser.add_argument("--folder", type=Path, default=ROOT, help=f"(default: {ROOT})")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
+    parser.add_argument("--seeds", type=int, help="runs of each arm at most (default: all)")
+    parser.add_argument("--list", action="store_true", help="say what there is, and run nothing")
+    options = parser.parse_args(arguments)
+    for name in options.tables:
+        if name not in names:
+            parser.error(f"there is no table {name}; there are: {', '.join(names)}")
+    for option in ("jobs", "seeds"):
+        value = getattr(options, option)
+        if value is not None and value < 1:
+            parser.error(f"--{option} must be at least 1, got {value}")
+    found = tables(options.folder, most=options.seeds)
+    options.tables = [found[name] for name in options.tables or names]
+    return options
+
+
+def summary(chosen: Sequence[Table], *, jobs: int) -> str:
+    """How much of some tables is done, and what is left of it."""
+    studies = [study for table in chosen for study in table.studies]
+    done, wanted = counts(studies)
+    text = f"{', '.join(table.name for table in chosen)}: {done} of {wanted} runs"
+    hours = hours_left(studies, jobs=jobs) if done < wanted else 0.0
+    return text if not hours else f"{text}, about {hours:.1f} h left with {jobs} at a time"
+
+
+def listing(chosen: Sequence[Table]) -> str:
+    """The questions, runs and commands of some tables."""
+    lines = []
+    for table in chosen:
+        done, wanted = counts(table.studies)
+        lines.append(f"{table.name}  {table.question}  {done} of {wanted} runs")
+        for study in table.studies:
+            done, wanted = counts([study])
+            lines += ["", f"    # {done} of {wanted}", f"    {study.command}"]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the runs that are missing.
+
+    Args:
+        arguments: The command line.
+
+    Returns:
+        Exit status: 0, the highest of ``compare.py``, or 128 and the number of the signal that
+        stopped it.
+    """
+    options = parse(arguments)
+    if options.list:
+        print(listing(options.tables))
+    worst = 0
+    for table in [] if options.list else options.tables:
+        for study in table.studies:
+            done, wanted = counts([study])
+            if done < wanted:
+                print(
+                    f"{summary(options.tables, jobs=options.jobs)}\n{table.name}: {study.command}"
+                )
+                status = compare.main([*study.arguments[:2], *_jobs(options), *study.arguments[2:]])
+                worst = max(worst, status)
+            free_checkpoints(study)
+            if worst >= 128:
+                return worst
+    print(summary(options.tables, jobs=options.jobs))
+    return worst
+
+
+def _jobs(options: argparse.Namespace) -> list[str]:
+    return ["--jobs", str(options.jobs)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
