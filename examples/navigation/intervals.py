@@ -10,21 +10,22 @@ beside current versions of what it depends on. Scores are arrays of shape ``[run
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from mpfa_envs import Interval
+from mpfa_envs.results import wilson
 
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]
 _LEVEL = 0.95
 _RESAMPLES = 2000
 _BATCH = 100
-_ALL = 2**62
-"""More than there are permutations, so that all of them are counted."""
+_MANY = 10_000
+"""Resamples where one takes no time."""
 
 
 def mean(scores: Array) -> Array:
@@ -142,55 +143,127 @@ def _bootstrap(statistic: Statistic, *counts: int, rng: np.random.Generator) -> 
     return Interval(value, float(found.low), float(found.high))
 
 
-def permutation_p(ours: Array, theirs: Array) -> float:
-    """Exact two-sided permutation test of the difference between the means of runs.
+def mean_interval(scores: Array, *, rng: np.random.Generator) -> Interval:
+    """Mean over runs with a bootstrap interval that holds for few runs.
 
     Args:
-        ours: Shape ``[runs, pairs]``.
-        theirs: Shape ``[other runs, pairs]``.
+        scores: A number for each run, shape ``[runs]``.
+        rng: Source of the resamples.
 
     Returns:
-        Share of all ways to deal the runs to the two sides that differ at least as much.
+        The mean and its interval, which is NaN for one run.
     """
+    low, high = widened_ends(resampled_means(scores, rng), len(scores))
+    return Interval(float(scores.mean()), float(low), float(high))
 
-    def distance(a: Array, b: Array, axis: int) -> Array:
-        return np.abs(a.mean(axis=axis) - b.mean(axis=axis))
 
-    found = stats.permutation_test(
-        (ours.mean(axis=1), theirs.mean(axis=1)),
-        distance,
-        vectorized=True,
-        n_resamples=_ALL,
-        alternative="greater",
+def difference_interval(ours: Array, theirs: Array, *, rng: np.random.Generator) -> Interval:
+    """Difference of the means of runs with a bootstrap interval that holds for few runs.
+
+    Args:
+        ours: A number for each run, shape ``[runs]``.
+        theirs: Shape ``[other runs]``.
+        rng: Source of the resamples.
+
+    Returns:
+        The difference and its interval, which is NaN if a side has one run.
+    """
+    found = resampled_means(ours, rng) - resampled_means(theirs, rng)
+    low, high = widened_ends(found, len(ours), len(theirs))
+    return Interval(float(ours.mean() - theirs.mean()), float(low), float(high))
+
+
+def resampled_means(scores: Array, rng: np.random.Generator) -> Array:
+    """Means of runs that are sampled with replacement.
+
+    Args:
+        scores: A number for each run, shape ``[..., runs]``.
+        rng: Source of the resamples, which all sets of data have in common.
+
+    Returns:
+        The means, shape ``[..., resamples]``.
+    """
+    return scores @ _resampled(scores.shape[-1], rng).T
+
+
+def widened_ends(resamples: Array, *runs: int) -> Array:
+    """Ends of the 95 % interval of a difference of means, or of one mean.
+
+    The percentiles of resamples of few runs are too near: their spread divides by n, not by n - 1,
+    and is that of the normal distribution where Student's t is due. They are moved away from the
+    middle by what both make (Hesterberg, 2015, https://doi.org/10.1080/00031305.2015.1089789).
+
+    Args:
+        resamples: Resampled differences or means, shape ``[..., resamples]``.
+        *runs: Number of runs of each side, or of the only one.
+
+    Returns:
+        Both ends, shape ``[2, ...]``; NaN for one run.
+    """
+    if min(runs) < 2:
+        return np.full((2, *resamples.shape[:-1]), math.nan)
+    freedom = sum(each - 1 for each in runs)
+    above = 0.5 + _LEVEL / 2
+    factor = math.sqrt(min(runs) / (min(runs) - 1)) * stats.t.ppf(above, freedom)
+    middle = resamples.mean(axis=-1)
+    ends = np.quantile(resamples, (1.0 - above, above), axis=-1)
+    return np.asarray(middle + (ends - middle) * factor / stats.norm.ppf(above))
+
+
+def difference_over_worlds(
+    ours: Array, theirs: Array, kinds: Sequence[str], *, rng: np.random.Generator
+) -> Interval:
+    """Difference of means with an interval for other runs *and* worlds.
+
+    Runs are resampled on each side by themselves, worlds in their kind and for both sides at once,
+    as both were tested in the same ones. The interval is on the wide side (Owen, 2007,
+    https://doi.org/10.1214/07-AOAS122).
+
+    Args:
+        ours: Shape ``[runs, worlds]``.
+        theirs: Shape ``[other runs, worlds]``.
+        kinds: What each world is one of; kinds count the same, however many worlds they have.
+        rng: Source of the resamples.
+
+    Returns:
+        The difference and its interval, which is NaN if a side has one run or a kind one world.
+    """
+    names = np.asarray(kinds)
+    each = [names == name for name in np.unique(names)]
+    even = sum(kind / kind.sum() for kind in each) / len(each)
+    worlds = np.zeros((_MANY, len(names)))
+    for kind in each:
+        worlds[:, kind] = _resampled(int(kind.sum()), rng) / len(each)
+    found = sum(
+        sign * ((_resampled(len(side), rng) @ side) * worlds).sum(axis=1)
+        for sign, side in ((1.0, ours), (-1.0, theirs))
     )
-    return float(found.pvalue)
+    value = float((ours.mean(axis=0) - theirs.mean(axis=0)) @ even)
+    if min(len(ours), len(theirs), *(kind.sum() for kind in each)) < 2:
+        return Interval(value, math.nan, math.nan)
+    low, high = np.quantile(found, (0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2))
+    return Interval(value, float(low), float(high))
 
 
-def least_p(ours: int, theirs: int) -> float:
-    """Least value that :func:`permutation_p` can have for these numbers of runs."""
-    sides = 2 if ours == theirs else 1
-    return min(1.0, sides / math.comb(ours + theirs, ours))
-
-
-def runs_needed(deviation: float, difference: float, *, power: float = 0.8) -> int:
-    """Runs of each of two methods until a t-test finds a difference between their means.
+def performance_profile(scores: Array, levels: Array) -> tuple[Array, Array, Array]:
+    """Share of runs with a score above each of some levels, with Wilson's 95 % intervals.
 
     Args:
-        deviation: Standard deviation from run to run.
-        difference: True difference of the means.
-        power: Chance to find it at the level of 5 %.
+        scores: A number for each run, shape ``[runs]``.
+        levels: Shape ``[levels]``.
 
     Returns:
-        The number of runs of each.
-
-    Examples:
-        >>> runs_needed(1.95, 2.0), runs_needed(1.95, 5.0)
-        (16, 4)
+        Share, lower and upper end, each of shape ``[levels]``.
     """
-    for runs in range(2, 10_000):
-        freedom, shift = 2 * runs - 2, difference / deviation * math.sqrt(runs / 2)
-        bound = stats.t.ppf(0.975, freedom)
-        found = stats.nct.sf(bound, freedom, shift) + stats.nct.cdf(-bound, freedom, shift)
-        if found >= power:
-            return runs
-    raise ValueError(f"difference must not vanish beside deviation, got {difference}, {deviation}")
+    above = (scores[:, None] > levels).sum(axis=0)
+    runs = len(scores)
+    of_counts = [wilson([True] * n + [False] * (runs - n)) for n in range(runs + 1)]
+    share, low, high = (
+        np.array([getattr(each, name) for each in of_counts]) for name in ("value", "low", "high")
+    )
+    return share[above], low[above], high[above]
+
+
+def _resampled(runs: int, rng: np.random.Generator) -> Array:
+    """Weights of runs that are sampled with replacement, shape ``[resamples, runs]``."""
+    return rng.multinomial(runs, np.full(runs, 1.0 / runs), size=_MANY) / runs

@@ -15,14 +15,13 @@ from navigation.intervals import (
     bootstrap_runs,
     bootstrap_runs_and_pairs,
     interquartile_mean,
-    least_p,
     mean,
-    permutation_p,
     probability_of_improvement,
-    runs_needed,
     t_interval,
 )
 from navigation.paper import NAMES, TABLE_2, TESTS
+from navigation.permutation import least_p, permutation_p
+from navigation.power import runs_needed
 
 _OF_THE_PAPER = ("mpfa_per", "per")
 """Methods whose rows of the paper stand under those of any study."""

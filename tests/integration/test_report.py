@@ -16,13 +16,12 @@ from navigation.intervals import (
     bootstrap_runs,
     bootstrap_runs_and_pairs,
     interquartile_mean,
-    least_p,
     mean,
-    permutation_p,
     probability_of_improvement,
-    runs_needed,
     t_interval,
 )
+from navigation.permutation import least_p, permutation_p
+from navigation.power import runs_needed
 from navigation.records import write_table
 
 LINE = "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |"
