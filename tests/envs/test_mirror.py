@@ -98,3 +98,20 @@ def test_what_is_stored_stays_as_it_was_and_draws_follow_the_seed() -> None:
 def test_a_chance_out_of_range_is_refused(chance: float) -> None:
     with pytest.raises(ValueError, match=r"chance must be (in \[0, 1\]|a finite number), got"):
         RandomMirror(chance=chance)
+
+
+def test_the_action_without_noise_is_mirrored_with_the_action_where_a_batch_has_it() -> None:
+    rows = TensorDict(
+        {
+            "observation": torch.rand(6, 24),
+            "action": torch.rand(6, 2),
+            "behavior_mean": torch.rand(6, 2),
+            "behavior_sigma": torch.rand(6, 1),
+            "next": {"observation": torch.rand(6, 24)},
+        },
+        [6],
+    )
+    found = RandomMirror(chance=1.0)(rows.clone())
+    for key in ("action", "behavior_mean"):
+        assert found[key].equal(rows[key].flip(-1))
+    assert found["behavior_sigma"].equal(rows["behavior_sigma"])

@@ -141,3 +141,13 @@ def test_the_share_that_phi_follows_is_in_the_rows(tmp_path: Path) -> None:
     phi = of_run(tmp_path)["phi"].dropna()
     assert phi.between(1, 10).all()
     assert phi.nunique() > 1
+
+
+def test_a_transition_in_the_place_of_an_old_one_was_never_learned_from() -> None:
+    log = UpdateLog(4, reward_scale=1.0)
+    log.wrote(torch.arange(4), torch.ones(4, 1))
+    log.learns(torch.arange(4))
+    log.wrote(torch.tensor([1]), torch.ones(1, 1))
+    log.learns(torch.tensor([0, 1]))
+    _, before, _ = log.state_dict()["last"]
+    assert before.tolist() == [1, -1]
