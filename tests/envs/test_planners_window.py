@@ -229,3 +229,12 @@ def test_with_few_speeds_and_slow_wheels_the_nearest_speeds_are_kept() -> None:
     window = DynamicWindow(samples=4, acceleration=0.1)
     chosen = speeds(window(observation(goal=(0.0, 3.0), left=0.3, right=0.25)))
     assert chosen == pytest.approx((0.35, 0.2))
+
+
+def test_it_keeps_off_a_wall_beside_it_if_clearance_counts() -> None:
+    seen = observation(goal=(3.0, 0.0), left=0.5, right=0.5)
+    seen[PARTS["lidar"]][:5] = 0.25 / 0.4  # On the left.
+    left, right = speeds(DynamicWindow(score=WindowScore(clearance=0.0))(seen))
+    assert left == right
+    left, right = speeds(DynamicWindow(score=WindowScore(clearance=1.0))(seen))
+    assert left > right
