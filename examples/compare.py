@@ -6,10 +6,12 @@
     python examples/compare.py --physics wheels           evaluated on wheels, however trained
     python examples/compare.py --arm default: --arm phi2:method.boost_factor=2    two arms of each
     python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
+    python examples/compare.py --ray HEAD:6379            on all machines of a Ray cluster
 
 What follows ``--`` goes to ``train.py``; an arm has settings of its own on top, for every learner,
 method and seed. Stopped at any moment, the same command goes on: finished
-runs are left alone, others continue at their last checkpoint. A run that was trained with other
+runs are left alone, others continue at their last checkpoint. So does a run whose machine is gone
+(``docs/scaling.md`` has what ``--ray`` needs). A run that was trained with other
 settings is an error, or with ``--anew`` trained again. ``report.py`` makes tables and figures of
 the folder. Files in it:
 
@@ -22,25 +24,26 @@ the folder. Files in it:
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-
-from tqdm import tqdm
 
 from navigation import files
 from navigation.arms import check_free, parse_arms
+from navigation.execution import Runs, Start
 from navigation.processes import Child
 from navigation.settings import GROUPS, register
 from navigation.stopping import Stop
-from navigation.studies import TESTED, Evaluation, Job, Study, collect, other_than_asked
+from navigation.studies import TESTED, Evaluation, Study, collect, other_than_asked
 from navigation.worlds import parse_worlds
 from torchrl_mpfa.spelling import unknown
 
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
+_JOBS = 2
+"""Runs at a time on one machine."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -52,7 +55,16 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--learners", nargs="+", default=["ddpg"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--folder", type=Path, default=Path("runs/compare"))
-    parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
+    parser.add_argument(
+        "--jobs", type=int, help=f"runs at a time (default: {_JOBS}; with --ray all that fit)"
+    )
+    parser.add_argument(
+        "--ray",
+        nargs="?",
+        const="",
+        metavar="ADDRESS",
+        help="run on a Ray cluster; without an address on that of RAY_ADDRESS or of this machine",
+    )
     parser.add_argument("--worlds", nargs="+", default=TESTED.words, help="(default: test)")
     parser.add_argument(
         "--episodes", type=int, default=TESTED.episodes, help="for each (default: 200)"
@@ -81,8 +93,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             if name in names[:number]:
                 parser.error(f"--{group}s has {name} twice")
     for option in ("jobs", "episodes"):
-        if getattr(options, option) < 1:
-            parser.error(f"--{option} must be at least 1, got {getattr(options, option)}")
+        value = getattr(options, option)
+        if value is not None and value < 1:
+            parser.error(f"--{option} must be at least 1, got {value}")
     try:
         parse_worlds(options.worlds)
     except (ValueError, OSError) as error:
@@ -90,92 +103,50 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-class Running:
-    """A run on its way: trained first, then evaluated, with a line on the screen.
+@contextmanager
+def executor(address: str | None) -> Iterator[Start]:
+    """Where commands are run.
 
     Args:
-        job: The run.
-        training: The command that trains it; None if that is done.
-        evaluation: The command that evaluates it.
-        position: Its line.
+        address: Of a Ray cluster, empty for the one that there is; None: on this machine.
+
+    Yields:
+        What starts one.
+
+    Raises:
+        ValueError: If Ray is not installed, or there is no such cluster.
     """
-
-    def __init__(
-        self, job: Job, training: list[str] | None, evaluation: list[str], *, position: int
-    ) -> None:
-        self.job = job
-        self.position = position
-        self._commands = [evaluation] if training is None else [training, evaluation]
-        job.path.mkdir(parents=True, exist_ok=True)
-        self.log = job.path / "output.log"
-        self._bar = tqdm(desc=job.name, unit="episode", position=position, leave=False)
-        self._child = Child(self._commands.pop(0), self.log)
-
-    def ended(self) -> int | None:
-        """Exit status of the last command, or of one that failed; None while it runs."""
-        status = self.job.status()
-        self._bar.total, self._bar.n = status.get("total"), status.get("done", 0)
-        self._bar.unit = status.get("unit", "it")
-        self._bar.set_postfix_str(status.get("summary", "") if self._commands else "evaluation")
-        exit_status = self._child.ended()
-        if exit_status == 0 and self._commands:
-            self._child = Child(self._commands.pop(0), self.log)
-            return None
-        if exit_status is not None:
-            self._bar.close()
-        return exit_status
-
-    def stop(self) -> None:
-        """Ask it to save and end."""
-        self._child.stop(signal.SIGTERM)
-
-    def wait(self) -> None:
-        """Wait until it has."""
-        self._child.wait()
-        self._bar.close()
+    if address is None:
+        yield Child
+        return
+    try:
+        from navigation.clusters import RemoteChild, connected
+    except ImportError as error:
+        raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
+    try:
+        with connected(address or None):
+            yield RemoteChild
+    except ConnectionError as error:
+        raise ValueError(f"--ray {address}: {error}") from error
 
 
-def run_all(
-    waiting: list[Job], options: argparse.Namespace, wanted: Evaluation, anew: set[Job]
-) -> tuple[list[Job], Stop]:
+def run_all(runs: Runs) -> Stop:
     """Train and evaluate, some at a time.
 
     Args:
-        waiting: The runs that are not done.
-        options: The command line.
-        wanted: What their policies shall do.
-        anew: Runs to train again from the start.
+        runs: What there is to do.
 
     Returns:
-        Those that failed, and whether all was stopped.
+        Whether all was stopped.
     """
-    running: list[Running] = []
-    failed: list[Job] = []
     stop = Stop("saving the runs; the same command continues them")
     with stop.listening():
-        while (waiting or running) and not stop:
-            while waiting and len(running) < options.jobs:
-                job = waiting.pop(0)
-                free = min(set(range(options.jobs)) - {each.position for each in running})
-                trained = job.is_trained() and job not in anew
-                training = None if trained else job.trains(options.overrides, anew=job in anew)
-                running.append(Running(job, training, job.evaluates(wanted), position=free))
+        while runs and not stop:
+            runs.begin()
             time.sleep(_PAUSE)
-            for each in list(running):
-                status = each.ended()
-                if status is None:
-                    continue
-                running.remove(each)
-                if status == 0:
-                    tqdm.write(f"{each.job.name}: trained and evaluated")
-                else:
-                    failed.append(each.job)
-                    tqdm.write(f"{each.job.name}: failed, see {each.log}")
-        for each in running:
-            each.stop()
-        for each in running:
-            each.wait()
-    return failed, stop
+            runs.look()
+        runs.stop()
+    return stop
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -190,6 +161,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = parse(arguments)
     register()
+    if options.ray is not None:
+        # The other machines know it by this name.
+        options.folder = options.folder.resolve()
     study = Study(
         options.folder,
         tuple(options.methods),
@@ -211,7 +185,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 )
             waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
             print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {options.folder}")
-            failed, stop = run_all(waiting, options, wanted, set(others))
+            with executor(options.ray if waiting else None) as start:
+                most = options.jobs or (_JOBS if options.ray is None else len(waiting))
+                runs = Runs(
+                    waiting, options.overrides, wanted, anew=set(others), start=start, most=most
+                )
+                stop = run_all(runs)
             if stop:
                 return stop.exit_status
             collect(jobs, wanted, options.folder)
@@ -219,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"compare.py: {error}", file=sys.stderr)
         return 2
     print(f"written: {options.folder / files.EPISODES}; now: report.py {options.folder}")
-    return 1 if failed else 0
+    return 1 if runs.failed else 0
 
 
 if __name__ == "__main__":

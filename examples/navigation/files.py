@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -62,6 +62,17 @@ def lock(folder: Path) -> Iterator[None]:
         yield
     finally:
         held.release()
+
+
+def wait_until_free(folder: Path, seconds: float) -> None:
+    """Wait until no process holds a folder, or so long.
+
+    Args:
+        folder: The folder.
+        seconds: The longest wait [s].
+    """
+    with suppress(Timeout), FileLock(folder / _LOCK, timeout=seconds):
+        pass
 
 
 def set_aside(folder: Path) -> None:

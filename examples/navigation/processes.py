@@ -7,8 +7,37 @@ import signal
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 from navigation.stopping import lifeline
+
+
+class Lost(Exception):
+    """The machine that a command ran on is gone, and the command with it."""
+
+
+class Started(Protocol):
+    """A command that was started, on this machine or on another."""
+
+    def ended(self) -> int | None:
+        """Exit status, or None while it runs.
+
+        Raises:
+            Lost: If its machine is gone.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Ask it to end."""
+        ...
+
+    def wait(self) -> int:
+        """Wait for its end and give the exit status.
+
+        Raises:
+            Lost: If its machine is gone.
+        """
+        ...
 
 
 class Child:

@@ -16,9 +16,10 @@ import torch
 
 import compare
 import evaluate
-from navigation import files
+from navigation import execution, files
 from navigation.arms import parse_arm, with_defaults
 from navigation.command_line import composed
+from navigation.processes import Lost
 from navigation.records import read_table
 from navigation.running import Refused, resume, start
 from tests.integration.tiny_runs import OVERRIDES
@@ -171,6 +172,15 @@ def test_arms_are_trained_with_settings_of_their_own_and_told_apart(
     assert "--arm None: method.alpha must be finite" in capsys.readouterr().err
 
 
+def assert_same_rows(one: Path, other: Path) -> None:
+    """Assert that two studies have the same episodes, but for the time that they took."""
+    found, expected = (
+        read_table(folder / files.EPISODES).drop(columns=["plan_s", "decision_s"])
+        for folder in (one, other)
+    )
+    assert found.equals(expected)
+
+
 def alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -213,11 +223,80 @@ def test_a_killed_study_leaves_no_training_behind_and_goes_on_to_the_same_rows(
     assert compare.main(arguments) == 0
     arguments[1] = str(tmp_path / "whole")
     assert compare.main(arguments) == 0
-    killed, whole = (
-        read_table(tmp_path / name / files.EPISODES).drop(columns=["plan_s", "decision_s"])
-        for name in ("killed", "whole")
-    )
-    assert killed.equals(whole)
+    assert_same_rows(tmp_path / "killed", tmp_path / "whole")
+
+
+def test_a_run_whose_machine_is_gone_goes_on_at_its_last_checkpoint(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    in_this_process: None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    commands: list[str] = []
+
+    class OnMachinesThatFail(InThisProcess):
+        """Trains and is gone before it says so, then is gone at each evaluation but the last."""
+
+        def __init__(self, command: Sequence[str], log: Path) -> None:
+            commands.append(Path(command[1]).name)
+            super().__init__(command, log)
+
+        def ended(self) -> int:
+            if len(commands) < 4:
+                raise Lost("machine 7 is gone")
+            return super().ended()
+
+    monkeypatch.setattr(compare, "Child", OnMachinesThatFail)
+    assert compare.main(study(tmp_path / "lost", methods=("per",))) == 0
+    assert commands == ["train.py", *["evaluate.py"] * 3]
+    assert capsys.readouterr().out.count("its machine is gone") == 3
+    assert not (tmp_path / "lost" / "ddpg-per-0" / files.PREVIOUS).exists()
+    monkeypatch.setattr(compare, "Child", InThisProcess)
+    assert compare.main(study(tmp_path / "whole", methods=("per",))) == 0
+    assert_same_rows(tmp_path / "lost", tmp_path / "whole")
+
+    # A run that takes down whatever it runs on is given up.
+    commands.clear()
+    monkeypatch.setattr(execution, "_MOST_LOSSES", 2)
+    monkeypatch.setattr(compare, "Child", OnMachinesThatFail)
+    assert compare.main(study(tmp_path / "never", methods=("per",))) == 1
+    assert "ddpg-per-0: failed, lost 2 machines" in capsys.readouterr().out
+
+
+def test_training_again_that_is_lost_goes_on_with_the_new_settings(
+    tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = [*study(tmp_path, "--anew", methods=("per",)), "method.alpha=0.9"]
+    assert compare.main(study(tmp_path, methods=("per",))) == 0
+    losses = [True]
+
+    class Gone(InThisProcess):
+        """Is gone before it has begun."""
+
+        def __init__(self, command: Sequence[str], log: Path) -> None:
+            if not losses:
+                super().__init__(command, log)
+
+        def ended(self) -> int:
+            if losses:
+                losses.clear()
+                raise Lost("machine 7 is gone")
+            return super().ended()
+
+    monkeypatch.setattr(compare, "Child", Gone)
+    assert compare.main(arguments) == 0
+    kept = json.loads((tmp_path / "ddpg-per-0" / files.SETTINGS).read_text())
+    assert kept["method"]["alpha"] == 0.9
+
+
+def test_a_study_says_what_it_needs_where_there_is_no_ray(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "navigation.clusters", raising=False)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert compare.main(study(tmp_path, "--ray")) == 2
+    assert "--ray needs Ray: pip install 'torchrl-mpfa[ray]'" in capsys.readouterr().err
+    assert not (tmp_path / "ddpg-mpfa_per-0").exists()
 
 
 @pytest.mark.usefixtures("in_this_process")
