@@ -22,6 +22,7 @@ from mpfa_envs.results import wilson
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]
 _LEVEL = 0.95
+_ENDS = (0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2)
 _RESAMPLES = 2000
 _BATCH = 100
 _MANY = 10_000
@@ -206,42 +207,59 @@ def widened_ends(resamples: Array, *runs: int) -> Array:
     above = 0.5 + _LEVEL / 2
     factor = math.sqrt(min(runs) / (min(runs) - 1)) * stats.t.ppf(above, freedom)
     middle = resamples.mean(axis=-1)
-    ends = np.quantile(resamples, (1.0 - above, above), axis=-1)
+    ends = np.quantile(resamples, _ENDS, axis=-1)
     return np.asarray(middle + (ends - middle) * factor / stats.norm.ppf(above))
 
 
-def difference_over_worlds(
-    ours: Array, theirs: Array, kinds: Sequence[str], *, rng: np.random.Generator
+def improvement_interval(
+    ours: Array, theirs: Array, *, paired: bool, rng: np.random.Generator
 ) -> Interval:
-    """Difference of means with an interval for other runs *and* worlds.
+    """Probability that a run of ours is better than one of theirs, with its interval.
 
-    Runs are resampled on each side by themselves, worlds in their kind and for both sides at once,
-    as both were tested in the same ones. The interval is on the wide side (Owen, 2007,
+    Args:
+        ours: A number for each run, the higher the better; shape ``[runs]``.
+        theirs: Shape ``[other runs]``.
+        paired: Whether the runs are of the same seeds in the same order, resampled together.
+        rng: Source of the resamples.
+
+    Returns:
+        The probability and its 95 % percentile interval; ties count half.
+    """
+    wins = (ours[:, None] > theirs) + 0.5 * (ours[:, None] == theirs)
+    value = float(wins.mean())
+    if min(wins.shape) < 2:
+        return Interval(value, math.nan, math.nan)
+    mine = _resampled(len(ours), rng)
+    others = mine if paired else _resampled(len(theirs), rng)
+    low, high = np.quantile(((mine @ wins) * others).sum(axis=1), _ENDS)
+    return Interval(value, float(low), float(high))
+
+
+def mean_over_worlds(scores: Array, kinds: Sequence[str], *, rng: np.random.Generator) -> Interval:
+    """Mean with an interval for other runs *and* worlds.
+
+    Runs are resampled, and worlds in their kind. The interval is on the wide side (Owen, 2007,
     https://doi.org/10.1214/07-AOAS122).
 
     Args:
-        ours: Shape ``[runs, worlds]``.
-        theirs: Shape ``[other runs, worlds]``.
+        scores: Of two methods their difference, as both were tested in the same worlds; shape
+            ``[runs, worlds]``.
         kinds: What each world is one of; kinds count the same, however many worlds they have.
         rng: Source of the resamples.
 
     Returns:
-        The difference and its interval, which is NaN if a side has one run or a kind one world.
+        The mean and its interval, which is NaN for one run or a kind with one world.
     """
     names = np.asarray(kinds)
     each = [names == name for name in np.unique(names)]
-    even = sum(kind / kind.sum() for kind in each) / len(each)
-    worlds = np.zeros((_MANY, len(names)))
-    for kind in each:
-        worlds[:, kind] = _resampled(int(kind.sum()), rng) / len(each)
-    found = sum(
-        sign * ((_resampled(len(side), rng) @ side) * worlds).sum(axis=1)
-        for sign, side in ((1.0, ours), (-1.0, theirs))
-    )
-    value = float((ours.mean(axis=0) - theirs.mean(axis=0)) @ even)
-    if min(len(ours), len(theirs), *(kind.sum() for kind in each)) < 2:
+    value = float(np.mean([scores[:, kind].mean() for kind in each]))
+    if min(len(scores), *(kind.sum() for kind in each)) < 2:
         return Interval(value, math.nan, math.nan)
-    low, high = np.quantile(found, (0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2))
+    runs = _resampled(len(scores), rng)
+    found = sum(
+        ((runs @ scores[:, kind]) * _resampled(int(kind.sum()), rng)).sum(axis=1) for kind in each
+    )
+    low, high = np.quantile(found / len(each), _ENDS)
     return Interval(value, float(low), float(high))
 
 

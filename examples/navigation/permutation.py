@@ -17,6 +17,9 @@ from navigation.intervals import Array
 
 MOST_DEALS = 200_000
 """Deals that are tried: all of them up to ten runs against ten, a sample of more."""
+MOST_FLIPS = 100_000
+"""Choices of signs that are tried where there are more than twenty seeds."""
+_ALL_FLIPS = 20
 _AT_ONCE = 4_000_000
 """Differences that are in memory at once."""
 
@@ -79,6 +82,41 @@ def rank_p(ours: Array, theirs: Array, *, most: int = MOST_DEALS) -> Array:
     return deal_p(ranks[..., : ours.shape[-1]], ranks[..., ours.shape[-1] :], most=most)
 
 
+def flip_p(gaps: Array) -> Array:
+    """Two-sided permutation test of differences between runs of the same seed.
+
+    Where neither method is better, each difference may as well have the other sign.
+
+    Args:
+        gaps: The difference of each seed, shape ``[..., seeds]``.
+
+    Returns:
+        Share of all ways to choose the signs in which the mean is as far from zero, shape
+        ``[...]``; of :data:`MOST_FLIPS` ways above twenty seeds.
+
+    Raises:
+        ValueError: If a difference is not finite.
+
+    Examples:
+        >>> float(flip_p(np.array([1.0, 2.0, 3.0])))
+        0.25
+    """
+    if not np.isfinite(gaps).all():
+        raise ValueError("differences must be finite, got one that is not")
+    seeds = gaps.shape[-1]
+    if seeds > _ALL_FLIPS:
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (MOST_FLIPS, seeds))
+        signs[0] = 1.0
+        sums = gaps @ signs.T
+    else:
+        # The sign of the first may stay: the other half has the same sizes.
+        sums = gaps[..., :1]
+        for seed in range(1, seeds):
+            gap = gaps[..., seed, None]
+            sums = np.concatenate((sums + gap, sums - gap), axis=-1)
+    return _as_far(np.abs(sums), np.abs(gaps).max(axis=-1))
+
+
 def least_p(ours: int, theirs: int) -> float:
     """Least value that :func:`permutation_p` can have for these numbers of runs."""
     sides = 2 if ours == theirs else 1
@@ -108,10 +146,13 @@ def holm(p: Array) -> Array:
 
 def _p(sets: Array, deals: Array) -> Array:
     """Share of deals that differ as much as the first one, for each set of data."""
-    gaps = np.abs(sets @ deals.T)
+    return _as_far(np.abs(sets @ deals.T), np.abs(sets).max(axis=1))
+
+
+def _as_far(sizes: Array, scale: Array) -> Array:
+    """Share of sizes, shape ``[..., sizes]``, that are not below the first one."""
     # What is equal but for rounding counts as equal.
-    scale = np.abs(sets).max(axis=1, initial=0.0)
-    found: Array = (gaps >= gaps[:, :1] - 1e-12 * np.maximum(scale, 1.0)[:, None]).mean(axis=1)
+    found: Array = (sizes >= sizes[..., :1] - 1e-12 * scale[..., None]).mean(axis=-1)
     return found
 
 

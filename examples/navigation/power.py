@@ -27,7 +27,8 @@ def runs_needed(deviation: float, difference: float, *, power: float = 0.8) -> i
         (16, 4)
     """
     for runs in range(2, 10_000):
-        if _power(difference / deviation, runs, runs, 0.05) >= power:
+        shift = difference / deviation * math.sqrt(runs / 2)
+        if _chance(2 * runs - 2, shift, 0.05) >= power:
             return runs
     raise ValueError(f"difference must not vanish beside deviation, got {difference}, {deviation}")
 
@@ -53,14 +54,40 @@ def difference_found(
     """
     if ours + theirs < 3:
         return math.nan
-    found = optimize.brentq(lambda d: _power(d, ours, theirs, level) - power, 1e-3, 1e3)
-    return deviation * float(found)
+    shift = math.sqrt(ours * theirs / (ours + theirs))
+    return deviation * _effect(ours + theirs - 2, shift, level, power)
 
 
-def _power(effect: float, ours: int, theirs: int, level: float) -> float:
-    """Chance to find a difference of so many standard deviations."""
-    freedom = ours + theirs - 2
-    shift = effect * math.sqrt(ours * theirs / (ours + theirs))
+def paired_difference_found(
+    deviation: float, seeds: int, *, level: float = 0.05, power: float = 0.8
+) -> float:
+    """As :func:`difference_found`, where runs of the same seed are compared.
+
+    Args:
+        deviation: Standard deviation of the difference from seed to seed.
+        seeds: Seeds that both methods have.
+        level: Level of the test.
+        power: Chance to find it.
+
+    Returns:
+        The difference, in units of the deviation's; NaN for one seed.
+
+    Examples:
+        >>> round(paired_difference_found(1.0, 20), 3)
+        0.66
+    """
+    if seeds < 2:
+        return math.nan
+    return deviation * _effect(seeds - 1, math.sqrt(seeds), level, power)
+
+
+def _effect(freedom: int, shift: float, level: float, power: float) -> float:
+    """Effect in standard deviations that is found with some chance."""
+    return float(optimize.brentq(lambda d: _chance(freedom, d * shift, level) - power, 1e-3, 1e3))
+
+
+def _chance(freedom: int, shift: float, level: float) -> float:
+    """Chance that a t-test finds what shifts its statistic by so much."""
     bound = stats.t.ppf(1.0 - level / 2, freedom)
     # The tail on the other side is computed as NaN where it is nothing.
     below = np.nan_to_num(stats.nct.cdf(-bound, freedom, shift))

@@ -7,11 +7,13 @@ worlds alone; the seeds of the tables begin at :data:`FIRST_SEED`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 from navigation.arms import Arm
-from navigation.paper import NAMES, studies
+from navigation.paper import NAMES, TABLE_2, TABLE_4, Tested, studies
 from navigation.studies import Evaluation, Job, Study
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.catalogue import ALIASES
@@ -97,15 +99,7 @@ PARTS = (
 """MPFA-PER with one thing changed."""
 
 Pair = tuple[str, str]
-
-
-@dataclass(frozen=True)
-class Family:
-    """Comparisons that are corrected for each other."""
-
-    name: str
-    pairs: tuple[Pair, ...]
-    """Labels of two arms each: the first less the second."""
+"""Labels of two arms: the first less the second."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +109,16 @@ class Table:
     name: str
     question: str
     studies: tuple[Study, ...]
-    families: tuple[Family, ...]
+    planned: tuple[Pair, ...]
+    """Comparisons that are corrected for each other."""
+    explored: tuple[Pair, ...]
+    """All others, corrected for each other."""
+    panels: dict[str, tuple[str, ...]]
+    """Arms that are shown together, by the title of their panel."""
+    primary: str = "area"
+    """The measure by which it is decided: ``area`` or ``success``."""
+    kinds: tuple[str, ...] = TEST.words
+    """Kinds of worlds in which the success of last policies counts, each of them the same."""
 
 
 def label_of(job: Job, root: Path) -> str:
@@ -183,17 +186,21 @@ _SIX = (*_FIVE, "mpf_per-per")
 _CONTROLS = ("mpfa_plus-uniform", "lap-uniform", "la3p-uniform_halves")
 
 
+def _arms(prefix: str, *methods: str, suffix: str = "") -> tuple[str, ...]:
+    return tuple(f"{prefix}/{method}{suffix}" for method in methods)
+
+
 def _table_c(root: Path) -> Table:
     folder, seeds = root / "sparse", _seeds(20)
-    others = [name for name in EVERY if name not in ("uniform", "per")]
     planned = {tuple(pair.split("-")) for pair in _SIX}
-    secondary = [
+    others = [
         f"{a}-{b}"
         for b in ("uniform", "per")
-        for a in others
-        # What is a primary comparison, or its reverse, is none of these.
-        if not {(a, b), (b, a)} & planned
+        for a in EVERY
+        # What is planned, or its reverse, is none of these.
+        if a not in ("uniform", "per") and not {(a, b), (b, a)} & planned
     ]
+    rest = [name for name in EVERY if name not in KEY]
     return Table(
         "C",
         "Sparse reward: does any priority learn faster than uniform replay, and MPFA-PER than PER?",
@@ -201,19 +208,29 @@ def _table_c(root: Path) -> Table:
             Study(folder, EVERY, SPARSE, seeds, ("td3",), evaluation=TEST),
             Study(folder, KEY, SPARSE, seeds, ("ddpg",), evaluation=TEST),
         ),
+        _pairs("sparse/td3", *_SIX),
         (
-            Family("primary, TD3", _pairs("sparse/td3", *_SIX)),
-            Family("secondary, TD3", _pairs("sparse/td3", *secondary, "la3p-uniform_halves")),
-            Family("secondary, DDPG", _pairs("sparse/ddpg", *_SIX, *_CONTROLS)),
+            *_pairs("sparse/td3", *others, "la3p-uniform_halves"),
+            *_pairs("sparse/ddpg", *_SIX, *_CONTROLS),
         ),
+        {
+            "TD3": _arms("sparse/td3", *KEY),
+            "DDPG": _arms("sparse/ddpg", *KEY),
+            "TD3, more of the paper's": _arms("sparse/td3", *(n for n in rest if n in NAMES)),
+            "TD3, others": _arms("sparse/td3", *(n for n in rest if n not in NAMES)),
+        },
     )
 
 
 def _table_d(root: Path) -> Table:
     arms = {v: Arm(f"v{v}", settings) for v, settings in VOLUMES.items() if v != 32}
     sparse, dense = root / "sparse", root / "dense"
-    pairs = (*_FIVE, "mpfa_plus-uniform", "lap-uniform", "geometric-uniform")
-    wanted = [("sparse", volume) for volume in VOLUMES] + [("dense", 32), ("dense", 256)]
+    where = {
+        f"{reward}, volume {volume}": (f"{reward}/td3", "" if volume == 32 else f"/v{volume}")
+        for reward, volumes in (("sparse", VOLUMES), ("dense", (32, 256)))
+        for volume in volumes
+    }
+    more = ("mpfa_plus-uniform", "lap-uniform", "geometric-uniform")
     return Table(
         "D",
         "Replay volume: how often must transitions be replayed for priorities to pay?",
@@ -223,15 +240,9 @@ def _table_d(root: Path) -> Table:
             Study(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), evaluation=TEST),
             Study(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), (arms[256],), TEST),
         ),
-        tuple(
-            Family(
-                f"{reward}, volume {volume}",
-                _pairs(
-                    f"{reward}/td3", *pairs, suffix="" if volume == 32 else f"/{arms[volume].name}"
-                ),
-            )
-            for reward, volume in wanted
-        ),
+        tuple(pair for at, end in where.values() for pair in _pairs(at, *_FIVE, suffix=end)),
+        tuple(pair for at, end in where.values() for pair in _pairs(at, *more, suffix=end)),
+        {title: _arms(at, *OF_VOLUMES, suffix=end) for title, (at, end) in where.items()},
     )
 
 
@@ -239,8 +250,8 @@ def _table_e(root: Path) -> Table:
     folder, seeds = root / "sparse", _seeds(20)
     whole = "sparse/td3/mpfa_per"
     methods = ("mpfa_per", "mpf_per", "mpfa_adaptive")
-    others = [f"{whole}/{arm.name}" for arm in PARTS]
-    others += [f"sparse/td3/{name}" for name in methods[1:]]
+    parts = [f"{whole}/{arm.name}" for arm in PARTS]
+    others = _arms("sparse/td3", *methods[1:])
     return Table(
         "E",
         "Which part of MPFA-PER does it?",
@@ -248,37 +259,56 @@ def _table_e(root: Path) -> Table:
             Study(folder, methods, SPARSE, seeds, ("td3",), evaluation=TEST),
             Study(folder, ("mpfa_per",), SPARSE, seeds, ("td3",), PARTS, TEST),
         ),
-        (Family("changed - MPFA-PER", tuple((other, whole) for other in others)),),
+        tuple((other, whole) for other in (*parts, *others)),
+        (),
+        {
+            "signals and weights": (whole, *parts[:8]),
+            "boost, decay, exponents": (whole, *parts[8:15], *others),
+            "readings": (whole, *parts[15:]),
+        },
     )
 
 
 def _table_a(root: Path) -> Table:
     folder = root / "paper"
     first = ("mpfa_per", "per", "uniform")
-    others = tuple(name for name in NAMES if name not in first)
     _, phi = studies(folder, seeds=10)
     phi = replace(phi, settings=(*PAPER, *phi.settings[1:]), seeds=_seeds(10))
     tested = (
         Study(folder, first, PAPER, _seeds(10)),
-        Study(folder, others, PAPER, _seeds(5)),
+        Study(folder, tuple(n for n in NAMES if n not in first), PAPER, _seeds(5)),
         Study(folder, first, PAPER, _seeds(10), ("plain",), (LETTER,)),
     )
     unseen = tuple(replace(study, evaluation=UNSEEN) for study in tested)
-    ours = [f"mpfa_per-{name}" for name in NAMES if name != "mpfa_per"]
+    neighbors = [f"{a}-{b}" for rows in (TABLE_2, TABLE_4) for a, b in pairwise(_in_order(rows))]
+    distant = [f"mpfa_per-{name}" for name in NAMES if name != "mpfa_per"]
     phis = "paper/phi/ddpg/mpfa_per"
+    one = f"paper/ddpg/mpfa_per/{ONE_ROBOT.name}"
     return Table(
         "A",
         "The paper's own task: are its tables confirmed?",
         (*tested, Study(folder, ("mpfa_per",), PAPER, _seeds(3), arms=(ONE_ROBOT,)), phi, *unseen),
+        _pairs("paper/ddpg", *neighbors),
         (
-            Family("primary, DDPG", _pairs("paper/ddpg", *ours, "per-uniform")),
-            Family("to the letter", _pairs("paper/plain", *_FIVE[:3], suffix=f"/{LETTER.name}")),
-            Family("phi", tuple((f"{phis}/phi3", f"{phis}/phi{other}") for other in (2, 4))),
-            Family(
-                "one robot", ((f"paper/ddpg/mpfa_per/{ONE_ROBOT.name}", "paper/ddpg/mpfa_per"),)
-            ),
+            *_pairs("paper/ddpg", *(d for d in distant if d not in neighbors), "per-uniform"),
+            *_pairs("paper/plain", *_FIVE[:3], suffix=f"/{LETTER.name}"),
+            *((f"{phis}/phi3", f"{phis}/phi{other}") for other in (2, 4)),
+            (one, "paper/ddpg/mpfa_per"),
         ),
+        {
+            "Table 2": _arms("paper/ddpg", *TABLE_2, "uniform"),
+            "Table 4": _arms("paper/ddpg", *TABLE_4),
+            "to the letter": _arms("paper/plain", *first, suffix=f"/{LETTER.name}"),
+            "one robot, sixteen": (one, "paper/ddpg/mpfa_per"),
+        },
+        primary="success",
+        kinds=("test",),
     )
+
+
+def _in_order(rows: Mapping[str, Tested]) -> list[str]:
+    """Methods from the most successful to the least, of equal ones the faster one first."""
+    return sorted(rows, key=lambda name: (-rows[name].success, rows[name].time))
 
 
 def _table_b(root: Path) -> Table:
@@ -287,7 +317,7 @@ def _table_b(root: Path) -> Table:
         "B",
         "Dense reward: does any priority help where every step is rewarded, and does any harm?",
         (Study(root / "dense", KEY, DENSE, _seeds(10), learners, evaluation=TEST),),
-        tuple(
-            Family(name.upper(), _pairs(f"dense/{name}", *_SIX, *_CONTROLS)) for name in learners
-        ),
+        tuple(pair for name in learners for pair in _pairs(f"dense/{name}", *_SIX)),
+        tuple(pair for name in learners for pair in _pairs(f"dense/{name}", *_CONTROLS)),
+        {name.upper(): _arms(f"dense/{name}", *KEY) for name in learners},
     )

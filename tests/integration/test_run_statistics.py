@@ -10,18 +10,16 @@ from scipy import stats
 
 from navigation.intervals import (
     Array,
-    bootstrap_runs,
     difference_interval,
-    difference_over_worlds,
-    interquartile_mean,
+    improvement_interval,
     mean_interval,
+    mean_over_worlds,
     performance_profile,
-    probability_of_improvement,
     resampled_means,
     widened_ends,
 )
-from navigation.permutation import deal_p, holm, permutation_p, rank_p
-from navigation.power import difference_found, runs_needed
+from navigation.permutation import deal_p, flip_p, holm, permutation_p, rank_p
+from navigation.power import difference_found, paired_difference_found, runs_needed
 
 
 def plain_p(ours: Array, theirs: Array) -> float:
@@ -139,9 +137,10 @@ def test_an_interval_of_one_run_is_none() -> None:
     one = np.array([0.5])
     assert np.isnan(mean_interval(one, rng=rng).low)
     assert np.isnan(difference_interval(one, np.array([0.2, 0.4]), rng=rng).high)
-    found = difference_over_worlds(one[None], np.zeros((3, 1)), ["a"], rng=rng)
-    assert found.value == 0.5
-    assert np.isnan(found.low)
+    for scores in (np.full((1, 3), 0.5), np.full((3, 1), 0.5)):
+        found = mean_over_worlds(scores, ["a"] * scores.shape[1], rng=rng)
+        assert found.value == 0.5
+        assert np.isnan(found.low)
 
 
 def test_the_interval_for_other_runs_and_worlds_covers_the_truth() -> None:
@@ -149,19 +148,16 @@ def test_the_interval_for_other_runs_and_worlds_covers_the_truth() -> None:
     kinds = ["a"] * 20 + ["b"] * 10
     covered, widths = 0, []
     for _ in range(100):
-        # Worlds are easy or hard for both, and a little more so for one of them.
-        easy, for_us = rng.normal(0, 0.3, 30), rng.normal(0.05, 0.2, 30)
-        a = 0.6 + rng.normal(0, 0.1, (8, 1)) + easy + for_us + rng.normal(0, 0.3, (8, 30))
-        b = 0.6 + rng.normal(0, 0.1, (8, 1)) + easy + rng.normal(0, 0.3, (8, 30))
-        found = difference_over_worlds(a, b, kinds, rng=rng)
+        worlds, runs = rng.normal(0.05, 0.2, 30), rng.normal(0, 0.1, (8, 1))
+        scores = runs + worlds + rng.normal(0, 0.3, (8, 30))
+        found = mean_over_worlds(scores, kinds, rng=rng)
         covered += found.low <= 0.05 <= found.high
         widths.append(found.high - found.low)
-        assert found.value == pytest.approx(
-            np.mean([(a - b)[:, :20].mean(), (a - b)[:, 20:].mean()])
-        )
-    assert covered / 100 >= 0.93
-    # What is hard for both sides does not widen it.
-    assert np.mean(widths) < 4 * np.sqrt(2 * 0.1**2 / 8 + 0.2**2 / 27 + 2 * 0.3**2 / 8 / 27) * 1.3
+        assert found.value == pytest.approx((scores[:, :20].mean() + scores[:, 20:].mean()) / 2)
+    assert covered / 100 >= 0.92
+    # Of each kind half: 40 worlds alike in the one, 20 in the other.
+    spread = np.sqrt(0.1**2 / 8 + (0.2**2 + 0.3**2 / 8) * (1 / 80 + 1 / 40))
+    assert 0.8 < np.mean(widths) / (2 * 1.96 * spread) < 1.3
 
 
 def test_a_profile_is_the_share_of_runs_above_each_level() -> None:
@@ -176,14 +172,63 @@ def test_a_profile_is_the_share_of_runs_above_each_level() -> None:
     assert (low <= share).all() and (share <= high).all()
 
 
-def test_improvement_and_the_middle_half_are_of_runs_where_each_is_one_number() -> None:
-    a, b = np.array([0.1, 0.5, 0.9, 0.7]), np.array([0.5, 0.2, 0.6])
-    wins = np.mean([0.5 if x == y else float(x > y) for x in a for y in b])
+@pytest.mark.parametrize("paired", [False, True])
+def test_improvement_counts_every_pair_of_runs(paired: bool) -> None:
     rng = np.random.default_rng(8)
-    found = bootstrap_runs(probability_of_improvement, a[:, None], b[:, None], rng=rng)
+    a, b = np.array([0.1, 0.5, 0.9, 0.7]), np.array([0.5, 0.2, 0.6, np.inf])
+    wins = np.mean([0.5 if x == y else float(x > y) for x in a for y in b])
+    found = improvement_interval(a, b, paired=paired, rng=rng)
     assert found.value == pytest.approx(wins)
     assert found.low < wins < found.high
-    assert bootstrap_runs(interquartile_mean, a[:, None], rng=rng).value == pytest.approx(0.6)
+
+
+def test_what_runs_have_in_common_by_their_seed_does_not_widen_the_interval_of_improvement() -> (
+    None
+):
+    rng = np.random.default_rng(8)
+    seeds = rng.normal(0, 1, 20)
+    a, b = (seeds + shift + rng.normal(0, 0.1, 20) for shift in (0.3, 0.0))
+    widths = [
+        found.high - found.low
+        for found in (improvement_interval(a, b, paired=p, rng=rng) for p in (True, False))
+    ]
+    assert widths[0] < 0.7 * widths[1]
+
+
+@pytest.mark.parametrize("seeds", [1, 2, 5, 7])
+def test_the_test_of_signs_tries_them_all(seeds: int) -> None:
+    rng = np.random.default_rng(seeds)
+    gaps = rng.integers(-3, 5, (4, seeds)) / 10
+    for row, p in zip(gaps, flip_p(gaps), strict=True):
+        as_far = [
+            abs(np.dot(signs, row)) >= abs(row.sum()) - 1e-9
+            for signs in itertools.product((-1, 1), repeat=seeds)
+        ]
+        assert p == pytest.approx(np.mean(as_far))
+
+
+def test_of_seeds_with_no_difference_five_in_a_hundred_are_called_different() -> None:
+    rng = np.random.default_rng(11)
+    gaps = rng.beta(5, 1, (1000, 12)) - rng.beta(5, 1, (1000, 12))
+    assert 0.035 <= (flip_p(gaps) < 0.05).mean() <= 0.065
+    # Twenty seeds are counted whole, more are sampled.
+    twenty, more = rng.normal(0.5, 1, 20), rng.normal(0.3, 1, 24)
+    known = stats.ttest_1samp(twenty, 0.0).pvalue
+    assert flip_p(twenty) == pytest.approx(known, rel=0.2)
+    assert flip_p(more) == pytest.approx(stats.ttest_1samp(more, 0.0).pvalue, rel=0.3)
+    assert flip_p(np.ones(20)) == pytest.approx(2 / 2**20)
+    with pytest.raises(ValueError, match="must be finite"):
+        flip_p(np.array([np.inf]))
+
+
+@pytest.mark.parametrize(("seeds", "level"), [(20, 0.05), (10, 0.01)])
+def test_the_difference_that_seeds_can_find_is_found_as_often_as_promised(
+    seeds: int, level: float
+) -> None:
+    rng = np.random.default_rng(10)
+    gaps = rng.normal(paired_difference_found(0.3, seeds, level=level), 0.3, (2000, seeds))
+    assert 0.77 <= (stats.ttest_1samp(gaps, 0.0, axis=1).pvalue < level).mean() <= 0.83
+    assert np.isnan(paired_difference_found(0.3, 1))
 
 
 @pytest.mark.parametrize(("ours", "theirs", "level"), [(20, 20, 0.05), (10, 5, 0.05), (8, 8, 0.01)])

@@ -52,16 +52,20 @@ def test_the_tables_have_the_runs_that_were_planned() -> None:
 def test_every_comparison_is_of_arms_that_are_run() -> None:
     for table in tables(ROOT).values():
         labels = {label_of(job, ROOT) for each in table.studies for job in each.jobs}
-        for family in table.families:
-            assert len(set(family.pairs)) == len(family.pairs) > 0
-            for pair in family.pairs:
-                assert set(pair) <= labels, (table.name, pair)
-                assert pair[0] != pair[1]
+        pairs = [*table.planned, *table.explored]
+        assert len(set(pairs)) == len(pairs) > 0
+        for pair in pairs:
+            assert set(pair) <= labels, (table.name, pair)
+            assert pair[0] != pair[1]
+            assert (pair[1], pair[0]) not in pairs
+        shown = {label for panel in table.panels.values() for label in panel}
+        assert shown <= labels
+        assert {label for pair in table.planned for label in pair} <= shown
 
 
 def test_the_primary_comparisons_of_sparse_rewards_are_the_six_that_were_planned() -> None:
-    primary, secondary, *_ = tables(ROOT)["C"].families
-    short = [tuple(label.removeprefix("sparse/td3/") for label in pair) for pair in primary.pairs]
+    table = tables(ROOT)["C"]
+    short = [tuple(label.removeprefix("sparse/td3/") for label in pair) for pair in table.planned]
     assert short == [
         ("per", "uniform"),
         ("mpfa_per", "uniform"),
@@ -70,9 +74,24 @@ def test_the_primary_comparisons_of_sparse_rewards_are_the_six_that_were_planned
         ("mpfa_plus", "mpfa_per"),
         ("mpf_per", "per"),
     ]
-    # Each of 23 other methods against two, less the four that are primary, and one control.
-    assert len(secondary.pairs) == 2 * 23 - 4 + 1
-    assert not set(primary.pairs) & set(secondary.pairs)
+    # Each of 23 other methods against two, less the four that are planned, and one control; DDPG's.
+    assert len(table.explored) == 2 * 23 - 4 + 1 + 9
+
+
+def test_the_order_of_the_paper_is_compared_neighbor_by_neighbor() -> None:
+    short = [
+        "-".join(label.removeprefix("paper/ddpg/") for label in pair)
+        for pair in tables(ROOT)["A"].planned
+    ]
+    assert short[:6] == [
+        *("mpfa_per-mpf_per", "mpf_per-raise", "raise-decay", "decay-td_reward"),
+        *("td_reward-td_loss", "td_loss-per"),
+    ]
+    # Equal success: the faster one is the better one.
+    assert short[6:] == [
+        *("mpfa_per-klper", "klper-ddpg_radam", "ddpg_radam-mw", "mw-hvper"),
+        "hvper-averaged_ddpg",
+    ]
 
 
 def test_no_two_studies_want_other_settings_of_one_run() -> None:
@@ -184,7 +203,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "C": Study(root / "s", ("per", "uniform"), settings, seeds, evaluation=worlds),
             "D": Study(root / "s", ("per",), settings, seeds, evaluation=worlds),
         }
-        return {name: Table(name, "Why?", (each,), ()) for name, each in of.items()}
+        return {name: Table(name, "Why?", (each,), (), (), {}) for name, each in of.items()}
 
     monkeypatch.setattr(study, "tables", two)
     monkeypatch.setattr(compare, "Child", InThisProcess)
