@@ -4,6 +4,7 @@
     python examples/report.py runs/compare runs/more           the runs of both, together
     python examples/report.py docs/results --output runs/results
     python examples/report.py runs/paper --paper          the paper's figures and tables
+    python examples/report.py docs/results/study --study --output runs/pages    those of the study
 
 Writes ``tables.md``, ``training.png`` (success and average reward over episodes and steps) and
 ``evaluations.png`` (greedy success in the validation world over steps). The arms of a study
@@ -15,6 +16,10 @@ With ``--paper`` it makes, of what runs there are, ``paper.md`` with Tables 2 to
 paper's numbers, ``figure_3.png``, ``figure_5.png``, ``figure_8.png`` to ``figure_11.png``,
 ``figure_13.png``, and ``claims.png`` with what Section 2.4 says of PER. Runs that are missing are
 named, with the command that makes them.
+
+With ``--study`` it makes, of the runs of ``study.py`` or of what its ``--keep`` wrote, a page and
+the figures of each table: curves, performance profiles, arms side by side, of table D replay volume
+by method; of table A, in ``paper/``, what ``--paper`` makes, for which the runs are needed.
 """
 
 from __future__ import annotations
@@ -31,8 +36,11 @@ from navigation.figures import Runs, plot_evaluations, plot_training
 from navigation.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
 from navigation.paper_figures import plot_paper
 from navigation.paper_tables import paper_tables
+from navigation.protocol import paper_studies, tables
 from navigation.records import read_table
-from navigation.studies import run_name
+from navigation.studies import Study, run_name
+from navigation.study_report import write_study
+from navigation.study_rows import is_kept
 from navigation.tables import (
     comparison_table,
     interval_table,
@@ -85,18 +93,16 @@ def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
     return found
 
 
-def write_paper(folder: Path, output: Path, *, seeds: int) -> int:
+def write_paper(wanted: Sequence[Study], output: Path) -> int:
     """Make the paper's tables and figures of the runs that there are, and name the others.
 
     Args:
-        folder: Of the study of all methods; that of Fig. 5 is in it.
+        wanted: The study of all methods, and that of Fig. 5.
         output: Where they go.
-        seeds: Runs of each method that there should be.
 
     Returns:
         Exit status: 1 if there are no runs at all.
     """
-    wanted = studies(folder, seeds=seeds)
     trained, updates, tested = (
         read_runs(wanted, find)
         for find in (
@@ -119,6 +125,26 @@ def write_paper(folder: Path, output: Path, *, seeds: int) -> int:
     return 0
 
 
+def report_study(folder: Path, output: Path) -> int:
+    """Make the pages and figures of the study.
+
+    Args:
+        folder: Of its runs, or of the rows that are kept of them.
+        output: Where they go.
+
+    Returns:
+        Exit status: 1 if there are no rows.
+    """
+    made = write_study(folder, output)
+    for path in made:
+        print(f"written: {path}")
+    if not made:
+        print(f"{folder} has no rows of the study, which study.py makes", file=sys.stderr)
+    elif output / "A.md" in made and not is_kept(folder):
+        write_paper(paper_studies(tables(folder)["A"]), output / "paper")
+    return 0 if made else 1
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Read the rows, write tables and figures.
 
@@ -134,6 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
     parser.add_argument("--output", type=Path, help="folder (default: that of the first study)")
     parser.add_argument("--paper", action="store_true", help="the paper's figures and tables")
+    parser.add_argument("--study", action="store_true", help="the pages of the study")
     parser.add_argument(
         "--seeds", type=int, default=RUNS, help=f"runs that --paper wants (default: {RUNS})"
     )
@@ -141,10 +168,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output = options.output or options.folders[0]
     if options.seeds < 1:
         parser.error(f"--seeds must be at least 1, got {options.seeds}")
+    for name in ("paper", "study"):
+        if getattr(options, name) and len(options.folders) > 1:
+            parser.error(f"--{name} takes one folder, got {len(options.folders)}")
     if options.paper:
-        if len(options.folders) > 1:
-            parser.error(f"--paper takes one folder, got {len(options.folders)}")
-        return write_paper(options.folders[0], output, seeds=options.seeds)
+        return write_paper(studies(options.folders[0], seeds=options.seeds), output)
+    if options.study:
+        return report_study(options.folders[0], output)
     rows = read_studies(options.folders)
     if not len(rows):
         folders = ", ".join(str(folder) for folder in options.folders)

@@ -4,6 +4,7 @@
     python examples/study.py                          all of them
     python examples/study.py C D --jobs 4             two tables, four runs at a time
     python examples/study.py --seeds 3                three runs of each arm first
+    python examples/study.py --keep docs/results/study    keep the rows of what is done
 
 Every run is one of ``compare.py``, by the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is under way, and the same command goes on. Tables A to
@@ -19,10 +20,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import compare
-from navigation.protocol import Table, tables
+from navigation.protocol import ROOT, Table, tables
 from navigation.remaining import counts, free_checkpoints, hours_left
-
-ROOT = Path("runs/study")
+from navigation.study_rows import keep, read_runs
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -38,6 +38,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     parser.add_argument("--seeds", type=int, help="runs of each arm at most (default: all)")
     parser.add_argument("--list", action="store_true", help="say what there is, and run nothing")
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="write the rows there, and run nothing"
+    )
     options = parser.parse_args(arguments)
     for name in options.tables:
         if name not in names:
@@ -73,6 +76,16 @@ def listing(chosen: Sequence[Table]) -> str:
     return "\n".join(lines)
 
 
+def kept(chosen: Sequence[Table], root: Path, folder: Path) -> str:
+    """Keep the rows of some tables, and say what was written."""
+    lines = []
+    for table in chosen:
+        rows = read_runs(table, root)
+        for path in keep(rows, folder, table.name) if len(rows.curves) else []:
+            lines.append(f"written: {path}, {path.stat().st_size / 1e6:.2f} MB")
+    return "\n".join(lines) or f"no run is at its end in {root}: nothing is written"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the runs that are missing.
 
@@ -84,10 +97,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stopped it.
     """
     options = parse(arguments)
-    if options.list:
-        print(listing(options.tables))
+    if options.list or options.keep:
+        if options.list:
+            print(listing(options.tables))
+        if options.keep:
+            print(kept(options.tables, options.folder, options.keep))
+        return 0
     worst = 0
-    for table in [] if options.list else options.tables:
+    for table in options.tables:
         for study in table.studies:
             done, wanted = counts([study])
             if done < wanted:

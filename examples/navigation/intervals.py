@@ -25,8 +25,6 @@ _LEVEL = 0.95
 _ENDS = (0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2)
 _RESAMPLES = 2000
 _BATCH = 100
-_MANY = 10_000
-"""Resamples where one takes no time."""
 
 
 def mean(scores: Array) -> Array:
@@ -284,4 +282,4 @@ def performance_profile(scores: Array, levels: Array) -> tuple[Array, Array, Arr
 
 def _resampled(runs: int, rng: np.random.Generator) -> Array:
     """Weights of runs that are sampled with replacement, shape ``[resamples, runs]``."""
-    return rng.multinomial(runs, np.full(runs, 1.0 / runs), size=_MANY) / runs
+    return rng.multinomial(runs, np.full(runs, 1.0 / runs), size=_RESAMPLES) / runs

@@ -117,6 +117,20 @@ def flip_p(gaps: Array) -> Array:
     return _as_far(np.abs(sums), np.abs(gaps).max(axis=-1))
 
 
+def rank_flip_p(ours: Array, theirs: Array) -> Array:
+    """As :func:`flip_p`, of the differences between ranks among all runs.
+
+    Args:
+        ours: A number for each seed, which may be infinite, shape ``[..., seeds]``.
+        theirs: Of the same seeds, shape ``[..., seeds]``.
+
+    Returns:
+        The p-values, shape ``[...]``.
+    """
+    ranks = stats.rankdata(np.concatenate((ours, theirs), axis=-1), axis=-1)
+    return flip_p(ranks[..., : ours.shape[-1]] - ranks[..., ours.shape[-1] :])
+
+
 def least_p(ours: int, theirs: int) -> float:
     """Least value that :func:`permutation_p` can have for these numbers of runs."""
     sides = 2 if ours == theirs else 1

@@ -7,17 +7,19 @@ worlds alone; the seeds of the tables begin at :data:`FIRST_SEED`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 from navigation.arms import Arm
 from navigation.paper import NAMES, TABLE_2, TABLE_4, Tested, studies
-from navigation.studies import Evaluation, Job, Study
+from navigation.studies import TESTED, Evaluation, Job, Study
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.catalogue import ALIASES
 
+ROOT = Path("runs/study")
+"""Folder of the study unless a command line says otherwise."""
 FIRST_SEED = 100
 ACTIONS = 24_000
 COMMON = (
@@ -136,6 +138,37 @@ def label_of(job: Job, root: Path) -> str:
     return "/".join(part for part in (folder, job.learner, job.method, job.arm.name) if part)
 
 
+def short_names(labels: Sequence[str]) -> dict[str, str]:
+    """Labels without the parts that all of them begin or end with.
+
+    Args:
+        labels: Of arms.
+
+    Returns:
+        Names by label.
+
+    Examples:
+        >>> list(short_names(["sparse/td3/per/v8", "sparse/td3/lap/v8"]).values())
+        ['per', 'lap']
+        >>> list(short_names(["sparse/td3/per", "sparse/td3/per/v8"]).values())
+        ['per', 'per/v8']
+    """
+    parts = [label.split("/") for label in labels]
+    for end in (0, -1):
+        while all(len(each) > 1 and each[end] == parts[0][end] for each in parts):
+            parts = [each[1:] if end == 0 else each[:-1] for each in parts]
+    return {label: "/".join(part) for label, part in zip(labels, parts, strict=True)}
+
+
+def paper_studies(table: Table) -> tuple[Study, ...]:
+    """Those of table A that the paper's own figures and tables are made of."""
+    return tuple(
+        study
+        for study in table.studies
+        if study.learners == ("ddpg",) and study.evaluation == TESTED and study.arms != (ONE_ROBOT,)
+    )
+
+
 def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
     """The tables, in the order in which they are run.
 
@@ -216,8 +249,12 @@ def _table_c(root: Path) -> Table:
         {
             "TD3": _arms("sparse/td3", *KEY),
             "DDPG": _arms("sparse/ddpg", *KEY),
-            "TD3, more of the paper's": _arms("sparse/td3", *(n for n in rest if n in NAMES)),
-            "TD3, others": _arms("sparse/td3", *(n for n in rest if n not in NAMES)),
+            "TD3, more of the paper's": _arms(
+                "sparse/td3", "uniform", "per", *(n for n in rest if n in NAMES)
+            ),
+            "TD3, others": _arms(
+                "sparse/td3", "uniform", "per", *(n for n in rest if n not in NAMES)
+            ),
         },
     )
 

@@ -18,7 +18,7 @@ from navigation.intervals import (
     resampled_means,
     widened_ends,
 )
-from navigation.permutation import deal_p, flip_p, holm, permutation_p, rank_p
+from navigation.permutation import deal_p, flip_p, holm, permutation_p, rank_flip_p, rank_p
 from navigation.power import difference_found, paired_difference_found, runs_needed
 
 
@@ -219,6 +219,12 @@ def test_of_seeds_with_no_difference_five_in_a_hundred_are_called_different() ->
     assert flip_p(np.ones(20)) == pytest.approx(2 / 2**20)
     with pytest.raises(ValueError, match="must be finite"):
         flip_p(np.array([np.inf]))
+
+
+def test_seeds_that_never_came_so_far_are_last_and_alike() -> None:
+    ours, theirs = np.array([1.0, 3.0, 4.0, np.inf]), np.array([2.0, np.inf, np.inf, np.inf])
+    # Ranks 1, 3, 4, 6.5 and 2, 6.5, 6.5, 6.5: differences of -1, -3.5, -2.5 and 0.
+    assert rank_flip_p(ours, theirs) == flip_p(np.array([-1.0, -3.5, -2.5, 0.0])) == 0.25
 
 
 @pytest.mark.parametrize(("seeds", "level"), [(20, 0.05), (10, 0.01)])
