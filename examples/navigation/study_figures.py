@@ -18,7 +18,7 @@ from navigation.intervals import (
     widened_ends,
 )
 from navigation.protocol import OF_VOLUMES, VOLUMES, Table, short_names
-from navigation.study_rows import Rows, scores_of
+from navigation.study_rows import Rows, by_run, scores_of
 from navigation.study_tables import MEASURES
 
 _LEVELS = np.linspace(0.0, 1.0, 201)
@@ -79,9 +79,9 @@ def plot_curves(table: Table, rows: Rows, path: Path) -> None:
     """
     rng = np.random.default_rng(0)
     curves: dict[str, list[pd.Series[Any]]] = {}
-    for (arm, _), each in rows.curves.groupby(["arm", "seed"], sort=False):
+    for arm, _, each in by_run(rows.curves):
         series = pd.Series(each["success"].to_numpy(), index=each["total_steps"].to_numpy())
-        curves.setdefault(str(arm), []).append(series)
+        curves.setdefault(arm, []).append(series)
     figure, axes = _panels(table)
     for axis, labels in zip(axes, table.panels.values(), strict=True):
         for place, name, label in _shown(labels, curves):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -122,30 +123,52 @@ def scores_of(rows: Rows, table: Table) -> dict[str, pd.DataFrame]:
         not tested), each kind of worlds of ``table.kinds`` counting the same.
     """
     found: dict[str, dict[int, dict[str, float]]] = {}
-    for (arm, seed), curve in rows.curves.groupby(["arm", "seed"], sort=False):
+    success = {arm: _success(worlds) for arm, worlds in worlds_of(rows, table).items()}
+    for arm, seed, curve in by_run(rows.curves):
         reached = curve.loc[curve["success"] >= GOAL, "total_steps"]
-        found.setdefault(str(arm), {})[int(seed)] = {
+        found.setdefault(arm, {})[seed] = {
             "area": area_under(curve["total_steps"], curve["success"]),
-            "actions": float(reached.iloc[0]) if len(reached) else float("inf"),
-            "success": float("nan"),
+            "actions": float(reached.iloc[0]) if len(reached) else math.inf,
+            "success": success.get(arm, {}).get(seed, math.nan),
         }
-    kinds = rows.tests["world"].map(family)
-    counted = rows.tests[kinds.isin(table.kinds)]
-    rates = counted.groupby(["arm", "seed", kinds], sort=False)["success"].mean()
-    for (arm, seed), success in rates.groupby(level=[0, 1], sort=False):
-        if len(success) == len(table.kinds) and seed in found.get(str(arm), {}):
-            found[str(arm)][int(seed)]["success"] = float(success.mean())
     return {arm: pd.DataFrame.from_dict(runs, "index") for arm, runs in found.items()}
 
 
+def by_run(table: pd.DataFrame) -> Iterator[tuple[str, int, pd.DataFrame]]:
+    """The rows of each run, with its arm and seed."""
+    for arm, of_arm in table.groupby("arm", sort=False):
+        for seed, of_run in of_arm.groupby("seed", sort=False):
+            yield str(arm), int(str(seed)), of_run
+
+
 def worlds_of(rows: Rows, table: Table) -> dict[str, pd.DataFrame]:
-    """Success in each world of ``table.kinds``, by arm: rows by seed, columns by world."""
-    counted = rows.tests[rows.tests["world"].map(family).isin(table.kinds)]
-    means = counted.groupby(["arm", "seed", "world"], sort=False)["success"].mean()
-    return {
-        str(arm): each.droplevel(0).unstack().dropna()
-        for arm, each in means.groupby(level=0, sort=False)
-    }
+    """Success in each world of ``table.kinds``, by arm: rows by seed, columns by world.
+
+    Of a kind with one world the columns are its pairs of start and goal. A run that was not tested
+    in all worlds of its arm is left out, and an arm without one in each kind of worlds.
+    """
+    kinds = rows.tests["world"].map(family)
+    number = rows.tests["world"].groupby(kinds).transform("nunique")
+    tests = rows.tests.assign(pair=rows.tests["episode"].where(number == 1, 0))
+    found = {}
+    for arm, of_arm in tests[kinds.isin(table.kinds)].groupby("arm", sort=False):
+        worlds = of_arm.pivot_table(
+            index="seed", columns=["world", "pair"], values="success", sort=False
+        )
+        if set(kinds_of(worlds)) == set(table.kinds):
+            found[str(arm)] = worlds.dropna()
+    return found
+
+
+def kinds_of(worlds: pd.DataFrame) -> list[str]:
+    """The kind of each column of :func:`worlds_of`."""
+    return [family(str(world)) for world in worlds.columns.get_level_values("world")]
+
+
+def _success(worlds: pd.DataFrame) -> dict[int, float]:
+    """Success of each run, each kind of worlds counting the same."""
+    means = worlds.T.groupby(kinds_of(worlds)).mean().mean()
+    return {int(str(seed)): float(value) for seed, value in means.items()}
 
 
 def missing(table: Table, rows: Rows, root: Path) -> str:

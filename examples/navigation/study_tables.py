@@ -22,7 +22,7 @@ from navigation.intervals import (
 from navigation.permutation import deal_p, flip_p, holm, rank_flip_p, rank_p
 from navigation.power import difference_found, paired_difference_found
 from navigation.protocol import Pair, Table, short_names
-from navigation.study_rows import GOAL, Rows, scores_of, worlds_of
+from navigation.study_rows import GOAL, Rows, kinds_of, scores_of, worlds_of
 from navigation.tables import table as markdown
 from navigation.worlds import family
 
@@ -32,11 +32,12 @@ Actions to {GOAL:.0%}: those until the first evaluation with so much, median of 
 that of the last policy, each kind of worlds counting the same. Differences are between runs of the
 same seeds, where both arms have the same ones.
 
-Intervals: bootstrap over seeds, or over seeds and worlds. *p*: of all ways to choose the signs of
-the differences, or without common seeds to deal the runs to both sides; of actions with their
-ranks. Corrected by Holm's method, runs that are missing having p = 1. *Found with 80 %*: the true
-difference that so many runs would have found, at a level of 0.05 over the number of comparisons.
-*Better run*: chance that a run of the first arm is better than one of the second."""
+Intervals: bootstrap over seeds, or over seeds and worlds, of a single world its pairs of start and
+goal. *p*: of all ways to choose the signs of the differences, or without common seeds to deal the
+runs to both sides; of actions with their ranks. Corrected by Holm's method, runs that are missing
+having p = 1. *Found with 80 %*: the true difference that so many runs would have found, at a level
+of 0.05 over the number of comparisons. *Better run*: chance that a run of the first arm is better
+than one of the second."""
 MEASURES = {
     "area": "area under the curve of greedy success in validation",
     "success": "success of the last policy",
@@ -160,7 +161,13 @@ def kind_lines(rows: Rows, labels: Sequence[str]) -> str:
     means = of_runs.groupby(level=[0, 1], sort=False).mean().unstack()
     short = short_names(labels)
     lines = [
-        [short[label], *("" if pd.isna(v) else f"{v:.1%}" for v in means.loc[label])]
+        [
+            short[label],
+            *(
+                "" if math.isnan(v) else f"{v:.1%}"
+                for v in np.asarray(means.loc[label], dtype=float)
+            ),
+        ]
         for label in labels
         if label in means.index
     ]
@@ -241,7 +248,7 @@ def _improvement(sides: Sides, measure: str, rng: np.random.Generator) -> Interv
 
 def _matrix(success: pd.DataFrame) -> tuple[Array, list[str]]:
     """Success by run and world, and the kind of each world."""
-    return success.to_numpy(dtype=float), [family(str(world)) for world in success.columns]
+    return success.to_numpy(dtype=float), kinds_of(success)
 
 
 def _mean(values: pd.Series) -> float:

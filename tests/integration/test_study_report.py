@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from navigation.protocol import OF_VOLUMES, Table, paper_studies, tables
 from navigation.records import write_table
 from navigation.studies import Evaluation, Job, Study
 from navigation.study_figures import mean_curve, plot_curves, plot_volumes
-from navigation.study_rows import Rows, keep, missing, read_kept, read_runs, scores_of
+from navigation.study_rows import Rows, keep, missing, read_kept, read_runs, scores_of, worlds_of
 from navigation.study_tables import comparison_lines, study_tables
 from tests.integration.test_figures import BLUE, ORANGE, colored, heights
 
@@ -99,9 +100,24 @@ def test_kinds_of_worlds_count_the_same_and_a_run_that_lacks_one_has_no_success(
     worlds = ["bars-test-1", "halls-test-1", "halls-test-2", "halls-test-3", "bars-test-1"]
     good = [True, False, False, False, True]
     tests = pd.DataFrame({"arm": "a", "seed": [0, 0, 0, 0, 1], "world": worlds, "success": good})
+    tests["episode"] = 0
     found = scores_of(Rows(curve, tests), table)["a"]["success"]
     assert found[0] == 0.5
     assert np.isnan(found[1])
+
+
+def test_of_one_world_the_pairs_are_what_else_might_have_been_tested() -> None:
+    seeds, pairs = np.divmod(np.arange(3 * 50), 50)
+    good = np.random.default_rng(0).uniform(size=150) < 0.6
+    tests = pd.DataFrame({"arm": "a", "seed": seeds, "episode": pairs, "success": good})
+    table = tables(Path("x"))["A"]
+    found = worlds_of(Rows(pd.DataFrame(), tests.assign(world="test")), table)["a"]
+    assert found.to_numpy().tolist() == good.reshape(3, 50).tolist()
+    # In as many worlds with several pairs, a world is one.
+    worlds = tests.assign(world=[f"bars-test-{pair // 5}" for pair in pairs])
+    bars = replace(table, kinds=("bars:test",))
+    found = worlds_of(Rows(pd.DataFrame(), worlds), bars)["a"]
+    assert found.to_numpy() == pytest.approx(good.reshape(3, 10, 5).mean(axis=2))
 
 
 def test_what_is_kept_comes_back_and_is_the_same_bytes_each_time(
@@ -259,7 +275,7 @@ def test_the_real_tables_are_made_of_rows_of_every_arm(tmp_path: Path) -> None:
         pd.DataFrame({"world": [word.replace(":", "-") + "-1" for word in table.kinds]}),
         how="cross",
     )
-    tests["success"] = rng.uniform(size=len(tests)) < 0.5
+    tests["success"], tests["episode"] = rng.uniform(size=len(tests)) < 0.5, 0
     text = study_tables(table, Rows(curves, tests), absent="")
     assert text.count("| sparse/td3/per/v8 − sparse/td3/uniform/v8 |") == 3
     assert f"corrected for {len(table.planned)}" in text
