@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mpfa_envs.discrete import WHEEL_PAIRS, DiscreteWheels
     from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
     from mpfa_envs.evaluation import Driver, evaluate, run_tasks
+    from mpfa_envs.export import export_policy
     from mpfa_envs.generators import (
         GENERATORS,
         generate_world,
@@ -96,6 +97,7 @@ __all__ = [
     "barn_world",
     "evaluate",
     "evaluation_pairs",
+    "export_policy",
     "generate_world",
     "generator_tasks",
     "load_policy",
@@ -164,6 +166,7 @@ _MODULES = {
     "barn_world": "barn",
     "evaluate": "evaluation",
     "evaluation_pairs": "tasks",
+    "export_policy": "export",
     "generate_world": "generators",
     "generator_tasks": "generators",
     "load_policy": "policy",

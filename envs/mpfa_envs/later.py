@@ -19,7 +19,7 @@ def after_import(awaited: str, module: str) -> None:
         awaited: Name of a module that may never be imported, or may not be installed.
         module: Name of the module that is imported after it.
     """
-    if awaited in sys.modules:
+    if sys.modules.get(awaited) is not None:
         import_module(module)
     elif not any(isinstance(each, _Waiting) and each.module == module for each in sys.meta_path):
         sys.meta_path.insert(0, _Waiting(awaited, module))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,9 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.lidar import Lidar
     from mpfa_envs.robot import RobotModel
-    from mpfa_envs.worlds import World
 
 RESOLUTION: Final = 0.1
 """Side of a cell [m]."""
@@ -27,6 +25,23 @@ _BLOCKED: Final = 0.06
 """Clearance of the robot's rim below which a cell is blocked [m]."""
 _NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
+
+
+class Rays(Protocol):
+    """What a map is made from: a :class:`~mpfa_envs.Lidar`, or one of a real robot."""
+
+    angles: NDArray[np.float64]
+    """Direction of each ray in the robot's frame [rad], ``[rays]``."""
+    max_range: float
+    """What a ray reports that meets nothing [m]."""
+
+
+class Place(Protocol):
+    """What is mapped: a :class:`~mpfa_envs.World`, or no more than its size is known."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and depth [m]."""
 
 
 class Sketch(NamedTuple):
@@ -70,7 +85,7 @@ class MapMemory:
         (True, True)
     """
 
-    def __init__(self, count: int, robot: RobotModel, lidar: Lidar) -> None:
+    def __init__(self, count: int, robot: RobotModel, lidar: Rays) -> None:
         self.arrays = MapArrays(
             np.zeros((count, 0, 0), dtype=np.uint8),
             np.zeros((count, 0, 0), dtype=np.int32),
@@ -82,7 +97,7 @@ class MapMemory:
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         self._lengths = RESOLUTION, robot.radius + _BLOCKED, robot.radius + _NEAR, lidar.max_range
 
-    def begin(self, index: int, world: World) -> None:
+    def begin(self, index: int, world: Place) -> None:
         """Forget what a robot has seen.
 
         Args:
@@ -104,6 +119,8 @@ class MapMemory:
         goals: NDArray[np.float64],
         ranges: NDArray[np.float64],
         chosen: NDArray[np.bool_] | None = None,
+        *,
+        directions: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
         """Enter a scan in the maps and find the ways.
 
@@ -112,6 +129,8 @@ class MapMemory:
             goals: Positions (x, y) [m], ``[N, 2]``.
             ranges: Range of each ray [m], ``[N, rays]``.
             chosen: Which robots have looked around, ``[N]``; None: all. The others' ways stay.
+            directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``;
+                None: those of the lidar.
 
         Returns:
             Direction (x, y) in the robot's frame and length [m] of the way, ``[N, 3]``; the length
@@ -119,7 +138,8 @@ class MapMemory:
         """
         if chosen is None:
             chosen = np.ones(len(motions), dtype=np.bool_)
-        directions, lengths = self._directions, self._lengths
+        directions = self._directions if directions is None else directions
+        lengths = self._lengths
         remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._ways)
         return self._ways
 

@@ -96,7 +96,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     Args:
         world: ``"A"`` to ``"D"``, ``"validation"``, ``"test"``, the path of a YAML file or a
             :class:`~mpfa_envs.World`.
-        robot: ``"turtlebot2"``, ``"burger"``, ``"waffle"`` or a :class:`~mpfa_envs.RobotModel`.
+        robot: A name in :data:`~mpfa_envs.ROBOTS`, or a :class:`~mpfa_envs.RobotModel`.
         physics: ``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on
             exact arcs, several times faster, and needs no PyBullet. Lidar, clearance and
             collisions are computed from the same shapes in both.

@@ -110,17 +110,22 @@ class Policy:
                 f"observation must have shape [..., {self.observation_size}], "
                 f"got {observation.shape}"
             )
-        rows = observation.astype(np.float64).reshape(-1, self.observation_size)
+        actions = self._choose(observation.reshape(-1, self.observation_size))
+        return actions.reshape(*observation.shape[:-1], self.action_size)
+
+    def _choose(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """From ``[N, O]`` to ``[N, A]``."""
         # Always as many rows at once: a matrix product of another height adds in another order.
         padding = -len(rows) % _BLOCK
-        blocks = np.pad(rows, ((0, padding), (0, 0))).reshape(-1, _BLOCK, self.observation_size)
+        padded = np.pad(rows.astype(np.float64), ((0, padding), (0, 0)))
+        blocks = padded.reshape(-1, _BLOCK, self.observation_size)
         actions = np.empty((len(blocks) * _BLOCK, self.action_size), dtype=np.float32)
         for number, block in enumerate(blocks):
             values: NDArray[np.float64] = block
             for layer in self.layers:
                 values = layer(values)
             actions[number * _BLOCK : (number + 1) * _BLOCK] = values
-        return actions[: len(rows)].reshape(*observation.shape[:-1], self.action_size)
+        return actions[: len(rows)]
 
     def __repr__(self) -> str:
         kinds = ", ".join(type(layer).__name__ for layer in self.layers)
@@ -137,6 +142,9 @@ def save_policy(policy: Policy, path: str | os.PathLike[str]) -> Path:
     Returns:
         The file.
 
+    Raises:
+        ValueError: If it is out of an ONNX file, which holds no layers.
+
     Examples:
         >>> import tempfile
         >>> from mpfa_envs import Policy, load_policy, save_policy
@@ -147,6 +155,8 @@ def save_policy(policy: Policy, path: str | os.PathLike[str]) -> Path:
         ...     load_policy(folder)
         Policy(24 -> 2: Linear)
     """
+    if not policy.layers:
+        raise ValueError(f"policy must have layers, got {policy!r}: copy its file and its card")
     file = _file(path)
     plain = [
         {
@@ -169,7 +179,7 @@ def save_policy(policy: Policy, path: str | os.PathLike[str]) -> Path:
     packed = io.BytesIO()
     text = json.dumps(about, indent=1).encode()
     np.savez(packed, allow_pickle=False, **{_ABOUT: np.frombuffer(text, np.uint8)}, **arrays)
-    _write_atomically(packed.getvalue(), file)
+    write_atomically(packed.getvalue(), file)
     return file
 
 
@@ -177,7 +187,8 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Read a policy without executing anything in the file.
 
     Args:
-        path: The file, or the folder of a run.
+        path: The file, or the folder of a run; or an ONNX file of :func:`~mpfa_envs.export_policy`
+            with its card beside it, which needs onnxruntime.
 
     Returns:
         The policy.
@@ -187,6 +198,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
         PolicyFileError: If it is no policy, was damaged, or is of another version.
     """
     file = _file(path)
+    if file.suffix == ".onnx":
+        from mpfa_envs.onnx_policy import OnnxPolicy
+
+        return OnnxPolicy(file)
     try:
         content = file.read_bytes()
     except FileNotFoundError:
@@ -230,7 +245,7 @@ def _file(path: str | os.PathLike[str]) -> Path:
     return path / FILE_NAME if path.is_dir() else path
 
 
-def _write_atomically(content: bytes, path: Path) -> None:
+def write_atomically(content: bytes, path: Path) -> None:
     """Write a file in one step: the old one or the new one, never half."""
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
         try:

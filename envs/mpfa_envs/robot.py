@@ -230,6 +230,16 @@ ROBOTS: Final[Mapping[str, RobotModel]] = {
             min_wheel_speed=0.026,
             max_wheel_speed=0.26,
         ),
+        RobotModel(
+            name="turtlebot4",
+            radius=0.175,
+            height=0.351,
+            mass=3.9,
+            wheel_base=0.233,
+            wheel_radius=0.03575,
+            min_wheel_speed=0.031,
+            max_wheel_speed=0.306,
+        ),
     )
 }
 """The robots that have a name. As for the TurtleBot2, no wheel stops or turns backwards."""
@@ -239,7 +249,7 @@ def resolve_robot(robot: str | RobotModel) -> RobotModel:
     """Look a robot up by name; a :class:`RobotModel` is returned as it is.
 
     Args:
-        robot: ``"turtlebot2"``, ``"burger"``, ``"waffle"`` or a model of your own.
+        robot: A name in :data:`ROBOTS` or a model of your own.
 
     Returns:
         The model.

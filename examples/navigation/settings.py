@@ -231,7 +231,7 @@ class EnvironmentSettings:
     """The navigation task."""
 
     robot: str = "turtlebot2"
-    """``turtlebot2``, ``burger`` or ``waffle``."""
+    """``turtlebot2``, ``turtlebot4``, ``burger`` or ``waffle``."""
     physics: str = "wheels"
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int = 500

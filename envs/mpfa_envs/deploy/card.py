@@ -1,0 +1,182 @@
+"""The card of an exported policy: what it senses, in which units, and what it may do."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from mpfa_envs.checks import check_count, check_number, check_positive
+from mpfa_envs.observation import (
+    DISTANCE_SCALE,
+    GOAL_CLOSENESS_DISTANCE,
+    SPEED_BOUND,
+    WAY_BOUND,
+    observation_slices,
+)
+from mpfa_envs.robot import RobotModel
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Mapping
+
+FORMAT: Final = 1
+SCALES: Final = {
+    "goal_closeness_distance": GOAL_CLOSENESS_DISTANCE,
+    "distance": DISTANCE_SCALE,
+    "speed_bound": SPEED_BOUND,
+    "way_bound": WAY_BOUND,
+}
+"""The scales of the observation that are the same for all policies, as cards have them."""
+_REDUCTIONS = ("min", "median", "single")
+_LARGEST = 2**28
+"""A file larger than this is no policy [bytes]."""
+
+
+class CardError(ValueError):
+    """A policy, its card, or what a robot has do not fit; the message says what."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a robot must know of a policy in order to run it.
+
+    The angles of the lidar's sectors and the scales of the observation are those of
+    :class:`~mpfa_envs.NavigationEnv`; a card with others is refused.
+    """
+
+    observation_size: int
+    action_size: int
+    sectors: int
+    """Equal sectors of the front 180 degrees, left to right."""
+    reduction: str
+    """What a sector reports of its rays: ``min``, ``median``, or ``single``, the middle one."""
+    max_range: float
+    """What a sector reports that meets nothing [m]."""
+    closeness_distance: float
+    """A range of this or less has closeness one [m]."""
+    memory: str
+    """``map``: it senses the way over a map that it makes; or ``none``."""
+    history: int
+    """Earlier scans that it senses."""
+    robot: RobotModel
+    """The robot that it learned with."""
+    period: float
+    """Time from decision to decision [s]."""
+    goal_radius: float
+    """Distance from the goal at which it has arrived [m]."""
+    env_arguments: Mapping[str, Any]
+    """Arguments of :class:`~mpfa_envs.NavigationEnv` under which it learned."""
+    training: Mapping[str, Any]
+    """How it was trained."""
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Card:
+        """Read a card from the values of its JSON file.
+
+        Raises:
+            CardError: If something is missing, of another kind, or not as this version senses.
+        """
+        try:
+            return cls._of(document)
+        except KeyError as error:
+            raise CardError(f"the card has no {error.args[0]!r}") from None
+        except (TypeError, ValueError) as error:
+            raise CardError(f"the card does not fit: {error}") from None
+
+    @classmethod
+    def _of(cls, document: Mapping[str, Any]) -> Card:
+        if document["format"] != FORMAT:
+            raise ValueError(f"format must be {FORMAT}, got {document['format']!r}")
+        lidar, scales, limits = (document[name] for name in ("lidar", "scales", "limits"))
+        for name, value in SCALES.items():
+            if scales[name] != value:
+                raise ValueError(f"scales.{name} must be {value}, got {scales[name]!r}")
+        card = cls(
+            observation_size=check_count("observation.size", document["observation"]["size"]),
+            action_size=check_count("action.size", document["action"]["size"]),
+            sectors=check_count("lidar.sectors", lidar["sectors"]),
+            reduction=lidar["reduction"],
+            max_range=check_positive("lidar.max_range", lidar["max_range"]),
+            closeness_distance=check_positive(
+                "scales.closeness_distance", scales["closeness_distance"]
+            ),
+            memory=document["memory"],
+            history=check_count("history", document["history"], least=0),
+            robot=RobotModel(**document["robot"]),
+            period=check_positive("limits.period", limits["period"]),
+            goal_radius=check_positive("limits.goal_radius", limits["goal_radius"]),
+            env_arguments=dict(document["env_arguments"]),
+            training=dict(document["training"]),
+        )
+        if card.reduction not in _REDUCTIONS:
+            raise ValueError(f"lidar.reduction must be one of {_REDUCTIONS}: {card.reduction!r}")
+        if card.memory not in ("none", "map"):
+            raise ValueError(f"memory must be 'none' or 'map', got {card.memory!r}")
+        if card.action_size != 2:
+            raise ValueError(f"action.size must be 2, a left and a right wheel: {card.action_size}")
+        if card.observation_size != card._sensed:
+            raise ValueError(
+                f"observation.size must be {card._sensed}, of {card.sectors} sectors, history "
+                f"{card.history} and memory {card.memory!r}, got {card.observation_size}"
+            )
+        return card
+
+    @property
+    def _sensed(self) -> int:
+        """Numbers that such a robot senses."""
+        memory: Any = self.memory
+        parts = observation_slices(self.sectors, memory=memory, history=self.history)
+        return max(part.stop for part in parts.values())
+
+
+def card_file(path: str | os.PathLike[str]) -> Path:
+    """Where the card of an ONNX file lies: beside it, ``policy.json`` for ``policy.onnx``."""
+    return Path(path).with_suffix(".json")
+
+
+def read_exported(path: str | os.PathLike[str]) -> tuple[Card, bytes]:
+    """Read an exported policy and its card; nothing in either is executed.
+
+    Args:
+        path: The ONNX file; the card lies beside it.
+
+    Returns:
+        The card and the content of the ONNX file.
+
+    Raises:
+        FileNotFoundError: If one of the two is missing.
+        CardError: If the card is no card, or of another file.
+    """
+    file, beside = Path(path), card_file(path)
+    for each, what in ((file, "policy"), (beside, "card of the policy")):
+        if not each.is_file():
+            raise FileNotFoundError(f"there is no {what} at {each}")
+        if each.stat().st_size > _LARGEST:
+            raise CardError(f"{each} is no {what}: it has {each.stat().st_size} bytes")
+    content = file.read_bytes()
+    try:
+        document = json.loads(beside.read_text(encoding="utf-8"))
+        wanted = document["sha256"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise CardError(f"{beside} is no card of a policy: {error!r}") from None
+    if (found := hashlib.sha256(content).hexdigest()) != wanted:
+        raise CardError(f"{beside} is the card of another file than {file}: sha256 {found}")
+    try:
+        return Card.of(document), content
+    except CardError as error:
+        raise CardError(f"{beside}: {error}") from None
+
+
+def check_finite(name: str, values: Any, size: int) -> tuple[float, ...]:
+    """So many finite numbers.
+
+    Raises:
+        ValueError: If there are more or fewer, or one is not finite.
+    """
+    found = tuple(check_number(name, value) for value in values)
+    if len(found) != size:
+        raise ValueError(f"{name} must be {size} numbers, got {len(found)}")
+    return found

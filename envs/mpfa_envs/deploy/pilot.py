@@ -1,0 +1,249 @@
+"""From scan, odometry and goal to wheel speeds: one decision of an exported policy."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.checks import check_positive, check_share
+from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
+from mpfa_envs.deploy.network import Network
+from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
+from mpfa_envs.observation import add_history, observe
+from mpfa_envs.robot import RobotModel, resolve_robot
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.deploy.way import Way
+
+_WIDER: Final = 0.01
+"""By how much a robot may be wider than that of the training [m]."""
+
+
+class Command(NamedTuple):
+    """What the robot should do until the next decision."""
+
+    left: float
+    """Speed of the left wheel [m/s]."""
+    right: float
+    """Speed of the right wheel [m/s]."""
+    linear: float
+    """The same as the body's forward speed [m/s],"""
+    angular: float
+    """and its turning speed, to the left [rad/s]."""
+
+
+class Pilot:
+    """Runs a policy on a robot: NumPy and onnxruntime, and Numba if the policy has a map.
+
+    A slower robot than that of the training drives the same arcs at a slower pace: its decisions
+    come later and its speeds are read as if it were the other one.
+
+    Args:
+        card: Of the policy.
+        network: From observations ``[1, O]`` to actions ``[1, 2]``.
+        robot: What drives, a name or a :class:`~mpfa_envs.RobotModel`; None: the robot that the
+            policy learned with.
+        pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can.
+        mount: Where the lidar is, see :class:`~mpfa_envs.deploy.Sectors`.
+        unseen: As there.
+        silent: As there.
+        map_size: Side of the map of a policy that has one [m], a square around where the robot is
+            when it begins; the way leads through it alone.
+
+    Raises:
+        CardError: If the robot does not fit the policy.
+        ImportError: If the policy has a map and there is no Numba.
+        ValueError: If an argument is out of its range.
+    """
+
+    def __init__(
+        self,
+        card: Card,
+        network: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        *,
+        robot: str | RobotModel | None = None,
+        pace: float | None = None,
+        mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        unseen: float | None = None,
+        silent: Silent = "refuse",
+        map_size: float = 40.0,
+    ) -> None:
+        self.card = card
+        self.robot = card.robot if robot is None else resolve_robot(robot)
+        learned = card.robot
+        if self.robot.radius > learned.radius + _WIDER:
+            raise CardError(
+                f"the policy learned with a robot of radius {learned.radius} m, "
+                f"{self.robot.name} has {self.robot.radius} m"
+            )
+        most = min(1.0, self.robot.max_wheel_speed / learned.max_wheel_speed)
+        self.pace = most if pace is None else check_share("pace", pace)
+        if not 0.0 < self.pace <= most:
+            raise ValueError(
+                f"pace must be above 0 and at most {most:.3g}, as {self.robot.name} drives "
+                f"{self.robot.max_wheel_speed} m/s, got {pace}"
+            )
+        self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
+        self._network = network
+        self._way = self._make_way(check_positive("map_size", map_size))
+        self._goal: tuple[float, float] | None = None
+        self._center: tuple[float, float] | None = None
+        self._fresh = True
+        self._observation: NDArray[np.float32] | None = None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], **options: Any) -> Pilot:
+        """Read an exported policy.
+
+        Args:
+            path: The ONNX file; its card lies beside it.
+            **options: As in :class:`Pilot`.
+
+        Returns:
+            The pilot.
+
+        Raises:
+            FileNotFoundError: If the file or its card is missing.
+            CardError: If they are damaged or do not fit.
+        """
+        card, content = read_exported(path)
+        network = Network(content, card.observation_size, card.action_size)
+        return cls(card, network, **options)
+
+    @property
+    def period(self) -> float:
+        """Time from decision to decision [s]."""
+        return self.card.period / self.pace
+
+    @property
+    def goal(self) -> tuple[float, float] | None:
+        """Where it drives to (x, y) [m]."""
+        return self._goal
+
+    def begin(
+        self, goal: tuple[float, float], *, map_center: tuple[float, float] | None = None
+    ) -> None:
+        """Set out for a goal, and forget what was seen before.
+
+        Args:
+            goal: Position (x, y) in the frame of the odometry [m].
+            map_center: Center of the map of a policy that has one (x, y) [m]; None: where the robot
+                is at its first decision.
+
+        Raises:
+            ValueError: If a number is not finite.
+        """
+        center = None if map_center is None else _pair("map_center", map_center)
+        self._goal = _pair("goal", goal)
+        self._center, self._fresh = center, True
+
+    def stop(self) -> None:
+        """Give up the goal."""
+        self._goal = None
+
+    def move_goal(self, goal: tuple[float, float]) -> None:
+        """Correct the goal on the way: what was seen is still true.
+
+        Args:
+            goal: Position (x, y) in the frame of the odometry [m].
+
+        Raises:
+            ValueError: If it is not finite, or the robot has not set out.
+        """
+        if self._goal is None:
+            raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
+        if (goal := _pair("goal", goal)) != self._goal:
+            self._goal = goal
+            if self._way is not None:
+                self._way.look_anew()
+
+    def arrived(self, pose: tuple[float, float, float]) -> bool:
+        """Whether a pose is at the goal, as the training counted it."""
+        return self._goal is not None and math.dist(pose[:2], self._goal) <= self.card.goal_radius
+
+    def observe(
+        self, scan: Scan, pose: tuple[float, float, float], speeds: tuple[float, float]
+    ) -> NDArray[np.float32]:
+        """What the policy senses, once for each decision.
+
+        Args:
+            scan: What the lidar has measured.
+            pose: Of the robot (x, y, heading) in the frame of the odometry [m, m, rad].
+            speeds: Forward and turning speed [m/s, rad/s].
+
+        Returns:
+            The observation, ``[O]``.
+
+        Raises:
+            ScanError: If the scan does not tell the range of every sector.
+            ValueError: If there is no goal, or a number is not finite.
+        """
+        if self._goal is None:
+            raise ValueError("goal must be given to begin() first")
+        x, y, heading = check_finite("pose", pose, 3)
+        linear, angular = check_finite("speeds", speeds, 2)
+        card = self.card
+        ranges, points = self.sectors.read(scan)
+        way = None
+        if self._way is not None:
+            if self._fresh:
+                self._way.begin(self._center or (x, y))
+            way = self._way.sense((x, y, heading), self._goal, points)
+        motion: Any = (x, y, heading, linear / self.pace, angular / self.pace)
+        distance = math.dist((x, y), self._goal)
+        near = card.closeness_distance
+        seen = observe(ranges, motion, self._goal, distance, card.robot, near, way)
+        if card.history:
+            last = None if self._fresh else self._observation
+            seen = add_history(seen, last, card.sectors, card.history)
+        self._observation, self._fresh = seen, False
+        return seen
+
+    def decide(
+        self, scan: Scan, pose: tuple[float, float, float], speeds: tuple[float, float]
+    ) -> Command:
+        """Choose what to do for the next :attr:`period`.
+
+        Args:
+            scan: As in :meth:`observe`.
+            pose: As there.
+            speeds: As there.
+
+        Returns:
+            The speeds.
+
+        Raises:
+            ScanError: If the scan does not tell the range of every sector.
+            ValueError: If there is no goal, or a number is not finite.
+        """
+        action = self._network(self.observe(scan, pose, speeds)[None])[0]
+        if not np.isfinite(action).all():
+            raise ValueError(f"the network's action must be finite, got {action}")
+        left, right = self.card.robot.wheel_speeds(action)
+        linear = self.pace * 0.5 * (left + right)
+        angular = self.pace * (right - left) / self.card.robot.wheel_base
+        turn = 0.5 * angular * self.robot.wheel_base
+        return Command(linear - turn, linear + turn, linear, angular)
+
+    def _make_way(self, size: float) -> Way | None:
+        """The map, if the policy has one; compiled before the first decision is due."""
+        if self.card.memory != "map":
+            return None
+        from mpfa_envs.deploy.way import Way
+
+        way = Way(self.card, size=size)
+        way.warm_up()
+        return way
+
+
+def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:
+    """Two finite numbers."""
+    x, y = check_finite(name, place, 2)
+    return x, y

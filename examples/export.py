@@ -1,0 +1,144 @@
+"""Write a trained policy as an ONNX file with a JSON card, for robots and other tools.
+
+    python examples/export.py runs/demo                             writes runs/demo/policy.onnx
+    python examples/export.py examples/policies/td3-mpfa_per.npz --output turtle.onnx
+    python examples/export.py runs/demo --quantize --output small.onnx    weights of eight bits
+
+The card beside it, ``policy.json``, says what the policy senses and in which units, what its robot
+may do, how it was trained, how well it drives (the evaluations in the run's folder) and which file
+it belongs to. The file is compared with the policy on a thousand observations, and both drive
+through the same tasks; what that shows is printed, and goes on the card.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpfa_envs import Policy, evaluate, export_policy, load_policy
+from navigation import files
+
+TOLERANCE = 1e-6
+"""By how much actions of the file may differ, unless it is quantized."""
+_OBSERVATIONS = 1000
+_LIKELY = (-1.0, 1.0)
+"""Where the numbers of an observation mostly lie."""
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("path", type=Path, help="policy.npz, or the folder of a run")
+    parser.add_argument("--output", type=Path, help="the file (default: NAME.onnx beside it)")
+    parser.add_argument("--quantize", action="store_true", help="round weights to eight bits")
+    parser.add_argument("--world", default="test", help="where both drive (default: test)")
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="tasks that both drive; 0: none (default: 100)"
+    )
+    options = parser.parse_args(arguments)
+    if options.episodes < 0:
+        parser.error(f"--episodes must be at least 0, got {options.episodes}")
+    try:
+        options.policy = load_policy(options.path)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    options.source = options.path / files.POLICY if options.path.is_dir() else options.path
+    options.output = options.output or options.source.with_suffix(".onnx")
+    if options.output.suffix != ".onnx":
+        parser.error(f"--output must end in .onnx, got {options.output}")
+    if not options.policy.layers:
+        parser.error(f"{options.path} is an ONNX file: export the policy.npz that it came from")
+    return options
+
+
+def known_results(source: Path) -> list[dict[str, Any]]:
+    """The evaluations in the folder of a policy that are of this very file."""
+    found = []
+    for file in sorted(source.parent.glob("evaluation*/evaluation.json")):
+        settings = file.parent / files.SETTINGS
+        if settings.is_file():
+            asked = json.loads(settings.read_text(encoding="utf-8"))
+            if asked.get("sha256") == files.digest(source):
+                numbers = json.loads(file.read_text(encoding="utf-8"))
+                worlds = {"worlds_asked": asked["words"], "physics": asked["physics"]}
+                found.append({**worlds, **numbers})
+    return found
+
+
+def largest_difference(one: Policy, other: Policy) -> float:
+    """By how much the actions of two policies differ at most, of a thousand observations."""
+    shape = (_OBSERVATIONS, one.observation_size)
+    seen = np.random.default_rng(0).uniform(*_LIKELY, shape).astype(np.float32)
+    return float(np.abs(one(seen) - other(seen)).max())
+
+
+def driven(policy: Policy, options: argparse.Namespace) -> dict[str, Any]:
+    """How a policy drives the tasks, on exact arcs."""
+    results = evaluate(policy, options.world, episodes=options.episodes, physics="kinematic")
+    rates = {
+        name: sum(getattr(each, name) for each in results) / len(results)
+        for name in ("success", "collision", "timeout")
+    }
+    return {"results": results, **rates}
+
+
+def main(arguments: Sequence[str] | None = None) -> Path:
+    """Export, compare, tell.
+
+    Args:
+        arguments: The command line.
+
+    Returns:
+        The file.
+    """
+    options = parse(arguments)
+    policy: Policy = options.policy
+    results = known_results(options.source)
+    # Beside its place at first: a file that differs from its policy must not lie there.
+    trial = options.output.with_name(f".{os.getpid()}.{options.output.name}")
+    try:
+        export_policy(policy, trial, quantize=options.quantize)
+        exported = load_policy(trial)
+    finally:
+        for file in (trial, trial.with_suffix(".json")):
+            file.unlink(missing_ok=True)
+    difference = largest_difference(policy, exported)
+    print(f"largest difference of an action, {_OBSERVATIONS} observations: {difference:.2g}")
+    if difference > TOLERANCE and not options.quantize:
+        raise SystemExit(f"the file differs from the policy by {difference}: not written")
+    if options.episodes:
+        both = {"policy": driven(policy, options), "file": driven(exported, options)}
+        for name, rates in both.items():
+            shown = ", ".join(
+                f"{key} {rates[key]:.1%}" for key in ("success", "collision", "timeout")
+            )
+            print(f"{name:6} {options.episodes} tasks in {options.world}: {shown}")
+        same = [
+            a == b for a, b in zip(*(each.pop("results") for each in both.values()), strict=True)
+        ]
+        print(f"the same to the last digit: {sum(same)} of {len(same)}")
+        results.append(
+            {
+                "exported": both["file"],
+                "before": both["policy"],
+                "world": options.world,
+                "episodes": options.episodes,
+                "physics": "kinematic",
+                "same": sum(same),
+            }
+        )
+    export_policy(policy, options.output, quantize=options.quantize, results=results)
+    print(f"written: {options.output} ({options.output.stat().st_size} bytes) and its card")
+    return Path(options.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""Small exported policies for the tests of what runs them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpfa_envs import Policy, export_policy
+from mpfa_envs.layers import LayerNorm, Linear, ReLU, Tanh
+
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "td3-mpfa_per.npz"
+ENV_ARGUMENTS = {"robot": "turtlebot2", "physics": "kinematic", "closeness_distance": 0.23}
+
+
+def make_policy(size: int = 24, **env_arguments: Any) -> Policy:
+    """A network of random weights."""
+    rng = np.random.default_rng(1)
+
+    def linear(inputs: int, outputs: int) -> Linear:
+        weight, bias = rng.normal(size=(outputs, inputs)), rng.normal(size=outputs)
+        return Linear((weight / inputs**0.5).astype(np.float32), bias.astype(np.float32))
+
+    scale = rng.uniform(0.5, 2.0, 32).astype(np.float32)
+    norm = LayerNorm(scale, rng.normal(size=32).astype(np.float32), 1e-5)
+    layers = [linear(size, 32), norm, ReLU(), linear(32, 2), Tanh()]
+    return Policy(layers, card={"seed": 3}, env_arguments={**ENV_ARGUMENTS, **env_arguments})
+
+
+def exported(folder: Path, size: int = 24, **env_arguments: Any) -> Path:
+    """A file of :func:`make_policy`, with its card."""
+    return export_policy(make_policy(size, **env_arguments), folder / "policy.onnx")

@@ -1,0 +1,189 @@
+"""The runtime of exported policies: it senses what the environment senses, alone and in time."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
+
+import mpfa_envs
+from mpfa_envs import NavigationEnv
+from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
+from mpfa_envs.observation import observation_slices
+from tests.envs.exported import exported
+
+Recorded = tuple[Scan, tuple[float, float, float], tuple[float, float]]
+
+
+def sense(env: NavigationEnv) -> Recorded:
+    """What a robot in the place of the environment's would measure, right to left."""
+    motion, angles = env._motion, env.lidar.angles
+    ranges = env.lidar.cast(*motion[:3])
+    scan = Scan(angles[-1], angles[0] - angles[1], ranges[::-1].copy())
+    return scan, motion[:3], motion[3:]
+
+
+def size_of(arguments: dict[str, Any]) -> int:
+    sectors = arguments.get("lidar", {}).get("sectors", 18)
+    remembered = {name: arguments[name] for name in ("memory", "history") if name in arguments}
+    return max(part.stop for part in observation_slices(sectors, **remembered).values())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"history": 3, "robot": "burger"},
+        {"memory": "map"},
+        {"lidar": {"reduction": "median", "rays_per_sector": 4, "sectors": 9}},
+        {"lidar": {"reduction": "single", "max_range": 3.0}, "memory": "map", "history": 1},
+    ],
+)
+def test_it_senses_what_the_environment_senses(tmp_path: Path, arguments: dict[str, Any]) -> None:
+    file = exported(tmp_path, size_of(arguments), **arguments)
+    options = {"closeness_distance": 0.23, "physics": "kinematic", **arguments}
+    env = NavigationEnv(world="C", **options)
+    pilot = Pilot.load(file, map_size=10.0)
+    rng = np.random.default_rng(0)
+    for episode in range(3):
+        seen, _ = env.reset(seed=episode)
+        assert env.task is not None
+        pilot.begin(env.task.goal, map_center=(0.0, 0.0))
+        for _ in range(30):
+            np.testing.assert_allclose(pilot.observe(*sense(env)), seen, rtol=0, atol=1e-6)
+            seen, _, ended, _, _ = env.step(rng.uniform(-0.2, 1.0, 2))
+            if ended:
+                break
+    env.close()
+
+
+def test_its_command_is_the_action_as_wheel_speeds_and_as_a_twist(tmp_path: Path) -> None:
+    file = exported(tmp_path)
+    pilot, policy = Pilot.load(file), mpfa_envs.load_policy(file)
+    env = NavigationEnv(world="C", closeness_distance=0.23, physics="kinematic")
+    seen, _ = env.reset(seed=3)
+    assert env.task is not None
+    pilot.begin(env.task.goal)
+    command = pilot.decide(*sense(env))
+    left, right = env.robot.wheel_speeds(policy(seen))
+    assert command[:2] == pytest.approx((left, right))
+    assert command[2:] == pytest.approx(((left + right) / 2, (right - left) / 0.23))
+
+
+def test_a_slower_robot_drives_the_same_arcs_at_a_slower_pace(tmp_path: Path) -> None:
+    file = exported(tmp_path)
+    fast, slow = Pilot.load(file), Pilot.load(file, robot="burger")
+    pace = 0.22 / 0.5
+    assert slow.pace == pytest.approx(pace) and slow.period == pytest.approx(0.2 / pace)
+    scan = Scan(-math.pi, math.pi / 180, np.full(360, 2.0))
+    for pilot in (fast, slow):
+        pilot.begin((3.0, 0.5))
+    want = fast.decide(scan, (0.0, 0.0, 0.1), (0.3, 0.5))
+    found = slow.decide(scan, (0.0, 0.0, 0.1), (0.3 * pace, 0.5 * pace))
+    assert found[2:] == pytest.approx((pace * want.linear, pace * want.angular), rel=1e-5)
+    assert (found.right - found.left) / 0.16 == pytest.approx(found.angular)
+
+
+def test_a_map_is_forgotten_with_the_goal_and_looked_at_anew_when_it_moves(tmp_path: Path) -> None:
+    pilot = Pilot.load(exported(tmp_path, 27, memory="map"))
+    ahead = Scan(-math.pi / 2, math.pi / 90, np.full(91, 1.0))
+    free = Scan(-math.pi / 2, math.pi / 90, np.full(91, math.inf))
+    still = (0.0, 0.0, 0.0), (0.0, 0.0)
+    pilot.begin((4.0, 0.0))
+    around = pilot.observe(ahead, *still)[26]
+    assert around > 0.5  # A half circle of walls, 1 m away, is ahead.
+    assert pilot.observe(free, *still)[26] == around
+    pilot.move_goal((-4.0, 0.0))
+    behind = pilot.observe(free, *still)
+    assert behind[24] == pytest.approx(-1.0, abs=0.1) and behind[26] == pytest.approx(0.4)
+    pilot.begin((4.0, 0.0))
+    assert pilot.observe(free, *still)[26] == pytest.approx(0.4)
+
+
+def test_it_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:
+    file = exported(tmp_path)
+    others = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numba", "scipy", "onnx")
+    code = f"""
+import sys
+for name in {(*others, "yaml", "PIL", "networkx")}:
+    sys.modules[name] = None  # As where it is not installed.
+from mpfa_envs.deploy import Pilot, Scan
+pilot = Pilot.load({str(file)!r})
+pilot.begin((3.0, 1.0))
+print(pilot.decide(Scan(-3.1, 0.01, [2.0] * 620), (0.0, 0.0, 0.0), (0.0, 0.0)))
+"""
+    path = {"PYTHONPATH": str(Path(mpfa_envs.__file__).parents[1])}
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        check=True, capture_output=True, text=True, env=path,
+    )  # fmt: skip
+    assert result.stdout.startswith("Command(left=0.")
+
+
+def test_a_decision_takes_a_few_milliseconds_at_most(tmp_path: Path) -> None:
+    pilot = Pilot.load(exported(tmp_path))
+    pilot.begin((3.0, 1.0))
+    scan = Scan(-math.pi, math.pi / 360, np.random.default_rng(0).uniform(0.5, 5.0, 720))
+    times = []
+    for _ in range(50):
+        start = time.perf_counter()
+        pilot.decide(scan, (0.0, 0.0, 0.0), (0.3, 0.0))
+        times.append(time.perf_counter() - start)
+    assert sorted(times)[10] < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robot": "waffle"}, "learned with a robot of radius 0.18 m, waffle has 0.22 m"),
+        ({"robot": "burger", "pace": 0.5}, "pace must be above 0 and at most 0.44, as burger"),
+        ({"pace": 0.0}, "pace must be above 0"),
+        ({"silent": "near"}, "silent must be one of"),
+        ({"mount": (0.0, 1.0)}, "mount must be 3 numbers, got 2"),
+        ({"unseen": -1.0}, "unseen must be positive, got -1.0"),
+        ({"map_size": math.inf}, "map_size must be a finite number, got inf"),
+    ],
+)
+def test_what_does_not_fit_the_card_is_refused(
+    tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        Pilot.load(exported(tmp_path), **options)
+
+
+def test_numbers_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
+    pilot = Pilot.load(exported(tmp_path))
+    scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))
+    with pytest.raises(ValueError, match="goal must be given to begin"):
+        pilot.decide(scan, *still)
+    with pytest.raises(ValueError, match="goal must be a finite number, got nan"):
+        pilot.begin((math.nan, 0.0))
+    pilot.begin((1.0, 0.0))
+    with pytest.raises(ValueError, match="pose must be a finite number, got nan"):
+        pilot.decide(scan, (0.0, math.nan, 0.0), (0.0, 0.0))
+    with pytest.raises(ValueError, match="speeds must be a finite number, got inf"):
+        pilot.decide(scan, (0.0, 0.0, 0.0), (math.inf, 0.0))
+    broken = Pilot(pilot.card, lambda seen: np.full((1, 2), np.nan, np.float32))
+    broken.begin((1.0, 0.0))
+    with pytest.raises(ValueError, match="the network's action must be finite"):
+        broken.decide(scan, *still)
+
+
+def test_a_network_of_another_size_is_refused(tmp_path: Path) -> None:
+    from mpfa_envs.deploy import Network
+
+    _, content = read_exported(exported(tmp_path))
+    with pytest.raises(CardError, match="the network must map"):
+        Network(content, 25, 2)
+    with pytest.raises(CardError, match="holds no network"):
+        Network(b"nothing", 24, 2)
+    with pytest.raises(CardError, match="the card has no 'format'"):
+        Card.of({})

@@ -1,0 +1,122 @@
+"""Scans of any kind as sectors: as a plain loop reads them, or refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime", reason="exported policies are of the extra onnx")
+
+from mpfa_envs.deploy import Card, Scan, ScanError, Sectors
+from mpfa_envs.robot import ROBOTS
+
+
+def card(**changes: Any) -> Card:
+    values: dict[str, Any] = {
+        "observation_size": 24,
+        "action_size": 2,
+        "sectors": 18,
+        "reduction": "min",
+        "max_range": 10.0,
+        "closeness_distance": 0.25,
+        "memory": "none",
+        "history": 0,
+        "robot": ROBOTS["turtlebot2"],
+        "period": 0.2,
+        "goal_radius": 0.5,
+        "env_arguments": {},
+        "training": {},
+    }
+    return Card(**values | changes)
+
+
+def plain(scan: Scan, reduction: str, mount: tuple[float, float, float]) -> list[float]:
+    """The sectors by a loop over rays, each of which has some."""
+    rays: list[list[tuple[float, float]]] = [[] for _ in range(18)]
+    for number, measured in enumerate(np.asarray(scan.ranges).tolist()):
+        angle = scan.angle_min + number * scan.angle_increment + mount[2]
+        far = measured >= scan.range_max
+        if not far and not measured >= max(scan.range_min, 0.0):
+            continue
+        distance = 10.0
+        if not far:
+            x, y = mount[0] + measured * math.cos(angle), mount[1] + measured * math.sin(angle)
+            angle, distance = math.atan2(y, x), min(math.hypot(x, y), 10.0)
+        degrees = math.degrees(math.remainder(angle, math.tau))
+        if abs(degrees) < 90.0:
+            sector = int((90.0 - degrees) // 10.0)
+            off = abs(degrees - (85.0 - 10.0 * sector))
+            rays[sector].append((distance, off))
+    if reduction == "single":
+        return [min(each, key=lambda ray: ray[1])[0] for each in rays]
+    reduce = {"min": min, "median": np.median}[reduction]
+    return [float(reduce([ray[0] for ray in each])) for each in rays]
+
+
+@pytest.mark.parametrize("reduction", ["min", "median", "single"])
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2), (-0.04, 0.02, -1.0)])
+@pytest.mark.parametrize(
+    ("start", "step", "count"),
+    [(-math.pi, math.tau / 360, 360), (0.001, math.tau / 719, 719), (3.1, -math.tau / 640, 640)],
+)
+def test_sectors_are_those_of_a_plain_loop(
+    reduction: str, mount: tuple[float, float, float], start: float, step: float, count: int
+) -> None:
+    rng = np.random.default_rng(count)
+    ranges = rng.uniform(0.1, 6.0, count)
+    odd = rng.choice([math.inf, math.nan, 0.0, -math.inf, 0.05], count)
+    ranges = np.where(rng.random(count) < 0.2, odd, ranges)
+    scan = Scan(start + 3e-3, step, ranges, range_min=0.12, range_max=5.5)
+    found, points = Sectors(card(reduction=reduction), mount=mount).read(scan)
+    np.testing.assert_allclose(found, plain(scan, reduction, mount), atol=1e-12)
+    assert len(points.angles) == len(points.ranges) and points.ranges.max() <= 10.0
+
+
+def test_what_meets_nothing_is_as_far_as_the_policy_sees() -> None:
+    for nothing in (math.inf, 3.5, 40.0):
+        scan = Scan(-math.pi, math.pi / 90, np.full(180, nothing), 0.1, 3.5)
+        assert (Sectors(card()).read(scan)[0] == 10.0).all()
+
+
+def test_a_sector_between_two_rays_has_the_nearer_one() -> None:
+    # A ray every 15 degrees, from -90 to 90: 1 m, 2 m and so on from the right.
+    scan = Scan(-math.pi / 2, math.pi / 12, np.arange(1.0, 14.0), 0.0, 100.0)
+    found, _ = Sectors(card(max_range=100.0)).read(scan)
+    # From the left: the rays at 90 and 75 degrees, then twice that at 60, between two sectors.
+    assert found[:4].tolist() == [13.0, 12.0, 11.0, 11.0]
+    assert set(found.tolist()) == set(np.arange(1.0, 14.0).tolist())
+
+
+def test_sectors_out_of_view_are_refused_or_have_the_range_that_one_says() -> None:
+    scan = Scan(-math.pi / 3, math.pi / 180, np.full(121, 1.0))
+    with pytest.raises(ScanError, match="the scan does not reach the sector at 85 degrees"):
+        Sectors(card()).read(scan)
+    found, _ = Sectors(card(), unseen=4.0).read(scan)
+    assert found[[0, 1, 16, 17]].tolist() == [4.0] * 4 and found[3:15].tolist() == [1.0] * 12
+
+
+def test_sectors_without_a_valid_ray_are_refused_or_free() -> None:
+    ranges = np.full(360, 2.0)
+    ranges[180:190] = 0.0  # From 0 to 9 degrees, to the left.
+    scan = Scan(-math.pi, math.pi / 180, ranges, range_min=0.1)
+    with pytest.raises(ScanError, match="no ray of the sector at 5 degrees is valid"):
+        Sectors(card()).read(scan)
+    found, _ = Sectors(card(), silent="far").read(scan)
+    assert found[8] == 10.0 and np.delete(found, 8).tolist() == [2.0] * 17
+
+
+@pytest.mark.parametrize(
+    ("scan", "message"),
+    [
+        (Scan(0.0, 0.1, []), r"ranges must have shape \[R\], got \(0,\)"),
+        (Scan(0.0, 0.1, [[1.0]]), r"ranges must have shape \[R\], got \(1, 1\)"),
+        (Scan(math.nan, 0.1, [1.0]), "a scan needs a first angle and a step, got nan and 0.1"),
+        (Scan(0.0, 0.0, [1.0]), "a scan needs a first angle and a step, got 0.0 and 0.0"),
+    ],
+)
+def test_what_is_no_scan_is_refused(scan: Scan, message: str) -> None:
+    with pytest.raises(ScanError, match=message):
+        Sectors(card()).read(scan)

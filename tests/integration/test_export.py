@@ -1,0 +1,71 @@
+"""The export script: a file, a card with results, and what was compared."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
+
+import evaluate
+import export
+from mpfa_envs import load_policy
+
+SHIPPED = Path(export.__file__).parent / "policies" / "td3-mpfa_per.npz"
+
+
+def test_the_script_tells_what_it_compared_and_puts_known_results_on_the_card(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(SHIPPED, tmp_path / "policy.npz")
+    evaluate.main([str(tmp_path), *["--worlds", "B", "--episodes", "2", "--no-pictures"]])
+    stale = tmp_path / "evaluation-stale"
+    shutil.copytree(tmp_path / "evaluation-B", stale)
+    settings = json.loads((stale / "settings.json").read_text())
+    (stale / "settings.json").write_text(json.dumps(settings | {"sha256": "of another"}))
+    file = export.main([str(tmp_path), "--episodes", "3"])
+    assert file == tmp_path / "policy.onnx"
+    known, compared = json.loads((tmp_path / "policy.json").read_text())["results"]
+    assert known["worlds_asked"] == ["B"] and known["episodes"] == 2
+    assert compared["episodes"] == compared["same"] == 3
+    assert compared["exported"] == compared["before"]
+    printed = capsys.readouterr().out
+    assert "largest difference of an action, 1000 observations: " in printed
+    assert "the same to the last digit: 3 of 3" in printed
+    evaluate.main([str(file), *["--worlds", "B", "--episodes", "2", "--no-pictures"]])
+    assert sorted(path.suffix for path in tmp_path.glob("policy.*")) == [".json", ".npz", ".onnx"]
+
+
+def test_a_file_that_differs_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(export, "TOLERANCE", -1.0)
+    with pytest.raises(SystemExit, match="the file differs from the policy by"):
+        export.main([str(SHIPPED), "--output", str(tmp_path / "policy.onnx"), "--episodes", "0"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_quantized_file_is_written_with_how_it_drives(tmp_path: Path) -> None:
+    file = tmp_path / "small.onnx"
+    export.main([str(SHIPPED), "--output", str(file), "--episodes", "1", "--quantize"])
+    assert json.loads((tmp_path / "small.json").read_text())["precision"] == "int8"
+    assert load_policy(file).observation_size == 24
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nothing.npz"], "there is no policy at nothing.npz"),
+        ([str(SHIPPED), "--output", "policy.pt"], "--output must end in .onnx, got policy.pt"),
+        ([str(SHIPPED), "--episodes", "-1"], "--episodes must be at least 0, got -1"),
+    ],
+)
+def test_a_wrong_command_line_is_refused(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        export.main(words)
+    assert message in capsys.readouterr().err
