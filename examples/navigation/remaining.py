@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from statistics import median
 
 from navigation import files
@@ -21,7 +22,7 @@ def free_checkpoints(study: Study) -> None:
         (job.path / files.CHECKPOINT).unlink(missing_ok=True)
 
 
-def seconds_of(job: Job, study: Study) -> float | None:
+def seconds_of(job: Job, study: Study) -> tuple[float, float] | None:
     """Time that a run and its evaluation took, alone in its process.
 
     Args:
@@ -29,17 +30,20 @@ def seconds_of(job: Job, study: Study) -> float | None:
         study: What it is a run of.
 
     Returns:
-        Wall-clock time [s]; None for a run without evaluations.
+        Wall-clock time of the training and of the evaluation [s]; None for a run without
+        evaluations during training.
     """
     found = read_table(job.path / files.EVALUATIONS)
     if not len(found):
         return None
-    # Written at the end of the training, and at the end of the evaluation that follows at once.
+    # The policy is written at the end of the training, the rows at that of the evaluation, which
+    # begins at once. A second one begins some time later: it takes no longer than a training.
     trained, tested = (
         path.stat().st_mtime
         for path in (job.path / files.POLICY, job.path / study.evaluation.folder / files.EPISODES)
     )
-    return float(found["trained_for"].iloc[-1] + found["seconds"].sum() + tested - trained)
+    training = float(found["trained_for"].iloc[-1] + found["seconds"].sum())
+    return training, min(tested - trained, training)
 
 
 def hours_left(studies: Sequence[Study], *, jobs: int) -> float | None:
@@ -52,34 +56,46 @@ def hours_left(studies: Sequence[Study], *, jobs: int) -> float | None:
     Returns:
         Hours, by the median run of each study, or of all if it has none yet; None before the first.
     """
-    typical = [_median(_seconds(study)) for study in studies]
-    of_all = _median(each for each in typical if each is not None)
+    typical = [_medians(_seconds(study)) for study in studies]
+    of_all = _medians([each for each in typical if each is not None])
     if of_all is None:
         return None
     left = 0.0
-    counted = set()
+    training: set[Path] = set()
+    testing: set[tuple[Path, str]] = set()
     for study, seconds in zip(studies, typical, strict=True):
+        to_train, to_test = seconds or of_all
         done = {job.path for job in jobs_done(study)}
         for job in study.jobs:
-            wanted = job.path, study.evaluation.folder
-            if job.path not in done and wanted not in counted:
-                counted.add(wanted)
-                left += of_all if seconds is None else seconds
+            test = job.path, study.evaluation.folder
+            if job.path in done or test in testing:
+                continue
+            testing.add(test)
+            left += to_test
+            if job.path not in training and not job.is_trained():
+                training.add(job.path)
+                left += to_train
     return left / jobs / 3600
 
 
 def counts(studies: Sequence[Study]) -> tuple[int, int]:
-    """Runs that are done, and all that are wanted; one that two studies want counts once."""
-    wanted = {(job.path, study.evaluation.folder) for study in studies for job in study.jobs}
-    done = {(job.path, study.evaluation.folder) for study in studies for job in jobs_done(study)}
-    return len(done), len(wanted)
+    """Runs that are trained and tested wherever they shall be, and all that are wanted."""
+    done: dict[Path, bool] = {}
+    for study in studies:
+        whole = {job.path for job in jobs_done(study)}
+        for job in study.jobs:
+            done[job.path] = done.get(job.path, True) and job.path in whole
+    return sum(done.values()), len(done)
 
 
-def _seconds(study: Study) -> list[float]:
+def _seconds(study: Study) -> list[tuple[float, float]]:
     found = (seconds_of(job, study) for job in jobs_done(study))
     return [seconds for seconds in found if seconds is not None]
 
 
-def _median(values: Iterable[float]) -> float | None:
-    found = list(values)
-    return median(found) if found else None
+def _medians(times: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
+    """Of training and evaluation."""
+    if not times:
+        return None
+    training, testing = zip(*times, strict=True)
+    return median(training), median(testing)

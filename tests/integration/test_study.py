@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from navigation.protocol import (
 )
 from navigation.remaining import counts, hours_left
 from navigation.settings import TrainSettings, register
-from navigation.studies import Study
+from navigation.studies import Evaluation, Study
 from navigation.worlds import parse_worlds
 from tests.integration.test_compare import InThisProcess
 from tests.integration.tiny_runs import OVERRIDES
@@ -268,6 +269,12 @@ def test_what_is_left_is_told_by_the_time_that_runs_took(small: Path) -> None:
     # 1,030 s and the evaluation's, of which there are three more.
     assert hours_left(wanted, jobs=2) == pytest.approx(3 * 1030 / 2 / 3600, rel=0.1)
     assert hours_left(wanted, jobs=1) == pytest.approx(3 * 1030 / 3600, rel=0.1)
+    # To be tested somewhere else takes no training.
+    elsewhere = replace(wanted[1], seeds=range(100, 101), evaluation=Evaluation(("A",), 2))
+    assert counts([elsewhere]) == (0, 1)
+    assert counts([*wanted, elsewhere]) == (0, 4)
+    more = hours_left([*wanted, elsewhere], jobs=1)
+    assert more is not None and 3 * 1030 < 3600 * more < 3 * 1030 + 300
 
 
 @pytest.mark.parametrize(
