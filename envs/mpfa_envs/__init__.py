@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mpfa_envs.mirror import Mirror, RandomMirror
     from mpfa_envs.navigation import NavigationEnv
     from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
+    from mpfa_envs.occupancy import OccupancyGrid
     from mpfa_envs.path import PathPlanner
     from mpfa_envs.planners import PLANNERS, DynamicWindow, MapPlanner, make_planner
     from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
@@ -43,8 +44,9 @@ if TYPE_CHECKING:
     from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
     from mpfa_envs.vector import VectorNavigationEnv
     from mpfa_envs.walkers import Walker
-    from mpfa_envs.world_file import WorldFileError, load_world, save_world
+    from mpfa_envs.world_file import load_world, save_world
     from mpfa_envs.worlds import World, WorldArrays
+    from mpfa_envs.yaml_nodes import WorldFileError
 
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start your own from."""
@@ -78,6 +80,7 @@ __all__ = [
     "Mirror",
     "NavigationEnv",
     "NavigationTorchEnv",
+    "OccupancyGrid",
     "PathPlanner",
     "Policy",
     "PolicyFileError",
@@ -147,6 +150,7 @@ _MODULES = {
     "Mirror": "mirror",
     "NavigationEnv": "navigation",
     "NavigationTorchEnv": "torchrl_env",
+    "OccupancyGrid": "occupancy",
     "PathPlanner": "path",
     "Policy": "policy",
     "PolicyFileError": "policy",
@@ -160,7 +164,7 @@ _MODULES = {
     "Walker": "walkers",
     "World": "worlds",
     "WorldArrays": "worlds",
-    "WorldFileError": "world_file",
+    "WorldFileError": "yaml_nodes",
     "WorldTask": "task_sets",
     "barn_task": "barn",
     "barn_world": "barn",

@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from mpfa_envs.checks import check_number, check_positive, check_share
+from mpfa_envs.kernels.cells import lower_clearances
 from mpfa_envs.kernels.grid import (
     MOVES,
     STEP_SCALE,
@@ -32,7 +33,14 @@ from mpfa_envs.kernels.grid import (
     number_cells,
     shortest_way,
 )
-from mpfa_envs.tasks import START_SLACK, Task
+from mpfa_envs.local_field import (
+    LocalField,
+    length_in_map,
+    sample_task_in_map,
+    usual_clearance,
+    within_cell,
+)
+from mpfa_envs.tasks import Task
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -44,8 +52,6 @@ __all__ = ["DistanceField", "FreeGrid", "sample_task_on_grid", "shortest_way"]
 RESOLUTION: Final = 0.1
 """Side of a cell unless another is asked for [m]."""
 _MOST_CELLS: Final = 4_000_000
-_ROOMY: Final = 0.1
-"""Share of the free cells with the usual clearance that a world must have to be asked for it."""
 _GOALS: Final = 30
 """Goals that are tried before a world is said to have no task."""
 _DETOURS: Final = 5
@@ -96,6 +102,9 @@ class FreeGrid:
         """Center of the first cell (x, y) [m]."""
         self.clearance: NDArray[np.float32] = clearance_grid(*world.arrays, self.xs, self.ys)
         """Distance of each center from the nearest obstacle or wall [m], ``[nx, ny]``."""
+        if (cells := world.occupancy) is not None:
+            left, right, _ = cells.arrays
+            lower_clearances(left, right, cells.resolution, self.xs, self.ys, self.clearance)
         self.free: NDArray[np.bool_] = self.clearance >= np.float32(self.distance)
         """Where the center keeps the distance, ``[nx, ny]``."""
 
@@ -178,6 +187,8 @@ class FreeGrid:
         """
         if not self.free.any():
             return math.inf
+        if self.world.occupancy is not None:
+            return length_in_map(self, start, goal)
         ways = self.distances(goal)
         return min(float(ways[cell]) + gap for cell, gap in self.cells_around(start))
 
@@ -254,6 +265,16 @@ class DistanceField:
         """Length of the shortest way [m], infinite where there is none, ``[nx, ny]``."""
         self.values[grid.free] = grid.distances(self.goal)
 
+    @property
+    def origin(self) -> tuple[float, float]:
+        """Center of the first cell (x, y) [m]."""
+        return self.grid.origin
+
+    @property
+    def resolution(self) -> float:
+        """Side of a cell [m]."""
+        return self.grid.resolution
+
     @cached_property
     def filled(self) -> NDArray[np.float32]:
         """As :attr:`values`; cells without a way have what the nearest cell with one has."""
@@ -282,11 +303,14 @@ def sample_task_on_grid(
     detour_chance: float = 0.0,
     start_clearance: float | None = None,
     goal_clearance: float | None = None,
-) -> tuple[Task, DistanceField]:
+) -> tuple[Task, DistanceField | LocalField]:
     """Sample a goal, and a start from which there is a way to it, over the cells of a grid.
 
     It takes milliseconds however many obstacles there are and however rare tasks are, where
     :func:`~mpfa_envs.sample_task` tries points one by one.
+
+    In the world of a map no way is longer than 20 m, start and goal have the usual clearance, and
+    the field is that of a window around the goal.
 
     Args:
         place: A grid, or a world, of which one is made.
@@ -323,6 +347,14 @@ def sample_task_on_grid(
     check_share("detour_chance", detour_chance)
     grid = _as_grid(place, distance)
     world = grid.world
+    if world.occupancy is not None:
+        return sample_task_in_map(
+            grid,
+            rng,
+            min_goal_distance=min_goal_distance,
+            max_goal_distance=max_goal_distance,
+            detour_chance=detour_chance,
+        )
     goal_room = _clearance(grid, goal_clearance)
     start_room = _clearance(grid, start_clearance)
     columns, rows = grid.cells.T
@@ -336,7 +368,7 @@ def sample_task_on_grid(
         if straight is not None and attempt >= _DETOURS:
             break
         goal_cell = goals[rng.integers(len(goals))]
-        goal = _within_cell(grid, rng, x[goal_cell], y[goal_cell], goal_room)
+        goal = within_cell(grid, rng, x[goal_cell], y[goal_cell], goal_room)
         field = DistanceField(grid, goal)
         way = field.values[columns, rows]
         direct = np.hypot(x - goal[0], y - goal[1])
@@ -349,7 +381,7 @@ def sample_task_on_grid(
         if not len(starts) or (detour and not wanted and straight is not None):
             continue
         cell = starts[rng.integers(len(starts))]
-        start = _within_cell(grid, rng, x[cell], y[cell], start_room)
+        start = within_cell(grid, rng, x[cell], y[cell], start_room)
         task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
         if wanted or not detour:
             return task, field
@@ -399,9 +431,7 @@ def _clearance(grid: FreeGrid, wanted: float | None) -> float:
     """The clearance that starts or goals keep [m]."""
     if wanted is not None:
         return max(check_positive("clearance", wanted), grid.distance)
-    usual = grid.distance + START_SLACK
-    roomy = np.count_nonzero(grid.clearance >= np.float32(usual))
-    return usual if roomy >= _ROOMY * np.count_nonzero(grid.free) else grid.distance
+    return usual_clearance(grid)
 
 
 def _in_regions(
@@ -413,13 +443,3 @@ def _in_regions(
         x_min, y_min, x_max, y_max = region.bounds
         inside |= (x_min <= x) & (x <= x_max) & (y_min <= y) & (y <= y_max)
     return inside
-
-
-def _within_cell(
-    grid: FreeGrid, rng: np.random.Generator, x: float, y: float, clearance: float
-) -> tuple[float, float]:
-    """A point of a cell that keeps the clearance, its center if no other is found."""
-    for across, up in (grid.resolution * (rng.random((4, 2)) - 0.5)).tolist():
-        if grid.world.clearance(x + across, y + up) >= clearance:
-            return float(x + across), float(y + up)
-    return float(x), float(y)

@@ -20,6 +20,7 @@ from mpfa_envs.worlds import World
 if TYPE_CHECKING:
     from mpfa_envs.arguments import TaskArguments
     from mpfa_envs.distance import DistanceField, FreeGrid
+    from mpfa_envs.local_field import LocalField
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """What stands for one world."""
@@ -38,7 +39,7 @@ class Episode(NamedTuple):
     """Start and goal."""
     shortest_path: float
     """The shortest path to the goal's center [m]."""
-    field: DistanceField | None
+    field: DistanceField | LocalField | None
     """Lengths of the ways to the goal, if the progress is along the shortest path."""
 
 
@@ -54,7 +55,9 @@ _kept_grid_of = lru_cache(maxsize=4)(_grid_of)
 """The same for worlds that stay; a grid takes some megabytes."""
 
 
-def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
+def distance_field(
+    world: World, distance: float, goal: tuple[float, float]
+) -> DistanceField | LocalField:
     """Measure the ways to a goal from everywhere in a world.
 
     Args:
@@ -63,10 +66,14 @@ def distance_field(world: World, distance: float, goal: tuple[float, float]) -> 
         goal: Where they lead (x, y) [m].
 
     Returns:
-        The field.
+        The field; in the world of a map, that of a window around the goal.
     """
     from mpfa_envs.distance import DistanceField
 
+    if world.occupancy is not None:
+        from mpfa_envs.local_field import LocalField
+
+        return LocalField(_kept_grid_of(world, distance), goal)
     return DistanceField(_kept_grid_of(world, distance), goal)
 
 

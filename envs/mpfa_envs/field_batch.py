@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.distance import DistanceField
+    from mpfa_envs.local_field import LocalField
 
 
 class FieldArrays(NamedTuple):
@@ -53,7 +54,7 @@ class FieldBatch:
         """What the compiled loops read; setting a larger field may replace the arrays."""
         return self._fields
 
-    def __setitem__(self, robot: int, field: DistanceField) -> None:
+    def __setitem__(self, robot: int, field: DistanceField | LocalField) -> None:
         nx, ny = field.filled.shape
         values = self._fields.values
         if nx > values.shape[1] or ny > values.shape[2]:
@@ -63,5 +64,5 @@ class FieldBatch:
             self._fields = self._fields._replace(values=wider)
         self._fields.values[robot, :nx, :ny] = field.filled
         self._fields.shapes[robot] = nx, ny
-        self._fields.origins[robot] = field.grid.origin
-        self._fields.resolutions[robot] = field.grid.resolution
+        self._fields.origins[robot] = field.origin
+        self._fields.resolutions[robot] = field.resolution

@@ -17,6 +17,7 @@ from mpfa_envs.checks import check_count, check_number, check_positive
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.occupancy import OccupancyGrid
     from mpfa_envs.worlds import World
 
 Reduction = Literal["min", "median", "single"]
@@ -84,6 +85,7 @@ class Lidar:
             centers = np.array([(c.x, c.y) for c in world.cylinders]).T[..., None]
             self._circles = centers, np.array([c.radius for c in world.cylinders])[:, None] ** 2
         self._polygons = world if world.polygons else None
+        self._occupancy = world.occupancy
         count = len(shapes)
         # Buffers: allocating them anew would cost as much as the arithmetic.
         self._origin = np.empty((2, 1, 1))
@@ -144,6 +146,8 @@ class Lidar:
             np.minimum(ranges, self._cast_at_circles(centers, squares), out=ranges)
         if self._polygons is not None:
             np.minimum(ranges, self._cast_at_polygons(self._polygons), out=ranges)
+        if self._occupancy is not None:
+            self._cast_at_cells(self._occupancy, ranges)
         np.maximum(ranges, 0.0, out=ranges)
         return np.minimum(ranges, self.max_range, out=ranges)
 
@@ -174,6 +178,16 @@ class Lidar:
         # A ray along an edge has no solution; the edges that it meets at the ends have one.
         ranges[~((share >= 0.0) & (share <= 1.0) & (ranges >= 0.0))] = math.inf
         return np.asarray(ranges.min(axis=0))
+
+    def _cast_at_cells(self, grid: OccupancyGrid, ranges: NDArray[np.float64]) -> None:
+        """Lower the range of each ray ``[rays]`` to that of the nearest occupied cell [m]."""
+        # Imported here because it needs Numba, which takes half a second.
+        from mpfa_envs.kernels.cells import cast_at_cells
+
+        x, y = self._origin[:, 0, 0].tolist()
+        beams = np.concatenate((self._directions[:, 0], self._inverse[:, 0]))
+        if cast_at_cells(x, y, beams, grid.arrays.gaps, grid.resolution, self.max_range, ranges):
+            ranges[:] = 0.0
 
     def scan(
         self, x: float, y: float, heading: float, *, rng: np.random.Generator | None = None

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.distance import DistanceField
+    from mpfa_envs.local_field import LocalField
     from mpfa_envs.map_memory import MapMemory
     from mpfa_envs.walker_batch import WalkerBatch
     from mpfa_envs.worlds import World
@@ -196,7 +197,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             self.lidar.sectors, self.world.diagonal
         )
         self._task: Task | None = None
-        self._field: DistanceField | None = None
+        self._field: DistanceField | LocalField | None = None
         self._running = False
         self._observation: NDArray[np.float32] | None = None
         self._trail: list[tuple[float, float]] = []

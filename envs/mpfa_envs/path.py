@@ -301,6 +301,8 @@ def _polygon(
 
 def is_small(world: World) -> bool:
     """Tell whether paths are planned exactly in a world, and not on a grid."""
+    if world.occupancy is not None:
+        return False
     corners = 12 * len(world.boxes) + _CIRCLE_CORNERS * len(world.cylinders)
     corners += sum(2 * len(polygon.vertices) for polygon in world.polygons)
     return corners <= _MOST_CORNERS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from mpfa_envs.occupancy import OccupancyGrid
 from mpfa_envs.shapes import Box, Cylinder, Polygon
 from mpfa_envs.walkers import Walker
 from mpfa_envs.worlds import World
@@ -33,6 +34,7 @@ def world_to_plain(world: World) -> dict[str, Any]:
         "start_regions": [_edges(box) for box in world.start_regions],
         "goal_regions": [_edges(box) for box in world.goal_regions],
         "walkers": [walker_to_plain(walker) for walker in world.walkers],
+        **({} if world.occupancy is None else {"occupancy": world.occupancy.plain}),
     }
 
 
@@ -79,6 +81,9 @@ def world_from_plain(values: dict[str, Any]) -> World:
             walkers=tuple(
                 Walker(**{**walker, "waypoints": tuple((x, y) for x, y in walker["waypoints"])})
                 for walker in values["walkers"]
+            ),
+            occupancy=(
+                OccupancyGrid.from_plain(values["occupancy"]) if "occupancy" in values else None
             ),
         )
     except (KeyError, TypeError, IndexError) as error:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.map_memory import Sketch
+    from mpfa_envs.occupancy import OccupancyGrid
     from mpfa_envs.robot import RobotModel
     from mpfa_envs.worlds import World
 
@@ -110,9 +111,21 @@ class _Canvas:
             self.disc(cylinder.x, cylinder.y, cylinder.radius, fill=OBSTACLE, outline=OBSTACLE_EDGE)
         for polygon in world.polygons:
             self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
+        if world.occupancy is not None:
+            self._draw_cells(world.occupancy)
         for walker in world.walkers:
             for leg in walker.legs:
                 self.line(leg, ROUND, 1.2)
+
+    def _draw_cells(self, grid: OccupancyGrid) -> None:
+        """Fill the occupied cells; a pixel with any is an obstacle."""
+        half = grid.size[0] / 2, grid.size[1] / 2
+        left, top = map(round, self.at(-half[0], half[1]))
+        right, bottom = map(round, self.at(half[0], -half[1]))
+        cells = Image.fromarray(np.flipud(grid.occupied.T).astype(np.uint8) * 255)
+        shrunk = cells.resize((right - left, bottom - top), Image.Resampling.BOX)
+        mask = shrunk.point([0] + 255 * [255])
+        self.image.paste(OBSTACLE, (left, top, right, bottom), mask)
 
     def rectangle(
         self,

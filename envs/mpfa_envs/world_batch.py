@@ -11,7 +11,23 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from mpfa_envs.occupancy import OccupancyGrid
     from mpfa_envs.worlds import World
+
+
+class GridArrays(NamedTuple):
+    """The maps that robots drive in; of each table only the first columns and rows count."""
+
+    left: NDArray[np.int16]
+    """The nearest occupied column to the left, ``[maps, most columns, most rows]``."""
+    right: NDArray[np.int16]
+    """The nearest to the right."""
+    gaps: NDArray[np.uint8]
+    """Columns or rows to the nearest occupied cell."""
+    shapes: NDArray[np.int64]
+    """Numbers of columns and rows, ``[maps, 2]``."""
+    resolutions: NDArray[np.float64]
+    """Side of a cell [m], ``[maps]``."""
 
 
 class BatchArrays(NamedTuple):
@@ -29,6 +45,10 @@ class BatchArrays(NamedTuple):
     """Where the edges of each polygon end in segments, ``[N, most polygons]``."""
     counts: NDArray[np.int64]
     """Numbers of boxes, circles, segments and polygons, ``[N, 4]``."""
+    grids: GridArrays
+    """Maps; robots in the same one share it."""
+    grid_of: NDArray[np.int64]
+    """Number of each robot's map, -1 without one, ``[N]``."""
 
 
 class WorldBatch:
@@ -60,7 +80,10 @@ class WorldBatch:
             np.empty((robots, 0, 4)),
             np.empty((robots, 0), dtype=np.int64),
             np.zeros((robots, 4), dtype=np.int64),
+            _grid_arrays([]),
+            np.full(robots, -1),
         )
+        self._grids: list[OccupancyGrid] = []
         # The same without the walkers.
         self._standing = self._rooms.counts.copy()
         for robot, world in enumerate(worlds):
@@ -102,6 +125,37 @@ class WorldBatch:
         self._standing[robot] = self._rooms.counts[robot]
         self._standing[robot, 1] -= len(walkers)
         self._worlds[robot] = world
+        self._rooms.grid_of[robot] = -1
+        if world.occupancy is not None:
+            self._set_grid(robot, world.occupancy)
+
+    def _set_grid(self, robot: int, grid: OccupancyGrid) -> None:
+        """Let a robot drive in a map, which it shares with whoever does so already."""
+        grids = self._grids
+        if grid not in grids:
+            used = {int(number) for number in self._rooms.grid_of if number >= 0}
+            kept = [number for number in range(len(grids)) if number in used]
+            places = np.full(len(grids) + 1, -1)
+            places[kept] = np.arange(len(kept))
+            self._grids = grids = [*(grids[number] for number in kept), grid]
+            # The last place stands for none: -1 stays -1.
+            self._rooms.grid_of[:] = places[self._rooms.grid_of]
+            self._rooms = self._rooms._replace(grids=_grid_arrays(grids))
+        self._rooms.grid_of[robot] = grids.index(grid)
+
+
+def _grid_arrays(grids: Sequence[OccupancyGrid]) -> GridArrays:
+    """Copy maps into tables."""
+    shapes = np.array([grid.occupied.shape for grid in grids], dtype=np.int64).reshape(-1, 2)
+    most = shapes.max(axis=0, initial=0)
+    left, right, gaps = (
+        np.zeros((len(grids), *most), kind) for kind in (np.int16, np.int16, np.uint8)
+    )
+    for number, (grid, (columns, rows)) in enumerate(zip(grids, shapes, strict=True)):
+        for table, values in zip((left, right, gaps), grid.arrays, strict=True):
+            table[number, :columns, :rows] = values
+    resolutions = np.array([grid.resolution for grid in grids], dtype=np.float64)
+    return GridArrays(left, right, gaps, shapes, resolutions)
 
 
 def _widened(table: NDArray[np.float64], count: int) -> NDArray[np.float64]:

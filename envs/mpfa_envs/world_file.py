@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import yaml
 
-from mpfa_envs.checks import did_you_mean
 from mpfa_envs.plain_worlds import walker_to_plain
 from mpfa_envs.shapes import Box, Cylinder, Polygon
 from mpfa_envs.walkers import Walker
 from mpfa_envs.worlds import World
+from mpfa_envs.yaml_nodes import NodeReader, is_map, read_nodes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,16 +34,12 @@ _FINEST: Final = 0.01
 """Room that a square of this diagonal may hold is not looked for [m]."""
 _MOST_CELLS: Final = 100_000
 """A region in which more squares are undecided is too large and too narrow to be looked through."""
-_LARGEST_FILE: Final = 1_000_000
-"""Longest text that is read [characters]."""
-
-
-class WorldFileError(ValueError):
-    """A file does not describe a world; the message names the file and the line."""
 
 
 def load_world(path: str | os.PathLike[str]) -> World:
     """Read a world from a YAML file; ``docs/worlds.md`` describes the format.
+
+    A map of ROS, a YAML file with the key ``image``, is read as by :meth:`World.from_map`.
 
     Args:
         path: The file.
@@ -63,39 +58,22 @@ def load_world(path: str | os.PathLike[str]) -> World:
         ('example', 4, 3)
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    if len(text) > _LARGEST_FILE:
-        raise WorldFileError(f"{path}: has {len(text)} characters, more than {_LARGEST_FILE}")
-    try:
-        # Nodes instead of objects: they carry line numbers, and no tag can run anything.
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
-    except RecursionError:
-        raise WorldFileError(f"{path}: is nested too deeply") from None
+    root = read_nodes(path)
+    if is_map(root):
+        # Imported here because most worlds are no maps.
+        from mpfa_envs.map_file import read_map
+
+        return read_map(path, root)
     return _Reader(path).world(root)
 
 
-class _Reader:
+class _Reader(NodeReader):
     """Turns the nodes of one file into a world."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def error(self, node: yaml.Node | None, text: str) -> WorldFileError:
-        """An error at the line of a node."""
-        line = node.start_mark.line + 1 if node else 1
-        return WorldFileError(f"{self._path}:{line}: {text}")
 
     def world(self, root: yaml.Node | None) -> World:
         """Read the whole file."""
         entries = self.mapping(root, "the file", _KEYS)
-        name = self._path.stem
+        name = self.path.stem
         if "name" in entries:
             name = self.text(entries["name"], "name")
         if "size" not in entries:
@@ -132,54 +110,6 @@ class _Reader:
             return World(**parts)
         except ValueError as error:
             raise self.error(node, str(error)) from error
-
-    def mapping(
-        self, node: yaml.Node | None, what: str, keys: tuple[str, ...]
-    ) -> dict[str, yaml.Node]:
-        """Read a mapping that has no other keys, and none twice."""
-        if not isinstance(node, yaml.MappingNode):
-            raise self.error(node, f"{what} must be a mapping with the keys {', '.join(keys)}")
-        entries: dict[str, yaml.Node] = {}
-        for key, value in node.value:
-            name = key.value if isinstance(key, yaml.ScalarNode) else None
-            if name not in keys:
-                hint = did_you_mean(name, keys) or f"known are {', '.join(keys)}"
-                raise self.error(key, f"unknown key {name!r} in {what}; {hint}")
-            if name in entries:
-                raise self.error(key, f"key {name!r} appears twice in {what}")
-            entries[name] = value
-        return entries
-
-    def items(self, node: yaml.Node, what: str) -> list[yaml.Node]:
-        """Read a list."""
-        if not isinstance(node, yaml.SequenceNode):
-            raise self.error(node, f"{what} must be a list")
-        return list(node.value)
-
-    def number(self, node: yaml.Node, what: str) -> float:
-        """Read a finite number."""
-        try:
-            value = float(node.value) if isinstance(node, yaml.ScalarNode) else math.nan
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            got = node.value if isinstance(node, yaml.ScalarNode) else "something else"
-            raise self.error(node, f"{what} must be a number in meters, got {got!r}")
-        return value
-
-    def text(self, node: yaml.Node, what: str) -> str:
-        """Read a word or more."""
-        if not isinstance(node, yaml.ScalarNode) or not node.value.strip():
-            raise self.error(node, f"{what} must be text")
-        return str(node.value)
-
-    def pair(self, node: yaml.Node, what: str, form: str) -> tuple[float, float]:
-        """Read a list of two numbers."""
-        values = self.items(node, what)
-        if len(values) != 2:
-            raise self.error(node, f"{what} must be {form}, got {len(values)} entries")
-        first, second = (self.number(value, what) for value in values)
-        return first, second
 
     def size(self, node: yaml.Node) -> tuple[float, float]:
         """Read the size of the room [m]."""
@@ -297,6 +227,9 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
         world: The world.
         path: The file; an existing one is overwritten.
 
+    Raises:
+        ValueError: If the world has the cells of a map, which :meth:`World.to_map` writes.
+
     Examples:
         >>> import tempfile
         >>> from pathlib import Path
@@ -306,6 +239,8 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
         ...     load_world(Path(folder) / "b.yaml") == WORLDS["B"]
         True
     """
+    if world.occupancy is not None:
+        raise ValueError(f"world {world.name!r} must be written by to_map, as it is a map's")
     content: dict[str, object] = {
         "name": world.name,
         "size": [float(side) for side in world.size],

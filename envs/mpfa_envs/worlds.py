@@ -6,14 +6,17 @@ import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 
+from mpfa_envs.occupancy import OccupancyGrid
 from mpfa_envs.shapes import Box, Cylinder, Polygon, Shape
 from mpfa_envs.walkers import MOST_WALKERS, Walker
 
 if TYPE_CHECKING:
+    import os
+
     from numpy.typing import NDArray
 
     from mpfa_envs.shapes import Point
@@ -60,6 +63,8 @@ class World:
         goal_regions: Where a goal may lie; empty: anywhere in the room.
         walkers: What moves, at most 100. All else that is said of a world, its clearance, its
             paths, its tasks, is said of the obstacles, which stand.
+        occupancy: Cells of a map, as large as the room, the occupied ones of which are obstacles
+            too, any number of them.
 
     Raises:
         ValueError: If the size is out of its range, there are too many obstacles or walkers, or
@@ -80,6 +85,7 @@ class World:
     start_regions: tuple[Box, ...] = ()
     goal_regions: tuple[Box, ...] = ()
     walkers: tuple[Walker, ...] = ()
+    occupancy: OccupancyGrid | None = None
 
     def __post_init__(self) -> None:
         if len(self.size) != 2 or not all(math.isfinite(side) and side > 0 for side in self.size):
@@ -95,6 +101,9 @@ class World:
             for shape in getattr(self, field):
                 if not self.holds(shape):
                     raise ValueError(f"{field} must lie in the room {self.room}, got {shape}")
+        grid = self.occupancy
+        if grid is not None and not np.allclose(grid.size, self.size, rtol=1e-9, atol=0.0):
+            raise ValueError(f"size must be that of the occupancy, {grid.size}, got {self.size}")
         self._check_walkers()
 
     def _check_walkers(self) -> None:
@@ -111,6 +120,40 @@ class World:
                         f"waypoints, which {walker} does not from {leg[0]} to {leg[1]}"
                     )
 
+    @staticmethod
+    def from_map(
+        path: str | os.PathLike[str], *, unknown: Literal["occupied", "free"] = "occupied"
+    ) -> World:
+        """Read a map of ROS, as :func:`~mpfa_envs.map_file.load_map` does.
+
+        Args:
+            path: The YAML file; it names the image.
+            unknown: What cells are of which the map knows nothing.
+
+        Returns:
+            The world, called as the file.
+
+        Raises:
+            WorldFileError: If a file cannot be read or is no map.
+        """
+        from mpfa_envs.map_file import load_map
+
+        return load_map(path, unknown=unknown)
+
+    def to_map(self, path: str | os.PathLike[str], *, resolution: float | None = None) -> None:
+        """Write a map for ROS, as :func:`~mpfa_envs.map_file.save_map` does.
+
+        Args:
+            path: The YAML file; an image with the ending .pgm is written beside it.
+            resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
+
+        Raises:
+            ValueError: If the map would have too many cells, or the path does not end in .yaml.
+        """
+        from mpfa_envs.map_file import save_map
+
+        save_map(self, path, resolution=resolution)
+
     def __hash__(self) -> int:
         """Worlds are keys of caches, and hundreds of obstacles are hashed once only."""
         return self._hash
@@ -118,9 +161,8 @@ class World:
     @cached_property
     def _hash(self) -> int:
         """Hash of all numbers; without the name it is the same in every process."""
-        return hash(
-            (self.size, self.obstacles, self.start_regions, self.goal_regions, self.walkers)
-        )
+        regions = self.start_regions, self.goal_regions
+        return hash((self.size, self.obstacles, *regions, self.walkers, self.occupancy))
 
     def renamed(self, name: str) -> World:
         """Give the same world another name; what was computed of it is kept."""
@@ -153,7 +195,8 @@ class World:
     @property
     def covered_area(self) -> float:
         """Area under obstacles, overlaps counted twice [m²]."""
-        return sum(obstacle.area for obstacle in self.obstacles)
+        cells = 0.0 if self.occupancy is None else self.occupancy.area
+        return sum(obstacle.area for obstacle in self.obstacles) + cells
 
     def holds(self, shape: Shape) -> bool:
         """Tell whether a shape lies in the room; it may touch the walls."""
@@ -199,7 +242,8 @@ class World:
             y: Position [m].
 
         Returns:
-            Distance [m]; zero in a box, negative in a cylinder, in a polygon and behind a wall.
+            Distance [m]; zero in a box or an occupied cell, negative in a cylinder, in a polygon
+            and behind a wall.
         """
         half_width, half_depth = self.size[0] / 2, self.size[1] / 2
         nearest = min(half_width - abs(x), half_depth - abs(y))
@@ -217,6 +261,12 @@ class World:
             nearest = min(nearest, float((np.hypot(*(centers - ((x,), (y,)))) - radii).min()))
         if self.polygons:
             nearest = min(nearest, float(self._to_polygons(np.array([[x, y]]))[0]))
+        if self.occupancy is not None:
+            # Imported here because it needs Numba, which takes half a second.
+            from mpfa_envs.kernels.cells import clearance_of_cells
+
+            left, right, _ = self.occupancy.arrays
+            nearest = clearance_of_cells(left, right, self.occupancy.resolution, x, y, nearest)
         return nearest
 
     def clearances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -226,7 +276,8 @@ class World:
             points: Positions, shape ``[N, 2]`` [m].
 
         Returns:
-            Distances, shape ``[N]`` [m], negative in an obstacle and behind a wall.
+            Distances, shape ``[N]`` [m], negative in an obstacle and behind a wall; zero in an
+            occupied cell.
         """
         x, y = points[:, 0], points[:, 1]
         nearest = np.minimum(self.size[0] / 2 - np.abs(x), self.size[1] / 2 - np.abs(y))
@@ -247,6 +298,11 @@ class World:
                     nearest[part] = np.minimum(nearest[part], gaps.min(axis=1))
             if self.polygons:
                 nearest[part] = np.minimum(nearest[part], self._to_polygons(points[part]))
+        if self.occupancy is not None:
+            from mpfa_envs.kernels.cells import clearances_of_cells
+
+            left, right, _ = self.occupancy.arrays
+            clearances_of_cells(left, right, self.occupancy.resolution, points, nearest)
         return nearest
 
     def clearance_along(self, start: Point, end: Point) -> float:

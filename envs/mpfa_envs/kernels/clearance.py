@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from mpfa_envs.kernels import njit
+from mpfa_envs.kernels.cells import clearance_of_cells
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,6 +55,13 @@ def clearance_at(worlds: BatchArrays, robot: int, x: float, y: float) -> float:
             square = dx * dx + dy * dy
             if square < near * near:
                 nearest = math.sqrt(square) - radius
+    number = worlds.grid_of[robot]
+    if number >= 0:
+        columns, rows = worlds.grids.shapes[number]
+        left = worlds.grids.left[number, :columns, :rows]
+        right = worlds.grids.right[number, :columns, :rows]
+        resolution = worlds.grids.resolutions[number]
+        nearest = clearance_of_cells(left, right, resolution, x, y, nearest)
     return nearest
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.kernels import njit
+from mpfa_envs.kernels.cells import cast_at_cells
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -70,6 +71,12 @@ def cast_rays(
             edges = worlds.segments[robot, first:last]
             inside |= _cast_at_polygon(x, y, ahead, edges, reach, beams, row)
             first = last
+        number = worlds.grid_of[robot]
+        if number >= 0:
+            columns, lines = worlds.grids.shapes[number]
+            gaps = worlds.grids.gaps[number, :columns, :lines]
+            resolution = worlds.grids.resolutions[number]
+            inside |= cast_at_cells(x, y, beams, gaps, resolution, max_range, row)
         for ray in range(rays):
             row[ray] = 0.0 if inside else min(max(row[ray], 0.0), max_range)
 

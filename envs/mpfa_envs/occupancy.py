@@ -1,0 +1,189 @@
+"""Which cells of a map are occupied, as a lidar's SLAM or a floor plan gives them."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import zlib
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.checks import check_number, check_positive
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MOST_CELLS: Final = 16_000_000
+"""No map has more cells, which is 4,000 x 4,000."""
+LONGEST_SIDE: Final = 30_000
+"""Nor more columns or rows: places in them are numbers of 16 bits."""
+_FARTHEST: Final = 255
+"""Distances between cells are told up to this [cells]."""
+
+
+class CellArrays(NamedTuple):
+    """What loops over rays and distances read of a map, each ``[columns, rows]``."""
+
+    left: NDArray[np.int16]
+    """The nearest occupied column in a cell's row, from it to the left; -32,768 if none is."""
+    right: NDArray[np.int16]
+    """The same to the right; 32,767 if none is."""
+    gaps: NDArray[np.uint8]
+    """Columns or rows to the nearest occupied cell, whichever are more, up to 255: no cell of the
+    square with fewer to each side is occupied."""
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyGrid:
+    """Square cells over a whole room; neither a robot nor a ray gets into an occupied one.
+
+    Two grids are equal if all their numbers are.
+
+    Args:
+        occupied: Which cells are occupied, shape ``[columns, rows]``, the first column at the left
+            and the first row at the bottom.
+        resolution: Side of a cell [m].
+        origin: Where the lower left corner is in the frame of the map (x, y) [m]. The world's own
+            frame begins in the middle of the room.
+
+    Raises:
+        ValueError: If there is no cell or there are too many, or a number is out of its range.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import OccupancyGrid, World
+        >>> cells = np.zeros((200, 100), dtype=bool)
+        >>> cells[100, 20:] = True
+        >>> grid = OccupancyGrid(cells, 0.05, origin=(-2.0, -1.0))
+        >>> world = World(name="two halls", size=grid.size, occupancy=grid)
+        >>> world.size, round(world.clearance(-1.0, 0.0), 3), grid.center
+        ((10.0, 5.0), 1.0, (3.0, 1.5))
+    """
+
+    occupied: NDArray[np.bool_]
+    resolution: float
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        cells = np.array(self.occupied)  # A copy, which nobody changes.
+        if cells.ndim != 2 or cells.dtype != np.bool_ or not cells.size:
+            raise ValueError(
+                "occupied must be an array [columns, rows] of bool, got shape "
+                f"{cells.shape} of {cells.dtype}"
+            )
+        if cells.size > MOST_CELLS or max(cells.shape) > LONGEST_SIDE:
+            raise ValueError(
+                f"occupied must have at most {MOST_CELLS} cells and {LONGEST_SIDE} a side, got "
+                f"{cells.shape}"
+            )
+        cells.flags.writeable = False
+        origin = tuple(check_number("origin", value) for value in self.origin)
+        if len(origin) != 2:
+            raise ValueError(f"origin must be two numbers, got {self.origin}")
+        # The dataclass is frozen; these are its only changes, before anyone sees it.
+        object.__setattr__(self, "occupied", cells)
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "resolution", check_positive("resolution", self.resolution))
+
+    def __repr__(self) -> str:
+        columns, rows = self.occupied.shape
+        return f"OccupancyGrid({columns} x {rows} cells of {self.resolution} m)"
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and depth of all cells [m]."""
+        columns, rows = self.occupied.shape
+        return columns * self.resolution, rows * self.resolution
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Where the world's (0, 0) is in the frame of the map (x, y) [m]."""
+        width, depth = self.size
+        return self.origin[0] + width / 2, self.origin[1] + depth / 2
+
+    @property
+    def area(self) -> float:
+        """Area of the occupied cells [m²]."""
+        return float(np.count_nonzero(self.occupied)) * self.resolution**2
+
+    @cached_property
+    def arrays(self) -> CellArrays:
+        """What loops over rays and distances read."""
+        columns = np.arange(len(self.occupied), dtype=np.int16)[:, None]
+        left = np.where(self.occupied, columns, np.int16(-32768))
+        right = np.where(self.occupied, columns, np.int16(32767))
+        np.maximum.accumulate(left, axis=0, out=left)
+        np.minimum.accumulate(right[::-1], axis=0, out=right[::-1])
+        gaps = np.full(self.occupied.shape, _FARTHEST, dtype=np.uint8)
+        if self.occupied.any():
+            # Imported here because few worlds are maps.
+            from scipy.ndimage import distance_transform_cdt
+
+            steps = distance_transform_cdt(~self.occupied, metric="chessboard")
+            np.minimum(steps, _FARTHEST, out=gaps, casting="unsafe")
+        return CellArrays(left, right, gaps)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """A number of 256 bits that no other grid has."""
+        numbers = repr((self.occupied.shape, self.resolution, self.origin)).encode()
+        return hashlib.sha256(numbers + np.packbits(self.occupied).tobytes()).digest()
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, OccupancyGrid):
+            return NotImplemented
+        return self is other or self.digest == other.digest
+
+    def __hash__(self) -> int:
+        """The same in every process."""
+        return int.from_bytes(self.digest[:7], "big")
+
+    @cached_property
+    def plain(self) -> dict[str, Any]:
+        """The grid as strings, numbers and lists; :meth:`from_plain` makes it anew."""
+        packed = zlib.compress(np.packbits(self.occupied).tobytes())
+        return {
+            "shape": list(self.occupied.shape),
+            "resolution": self.resolution,
+            "origin": list(self.origin),
+            "cells": base64.b64encode(packed).decode(),
+        }
+
+    @staticmethod
+    def from_plain(values: dict[str, Any]) -> OccupancyGrid:
+        """Make a grid of what :attr:`plain` gave.
+
+        Args:
+            values: Its fields by name.
+
+        Returns:
+            The grid, the same object for equal values while it is among the last few.
+
+        Raises:
+            ValueError: If they are not those of a grid.
+        """
+        try:
+            columns, rows = (int(side) for side in values["shape"])
+            x, y = values["origin"]
+            return _unpacked(columns, rows, values["resolution"], (x, y), values["cells"])
+        except (KeyError, TypeError, zlib.error) as error:
+            raise ValueError(f"occupancy must hold the fields of a grid: {error}") from error
+
+
+@lru_cache(maxsize=8)
+def _unpacked(
+    columns: int, rows: int, resolution: float, origin: tuple[float, float], cells: str
+) -> OccupancyGrid:
+    """Make a grid; its cells are packed and compressed."""
+    if min(columns, rows) < 1 or columns * rows > MOST_CELLS:
+        raise ValueError(f"shape of the occupancy is out of its range, got {(columns, rows)}")
+    size = math.ceil(columns * rows / 8)
+    packed = zlib.decompressobj().decompress(base64.b64decode(cells), size)
+    if len(packed) != size:
+        raise ValueError(f"cells of the occupancy must be {size} bytes, got {len(packed)}")
+    bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=columns * rows)
+    return OccupancyGrid(bits.reshape(columns, rows).astype(np.bool_), resolution, origin)

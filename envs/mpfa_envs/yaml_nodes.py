@@ -1,0 +1,117 @@
+"""Reading YAML files with errors that name the line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Final
+
+import yaml
+
+from mpfa_envs.checks import did_you_mean
+
+_LARGEST_FILE: Final = 1_000_000
+"""Longest text that is read [characters]."""
+
+
+class WorldFileError(ValueError):
+    """A file does not describe a world; the message names the file and the line."""
+
+
+def read_nodes(path: Path) -> yaml.Node | None:
+    """Read a file as nodes, which carry line numbers, and of which no tag can run anything.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The outermost node; None if the file is empty.
+
+    Raises:
+        WorldFileError: If the file cannot be read, is too large, or is not YAML.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise WorldFileError(f"{path}: cannot be read: {error}") from error
+    if len(text) > _LARGEST_FILE:
+        raise WorldFileError(f"{path}: has {len(text)} characters, more than {_LARGEST_FILE}")
+    try:
+        return yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
+    except RecursionError:
+        raise WorldFileError(f"{path}: is nested too deeply") from None
+
+
+def is_map(root: yaml.Node | None) -> bool:
+    """Tell whether a file describes a map of ROS, which names an image."""
+    return isinstance(root, yaml.MappingNode) and any(
+        key.value == "image" for key, _ in root.value if isinstance(key, yaml.ScalarNode)
+    )
+
+
+class NodeReader:
+    """Reads values from the nodes of one file.
+
+    Args:
+        path: The file, for messages.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def error(self, node: yaml.Node | None, text: str) -> WorldFileError:
+        """An error at the line of a node."""
+        line = node.start_mark.line + 1 if node else 1
+        return WorldFileError(f"{self.path}:{line}: {text}")
+
+    def mapping(
+        self, node: yaml.Node | None, what: str, keys: tuple[str, ...]
+    ) -> dict[str, yaml.Node]:
+        """Read a mapping that has no other keys, and none twice."""
+        if not isinstance(node, yaml.MappingNode):
+            raise self.error(node, f"{what} must be a mapping with the keys {', '.join(keys)}")
+        entries: dict[str, yaml.Node] = {}
+        for key, value in node.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else None
+            if name not in keys:
+                hint = did_you_mean(name, keys) or f"known are {', '.join(keys)}"
+                raise self.error(key, f"unknown key {name!r} in {what}; {hint}")
+            if name in entries:
+                raise self.error(key, f"key {name!r} appears twice in {what}")
+            entries[name] = value
+        return entries
+
+    def items(self, node: yaml.Node, what: str) -> list[yaml.Node]:
+        """Read a list."""
+        if not isinstance(node, yaml.SequenceNode):
+            raise self.error(node, f"{what} must be a list")
+        return list(node.value)
+
+    def number(self, node: yaml.Node, what: str, unit: str = " in meters") -> float:
+        """Read a finite number; the unit is what an error says behind "a number"."""
+        try:
+            value = float(node.value) if isinstance(node, yaml.ScalarNode) else math.nan
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            got = node.value if isinstance(node, yaml.ScalarNode) else "something else"
+            raise self.error(node, f"{what} must be a number{unit}, got {got!r}")
+        return value
+
+    def text(self, node: yaml.Node, what: str) -> str:
+        """Read a word or more."""
+        if not isinstance(node, yaml.ScalarNode) or not node.value.strip():
+            raise self.error(node, f"{what} must be text")
+        return str(node.value)
+
+    def pair(self, node: yaml.Node, what: str, form: str) -> tuple[float, float]:
+        """Read a list of two numbers."""
+        values = self.items(node, what)
+        if len(values) != 2:
+            raise self.error(node, f"{what} must be {form}, got {len(values)} entries")
+        first, second = (self.number(value, what) for value in values)
+        return first, second

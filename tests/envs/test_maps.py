@@ -1,0 +1,356 @@
+"""Maps of ROS: what is read and written, and what a robot meets in them."""
+
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mpfa_envs import (
+    ROBOTS,
+    WORLDS,
+    Box,
+    FreeGrid,
+    Lidar,
+    NavigationEnv,
+    OccupancyGrid,
+    VectorNavigationEnv,
+    World,
+    WorldFileError,
+    load_world,
+    save_world,
+)
+from mpfa_envs.kernels.grid import MOVES, STEP_SCALE
+from mpfa_envs.kernels.ways import ways_from
+from mpfa_envs.local_field import LocalField
+from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+
+GOOD = {
+    "image": "map.pgm",
+    "resolution": 0.05,
+    "origin": "[-1.0, 2.0, 0.0]",
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.196,
+}
+
+
+def write_map(folder, shades, **changes):
+    """A map of some shades [rows, columns], with changed or missing keys."""
+    if shades is not None:
+        Image.fromarray(np.asarray(shades)).save(folder / "map.pgm", format="PPM")
+    values = {**GOOD, **changes}
+    lines = [f"{key}: {value}" for key, value in values.items() if value is not None]
+    (folder / "map.yaml").write_text("\n".join(lines) + "\n")
+    return folder / "map.yaml"
+
+
+def cells(shape=(40, 30), share=0.06, seed=0):
+    """Some occupied cells with free ones at the sides."""
+    occupied = np.random.default_rng(seed).random(shape) < share
+    occupied[[0, 1, -1], :] = False
+    occupied[:, [0, 1, -1]] = False
+    return occupied
+
+
+@pytest.fixture(scope="module")
+def scattered():
+    """The same room twice: with the cells of a map, and with a box for each."""
+    grid = OccupancyGrid(cells(), 0.2)
+    (half_x, half_y), side = (half / 2 for half in grid.size), grid.resolution
+    corners = np.argwhere(grid.occupied) * side - (half_x, half_y)
+    boxes = tuple(Box(x, y, x + side, y + side) for x, y in corners.tolist())
+    return (
+        World(name="map", size=grid.size, occupancy=grid),
+        World(name="boxes", size=grid.size, boxes=boxes),
+    )
+
+
+def places(world, count, seed=1):
+    """Points and headings in the room."""
+    half = np.array(world.size) / 2
+    rng = np.random.default_rng(seed)
+    return np.column_stack(
+        (rng.uniform(-half, half, (count, 2)), rng.uniform(-math.pi, math.pi, count))
+    )
+
+
+def test_cells_are_as_far_as_boxes_in_their_place(scattered):
+    cells, boxes = scattered
+    points = places(cells, 400)[:, :2]
+    expected = np.array([boxes.clearance(x, y) for x, y in points])
+    np.testing.assert_allclose([cells.clearance(x, y) for x, y in points], expected, atol=1e-12)
+    np.testing.assert_allclose(cells.clearances(points), expected, atol=1e-12)
+    grids = [FreeGrid(world, distance=0.2, resolution=0.07) for world in (cells, boxes)]
+    expected = np.maximum(grids[1].clearance, 0.0)
+    behind = grids[1].clearance < 0.0
+    np.testing.assert_allclose(
+        np.maximum(grids[0].clearance, 0.0)[~behind], expected[~behind], atol=1e-6
+    )
+
+
+def test_rays_meet_cells_where_they_meet_boxes_in_their_place(scattered):
+    lidars = [Lidar(world, sectors=18) for world in scattered]
+    for x, y, heading in places(scattered[0], 200):
+        np.testing.assert_allclose(*(lidar.cast(x, y, heading) for lidar in lidars), atol=1e-9)
+
+
+def test_rays_along_the_cells_edges_meet_what_they_point_at():
+    occupied = np.zeros((20, 20), dtype=bool)
+    occupied[15, 10] = occupied[10, 15] = True
+    lidar = Lidar(World(name="two", occupancy=OccupancyGrid(occupied, 0.5)), sectors=3)
+    ranges = lidar.cast(0.25, 0.25, 0.0)
+    assert ranges[len(ranges) // 2] == pytest.approx(2.25)  # Straight on, to the cell's near side.
+    np.testing.assert_allclose(lidar.cast(0.25, 0.25, math.pi / 2).min(), 2.25)
+
+
+def test_one_robot_and_many_sense_and_drive_the_same_in_a_map(scattered):
+    world = scattered[0]
+    env = NavigationEnv(world=world, physics="kinematic", progress="shortest_path", history=1)
+    many = VectorNavigationEnv(
+        3, world=[world, WORLDS["B"]], physics="kinematic", progress="shortest_path", history=1
+    )
+    seen, info = env.reset(seed=7)
+    all_seen, infos = many.reset(seed=[7, 8, 9])
+    rng = np.random.default_rng(0)
+    for _ in range(80):
+        np.testing.assert_allclose(all_seen[0], seen, atol=1e-6)
+        for key, value in info.items():
+            assert infos[key][0] == pytest.approx(value, abs=1e-9), key
+        actions = rng.uniform(-1.0, 1.0, (3, 2)).astype(np.float32)
+        seen, _, terminated, truncated, info = env.step(actions[0])
+        all_seen, _, _, _, infos = many.step(actions)
+        if terminated or truncated:
+            break
+    assert info["sim_time"] > 0.5
+
+
+def test_robots_in_one_map_share_it_and_maps_without_robots_go(scattered):
+    world = scattered[0]
+    other = World(name="other", size=(4.0, 4.0), occupancy=OccupancyGrid(cells((20, 20)), 0.2))
+    again = world_from_plain(world_to_plain(world))
+    env = VectorNavigationEnv(3, world=[world, WORLDS["B"], again], physics="kinematic")
+    env.reset(seed=0)
+    arrays = env._batch.worlds.arrays
+    assert arrays.grid_of.tolist() == [0, -1, 0]
+    assert arrays.grids.shapes.tolist() == [[40, 30]]
+    env._batch.worlds[0] = env._batch.worlds[2] = WORLDS["B"]
+    env._batch.worlds[1] = other
+    arrays = env._batch.worlds.arrays
+    assert arrays.grid_of.tolist() == [-1, 0, -1]
+    assert arrays.grids.shapes.tolist() == [[20, 20]]
+
+
+def test_many_robots_go_on_in_a_map_to_the_bit(scattered):
+    def make():
+        return VectorNavigationEnv(
+            2, world=scattered[0], physics="kinematic", progress="shortest_path"
+        )
+
+    env, other = make(), make()
+    env.reset(seed=3)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 2, 2))
+    for action in actions[:7]:
+        env.step(action)
+    other.load_state_dict(env.state_dict())
+    for action in actions[7:]:
+        for one, two in zip(env.step(action)[:4], other.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+def test_a_map_that_is_written_is_read_as_it_was(scattered, tmp_path):
+    grid = OccupancyGrid(cells(), 0.2, origin=(-3.5, 12.25))
+    world = World(name="floor", size=grid.size, occupancy=grid)
+    world.to_map(tmp_path / "floor.yaml")
+    assert World.from_map(tmp_path / "floor.yaml") == world
+    assert load_world(tmp_path / "floor.yaml") == world
+    assert hash(load_world(tmp_path / "floor.yaml")) == hash(world)
+    assert world_from_plain(world_to_plain(world)) == world
+    assert world != World(name="floor", size=grid.size, occupancy=OccupancyGrid(cells(), 0.2))
+
+
+@pytest.mark.parametrize("name", ["D", "barn-3", "halls-2"])
+def test_shapes_become_cells_that_cover_them_and_little_more(name, tmp_path):
+    world = NavigationEnv(world=name, physics="kinematic").world
+    world.to_map(tmp_path / "map.yaml", resolution=0.1)
+    found = World.from_map(tmp_path / "map.yaml")
+    points = places(world, 500)[:, :2]
+    gaps = found.clearances(points) - np.maximum(world.clearances(points), 0.0)
+    assert gaps.max() <= 0.1  # A corner of an obstacle may stick out of its cell.
+    assert gaps.min() >= -0.1 * math.sqrt(2)
+
+
+def test_the_image_is_upside_down_and_the_origin_is_its_lower_left_corner(tmp_path):
+    shades = np.full((20, 40), 254, dtype=np.uint8)
+    shades[0, 10] = 0  # At the top.
+    world = World.from_map(write_map(tmp_path, shades))
+    assert world.size == (2.0, 1.0)
+    assert world.occupancy.occupied[10, 19]
+    assert world.occupancy.occupied.sum() == 1
+    assert world.occupancy.center == (0.0, 2.5)
+    assert world.clearance(-0.475, 0.475) == 0.0
+
+
+def test_what_lies_around_the_free_cells_is_cut_off(tmp_path):
+    shades = np.full((60, 50), 205, dtype=np.uint8)
+    shades[10:30, 15:40] = 254
+    shades[10:30, 14] = 0
+    world = World.from_map(write_map(tmp_path, shades))
+    assert world.occupancy.occupied.shape == (27, 22)
+    assert world.occupancy.origin == pytest.approx((-1.0 + 14 * 0.05, 2.0 + 29 * 0.05))
+    whole = World.from_map(write_map(tmp_path, shades), unknown="free")
+    assert whole.size == (2.5, 3.0)
+    assert whole.occupancy.occupied.sum() == 20
+
+
+@pytest.mark.parametrize(
+    ("changes", "occupied"),
+    [
+        ({}, [1, 1, 1, 0]),  # 0, 100 and 205 are p of 1, 0.61 and 0.2, 254 of 0.004.
+        ({"occupied_thresh": 0.6, "free_thresh": 0.21}, [1, 1, 0, 0]),
+        ({"negate": 1}, [0, 1, 1, 1]),
+        ({"mode": "scale"}, [1, 1, 0, 0]),
+        ({"mode": "scale", "occupied_thresh": 0.99, "free_thresh": 0.5}, [1, 0, 0, 0]),
+        ({"mode": "raw"}, [0, 1, 1, 1]),
+    ],
+)
+def test_shades_mean_what_the_thresholds_and_the_mode_say(changes, occupied, tmp_path):
+    shades = np.full((3, 12), 0 if occupied[0] == 0 else 254, dtype=np.uint8)
+    shades[1, 1:12:3] = [0, 100, 205, 254]
+    world = World.from_map(write_map(tmp_path, shades, **changes))
+    assert world.occupancy.occupied[1:12:3, 1].astype(int).tolist() == occupied
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+def test_transparent_cells_are_unknown_with_scale(mode, tmp_path):
+    pixels = np.full((3, 3, 4), 255, dtype=np.uint8)
+    pixels[1, 1, 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "map.png")
+    path = write_map(tmp_path, None, image="map.png", mode=mode)
+    assert World.from_map(path).occupancy.occupied[1, 1] == (mode == "scale")
+    assert not World.from_map(path, unknown="free").occupancy.occupied.any()
+
+
+@pytest.mark.parametrize("kind", ["P2", "P5"])
+def test_images_may_have_comments_and_be_text(kind, tmp_path):
+    head = f"{kind}\n# made by a robot\n3 2\n# and more\n255\n".encode()
+    rows = [254, 0, 254, 254, 254, 254]
+    body = " ".join(map(str, rows)).encode() if kind == "P2" else bytes(rows)
+    path = write_map(tmp_path, None)
+    (tmp_path / "map.pgm").write_bytes(head + body)
+    assert World.from_map(path).occupancy.occupied.T.tolist() == [[False] * 3, [False, True, False]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line", "reason"),
+    [
+        ({"image": "other.pgm"}, 1, "there is no"),
+        ({"image": "map.yaml"}, 1, "cannot be read"),
+        ({"resolution": -0.05}, 2, "resolution must be positive, got -0.05"),
+        ({"resolution": 500}, 2, None),
+        ({"resolution": "fine"}, 2, "resolution must be a number in meters, got 'fine'"),
+        ({"origin": "[0, 0]"}, 3, "origin must be .x, y, yaw., got 2 entries"),
+        ({"origin": "[0, 0, 0.3]"}, 3, "yaw of 0"),
+        ({"negate": 2}, 4, "negate must be 0 or 1, got 2"),
+        ({"occupied_thresh": 0.1}, 6, "free_thresh must be below occupied = 0.1, got 0.196"),
+        ({"occupied_thresh": 1.5}, 5, r"occupied_thresh must be in \[0, 1\], got 1.5"),
+        ({"mode": "tinary"}, 7, "mode must be one of .*, got tinary"),
+        ({"rezolution": 1}, 7, "unknown key 'rezolution' in the file; did you mean 'resolution'"),
+        ({"negate": None}, 1, "negate is missing"),
+        ({"resolution": "!!python/object:os.system x"}, 2, None),
+    ],
+)
+def test_a_bad_map_is_refused_with_the_line_and_the_reason(changes, line, reason, tmp_path):
+    shades = np.full((3, 4), 254, dtype=np.uint8)
+    with pytest.raises(WorldFileError, match=reason) as caught:
+        World.from_map(write_map(tmp_path, shades, **changes))
+    wrong = 1 if changes == {"resolution": 500} else line
+    assert f"map.yaml:{wrong}: " in str(caught.value)
+
+
+def test_images_that_are_huge_broken_or_full_are_refused(tmp_path):
+    path = write_map(tmp_path, None)
+    for side, reason in ((5000, "at most 16000000 pixels"), (100_000, "exceeds limit")):
+        (tmp_path / "map.pgm").write_bytes(f"P5\n{side} {side}\n255\n".encode())
+        with pytest.raises(WorldFileError, match=reason):
+            World.from_map(path)
+    (tmp_path / "map.pgm").write_bytes(b"P5\n100 100\n255\nshort")
+    with pytest.raises(WorldFileError, match="cannot be read"):
+        World.from_map(path)
+    write_map(tmp_path, np.zeros((3, 3), dtype=np.uint8))
+    with pytest.raises(WorldFileError, match="must have a free cell"):
+        World.from_map(path)
+    with pytest.raises(ValueError, match="unknown must be one of"):
+        World.from_map(path, unknown="maybe")
+
+
+def test_bad_grids_and_worlds_are_refused_before_they_are_made(scattered, tmp_path):
+    world = scattered[0]
+    with pytest.raises(ValueError, match="occupied must be an array"):
+        OccupancyGrid(np.zeros((3, 3)), 0.1)
+    with pytest.raises(ValueError, match="resolution must be positive"):
+        OccupancyGrid(np.zeros((3, 3), dtype=bool), 0.0)
+    with pytest.raises(ValueError, match="size must be that of the occupancy"):
+        World(name="map", size=(3.0, 3.0), occupancy=world.occupancy)
+    with pytest.raises(ValueError, match="must be written by to_map"):
+        save_world(world, tmp_path / "world.yaml")
+    with pytest.raises(ValueError, match="path must end in"):
+        world.to_map(tmp_path / "map.pgm")
+    with pytest.raises(ValueError, match="resolution must leave"):
+        WORLDS["A"].to_map(tmp_path / "map.yaml", resolution=0.001)
+    assert not list(tmp_path.iterdir())
+    plain = {**world.occupancy.plain, "cells": "AAAA"}
+    with pytest.raises(ValueError, match="occupancy must hold"):
+        OccupancyGrid.from_plain(plain)
+
+
+def test_cells_in_buckets_find_the_ways_of_dijkstra_to_the_bit():
+    grid = FreeGrid(WORLDS["D"], distance=0.25)
+    around = grid.cells_around((0.3, 0.2))
+    seeds = np.array([grid.cells[cell] for cell, _ in around])
+    gaps = np.array([gap for _, gap in around])
+    expected = grid.distances((0.3, 0.2))
+    step = grid.resolution * STEP_SCALE
+    found = ways_from(grid.free, seeds, gaps, MOVES, step, math.inf)[grid.free]
+    np.testing.assert_array_equal(found, expected)
+    near = ways_from(grid.free, seeds, gaps, MOVES, step, 3.0)[grid.free]
+    np.testing.assert_array_equal(near, np.where(expected <= 3.0, expected, math.inf))
+
+
+def test_ways_in_a_map_are_those_among_boxes_in_their_place(scattered):
+    grids = [FreeGrid(world, distance=0.18) for world in scattered]
+    rng = np.random.default_rng(2)
+    free = grids[0].cells
+    for _ in range(20):
+        start, goal = (grids[0].center(*free[rng.integers(len(free))]) for _ in range(2))
+        lengths = [grid.length(start, goal) for grid in grids]
+        assert lengths[0] == pytest.approx(lengths[1], abs=1e-9)
+    field = LocalField(grids[0], goal, 2.0)
+    assert field.ways[np.isfinite(field.ways)].max() <= 2.0
+    assert field.at(*goal) < 0.1
+
+
+def test_wheels_drive_in_a_map_as_among_boxes(scattered):
+    pytest.importorskip("pybullet")
+    envs = [NavigationEnv(world=world) for world in scattered]
+    task = envs[0].reset(seed=0) and envs[0].task
+    radius = ROBOTS["turtlebot2"].radius
+    assert scattered[1].clearance(*task.start[:2]) > radius
+    envs[1].reset(options=task._asdict())
+    for _ in range(10):
+        one, two = (env.step([0.6, 0.2]) for env in envs)
+        np.testing.assert_allclose(one[0], two[0], atol=1e-6)
+        if one[2]:
+            break
+    for env in envs:
+        env.close()
+
+
+def test_a_map_is_drawn(scattered):
+    env = NavigationEnv(world=scattered[0], physics="kinematic", render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    env = NavigationEnv(world=scattered[1], physics="kinematic", render_mode="rgb_array")
+    env.reset(seed=0)
+    # Boxes have an edge that cells have not.
+    assert (picture != env.render()).any(axis=-1).mean() < 0.35
