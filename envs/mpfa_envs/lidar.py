@@ -25,11 +25,11 @@ Reduction = Literal["min", "median", "single"]
 
 
 class Lidar:
-    """Ranges over the front half plane, left to right, one per sector.
+    """Ranges over a field of view that the robot's front halves, left to right, one per sector.
 
     Args:
         world: What the rays hit.
-        sectors: Number of equal sectors of the 180 degrees.
+        sectors: Number of equal sectors of the field of view.
         rays_per_sector: Rays in each sector, at the middles of its equal parts. One each, as the
             paper may have it, leaves gaps of 10 degrees, 17 cm at 1 m, that hide a table leg.
         reduction: ``"min"`` reports the nearest return of a sector, ``"median"`` the median, and
@@ -37,6 +37,8 @@ class Lidar:
         max_range: A ray that meets nothing within this distance reports this distance [m]. The
             default is a side of the built-in rooms.
         noise: Standard deviation of Gaussian noise on each ray [m].
+        field_of_view: Angle from the first edge of the first sector to the last of the last one
+            [deg], at most 360: of sectors of 10 degrees a whole turn has 36.
 
     Raises:
         ValueError: If a number is out of its range or the reduction is unknown.
@@ -57,6 +59,7 @@ class Lidar:
         reduction: Reduction = "min",
         max_range: float = 10.0,
         noise: float = 0.0,
+        field_of_view: float = 180.0,
     ) -> None:
         if reduction not in get_args(Reduction):
             raise ValueError(f"reduction must be one of {get_args(Reduction)}, got {reduction!r}")
@@ -68,8 +71,11 @@ class Lidar:
         self.noise = check_number("noise", noise)
         if self.noise < 0:
             raise ValueError(f"noise must not be negative, got {noise}")
+        self.field_of_view = check_positive("field_of_view", field_of_view)
+        if self.field_of_view > 360.0:
+            raise ValueError(f"field_of_view must be at most 360 degrees, got {field_of_view}")
         rays = sectors * self.rays_per_sector
-        self.angles = math.pi * (0.5 - (np.arange(rays) + 0.5) / rays)
+        self.angles = math.radians(self.field_of_view) * (0.5 - (np.arange(rays) + 0.5) / rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
         room = world.room
         shapes = [*world.boxes, room]

@@ -282,6 +282,7 @@ class RobotBatch:
             chosen,
             self.worlds.arrays,
             self._directions,
+            math.radians(lidar.field_of_view),
             lidar.max_range,
             ranges,
         )

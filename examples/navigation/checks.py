@@ -120,6 +120,7 @@ RULES: dict[str, Rule] = {
     "environment.progress": choice("straight_line", "shortest_path", "none"),
     "environment.memory": choice("none", "map"),
     "environment.history": at_least(0),
+    "environment.field_of_view": (lambda value: 10.0 <= value <= 360.0, "from 10 to 360 [deg]"),
     "environment.max_goal_distance": POSITIVE,
     "environment.episodes_per_world": at_least(1),
     "evaluation.every": at_least(0),

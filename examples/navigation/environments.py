@@ -11,6 +11,8 @@ from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
 from mpfa_envs.robot import resolve_robot
 from navigation.settings import EnvironmentSettings
 
+_AHEAD, _SECTOR = 180.0, 10.0
+"""The lidar's field of view unless it is said, and that of a sector [deg]."""
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
@@ -23,6 +25,8 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     Returns:
         Arguments of :class:`mpfa_envs.NavigationEnv`.
     """
+    # Only where it is not the default: policies are asked for no argument that they do not need.
+    seen = {} if settings.field_of_view == _AHEAD else {"lidar": _lidar(settings.field_of_view)}
     return {
         "robot": settings.robot,
         "physics": settings.physics,
@@ -30,9 +34,14 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "action_repeat": settings.action_repeat,
         "memory": settings.memory,
         "history": settings.history,
+        **seen,
         # The lidar saturates where the training ends an episode, and tells all distances above.
         "closeness_distance": collision_distance(settings),
     }
+
+
+def _lidar(field_of_view: float) -> dict[str, Any]:
+    return {"field_of_view": field_of_view, "sectors": round(field_of_view / _SECTOR)}
 
 
 def collision_distance(settings: EnvironmentSettings) -> float:

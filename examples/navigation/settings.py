@@ -261,6 +261,9 @@ class EnvironmentSettings:
     history: int = 0
     """Earlier scans of the lidar that it senses beside the last one, by which it may tell what
     moves."""
+    field_of_view: float = 180.0
+    """Angle that the lidar sees [deg], in sectors of 10 degrees. A robot that must keep moving is
+    run into from behind by people unless it sees all 360."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""
 

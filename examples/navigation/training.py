@@ -76,7 +76,11 @@ class TrainingRun:
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
         robots = vector_of(env)
-        self._remembered: dict[str, Any] = {"memory": robots.memory, "history": robots.history}
+        self._remembered: dict[str, Any] = {
+            "sectors": robots.lidar.sectors,
+            "memory": robots.memory,
+            "history": robots.history,
+        }
         capacity, scale = settings.method.capacity, settings.learner.reward_scale
         self.log = UpdateLog(capacity, reward_scale=scale)
         self._build()

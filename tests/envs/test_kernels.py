@@ -42,30 +42,37 @@ def cast_all(worlds: list[World], motions: np.ndarray, lidar: Lidar) -> np.ndarr
     ranges = np.full((len(worlds), lidar.angles.size), np.nan)
     directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
     chosen = np.ones(len(worlds), dtype=np.bool_)
-    cast_rays(motions, chosen, WorldBatch(worlds).arrays, directions, lidar.max_range, ranges)
+    view = math.radians(lidar.field_of_view)
+    cast_rays(motions, chosen, WorldBatch(worlds).arrays, directions, view, lidar.max_range, ranges)
     return ranges
 
 
 @pytest.mark.parametrize("mix", MIXES, ids=str)
 @pytest.mark.parametrize("max_range", [10.0, 1.5])
-def test_the_rays_are_those_of_the_lidar(mix: dict[str, int], max_range: float) -> None:
+@pytest.mark.parametrize("view", [180.0, 90.0, 270.0, 360.0])
+def test_the_rays_are_those_of_the_lidar(
+    mix: dict[str, int], max_range: float, view: float
+) -> None:
     rng = np.random.default_rng(1)
     worlds = [random_shapes(rng, **mix) for _ in range(60)]
     motions = somewhere(rng, 60)
-    lidars = [Lidar(world, max_range=max_range) for world in worlds]
+    lidars = [Lidar(world, max_range=max_range, field_of_view=view) for world in worlds]
     expected = [each.cast(*pose) for each, pose in zip(lidars, motions[:, :3], strict=True)]
     np.testing.assert_allclose(cast_all(worlds, motions, lidars[0]), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi, 0.7])
 @pytest.mark.parametrize(("sectors", "rays"), [(1, 1), (2, 1), (18, 3), (360, 2)])
-def test_any_number_of_rays_sees_boxes_all_around(heading: float, sectors: int, rays: int) -> None:
+@pytest.mark.parametrize("view", [180.0, 330.0, 360.0])
+def test_any_number_of_rays_sees_boxes_all_around(
+    heading: float, sectors: int, rays: int, view: float
+) -> None:
     ring = tuple(
         Box(x - 0.3, y - 0.2, x + 0.3, y + 0.2)
         for x, y in ((2, 0), (2, 2), (0, 2), (-2, 2), (-2, 0), (-2, -2), (0, -2), (2, -2))
     )
     world = World(name="ring", boxes=ring)
-    lidar = Lidar(world, sectors=sectors, rays_per_sector=rays)
+    lidar = Lidar(world, sectors=sectors, rays_per_sector=rays, field_of_view=view)
     motions = np.array([[0.01, 0.02, heading, 0.0, 0.0]])
     np.testing.assert_allclose(
         cast_all([world], motions, lidar)[0], lidar.cast(0.01, 0.02, heading), atol=1e-9
@@ -108,7 +115,9 @@ def test_a_world_replaces_another_whatever_their_sizes() -> None:
         batch[0] = world
         motions = somewhere(rng, 2)
         ranges = np.empty((2, lidar.angles.size))
-        cast_rays(motions, np.ones(2, dtype=np.bool_), batch.arrays, directions, 10.0, ranges)
+        cast_rays(
+            motions, np.ones(2, dtype=np.bool_), batch.arrays, directions, math.pi, 10.0, ranges
+        )
         for row, each, motion in zip(ranges, (world, WORLDS["D"]), motions, strict=True):
             np.testing.assert_allclose(row, Lidar(each).cast(*motion[:3]), atol=1e-9)
     assert batch[0] is world and len(batch) == 2

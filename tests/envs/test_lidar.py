@@ -17,6 +17,23 @@ def test_the_rays_go_from_left_to_right_over_the_front() -> None:
     assert np.degrees(single.angles[[0, 1, -1]]) == pytest.approx([85, 75, -85])
 
 
+def test_a_field_of_view_of_a_whole_turn_sees_what_is_behind() -> None:
+    world = World(name="behind", cylinders=(Cylinder(-1.5, 0.0, 0.25),))
+    whole = Lidar(world, sectors=36, field_of_view=360.0)
+    assert np.degrees(whole.angles[[0, -1]]) == pytest.approx([180 - 5 / 3, -180 + 5 / 3])
+    ranges = whole.scan(0.0, 0.0, 0.0)
+    assert ranges[[0, -1]] == pytest.approx(1.25, abs=0.01)
+    ahead = Lidar(world).scan(0.0, 0.0, 0.0)
+    np.testing.assert_allclose(ranges[9:27], ahead, rtol=1e-12)
+    assert ahead.min() > 4.9
+
+
+@pytest.mark.parametrize("angle", [0.0, -90.0, 361.0, math.nan])
+def test_a_field_of_view_that_no_lidar_has_is_refused(angle: float) -> None:
+    with pytest.raises(ValueError, match="field_of_view"):
+        Lidar(WORLDS["A"], field_of_view=angle)
+
+
 def test_a_wall_ahead_is_seen_at_its_distance() -> None:
     lidar = Lidar(WORLDS["A"], sectors=3, reduction="single")
     for heading, ahead in ((0.0, 4.0), (math.pi / 2, 3.0), (math.pi, 6.0), (-math.pi / 2, 7.0)):

@@ -84,6 +84,7 @@ def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
         {"progress": "none", "collision_distance": "contact"},
         {"progress": "shortest_path", "progress_scale": 7.0},
         {"memory": "map", "lidar": {"noise": 0.02}},
+        {"memory": "map", "lidar": {"field_of_view": 360.0, "sectors": 36}},
     ],
     ids=lambda arguments: "-".join(arguments) or "defaults",
 )

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 
 import pytest
+import torch
 
-from mpfa_envs import NavigationEnv
+from mpfa_envs import Mirror, NavigationEnv, RandomMirror, load_policy
 from mpfa_envs.reward import PROGRESS_SCALE
 from navigation.environments import env_arguments, make_training_env
 from navigation.settings import EnvironmentSettings
+from tests.integration.tiny_runs import tiny, train
 
 
 @pytest.mark.parametrize(("robot", "radius"), [("turtlebot2", 0.18), ("burger", 0.105)])
@@ -38,6 +41,20 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     assert judging.closeness_distance == pytest.approx(0.28)
     training.close()
     judging.close()
+
+
+def test_a_lidar_that_sees_a_whole_turn_is_asked_for_and_mirrored(tmp_path: Path) -> None:
+    assert "lidar" not in env_arguments(EnvironmentSettings())
+    settings = tiny()
+    settings.environment.field_of_view, settings.environment.history = 360.0, 1
+    run = train(tmp_path / "run", settings)
+    lidar = load_policy(run.folder / "policy.npz").env_arguments["lidar"]
+    assert lidar == {"field_of_view": 360.0, "sectors": 36}
+    batch = run.buffer[:40]["observation"]
+    assert batch.shape[-1] == 36 + 6 + 36
+    mirror = Mirror(sectors=36, history=1)
+    transform = next(each for each in run.buffer._transform if isinstance(each, RandomMirror))
+    assert torch.equal(transform.mirror.observation(batch), mirror.observation(batch))
 
 
 def test_the_defaults_are_those_of_the_environment_itself() -> None:

@@ -32,6 +32,7 @@ def cast_rays(
     chosen: NDArray[np.bool_],
     worlds: BatchArrays,
     directions: NDArray[np.float64],
+    view: float,
     max_range: float,
     ranges: NDArray[np.float64],
 ) -> None:
@@ -42,6 +43,7 @@ def cast_rays(
         chosen: Which robots look around, ``[N]``; the others' ranges stay.
         worlds: The room of each robot.
         directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``.
+        view: The field of view, of which each ray is in the middle of an equal part [rad].
         max_range: Greatest range [m].
         ranges: Where the ranges go [m], ``[N, rays]``; zero in an obstacle.
     """
@@ -61,15 +63,15 @@ def cast_rays(
         for index in range(worlds.counts[robot, 0]):
             # Plain numbers: a view of a row would cost more than what is done with it.
             x0, y0, x1, y1 = boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3]
-            inside |= _cast_at_box(x0 - x, y0 - y, x1 - x, y1 - y, ahead, reach, beams, row)
+            inside |= _cast_at_box(x0 - x, y0 - y, x1 - x, y1 - y, ahead, view, reach, beams, row)
         for index in range(worlds.counts[robot, 1]):
             dx, dy, radius = circles[index, 0] - x, circles[index, 1] - y, circles[index, 2]
-            inside |= _cast_at_circle(dx, dy, radius, ahead, reach, beams, row)
+            inside |= _cast_at_circle(dx, dy, radius, ahead, view, reach, beams, row)
         first = 0
         for polygon in range(worlds.counts[robot, 3]):
             last = worlds.polygon_ends[robot, polygon]
             edges = worlds.segments[robot, first:last]
-            inside |= _cast_at_polygon(x, y, ahead, edges, reach, beams, row)
+            inside |= _cast_at_polygon(x, y, ahead, edges, view, reach, beams, row)
             first = last
         number = worlds.grid_of[robot]
         if number >= 0:
@@ -115,7 +117,13 @@ def _cast_at_walls(
 
 @njit
 def _span(
-    ahead: tuple[float, float], x0: float, y0: float, x1: float, y1: float, rays: int
+    ahead: tuple[float, float],
+    x0: float,
+    y0: float,
+    x1: float,
+    y1: float,
+    view: float,
+    rays: int,
 ) -> tuple[int, int]:
     """First and last ray between the directions of two points, by the shorter way.
 
@@ -125,22 +133,26 @@ def _span(
     cosine, sine = ahead
     front0, left0 = cosine * x0 + sine * y0, cosine * y0 - sine * x0
     front1, left1 = cosine * x1 + sine * y1, cosine * y1 - sine * x1
-    if front0 <= 0.0 and front1 <= 0.0:
+    if view <= math.pi and front0 <= 0.0 and front1 <= 0.0:
         return 0, -1
     low, high = _direction(front0, left0), _direction(front1, left1)
     if low > high:
         low, high = high, low
     if high - low > math.pi:
-        # The way between them leads around the back.
+        # The way between them leads around the back, where a wide view has both its ends.
+        if view > math.pi:
+            return 0, rays - 1
         low, high = (high, math.pi) if abs(high) < abs(low) else (-math.pi, low)
-    return _rays_between(low, high, rays)
+    return _rays_between(low, high, view, rays)
 
 
 @njit
-def _rays_between(low: float, high: float, rays: int) -> tuple[int, int]:
+def _rays_between(low: float, high: float, view: float, rays: int) -> tuple[int, int]:
     """First and last ray between two directions in the robot's frame [rad]."""
-    # Ray k points at (1/2 - (k + 1/2) / rays) π; int() rounds up what is negative.
-    per_angle, middle = rays / math.pi, 0.5 * (rays - 1)
+    if view > math.pi and (low < -math.pi or high > math.pi):
+        return 0, rays - 1
+    # Ray k points at (1/2 - (k + 1/2) / rays) view; int() rounds up what is negative.
+    per_angle, middle = rays / view, 0.5 * (rays - 1)
     first = int(max(middle - (high + _GUARD) * per_angle, -1.0) + 1.0)
     last = int(min(middle - (low - _GUARD) * per_angle, rays - 1.0) + 1.0) - 1
     return first, last
@@ -170,6 +182,7 @@ def _cast_at_box(
     x1: float,
     y1: float,
     ahead: tuple[float, float],
+    view: float,
     reach: float,
     beams: NDArray[np.float64],
     row: NDArray[np.float64],
@@ -192,7 +205,7 @@ def _cast_at_box(
         left, low, right, high = x0, y1, x1, y0
     else:
         left, low, right, high = x0, y0, x1, y1
-    first, last = _span(ahead, left, low, right, high, row.shape[0])
+    first, last = _span(ahead, left, low, right, high, view, row.shape[0])
     for ray in range(first, last + 1):
         across, up = beams[2, ray], beams[3, ray]
         a, b, c, d = x0 * across, x1 * across, y0 * up, y1 * up
@@ -208,6 +221,7 @@ def _cast_at_circle(
     dy: float,
     radius: float,
     ahead: tuple[float, float],
+    view: float,
     reach: float,
     beams: NDArray[np.float64],
     row: NDArray[np.float64],
@@ -218,13 +232,13 @@ def _cast_at_circle(
     far = reach + radius
     if square <= radius * radius:
         return True
-    if front < -radius or square > far * far:
+    if (view <= math.pi and front < -radius) or square > far * far:
         return False
     # asin(s) <= s + 0.571 s³: a little wider than the circle looks.
     sine = radius / math.sqrt(square)
     half = sine + 0.571 * sine * sine * sine
     middle = _direction(front, ahead[0] * dy - ahead[1] * dx)
-    first, last = _rays_between(middle - half, middle + half, row.shape[0])
+    first, last = _rays_between(middle - half, middle + half, view, row.shape[0])
     for ray in range(first, last + 1):
         along = dx * beams[0, ray] + dy * beams[1, ray]
         inner = along * along + radius * radius - square
@@ -241,6 +255,7 @@ def _cast_at_polygon(
     y: float,
     ahead: tuple[float, float],
     edges: NDArray[np.float64],
+    view: float,
     reach: float,
     beams: NDArray[np.float64],
     row: NDArray[np.float64],
@@ -255,7 +270,7 @@ def _cast_at_polygon(
         if max(min(x0, x1), -max(x0, x1), min(y0, y1), -max(y0, y1)) > reach:
             continue
         along_x, along_y = x1 - x0, y1 - y0
-        first, last = _span(ahead, x0, y0, x1, y1, row.shape[0])
+        first, last = _span(ahead, x0, y0, x1, y1, view, row.shape[0])
         for ray in range(first, last + 1):
             across, up = beams[0, ray], beams[1, ray]
             slant = across * along_y - up * along_x
