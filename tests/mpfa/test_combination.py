@@ -177,13 +177,13 @@ def test_a_product_wants_both_signals_and_a_sum_and_a_mixture_either():
 
 def test_goals_alone_are_raised_and_steps_towards_them_are_not():
     rewards = torch.tensor([10.0] * 5 + [0.4] * 45 + [-0.4] * 50)
-    replay = make_replay("mpfa_plus", capacity=100, batch_size=8)
+    replay = make_replay("mpfa_plus", boost=True, capacity=100, batch_size=8)
     replay.buffer.extend(TensorDict({"next": {"reward": rewards.unsqueeze(1)}}, [100]))
     for _ in range(3):
         set_signals(replay.buffer, td_error=torch.ones(100), action_gradient=torch.ones(100))
     found = replay.buffer.sampler.priorities()
     assert found[5:50].unique().tolist() == found[50:].unique().tolist()  # Steps are alike.
-    plain = make_replay("mpfa_plus", boost=False, capacity=100, batch_size=8)
+    plain = make_replay("mpfa_plus", capacity=100, batch_size=8)
     assert plain.buffer.sampler.adjustments == ()
     assert float(found[0]) == pytest.approx(
         3 * float(10 / rewards.abs().mean() + 2 + EPS), rel=0.01

@@ -126,7 +126,9 @@ METHODS: dict[str, Method] = {
     "mpfa_plus": Method(
         "mpfa_plus",
         fusion="scaled",
-        # Signals are in units of their means, of which a floor of 1 is not one.
+        # What one gets with boost=True: signals are in units of their means, of which a floor of 1
+        # is not one.
+        boost=False,
         boost_bound="none",
         # More than a step can bring, and less than a goal.
         positive_above=1.0,
