@@ -78,6 +78,15 @@ def test_only_the_tracking_of_the_training_application_imports_wandb():
     }
 
 
+def test_only_the_nodes_import_rclpy():
+    messages = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_msgs", "tf2_ros"}
+    users = importers(EVERYTHING, {"rclpy", *messages})
+    assert {user for user in users if not user.startswith("tests/")} == {
+        "envs/mpfa_envs/ros/policy_node.py",
+        "envs/mpfa_envs/ros/robot_node.py",
+    }
+
+
 def test_no_file_puts_folders_on_the_path():
     # Packages are found because they are installed; a script finds what lies beside it.
     found = [path for path in EVERYTHING if "sys.path" in path.read_text(encoding="utf-8")]

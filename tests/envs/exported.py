@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from mpfa_envs import Policy, export_policy
+from mpfa_envs.deploy import Card
 from mpfa_envs.layers import LayerNorm, Linear, ReLU, Tanh
+from mpfa_envs.robot import ROBOTS
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "td3-mpfa_per.npz"
 ENV_ARGUMENTS = {"robot": "turtlebot2", "physics": "kinematic", "closeness_distance": 0.23}
@@ -31,3 +33,23 @@ def make_policy(size: int = 24, **env_arguments: Any) -> Policy:
 def exported(folder: Path, size: int = 24, **env_arguments: Any) -> Path:
     """A file of :func:`make_policy`, with its card."""
     return export_policy(make_policy(size, **env_arguments), folder / "policy.onnx")
+
+
+def card(**changes: Any) -> Card:
+    """The card of a policy for a TurtleBot2, without a file."""
+    values: dict[str, Any] = {
+        "observation_size": 24,
+        "action_size": 2,
+        "sectors": 18,
+        "reduction": "min",
+        "max_range": 10.0,
+        "closeness_distance": 0.25,
+        "memory": "none",
+        "history": 0,
+        "robot": ROBOTS["turtlebot2"],
+        "period": 0.2,
+        "goal_radius": 0.5,
+        "env_arguments": {},
+        "training": {},
+    }
+    return Card(**values | changes)

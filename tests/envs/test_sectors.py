@@ -3,34 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("onnxruntime", reason="exported policies are of the extra onnx")
 
-from mpfa_envs.deploy import Card, Scan, ScanError, Sectors
-from mpfa_envs.robot import ROBOTS
-
-
-def card(**changes: Any) -> Card:
-    values: dict[str, Any] = {
-        "observation_size": 24,
-        "action_size": 2,
-        "sectors": 18,
-        "reduction": "min",
-        "max_range": 10.0,
-        "closeness_distance": 0.25,
-        "memory": "none",
-        "history": 0,
-        "robot": ROBOTS["turtlebot2"],
-        "period": 0.2,
-        "goal_radius": 0.5,
-        "env_arguments": {},
-        "training": {},
-    }
-    return Card(**values | changes)
+from mpfa_envs.deploy import Scan, ScanError, Sectors
+from tests.envs.exported import card
 
 
 def plain(scan: Scan, reduction: str, mount: tuple[float, float, float]) -> list[float]:
@@ -106,6 +86,13 @@ def test_sectors_without_a_valid_ray_are_refused_or_free() -> None:
         Sectors(card()).read(scan)
     found, _ = Sectors(card(), silent="far").read(scan)
     assert found[8] == 10.0 and np.delete(found, 8).tolist() == [2.0] * 17
+
+
+@pytest.mark.parametrize("broken", [0.0, math.nan, -math.inf])
+def test_a_lidar_that_measures_nothing_valid_is_not_one_that_sees_free_space(broken: float) -> None:
+    scan = Scan(-math.pi, math.pi / 180, np.full(360, broken), range_min=0.1)
+    with pytest.raises(ScanError, match="none of the scan's 360 rays is valid"):
+        Sectors(card(), silent="far").read(scan)
 
 
 @pytest.mark.parametrize(

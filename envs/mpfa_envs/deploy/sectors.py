@@ -68,7 +68,8 @@ class Sectors:
         unseen: Range to report for sectors outside of the scan's field of view [m]; None refuses
             such a scan.
         silent: What to do where no ray of a sector is valid: ``"refuse"`` the scan, or hold that
-            nothing is there, ``"far"``, for a lidar that reports 0 or NaN for it.
+            nothing is there, ``"far"``, for a lidar that reports 0 or NaN for it. A scan without
+            any valid ray is refused in both.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -144,6 +145,9 @@ class Sectors:
         far = self.card.max_range
         missed = ranges >= scan.range_max
         valid = missed | (ranges >= scan.range_min) & (ranges >= 0.0)
+        # A lidar that is broken is not one that meets nothing, whatever that reports.
+        if not valid.any():
+            raise ScanError(f"none of the scan's {ranges.size} rays is valid")
         angles, distances = directions, np.where(missed, far, ranges)
         if across or up:
             met_x = across + distances * np.cos(directions)

@@ -1,0 +1,55 @@
+"""Messages of ROS as plain values, and back; any object with the same attributes will do."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from mpfa_envs.deploy.sectors import Scan
+
+
+def seconds(stamp: Any) -> float:
+    """A ``builtin_interfaces/Time`` [s]."""
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+def yaw(orientation: Any) -> float:
+    """Heading of a quaternion [rad]; NaN if it is none."""
+    x, y, z, w = (float(getattr(orientation, name)) for name in "xyzw")
+    norm = x * x + y * y + z * z + w * w
+    if not norm > 0.0:
+        return math.nan
+    return math.atan2(2.0 * (w * z + x * y) / norm, 1.0 - 2.0 * (y * y + z * z) / norm)
+
+
+def scan_of(message: Any) -> Scan:
+    """A ``sensor_msgs/LaserScan``."""
+    return Scan(
+        message.angle_min,
+        message.angle_increment,
+        message.ranges,
+        message.range_min,
+        message.range_max,
+    )
+
+
+def odometry_of(message: Any) -> tuple[tuple[float, float, float], tuple[float, float]]:
+    """Pose and speeds of a ``nav_msgs/Odometry``."""
+    pose, twist = message.pose.pose, message.twist.twist
+    place = pose.position
+    return (place.x, place.y, yaw(pose.orientation)), (twist.linear.x, twist.angular.z)
+
+
+def transformed(place: tuple[float, float], transform: Any) -> tuple[float, float]:
+    """A place of the source frame in the target frame of a ``geometry_msgs/Transform``."""
+    turn, move = yaw(transform.rotation), transform.translation
+    cosine, sine = math.cos(turn), math.sin(turn)
+    x, y = place
+    return cosine * x - sine * y + move.x, sine * x + cosine * y + move.y
+
+
+def write_pose(message: Any, pose: tuple[float, float, float]) -> None:
+    """Enter (x, y, heading) in a ``geometry_msgs/Pose``."""
+    message.position.x, message.position.y = float(pose[0]), float(pose[1])
+    message.orientation.z = math.sin(pose[2] / 2.0)
+    message.orientation.w = math.cos(pose[2] / 2.0)

@@ -1,0 +1,174 @@
+"""The ROS 2 node of a policy: messages in and out, all else is :class:`Controller`'s."""
+
+from __future__ import annotations
+
+import signal
+from functools import partial
+from typing import Any, Final
+
+import rclpy
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
+from rclpy.time import Time
+from sensor_msgs.msg import LaserScan
+
+from mpfa_envs.deploy import Pilot
+from mpfa_envs.ros.controller import Controller
+from mpfa_envs.ros.messages import odometry_of, scan_of, seconds, transformed
+
+PARAMETERS: Final[dict[str, Any]] = {
+    "policy": "",
+    "robot": "",
+    "pace": 0.0,
+    "mount": [0.0, 0.0, 0.0],
+    "unseen": 0.0,
+    "silent": "refuse",
+    "map_size": 40.0,
+    "stop_distance": 0.05,
+    "scan_timeout": 0.5,
+    "odometry_timeout": 0.5,
+    "rate": 20.0,
+    "trust_stamps": True,
+    "stamped": False,
+    "base_frame": "base_link",
+    "scan_topic": "scan",
+    "odometry_topic": "odom",
+    "goal_topic": "goal_pose",
+    "command_topic": "cmd_vel",
+}
+"""The parameters with their defaults; docs/robot.md tells what they are."""
+
+
+class PolicyNode(Node):
+    """Subscribes scan, odometry and goal, publishes speeds."""
+
+    def __init__(self) -> None:
+        super().__init__("mpfa_policy")
+        for name, default in PARAMETERS.items():
+            self.declare_parameter(name, default)
+        value = self._value
+        options = {name: value(name) for name in ("silent", "map_size")}
+        pilot = Pilot.load(
+            value("policy"),
+            robot=value("robot") or None,
+            pace=value("pace") or None,
+            mount=tuple(value("mount")),
+            unseen=value("unseen") or None,
+            **options,
+        )
+        limits = {n: value(n) for n in ("stop_distance", "scan_timeout", "odometry_timeout")}
+        self.controller = Controller(pilot, **limits)
+        self._stamped = value("stamped")
+        self._trust_stamps = value("trust_stamps")
+        self._base_frame = value("base_frame")
+        self._odometry_frame = ""
+        self._goal: tuple[tuple[float, float], str] | None = None
+        self._reason = ""
+        self._transforms = self._listen()
+        kind = TwistStamped if self._stamped else Twist
+        self._commands = self.create_publisher(kind, value("command_topic"), 1)
+        sensor = partial(self.create_subscription, qos_profile=qos_profile_sensor_data)
+        sensor(LaserScan, value("scan_topic"), self._on_scan)
+        sensor(Odometry, value("odometry_topic"), self._on_odometry)
+        self.create_subscription(PoseStamped, value("goal_topic"), self._on_goal, 1)
+        self.create_timer(1.0 / value("rate"), self._tick)
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _listen(self) -> Any:
+        """The transforms between frames, where tf2 is installed."""
+        try:
+            from tf2_ros import Buffer, TransformListener
+        except ImportError:
+            return None
+        buffer = Buffer()
+        self._listener = TransformListener(buffer, self)
+        return buffer
+
+    def _now(self) -> float:
+        return float(self.get_clock().now().nanoseconds) * 1e-9
+
+    def _time_of(self, header: Any) -> float:
+        return seconds(header.stamp) if self._trust_stamps else self._now()
+
+    def _on_scan(self, message: Any) -> None:
+        self.controller.see(scan_of(message), self._time_of(message.header))
+        self._tick()
+
+    def _on_odometry(self, message: Any) -> None:
+        self._odometry_frame = message.header.frame_id
+        self.controller.feel(*odometry_of(message), self._time_of(message.header))
+
+    def _on_goal(self, message: Any) -> None:
+        place = message.pose.position.x, message.pose.position.y
+        self._goal = place, message.header.frame_id
+        try:
+            self.controller.aim(self._in_odometry(place, message.header.frame_id))
+        # What tf2 raises has no public base class.
+        except Exception as error:
+            self.controller.aim(None, f"goal in frame {message.header.frame_id!r}: {error}")
+        self._tick()
+
+    def _in_odometry(self, place: tuple[float, float], frame: str) -> tuple[float, float]:
+        """A place of another frame in that of the odometry."""
+        if frame in ("", self._odometry_frame):
+            return place
+        if self._transforms is None:
+            raise LookupError("tf2_ros is not installed")
+        if not self._odometry_frame:
+            raise LookupError("there was no odometry yet")
+        found = self._transforms.lookup_transform(self._odometry_frame, frame, Time())
+        return transformed(place, found.transform)
+
+    def _tick(self) -> None:
+        if self.controller.pilot.goal is not None and self._goal is not None:
+            try:
+                self.controller.correct_goal(self._in_odometry(*self._goal))
+            # As above; a correction that fails once is made later.
+            except Exception as error:
+                self.get_logger().warning(f"goal not corrected: {error}")
+        order = self.controller.tick(self._now())
+        if order is None:
+            return
+        reason = order.reason.partition(":")[0]
+        if reason != self._reason:
+            self._reason = reason
+            self.get_logger().info(order.reason)
+        self._publish(order.linear, order.angular)
+
+    def _publish(self, linear: float, angular: float) -> None:
+        message = TwistStamped() if self._stamped else Twist()
+        twist = message
+        if self._stamped:
+            message.header.stamp = self.get_clock().now().to_msg()
+            message.header.frame_id = self._base_frame
+            twist = message.twist
+        twist.linear.x, twist.angular.z = float(linear), float(angular)
+        self._commands.publish(message)
+
+    def stop(self) -> None:
+        """Have the robot stand still."""
+        self._publish(0.0, 0.0)
+
+
+def main() -> None:
+    """Run the node until it is told to end."""
+    # The signal handlers of rclpy would end all publishing before the robot is stopped.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    node = PolicyNode()
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        node.stop()
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

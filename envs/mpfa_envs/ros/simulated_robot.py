@@ -1,0 +1,142 @@
+"""A robot in a simulated world as the outside of a real one: it obeys speeds, and measures."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.checks import check_count, check_positive
+from mpfa_envs.deploy.card import check_finite
+from mpfa_envs.deploy.sectors import Scan
+from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
+from mpfa_envs.lidar import Lidar
+from mpfa_envs.robot import RobotModel, resolve_robot
+
+if TYPE_CHECKING:
+    import os
+
+    from mpfa_envs.arguments import Physics
+    from mpfa_envs.worlds import World
+
+
+class SimulatedRobot:
+    """What drives in :class:`~mpfa_envs.NavigationEnv`, seen as robots are: speeds in, scans out.
+
+    Args:
+        world: Where it is, as there.
+        robot: As there.
+        physics: As there.
+        time_step: Duration of a step [s].
+        rays: Rays of its lidar, equal parts of the field.
+        field: Directions of the first and of the last ray [rad].
+        max_range: A ray that meets nothing within this distance reports infinity [m].
+        noise: Standard deviation of the ranges [m].
+        command_timeout: It stands still when it was told nothing for so long [s].
+        seed: Of the noise.
+
+    Raises:
+        ImportError: If there is no PyBullet and physics is ``"wheels"``.
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from mpfa_envs.ros.simulated_robot import SimulatedRobot
+        >>> robot = SimulatedRobot("A", physics="kinematic")
+        >>> robot.place((0.0, 0.0, 0.0))
+        >>> robot.obey(0.5, 0.0)
+        >>> robot.step()
+        >>> robot.motion.x, len(robot.scan().ranges)
+        (0.05, 360)
+    """
+
+    def __init__(
+        self,
+        world: str | os.PathLike[str] | World = "test",
+        *,
+        robot: str | RobotModel = "turtlebot2",
+        physics: Physics = "wheels",
+        time_step: float = 0.1,
+        rays: int = 360,
+        field: tuple[float, float] = (-math.pi, math.pi - math.tau / 360),
+        max_range: float = 10.0,
+        noise: float = 0.0,
+        command_timeout: float = 0.5,
+        seed: int = 0,
+    ) -> None:
+        self.world = resolve_world(world)
+        self.robot = resolve_robot(robot)
+        self.time_step = check_positive("time_step", time_step)
+        first, last = check_finite("field", field, 2)
+        if check_count("rays", rays, least=2) and not first < last:
+            raise ValueError(f"field must rise, got {field}")
+        if physics not in ("wheels", "kinematic"):
+            raise ValueError(f"physics must be 'wheels' or 'kinematic', got {physics!r}")
+        self._lidar = Lidar(
+            self.world, sectors=rays, reduction="single", max_range=max_range, noise=noise
+        )
+        self._lidar.angles = np.linspace(first, last, rays)
+        self._timeout = check_positive("command_timeout", command_timeout)
+        self._rng = np.random.default_rng(check_count("seed", seed, least=0))
+        self._drive: Drive = (
+            KinematicDrive(self.robot, time_step=self.time_step)
+            if physics == "kinematic"
+            else WheelDrive(self.robot, self.world, time_step=self.time_step)
+        )
+        self.time = 0.0
+        """Since the robot was made [s]."""
+        self.place((0.0, 0.0, 0.0))
+
+    def place(self, start: tuple[float, float, float]) -> None:
+        """Put it at rest somewhere else.
+
+        Args:
+            start: Pose (x, y, heading) [m, m, rad].
+
+        Raises:
+            ValueError: If it is not finite.
+        """
+        x, y, heading = check_finite("start", start, 3)
+        self.motion: Motion = self._drive.place(x, y, heading)
+        self.touched = False
+        """Whether its rim has met an obstacle since it was placed."""
+        self._told = (0.0, 0.0)
+        self._told_at = -math.inf
+
+    def obey(self, linear: float, angular: float) -> None:
+        """Take speeds of the body, which hold until others come, or none for a while.
+
+        Args:
+            linear: Forward [m/s].
+            angular: Turning to the left [rad/s]. Wheels that would be too fast are as fast as they
+                can; a speed that is not finite is zero.
+        """
+        told = linear, angular
+        self._told = told if all(map(math.isfinite, told)) else (0.0, 0.0)
+        self._told_at = self.time
+
+    def step(self) -> None:
+        """Drive for a time step."""
+        # A sum of steps is no more exact than this.
+        fresh = self.time - self._told_at <= self._timeout + 1e-9
+        linear, angular = self._told if fresh else (0.0, 0.0)
+        turn, fastest = 0.5 * angular * self.robot.wheel_base, self.robot.max_wheel_speed
+        left, right = (
+            min(max(speed, -fastest), fastest) for speed in (linear - turn, linear + turn)
+        )
+        self.motion = self._drive.move(left, right)
+        self.time += self.time_step
+        clearance = self.world.clearance(self.motion.x, self.motion.y)
+        self.touched = self.touched or clearance <= self.robot.radius
+
+    def scan(self) -> Scan:
+        """What the lidar, at the robot's center, measures."""
+        ranges = self._lidar.measure(*self.motion[:3], rng=self._rng)
+        angles, far = self._lidar.angles, self._lidar.max_range
+        ranges = np.where(ranges >= far, math.inf, ranges)
+        return Scan(float(angles[0]), float(angles[1] - angles[0]), ranges, 0.0, far)
+
+    def close(self) -> None:
+        """Release the physics server."""
+        self._drive.close()

@@ -1,0 +1,121 @@
+"""Controller and simulated robot coupled as by topics: it drives as in the environment."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
+
+from mpfa_envs import World, evaluate, export_policy, load_policy, world_tasks
+from mpfa_envs.deploy import Pilot
+from mpfa_envs.ros.controller import Controller
+from mpfa_envs.ros.simulated_robot import SimulatedRobot
+from tests.envs.exported import SHIPPED
+
+
+def drive(controller: Controller, robot: SimulatedRobot, *, limit: float = 50.0) -> str:
+    """Drive to the controller's goal: ``arrived``, ``touched``, or why it stood still at last."""
+    end, reason = robot.time + limit, ""
+    while robot.time < end - 1e-6:
+        controller.feel(robot.motion[:3], robot.motion[3:], robot.time)
+        controller.see(robot.scan(), robot.time)
+        order = controller.tick(robot.time)
+        assert order is not None
+        if order.reason == "arrived":
+            return "arrived"
+        reason = order.reason
+        robot.obey(order.linear, order.angular)
+        robot.step()
+        if robot.touched:
+            return "touched"
+    return reason
+
+
+def ends(folder: Path, physics: str, count: int, *, rays: int, world: str) -> list[str]:
+    """How drives between the pairs of a world end."""
+    file = export_policy(load_policy(SHIPPED), folder / "policy.onnx")
+    controller = Controller(Pilot.load(file), stop_distance=0.0)
+    half = 0.5 * math.pi * (1.0 - 1.0 / rays)
+    robot = SimulatedRobot(world, physics=physics, rays=rays, field=(-half, half))
+    found = []
+    for each in world_tasks(world, episodes=count, seed=0):
+        robot.place(each.task.start)
+        controller.aim(each.task.goal)
+        found.append(drive(controller, robot))
+    robot.close()
+    return found
+
+
+def in_the_environment(physics: str, count: int, world: str) -> list[bool]:
+    results = evaluate(load_policy(SHIPPED), world, episodes=count, physics=physics)
+    return [result.success for result in results]
+
+
+def test_on_exact_arcs_it_succeeds_where_it_does_in_the_environment(tmp_path: Path) -> None:
+    found = ends(tmp_path, "kinematic", 5, rays=54, world="test")
+    assert [end == "arrived" for end in found] == in_the_environment("kinematic", 5, "test")
+
+
+def test_twenty_drives_on_wheels_succeed_as_in_the_environment(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    found = ends(tmp_path, "wheels", 20, rays=54, world="test")
+    assert [end == "arrived" for end in found] == in_the_environment("wheels", 20, "test")
+
+
+def test_the_simulated_robot_obeys_for_as_long_as_it_is_told() -> None:
+    robot = SimulatedRobot("A", physics="kinematic", command_timeout=0.3)
+    robot.obey(0.4, 0.5)
+    for _ in range(10):
+        robot.step()
+    assert robot.time == pytest.approx(1.0)
+    x, y, heading, *speeds = robot.motion
+    # Told at 0 s: the steps that begin at 0, 0.1, 0.2 and 0.3 s.
+    assert heading == pytest.approx(0.2) and speeds == [0.0, 0.0]
+    assert (x, y) == pytest.approx((0.8 * math.sin(0.2), 0.8 * (1 - math.cos(0.2))))
+    robot.obey(0.0, -1.0)
+    robot.step()
+    assert robot.motion.heading == pytest.approx(0.1)  # It turns on the spot.
+    robot.obey(math.nan, 0.0)
+    robot.step()
+    assert robot.motion.linear_speed == 0.0
+    robot.obey(9.0, 0.0)
+    robot.step()
+    assert robot.motion.linear_speed == 0.5
+
+
+def test_its_scan_is_what_is_around_it() -> None:
+    robot = SimulatedRobot(World(name="room", size=(6.0, 4.0)), physics="kinematic", max_range=2.5)
+    scan = robot.scan()
+    around = dict(zip(range(-180, 180), np.asarray(scan.ranges).tolist(), strict=True))
+    assert scan.angle_min == -math.pi and scan.angle_increment == pytest.approx(math.pi / 180)
+    assert (around[0], around[-180]) == (math.inf, math.inf)
+    assert (around[90], around[-90]) == pytest.approx((2.0, 2.0))
+
+
+def test_it_touches_what_it_meets_until_it_is_placed_elsewhere() -> None:
+    robot = SimulatedRobot(World(name="room", size=(2.0, 2.0)), physics="kinematic")
+    for _ in range(20):
+        robot.obey(0.5, 0.0)
+        robot.step()
+    assert robot.touched
+    robot.place((0.0, 0.0, 1.0))
+    assert not robot.touched and robot.motion == (0.0, 0.0, 1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"physics": "none"}, "physics must be 'wheels' or 'kinematic', got 'none'"),
+        ({"rays": 1}, "rays must be an integer of at least 2, got 1"),
+        ({"field": (1.0, 1.0)}, r"field must rise, got \(1.0, 1.0\)"),
+        ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
+        ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+    ],
+)
+def test_a_robot_that_cannot_be_is_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SimulatedRobot("A", **{"physics": "kinematic", **options})  # type: ignore[arg-type]

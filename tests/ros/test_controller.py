@@ -1,0 +1,247 @@
+"""What the policy's node decides: when it drives, and all that it stops for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime", reason="exported policies are of the extra onnx")
+
+from mpfa_envs.deploy import Pilot, Scan
+from mpfa_envs.ros import messages
+from mpfa_envs.ros.controller import Controller, Order
+from tests.envs.exported import card
+
+STILL = (0.0, 0.0)
+
+
+def scan(*ranges: float, free: float = 3.0) -> Scan:
+    """A scan all around, a ray a degree from behind; the given ranges begin ahead."""
+    values = np.full(360, free)
+    values[180 : 180 + len(ranges)] = ranges
+    return Scan(-math.pi, math.pi / 180, values, 0.1, 8.0)
+
+
+def make(network: Any = None, **options: Any) -> tuple[Controller, list[np.ndarray]]:
+    """A controller that wants to drive straight ahead, and what its network is asked."""
+    asked: list[np.ndarray] = []
+
+    def ahead(seen: np.ndarray) -> np.ndarray:
+        asked.append(seen[0])
+        return np.ones((1, 2), np.float32)
+
+    return Controller(Pilot(card(), network or ahead), **options), asked
+
+
+def ready(**options: Any) -> tuple[Controller, list[np.ndarray]]:
+    """One that has all that it needs at time 10."""
+    controller, asked = make(**options)
+    controller.aim((4.0, 0.0))
+    controller.see(scan(), 10.0)
+    controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
+    return controller, asked
+
+
+def reasons(controller: Controller, times: Sequence[float]) -> list[str | None]:
+    orders = [controller.tick(time) for time in times]
+    return [None if order is None else order.reason for order in orders]
+
+
+def test_it_drives_when_it_has_all_that_it_needs() -> None:
+    controller, _ = ready()
+    assert controller.tick(10.0) == Order(0.5, 0.0, "driving")
+
+
+def test_an_order_holds_until_the_next_decision_is_due() -> None:
+    controller, asked = ready()
+    times = [10.0, 10.05, 10.1, 10.15, 10.17, 10.2, 10.3, 10.35]
+    assert reasons(controller, times) == ["driving"] * 8
+    assert len(asked) == 3  # At 10, at 10.17, a little early, and at 10.35.
+
+
+def test_a_clock_that_jumps_back_brings_a_new_decision() -> None:
+    controller, asked = ready()
+    controller.tick(10.0)
+    controller.tick(9.9)
+    assert len(asked) == 2
+
+
+def test_without_a_goal_it_says_nothing_and_after_one_it_stops_once() -> None:
+    controller, asked = make()
+    controller.see(scan(), 10.0)
+    controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
+    assert reasons(controller, [10.0, 10.1]) == [None, None]
+    controller.aim((4.0, 0.0))
+    controller.tick(10.1)
+    controller.aim(None)
+    assert controller.tick(10.2) == Order(0.0, 0.0, "no goal")
+    assert reasons(controller, [10.3, 10.4]) == [None, None]
+    assert len(asked) == 1
+
+
+def test_at_the_goal_it_stops_once_and_sets_out_for_the_next() -> None:
+    controller, asked = ready()
+    controller.tick(10.0)
+    controller.feel((3.6, 0.2, 0.0), (0.5, 0.0), 10.1)
+    assert controller.tick(10.1) == Order(0.0, 0.0, "arrived")
+    assert reasons(controller, [10.2, 10.3]) == [None, None]
+    controller.aim((0.0, 0.0))
+    assert reasons(controller, [10.31]) == ["driving"]
+    assert len(asked) == 2
+
+
+def test_it_waits_for_the_first_scan_and_odometry() -> None:
+    controller, _ = make()
+    controller.aim((4.0, 0.0))
+    assert controller.tick(10.0) == Order(0.0, 0.0, "no scan")
+    controller.see(scan(), 10.0)
+    assert controller.tick(10.0) == Order(0.0, 0.0, "no odometry")
+    controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
+    assert reasons(controller, [10.0]) == ["driving"]
+
+
+def test_a_stale_scan_stops_it_until_another_comes() -> None:
+    controller, asked = ready(scan_timeout=0.3, odometry_timeout=9.0)
+    assert reasons(controller, [10.0, 10.29, 10.31]) == [
+        "driving", "driving", "stale scan: 0.3 s old",
+    ]  # fmt: skip
+    before = len(asked)
+    controller.see(scan(), 10.4)
+    assert reasons(controller, [10.4]) == ["driving"]
+    assert len(asked) == before + 1  # What it wanted before the stop is not taken up.
+
+
+def test_what_comes_from_the_future_is_stale() -> None:
+    controller, _ = ready()
+    controller.see(scan(), 12.0)
+    assert reasons(controller, [10.0]) == ["stale scan: -2.0 s old"]
+    controller.see(scan(), math.nan)
+    assert reasons(controller, [10.0]) == ["stale scan: nan s old"]
+
+
+def test_stale_odometry_stops_it() -> None:
+    controller, _ = ready(scan_timeout=9.0)
+    assert reasons(controller, [10.5, 10.6]) == ["driving", "stale odometry: 0.6 s old"]
+
+
+@pytest.mark.parametrize(
+    ("nearest", "stops"), [(0.2, True), (0.279, True), (0.281, False), (0.05, False)]
+)
+def test_an_obstacle_inside_the_stop_distance_stops_it(nearest: float, stops: bool) -> None:
+    # 0.18 m is the robot's radius; 0.05 m is below what this lidar can measure.
+    controller, _ = ready(stop_distance=0.1)
+    controller.see(scan(2.0, nearest, 2.0), 10.0)
+    order = controller.tick(10.0)
+    assert order is not None
+    if stops:
+        assert order == Order(0.0, 0.0, f"obstacle: {nearest - 0.18:.2f} m from the rim")
+        controller.see(scan(), 10.1)
+        assert reasons(controller, [10.1]) == ["driving"]
+    else:
+        assert order.reason == "driving"
+
+
+def test_what_is_behind_does_not_stop_it() -> None:
+    controller, _ = ready()
+    values = np.full(360, 3.0)
+    values[:80] = 0.2
+    controller.see(Scan(-math.pi, math.pi / 180, values), 10.0)
+    assert reasons(controller, [10.0]) == ["driving"]
+
+
+def test_a_narrow_robot_stops_at_its_own_rim() -> None:
+    pilot = Pilot(card(), lambda seen: np.ones((1, 2), np.float32), robot="burger")
+    controller = Controller(pilot, stop_distance=0.1)
+    controller.aim((4.0, 0.0))
+    controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
+    controller.see(scan(0.21), 10.0)
+    order = controller.tick(10.0)
+    assert order is not None and order.linear == pytest.approx(0.22)
+    controller.see(scan(0.20), 10.0)
+    assert reasons(controller, [10.0]) == ["obstacle: 0.10 m from the rim"]
+
+
+@pytest.mark.parametrize("place", range(5))
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_odometry_that_is_not_finite_stops_it(place: int, number: float) -> None:
+    controller, _ = ready()
+    values = [0.0] * 5
+    values[place] = number
+    controller.feel((values[0], values[1], values[2]), (values[3], values[4]), 10.0)
+    assert controller.tick(10.0) == Order(0.0, 0.0, "odometry is not finite")
+
+
+def test_a_goal_that_is_not_finite_gives_up_the_goal() -> None:
+    controller, _ = ready()
+    controller.tick(10.0)
+    controller.aim((math.nan, 0.0))
+    assert controller.tick(10.1) == Order(0.0, 0.0, "goal must be a finite number, got nan")
+    assert controller.tick(10.2) is None
+    controller.aim((1.0, 0.0))
+    controller.correct_goal((math.inf, 0.0))
+    assert reasons(controller, [10.3, 10.4]) == ["goal must be a finite number, got inf", None]
+
+
+def test_a_corrected_goal_is_driven_to_and_none_is_not_made_up() -> None:
+    controller, asked = ready()
+    controller.correct_goal((0.0, 4.0))
+    controller.tick(10.0)
+    assert asked[0][18:20] == pytest.approx((0.0, 1.0), abs=1e-6)  # To the left.
+    controller.aim(None)
+    controller.correct_goal((1.0, 1.0))
+    assert controller.pilot.goal is None
+
+
+def test_a_scan_that_tells_too_little_stops_it() -> None:
+    controller, _ = ready()
+    controller.see(scan(*[math.nan] * 20), 10.0)
+    assert reasons(controller, [10.0]) == ["no ray of the sector at 5 degrees is valid"]
+    controller.see(Scan(-1.0, 0.1, np.ones(20)), 10.0)
+    assert reasons(controller, [10.0]) == ["the scan does not reach the sector at 85 degrees"]
+    controller.see(Scan(math.nan, 0.1, np.ones(20)), 10.0)
+    assert reasons(controller, [10.0]) == ["a scan needs a first angle and a step, got nan and 0.1"]
+
+
+def test_an_action_that_is_not_finite_stops_it() -> None:
+    controller, _ = ready(network=lambda seen: np.full((1, 2), np.nan, np.float32))
+    order = controller.tick(10.0)
+    assert order is not None and order[:2] == (0.0, 0.0)
+    assert order.reason.startswith("the network's action must be finite, got")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stop_distance": -0.1}, "stop_distance must not be negative, got -0.1"),
+        ({"stop_distance": math.nan}, "stop_distance must be a finite number, got nan"),
+        ({"scan_timeout": 0.0}, "scan_timeout must be positive, got 0.0"),
+        ({"odometry_timeout": math.inf}, "odometry_timeout must be a finite number, got inf"),
+    ],
+)
+def test_limits_that_are_none_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**options)
+
+
+def names(**values: Any) -> SimpleNamespace:
+    return SimpleNamespace(**values)
+
+
+def test_messages_are_read_and_written_as_ros_means_them() -> None:
+    pose = names(position=names(), orientation=names(x=0.0, y=0.0))
+    messages.write_pose(pose, (1.0, -2.0, 2.5))
+    assert messages.yaw(pose.orientation) == pytest.approx(2.5)
+    assert math.isnan(messages.yaw(names(x=0.0, y=0.0, z=0.0, w=0.0)))
+    twist = names(linear=names(x=0.3), angular=names(z=-0.4))
+    odometry = names(pose=names(pose=pose), twist=names(twist=twist))
+    place, speeds = messages.odometry_of(odometry)
+    assert place == pytest.approx((1.0, -2.0, 2.5)) and speeds == (0.3, -0.4)
+    assert messages.seconds(names(sec=3, nanosec=500_000_000)) == 3.5
+    quarter = names(x=0.0, y=0.0, z=math.sin(math.pi / 4), w=math.cos(math.pi / 4))
+    transform = names(rotation=quarter, translation=names(x=10.0, y=0.0))
+    assert messages.transformed((2.0, 1.0), transform) == pytest.approx((9.0, 2.0))
