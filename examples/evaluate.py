@@ -20,6 +20,7 @@ import argparse
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +35,7 @@ from mpfa_envs import (
     PLANNERS,
     EpisodeResult,
     Policy,
+    RobotNoise,
     World,
     load_policy,
     make_planner,
@@ -98,6 +100,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         choices=["wheels", "kinematic"],
         help="default: as trained; of a planner kinematic",
     )
+    parser.add_argument(
+        "--noise",
+        type=read_noise,
+        metavar="NAME=VALUE,...",
+        help="errors of a robot: range_noise, dropout, slip, latency, drift (default: none)",
+    )
     parser.add_argument("--no-pictures", action="store_true", help="write tables alone")
     options = parser.parse_args(arguments)
     for name, least in (("episodes", 1), ("seed", 0)):
@@ -114,6 +122,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     return options
+
+
+def read_noise(words: str) -> RobotNoise:
+    """What ``--noise slip=0.1,latency=1`` says."""
+    try:
+        values = {
+            name: float(value) for name, _, value in (w.partition("=") for w in words.split(","))
+        }
+        if "latency" in values and values["latency"].is_integer():
+            values["latency"] = int(values["latency"])
+        return RobotNoise(**values)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def load_driver(options: argparse.Namespace) -> Drivable:
@@ -248,12 +269,14 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     rows = []
     with files.lock(folder):
         for world in options.names:
-            drives = drive(policy, world, progress=not options.no_pictures, **asked)
+            drives = drive(
+                policy, world, noise=options.noise, progress=not options.no_pictures, **asked
+            )
             results += drives.results
             driven.append(drives)
             rows.append({"world": world_name(world), **summary_row(drives.results)})
         if not options.no_pictures:
-            write_pictures(policy, driven, folder, physics=options.physics)
+            write_pictures(policy, driven, folder, physics=options.physics, noise=options.noise)
         if len(rows) > 1:
             rows.append({"world": "total", **summary_row(results)})
         summary = pd.DataFrame(rows)
@@ -263,6 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
         document: dict[str, Any] = {"words": options.worlds, **asked}
+        if options.noise is not None:
+            document["noise"] = asdict(options.noise)
         if isinstance(policy, Policy):
             file = options.path / files.POLICY if options.path.is_dir() else options.path
             document |= {"card": policy.card, "sha256": files.digest(file)}

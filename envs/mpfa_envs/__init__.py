@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from mpfa_envs.map_memory import MapMemory
     from mpfa_envs.mirror import Mirror, RandomMirror
     from mpfa_envs.navigation import NavigationEnv
+    from mpfa_envs.noise import RobotNoise
     from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
     from mpfa_envs.occupancy import OccupancyGrid
     from mpfa_envs.path import PathPlanner
@@ -88,6 +89,7 @@ __all__ = [
     "RandomMirror",
     "RewardTerms",
     "RobotModel",
+    "RobotNoise",
     "StepOutcome",
     "Task",
     "VectorNavigationEnv",
@@ -158,6 +160,7 @@ _MODULES = {
     "RandomMirror": "mirror",
     "RewardTerms": "reward",
     "RobotModel": "robot",
+    "RobotNoise": "noise",
     "StepOutcome": "reward",
     "Task": "tasks",
     "VectorNavigationEnv": "vector",

@@ -12,6 +12,7 @@ from gymnasium.spaces import Box as BoxSpace
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 from mpfa_envs.lidar import Lidar
+from mpfa_envs.noise import NoisyMotion, RobotNoise, resolve_noise
 from mpfa_envs.observation import Memory, observation_bounds, observation_slices
 from mpfa_envs.reward import RewardFunction, navigation_reward
 from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
@@ -58,6 +59,7 @@ class TaskArguments:
         lidar: Mapping[str, Any] | None,
         memory: Memory,
         history: int,
+        noise: RobotNoise | Mapping[str, Any] | None,
         closeness_distance: float | None,
         min_goal_distance: float,
         detour_chance: float,
@@ -101,7 +103,13 @@ class TaskArguments:
             if closeness_distance is None
             else check_positive("closeness_distance", closeness_distance)
         )
-        self._lidar_arguments = lidar or {}
+        self.noise = resolve_noise(noise)
+        self._lidar_arguments: dict[str, Any] = dict(lidar or {})
+        for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
+            if value > 0.0:
+                if name in self._lidar_arguments:
+                    raise ValueError(f"lidar must not hold {name!r} beside noise={self.noise}")
+                self._lidar_arguments[name] = value
 
     def _make_lidar(self, world: World) -> Lidar:
         """The lidar in a world."""
@@ -111,6 +119,13 @@ class TaskArguments:
             raise ValueError(
                 f"lidar must hold arguments of Lidar, got {self._lidar_arguments!r}: {error}"
             ) from error
+
+    def _make_noise(self, robots: int) -> NoisyMotion | None:
+        """What disturbs the motion of some robots, if anything does."""
+        if not self.noise.is_in_motion:
+            return None
+        base, step = self.robot.wheel_base, self.time_step
+        return NoisyMotion(self.noise, robots, wheel_base=base, time_step=step)
 
     def _make_spaces(
         self, sectors: int, diagonal: float

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive
+from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,6 +39,7 @@ class Lidar:
         noise: Standard deviation of Gaussian noise on each ray [m].
         field_of_view: Angle from the first edge of the first sector to the last of the last one
             [deg], at most 360: of sectors of 10 degrees a whole turn has 36.
+        dropout: Chance that a ray reports the greatest range, whatever it meets.
 
     Raises:
         ValueError: If a number is out of its range or the reduction is unknown.
@@ -60,6 +61,7 @@ class Lidar:
         max_range: float = 10.0,
         noise: float = 0.0,
         field_of_view: float = 180.0,
+        dropout: float = 0.0,
     ) -> None:
         if reduction not in get_args(Reduction):
             raise ValueError(f"reduction must be one of {get_args(Reduction)}, got {reduction!r}")
@@ -74,6 +76,7 @@ class Lidar:
         self.field_of_view = check_positive("field_of_view", field_of_view)
         if self.field_of_view > 360.0:
             raise ValueError(f"field_of_view must be at most 360 degrees, got {field_of_view}")
+        self.dropout = check_share("dropout", dropout)
         rays = sectors * self.rays_per_sector
         self.angles = math.radians(self.field_of_view) * (0.5 - (np.arange(rays) + 0.5) / rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
@@ -239,12 +242,29 @@ class Lidar:
             ValueError: If there is noise and no generator.
         """
         ranges = self.cast(x, y, heading, moving=moving)
-        if self.noise > 0:
+        if self.is_noisy:
             if rng is None:
                 raise ValueError(f"rng must be a Generator when noise is {self.noise}, got None")
+            self.disturb(ranges, rng)
+        return ranges
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether two scans from one place differ."""
+        return self.noise > 0.0 or self.dropout > 0.0
+
+    def disturb(self, ranges: NDArray[np.float64], rng: np.random.Generator) -> None:
+        """Add the noise to a scan, and let rays drop out.
+
+        Args:
+            ranges: Range of each ray, changed in place [m], shape ``[rays]``.
+            rng: Source of the noise.
+        """
+        if self.noise > 0.0:
             ranges += self.noise * rng.standard_normal(ranges.size)
             np.clip(ranges, 0.0, self.max_range, out=ranges)
-        return ranges
+        if self.dropout > 0.0:
+            ranges[rng.random(ranges.size) < self.dropout] = self.max_range
 
     def reduce(self, ranges: NDArray[np.float64]) -> NDArray[np.float64]:
         """Give the range of every sector.

@@ -14,9 +14,10 @@ from gymnasium.error import ResetNeeded
 from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.drives import Drive, KinematicDrive, WheelDrive
+from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
 from mpfa_envs.episodes import distance_field
-from mpfa_envs.observation import INFO_TYPES, Memory, add_history, observe
+from mpfa_envs.noise import RobotNoise
+from mpfa_envs.observation import INFO_TYPES, Memory
 from mpfa_envs.path import shortest_length
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
@@ -25,6 +26,7 @@ from mpfa_envs.reward import (
     StepOutcome,
 )
 from mpfa_envs.robot import RobotModel
+from mpfa_envs.senses import Senses
 from mpfa_envs.tasks import Task, check_task, sample_task
 from mpfa_envs.walkers import no_encounters
 
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
 
     from mpfa_envs.distance import DistanceField
     from mpfa_envs.local_field import LocalField
-    from mpfa_envs.map_memory import MapMemory
     from mpfa_envs.walker_batch import WalkerBatch
     from mpfa_envs.worlds import World
 
@@ -121,6 +122,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             senses what is before it and nothing else.
         history: How many earlier scans it senses beside the last one, sector by sector: those of
             the decisions before, the newest first, by which it may tell what moves.
+        noise: Errors of the lidar, the wheels, the time and the odometry, none by default: a
+            :class:`~mpfa_envs.RobotNoise` or its numbers by name.
         closeness_distance: A range of this or less has closeness one [m]. None: the default of
             collision_distance, whatever that is.
         min_goal_distance: Least distance between a sampled start and goal [m].
@@ -167,6 +170,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         lidar: Mapping[str, Any] | None = None,
         memory: Memory = "none",
         history: int = 0,
+        noise: RobotNoise | Mapping[str, Any] | None = None,
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         detour_chance: float = 0.8,
@@ -187,6 +191,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             lidar=lidar,
             memory=memory,
             history=history,
+            noise=noise,
             closeness_distance=closeness_distance,
             min_goal_distance=min_goal_distance,
             detour_chance=detour_chance,
@@ -199,10 +204,10 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._task: Task | None = None
         self._field: DistanceField | LocalField | None = None
         self._running = False
-        self._observation: NDArray[np.float32] | None = None
         self._trail: list[tuple[float, float]] = []
-        self._map = self._make_map() if self.memory == "map" else None
+        self._senses = Senses(self, self.lidar)
         self._walkers = self._make_walkers() if self.world.walkers else None
+        self._noise = self._make_noise(1)
         self._drive: Drive = (
             KinematicDrive(self.robot, time_step=self.time_step)
             if physics == "kinematic"
@@ -270,8 +275,9 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._min_clearance = self._to_obstacle(*task.start[:2]) - self.robot.radius
         self._trail = [task.start[:2]]
         self._running = True
-        if self._map is not None:
-            self._map.begin(0, self.world)
+        if self._noise is not None:
+            self._noise.begin(0, self._motion[:3], self.np_random)
+        self._senses.begin(self.world)
         return self._observe(), self._info(False, False, False, RewardTerms())
 
     def step(
@@ -309,7 +315,12 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         """
         if self._walkers is not None:
             self._walkers.move(_ALONE, np.array([self._motion]))
+        if self._noise is not None:
+            told = np.array([[left, right]])
+            left, right = self._noise.drive(told, _ALONE, [self.np_random])[0].tolist()
         motion = self._drive.move(left, right)
+        if self._noise is not None:
+            self._noise.measure(np.array([motion]), _ALONE)
         if self._walkers is not None:
             self._walkers.count_encounters(np.array([motion]), _ALONE, self._encounters)
         self._steps += 1
@@ -366,7 +377,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             goal_radius=self.goal_radius,
             trail=self._trail,
             rays=(self.lidar.angles, ranges),
-            sketch=None if self._map is None else self._map.sketch(0, motion.x, motion.y),
+            sketch=self._senses.sketch(motion.x, motion.y),
             walkers=walkers,
         )
 
@@ -375,16 +386,9 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         self._running = False
         self._drive.close()
 
-    def _make_map(self) -> MapMemory:
-        """The map that the robot makes."""
-        # Imported here because it needs Numba, which takes half a second.
-        from mpfa_envs.map_memory import MapMemory
-
-        return MapMemory(1, self.robot, self.lidar)
-
     def _make_walkers(self) -> WalkerBatch:
         """What moves around the robot."""
-        # Imported here for the same reason.
+        # Imported here because it needs Numba, which takes half a second.
         from mpfa_envs.walker_batch import WalkerBatch
         from mpfa_envs.world_batch import WorldBatch
 
@@ -394,23 +398,11 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     def _observe(self) -> NDArray[np.float32]:
         """Sense the world and build the observation."""
         motion = self._motion
-        lidar = self.lidar
-        rng, walkers = self.np_random if lidar.noise else None, self._walkers
-        moving = None if walkers is None else walkers.circles(0)
-        rays = lidar.measure(*motion[:3], rng=rng, moving=moving)
-        way = None
-        if self._map is not None:
-            motions, met = np.array([motion]), rays[None]
-            if walkers is not None:
-                met = walkers.without(motions, lidar, met)
-            way = self._map.remember(motions, np.array([self._goal]), met)[0]
-        ranges, near = lidar.reduce(rays), self.closeness_distance
-        seen = observe(ranges, motion, self._goal, self._distance, self.robot, near, way)
-        if self.history:
-            last = self._observation if self._steps else None
-            seen = add_history(seen, last, lidar.sectors, self.history)
-            self._observation = seen.copy()
-        return seen
+        odometry = motion
+        if self._noise is not None and self._noise.has_odometry:
+            odometry = Motion(*self._noise.odometry[0].tolist())
+        rng = self.np_random if self.lidar.is_noisy else None
+        return self._senses.observe(motion, odometry, self._goal, walkers=self._walkers, rng=rng)
 
     def _info(
         self, success: bool, collision: bool, timeout: bool, terms: RewardTerms

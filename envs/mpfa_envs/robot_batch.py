@@ -102,6 +102,9 @@ class RobotBatch:
         """What they sense, ``[N, O]``."""
         self.drives = make_drives(rules.physics, rules.robot, count, time_step=rules.time_step)
         """How they move."""
+        self.noise = rules._make_noise(count)
+        """What disturbs their motion, if anything does."""
+        self._held = np.zeros((len(NUMBERS), count))
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         robot = rules.robot
         self._lengths = robot.radius, rules.collision_distance, rules.goal_radius, rules.time_step
@@ -146,6 +149,8 @@ class RobotBatch:
         numbers[ENCOUNTERS:] = no_encounters()
         self.trails[index, 0] = x, y
         self.running[index] = True
+        if self.noise is not None:
+            self.noise.begin(index, (x, y, heading), rng)
         if self.memory is not None:
             self.memory.begin(index, episode.world)
 
@@ -171,19 +176,28 @@ class RobotBatch:
             raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
         return speeds
 
-    def advance(self, speeds: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:
+    def advance(
+        self,
+        speeds: NDArray[np.float64],
+        moving: NDArray[np.bool_],
+        rngs: Sequence[np.random.Generator],
+    ) -> None:
         """Hold the wheel speeds until the next actions are due.
 
         Args:
             speeds: Of the left and the right wheel [m/s], ``[N, 2]``.
             moving: Which robots move, ``[N]``; the others' rows stay.
+            rngs: Source of each robot's noise.
         """
         episodes, worlds, running = self.episodes, self.worlds.arrays, moving.copy()
         episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
         self._lengthen_trails(int(episodes.steps.max()) + self._rules.action_repeat)
         for _ in range(self._rules.action_repeat):
             self.walkers.move(running, episodes.motions)
-            self.drives.move(episodes.motions, running, speeds)
+            driven = speeds if self.noise is None else self.noise.drive(speeds, running, rngs)
+            self.drives.move(episodes.motions, running, driven)
+            if self.noise is not None:
+                self.noise.measure(episodes.motions, running)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
             judge(episodes, worlds, running, self.trails, self._lengths, self._rules.max_steps)
             if self._fields is not None:
@@ -253,6 +267,7 @@ class RobotBatch:
             "running": self.running,
             "observations": self.observations,
             "ranges": self.ranges,
+            **({} if self.noise is None else self.noise.arrays()),
         }
 
     def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
@@ -286,18 +301,17 @@ class RobotBatch:
             lidar.max_range,
             ranges,
         )
-        if lidar.noise > 0.0:
+        if lidar.is_noisy:
             for index in np.flatnonzero(chosen).tolist():
-                ranges[index] += lidar.noise * rngs[index].standard_normal(ranges.shape[1])
-            np.clip(ranges, 0.0, lidar.max_range, out=ranges)
+                lidar.disturb(ranges[index], rngs[index])
+        held = self._by_odometry()
         ways = _NO_WAYS
         if self.memory is not None:
-            motions, goals = self.episodes.motions, self.episodes.goals
-            seen = self.walkers.without(motions, lidar, ranges)
-            ways = self.memory.remember(motions, goals, seen, chosen)
+            seen = self.walkers.without(self.episodes.motions, lidar, ranges)
+            ways = self.memory.remember(held.motions, held.goals, seen, chosen)
         median = lidar.reduction == "median"
         observe_all(
-            self.episodes,
+            held,
             chosen,
             ranges,
             median,
@@ -307,6 +321,14 @@ class RobotBatch:
             self._rules.history,
             self.observations,
         )
+
+    def _by_odometry(self) -> EpisodeArrays:
+        """The episodes with the poses, speeds and distances that the robots hold to be true."""
+        if self.noise is None or not self.noise.has_odometry:
+            return self.episodes
+        motions = self.noise.odometry
+        self._held[DISTANCE] = np.hypot(*(self.episodes.goals - motions[:, :2]).T)
+        return self.episodes._replace(motions=motions, numbers=self._held)
 
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m]."""

@@ -17,6 +17,7 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.episodes import EpisodeSource, WorldChoice
 from mpfa_envs.kernels.step import outcomes
+from mpfa_envs.noise import RobotNoise
 from mpfa_envs.observation import INFO_TYPES, Memory
 from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
 from mpfa_envs.robot import RobotModel
@@ -75,6 +76,7 @@ class VectorNavigationEnv(
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults.
         memory: What a robot remembers of its episode.
         history: How many earlier scans it senses beside the last one.
+        noise: Errors of the lidar, the wheels, the time and the odometry.
         closeness_distance: A range of this or less has closeness one [m].
         min_goal_distance: Least distance between a sampled start and goal [m].
         max_goal_distance: Longest way between them [m].
@@ -126,6 +128,7 @@ class VectorNavigationEnv(
         lidar: Mapping[str, Any] | None = None,
         memory: Memory = "none",
         history: int = 0,
+        noise: RobotNoise | Mapping[str, Any] | None = None,
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         max_goal_distance: float = math.inf,
@@ -151,6 +154,7 @@ class VectorNavigationEnv(
             lidar=lidar,
             memory=memory,
             history=history,
+            noise=noise,
             closeness_distance=closeness_distance,
             min_goal_distance=min_goal_distance,
             detour_chance=detour_chance,
@@ -171,11 +175,8 @@ class VectorNavigationEnv(
             episodes_per_world=episodes_per_world,
             max_goal_distance=max_goal_distance,
         )
-        self.metadata = {
-            "render_modes": ["rgb_array"],
-            "render_fps": 10,
-            "autoreset_mode": self.autoreset_mode,
-        }
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+        self.metadata["autoreset_mode"] = self.autoreset_mode
         self.single_observation_space, self.single_action_space = self._make_spaces(
             self.lidar.sectors, self._source.diagonal
         )
@@ -357,7 +358,7 @@ class VectorNavigationEnv(
         moving = chosen & self._batch.running
         for index in np.flatnonzero(waiting).tolist():
             self._begin(index, None)
-        self._batch.advance(speeds, moving)
+        self._batch.advance(speeds, moving, self._rngs)
         self._batch.sense(chosen, self._rngs)
         rewards, terminated, truncated = outcomes(self._batch.episodes, moving)
         infos: dict[str, Any] = {}

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from mpfa_envs.noise import RobotNoise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,6 +41,8 @@ def describe(rules: TaskArguments, lidar: Lidar, robots: int) -> dict[str, Any]:
         "progress": rules.progress,
         "memory": rules.memory,
         "history": rules.history,
+        # None without, as states had it before there was any.
+        "noise": None if rules.noise == RobotNoise() else asdict(rules.noise),
         "rays": lidar.angles.size,
         "sectors": lidar.sectors,
     }

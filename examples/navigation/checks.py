@@ -12,8 +12,9 @@ import torch
 
 from mpfa_envs import world_tasks
 from mpfa_envs.robot import resolve_robot
+from navigation.environment_settings import EnvironmentSettings
 from navigation.environments import make_training_env
-from navigation.settings import EnvironmentSettings, TrainSettings, is_discrete
+from navigation.settings import TrainSettings, is_discrete
 from navigation.worlds import is_of_a_test
 from torchrl_mpfa.methods.assembly import WORDS
 
@@ -121,6 +122,11 @@ RULES: dict[str, Rule] = {
     "environment.memory": choice("none", "map"),
     "environment.history": at_least(0),
     "environment.field_of_view": (lambda value: 10.0 <= value <= 360.0, "from 10 to 360 [deg]"),
+    "environment.noise.range_noise": NOT_NEGATIVE,
+    "environment.noise.dropout": SHARE,
+    "environment.noise.slip": (lambda value: 0.0 <= value <= 0.45, "in [0, 0.45]"),
+    "environment.noise.latency": at_least(0),
+    "environment.noise.drift": NOT_NEGATIVE,
     "environment.max_goal_distance": POSITIVE,
     "environment.episodes_per_world": at_least(1),
     "evaluation.every": at_least(0),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 from torchrl.envs import EnvBase, TransformedEnv
 
 from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
 from mpfa_envs.robot import resolve_robot
-from navigation.settings import EnvironmentSettings
+from navigation.environment_settings import EnvironmentSettings
 
 _AHEAD, _SECTOR = 180.0, 10.0
 """The lidar's field of view unless it is said, and that of a sector [deg]."""
@@ -73,6 +74,7 @@ def make_training_env(
         detour_chance=settings.detour_chance,
         max_goal_distance=settings.max_goal_distance or math.inf,
         episodes_per_world=settings.episodes_per_world,
+        noise=asdict(settings.noise),
         **env_arguments(settings),
     )
     return TransformedEnv(env, DiscreteWheels()) if discrete else env

@@ -18,6 +18,7 @@ from mpfa_envs import (
     EpisodeResult,
     MapPlanner,
     Policy,
+    RobotNoise,
     VectorNavigationEnv,
     WorldTask,
     evaluate,
@@ -60,6 +61,7 @@ def drive(
     episodes: int | None,
     seed: int,
     physics: str | None,
+    noise: RobotNoise | None = None,
     progress: bool,
 ) -> Drives:
     """Drive a policy through fixed tasks, contact being the only collision.
@@ -72,12 +74,13 @@ def drive(
         episodes: Number of tasks; None: as many as there usually are.
         seed: Seed of the tasks in a world.
         physics: ``wheels`` or ``kinematic``; None: as trained.
+        noise: Errors of the robot; None: none.
         progress: Whether to show a bar.
 
     Returns:
         Tasks, results and ways.
     """
-    arguments = dict(policy.env_arguments)
+    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
     if physics is not None:
         arguments["physics"] = physics
     tasks = world_tasks(world, episodes=episodes, seed=seed, robot=arguments["robot"])
@@ -91,10 +94,16 @@ def drive(
 
 
 def film(
-    policy: Drivable, episode: WorldTask, *, physics: str | None, seed: int = 0
+    policy: Drivable,
+    episode: WorldTask,
+    *,
+    physics: str | None,
+    noise: RobotNoise | None = None,
+    seed: int = 0,
 ) -> list[NDArray[np.uint8]]:
     """Pictures of an episode, each of shape ``[height, width, 3]``."""
     arguments = {**policy.env_arguments, "collision_distance": "contact", "world": episode.world}
+    arguments["noise"] = noise
     if physics is not None:
         arguments["physics"] = physics
     if episode.max_steps is not None:

@@ -18,6 +18,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from navigation.assessment import AssessmentSettings
+from navigation.environment_settings import EnvironmentSettings
 from torchrl_mpfa.methods import METHODS, Method
 
 
@@ -224,48 +225,6 @@ def curriculum_name(stages: Sequence[Stage]) -> str:
         return whole
     digest = hashlib.sha256(repr(list(stages)).encode()).hexdigest()[:8]
     return f"{parts[0][:20]}+{len(parts) - 1}-more-{digest}"
-
-
-@dataclass
-class EnvironmentSettings:
-    """The navigation task."""
-
-    robot: str = "turtlebot2"
-    """``turtlebot2``, ``turtlebot4``, ``burger`` or ``waffle``."""
-    physics: str = "wheels"
-    """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
-    max_steps: int = 500
-    """Time limit of an episode [0.1 s]."""
-    action_repeat: int = 2
-    """Time steps of 0.1 s for which an action is held. With one, rewards are twice as many actions
-    away, and DDPG is less reliable (``docs/tuning.md``)."""
-    progress_scale: float = 5.0
-    """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
-    far away, and a critic that is a little too smooth would rather circle than arrive."""
-    clearance: float = 0.07
-    """Clearance below which training counts a collision [m]. With 0.17 m, 0.35 m from the robot's
-    center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
-    detour_chance: float = 0.8
-    """Chance that start and goal of an episode must have something between them. As they come, up
-    to a half of the goals can be driven at blindly."""
-    progress: str = "straight_line"
-    """What Eq. 25 measures approach by: ``straight_line`` (the paper), ``shortest_path``, or
-    ``none``, the goal and the collision alone."""
-    max_goal_distance: float | None = None
-    """Longest way of a sampled task [m]; null: as it comes."""
-    episodes_per_world: int = 1
-    """Episodes of a robot in a world of a generator before it gets another one."""
-    memory: str = "none"
-    """``map``: the robot makes a map of what its lidar met and senses the way to the goal that is
-    open on it; ``none``: it senses what is before it alone."""
-    history: int = 0
-    """Earlier scans of the lidar that it senses beside the last one, by which it may tell what
-    moves."""
-    field_of_view: float = 180.0
-    """Angle that the lidar sees [deg], in sectors of 10 degrees. A robot that must keep moving is
-    run into from behind by people unless it sees all 360."""
-    mirror: bool = True
-    """Show the learner half of what it samples in the mirror: left and right are alike."""
 
 
 @dataclass

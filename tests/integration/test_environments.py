@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import inspect
+from argparse import ArgumentTypeError
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
 
-from mpfa_envs import Mirror, NavigationEnv, RandomMirror, load_policy
+from evaluate import read_noise
+from mpfa_envs import Mirror, NavigationEnv, RandomMirror, RobotNoise, load_policy
 from mpfa_envs.reward import PROGRESS_SCALE
-from navigation.environments import env_arguments, make_training_env
-from navigation.settings import EnvironmentSettings
+from navigation.environment_settings import EnvironmentSettings, NoiseSettings
+from navigation.environments import env_arguments, make_training_env, vector_of
 from tests.integration.tiny_runs import tiny, train
 
 
@@ -88,3 +91,18 @@ def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> N
         assert getattr(trained, name) == getattr(plain, name), name
     assert settings.progress_scale == PROGRESS_SCALE
     assert EnvironmentSettings().physics == "wheels"
+
+
+def test_the_settings_of_noise_are_those_of_the_environment() -> None:
+    assert asdict(NoiseSettings()) == asdict(RobotNoise())
+    settings = EnvironmentSettings(physics="kinematic", noise=NoiseSettings(slip=0.1, latency=2))
+    env = make_training_env("A", settings, robots=2)
+    assert vector_of(env).noise == RobotNoise(slip=0.1, latency=2)
+    env.close()
+
+
+def test_noise_on_the_command_line_is_read_or_refused() -> None:
+    assert read_noise("slip=0.1,latency=2") == RobotNoise(slip=0.1, latency=2)
+    for words in ("slip=2", "slip", "latency=0.5", "wind=1"):
+        with pytest.raises(ArgumentTypeError):
+            read_noise(words)

@@ -1,0 +1,238 @@
+"""Noise as on a robot: what each kind does, and that one robot and many have the same."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    OBSERVATION,
+    WORLDS,
+    Lidar,
+    NavigationEnv,
+    NavigationTorchEnv,
+    RobotNoise,
+    Task,
+    VectorNavigationEnv,
+)
+from mpfa_envs.noise import NoisyMotion
+
+ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
+AHEAD = Task((-4.0, 0.0, 0.0), (4.0, 0.0))
+KINEMATIC = {"physics": "kinematic"}
+
+
+def drive(noise, actions, *, world="A", task=AHEAD, seed=0, **arguments):
+    """Observations, poses and infos of one robot; the first ones are those of the reset."""
+    env = NavigationEnv(world=world, noise=noise, **{**KINEMATIC, **arguments})
+    seen, info = env.reset(seed=seed, options=task and task._asdict())
+    rows = [(seen, info)]
+    for action in actions:
+        seen, _, terminated, truncated, info = env.step(action)
+        rows.append((seen, info))
+        if terminated or truncated:
+            break
+    env.close()
+    return np.array([seen for seen, _ in rows]), [info for _, info in rows]
+
+
+def places(infos):
+    return np.array([[info[name] for name in ("x", "y", "heading")] for info in infos])
+
+
+@pytest.mark.parametrize("noise", [None, RobotNoise(), {}])
+def test_without_noise_nothing_is_added(noise):
+    env = VectorNavigationEnv(2, noise=noise, **KINEMATIC)
+    assert env.noise == RobotNoise()
+    assert env._batch.noise is None
+    assert not env.lidar.is_noisy
+
+
+@pytest.mark.parametrize("memory", ["none", "map"])
+@pytest.mark.parametrize(
+    "noise",
+    [ALL, RobotNoise(latency=3), RobotNoise(drift=0.1), RobotNoise(slip=0.2)],
+    ids=["all", "latency", "drift", "slip"],
+)
+def test_one_robot_and_many_have_the_same_noise(noise, memory):
+    rng = np.random.default_rng(0)
+    arguments = {"world": "test", "noise": noise, "memory": memory, "history": 1, **KINEMATIC}
+    many = VectorNavigationEnv(3, **arguments)
+    alone = [NavigationEnv(**arguments) for _ in range(3)]
+    seeds = [5, 6, 7]
+    all_seen, infos = many.reset(seed=seeds)
+    begun = [env.reset(seed=seed) for env, seed in zip(alone, seeds, strict=True)]
+    steps = 0
+    for _ in range(3):  # Three episodes each, the later ones from where the random numbers are.
+        ended = np.zeros(3, dtype=bool)
+        for index, (seen, _) in enumerate(begun):
+            np.testing.assert_allclose(all_seen[index], seen, atol=1e-6)
+        while not ended.all():
+            actions = rng.uniform(-0.5, 1.0, (3, 2))
+            running = ~ended
+            all_seen, _, _, _, infos = many.step(actions, only=running)
+            steps += 1
+            for index in np.flatnonzero(running).tolist():
+                seen, _, terminated, truncated, info = alone[index].step(actions[index])
+                np.testing.assert_allclose(all_seen[index], seen, atol=1e-6)
+                for key in ("x", "y", "heading", "path_length", "distance"):
+                    assert infos[key][index] == pytest.approx(info[key], abs=1e-9)
+                ended[index] = terminated or truncated
+        begun = [env.reset() for env in alone]
+        all_seen, _ = many.reset()
+    assert steps > 30
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
+def test_noisy_robots_go_on_to_the_bit(physics):
+    if physics == "wheels":
+        pytest.importorskip("pybullet")
+
+    def make():
+        return VectorNavigationEnv(2, world="rooms", noise=ALL, memory="map", physics=physics)
+
+    env, other = make(), make()
+    env.reset(seed=3)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 2, 2))
+    for action in actions[:6]:
+        env.step(action)
+    other.load_state_dict(env.state_dict())
+    for action in actions[6:]:
+        for one, two in zip(env.step(action)[:4], other.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(one, two)
+    env.close()
+    other.close()
+
+
+def test_a_state_of_other_noise_is_refused_and_one_from_before_there_was_any_is_not():
+    env = VectorNavigationEnv(1, noise=ALL, **KINEMATIC)
+    quiet = VectorNavigationEnv(1, **KINEMATIC)
+    env.reset(seed=0)
+    quiet.reset(seed=0)
+    with pytest.raises(ValueError, match="noise = None"):
+        quiet.load_state_dict(env.state_dict())
+    state = quiet.state_dict()
+    del state["arguments"]["noise"]
+    quiet.load_state_dict(state)
+
+
+def test_late_actions_are_those_that_were_told_before():
+    actions = np.random.default_rng(1).uniform(-1.0, 1.0, (30, 2))
+    _, prompt = drive(None, actions, action_repeat=1)
+    _, late = drive(RobotNoise(latency=3), actions, action_repeat=1)
+    np.testing.assert_allclose(places(late)[:4], [AHEAD.start] * 4)  # It stands.
+    np.testing.assert_allclose(places(late)[3:], places(prompt)[:-3], atol=1e-12)
+
+
+def test_latency_counts_time_steps_and_not_decisions():
+    _, late = drive(RobotNoise(latency=3), np.ones((4, 2)), action_repeat=2)
+    np.testing.assert_allclose(places(late)[:, 0] + 4.0, [0.0, 0.0, 0.05, 0.15, 0.25], atol=1e-12)
+
+
+def test_a_slipping_wheel_loses_the_share_that_is_said_and_odometry_does_not_see_it():
+    seen, infos = drive(RobotNoise(slip=0.2), np.ones((60, 2)), action_repeat=1)
+    told, driven = 0.05 * 60, infos[-1]["path_length"]
+    assert driven == pytest.approx(0.8 * told, rel=0.03)
+    # By odometry the robot has gone straight ahead, as it was told.
+    goal = seen[-1][OBSERVATION["goal_distance"]] * 10.0
+    assert goal == pytest.approx(8.0 - told, abs=1e-5)
+    np.testing.assert_allclose(seen[-1][OBSERVATION["goal_direction"]], [1.0, 0.0], atol=1e-6)
+    assert abs(infos[-1]["heading"]) > 1e-3
+
+
+def test_drift_scales_ways_and_turns_alike_throughout_an_episode():
+    motion = NoisyMotion(RobotNoise(drift=0.05), 4000, wheel_base=0.23, time_step=0.1)
+    rng = np.random.default_rng(0)
+    for robot in range(4000):
+        motion.begin(robot, (0.0, 0.0, 0.0), rng)
+    motions, everyone = np.zeros((4000, 5)), np.ones(4000, dtype=bool)
+    motions[:, 0] = 0.05
+    motion.measure(motions, everyone)
+    ways = motion.odometry[:, 0] / 0.05
+    assert ways.mean() == pytest.approx(1.0, abs=0.003)
+    assert ways.std() == pytest.approx(0.05, rel=0.04)
+    np.testing.assert_allclose(motion.odometry[:, 3], ways * 0.5)
+    motions[:, 2] = 0.2  # A turn on the spot.
+    motion.measure(motions, everyone)
+    turns = motion.odometry[:, 2] / 0.2
+    assert turns.std() == pytest.approx(0.05, rel=0.04)
+    assert abs(np.corrcoef(ways, turns)[0, 1]) < 0.05
+    motions[:, 0] = 0.05 + 0.05 * math.cos(0.2)
+    motions[:, 1] = 0.05 * math.sin(0.2)
+    motion.measure(motions, everyone)
+    np.testing.assert_allclose(np.hypot(*(motion.odometry[:, :2]).T), 0.1 * ways, rtol=0.02)
+
+
+def test_odometry_without_errors_is_where_the_robot_is():
+    motion = NoisyMotion(RobotNoise(drift=1e-300), 1, wheel_base=0.23, time_step=0.1)
+    actions = np.random.default_rng(3).uniform(-1.0, 1.0, (50, 2))
+    _, infos = drive(None, actions, task=Task((0.0, 0.0, 3.0), (4.0, 4.0)), action_repeat=1)
+    rows = places(infos)
+    motion.begin(0, rows[0], np.random.default_rng(0))
+    for row in rows[1:]:
+        motion.measure(np.concatenate((row, [0.0, 0.0]))[None], np.ones(1, dtype=bool))
+        np.testing.assert_allclose(motion.odometry[0, :3], row, atol=1e-12)
+
+
+def test_the_task_is_judged_by_where_the_robot_is():
+    noise = RobotNoise(drift=0.3)
+    seen, infos = drive(noise, np.ones((80, 2)), seed=2)
+    assert infos[-1]["success"]
+    assert infos[-1]["distance"] == pytest.approx(math.dist(places(infos)[-1][:2], AHEAD.goal))
+    held = seen[-1][OBSERVATION["goal_distance"]][0] * 10.0
+    assert abs(held - infos[-1]["distance"]) > 0.1
+
+
+def test_rays_drop_out_as_often_as_is_said():
+    lidar = Lidar(WORLDS["A"], dropout=0.1, max_range=20.0)
+    rng = np.random.default_rng(0)
+    scans = np.array([lidar.measure(0.0, 0.0, 0.0, rng=rng) for _ in range(400)])
+    lost = scans == 20.0
+    assert lost.mean() == pytest.approx(0.1, abs=0.006)
+    clear = Lidar(WORLDS["A"], max_range=20.0).measure(0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(scans[~lost], np.broadcast_to(clear, scans.shape)[~lost])
+    with pytest.raises(ValueError, match="rng must be a Generator"):
+        lidar.measure(0.0, 0.0, 0.0)
+
+
+def test_a_seed_has_its_noise():
+    actions = np.full((20, 2), 0.5)
+    one, again, other = (drive(ALL, actions, seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
+
+
+def test_torchrl_takes_noise_by_name():
+    env = NavigationTorchEnv(num_envs=2, noise={"latency": 1, "slip": 0.1}, **KINEMATIC)
+    assert env.env.noise == RobotNoise(latency=1, slip=0.1)
+    env.set_seed(0)
+    assert env.rollout(4)["next", "observation"].isfinite().all()
+    env.close()
+
+
+def test_twice_the_noise_is_twice_each():
+    assert ALL.times(2) == RobotNoise(range_noise=0.06, dropout=0.1, slip=0.2, latency=4, drift=0.1)
+    assert ALL.times(0) == RobotNoise()
+
+
+@pytest.mark.parametrize(
+    ("noise", "reason"),
+    [
+        ({"range_noise": -0.1}, "range_noise must not be negative, got -0.1"),
+        ({"drift": math.nan}, "drift must be a finite number, got nan"),
+        ({"dropout": 1.5}, r"dropout must be in \[0, 1\], got 1.5"),
+        ({"slip": 0.6}, r"slip must be in \[0, 0.45\], got 0.6"),
+        ({"latency": 0.5}, "latency must be an integer of at least 0, got 0.5"),
+        ({"latecy": 1}, "noise must be a RobotNoise or hold arguments of it"),
+        (3, "noise must be a RobotNoise or hold arguments of it, got 3"),
+    ],
+)
+def test_wrong_noise_is_refused(noise, reason):
+    for make in (NavigationEnv, lambda **kwargs: VectorNavigationEnv(1, **kwargs)):
+        with pytest.raises(ValueError, match=reason):
+            make(noise=noise, **KINEMATIC)
+
+
+def test_noise_of_the_lidar_is_said_once():
+    with pytest.raises(ValueError, match="lidar must not hold 'noise' beside noise="):
+        NavigationEnv(lidar={"noise": 0.1}, noise={"range_noise": 0.1}, **KINEMATIC)
