@@ -105,7 +105,7 @@ def _measure(
 ) -> tuple[float, float]:
     """CPU time of a robot's scan and of a clearance [s]."""
     ranges, everyone = np.zeros((ROBOTS, rays.shape[1])), np.ones(ROBOTS, dtype=np.bool_)
-    scan = spent(lambda: cast_rays(motions, everyone, arrays, rays, 10.0, ranges), times)
+    scan = spent(lambda: cast_rays(motions, everyone, arrays, rays, np.pi, 10.0, ranges), times)
     near = spent(lambda: clearance_at(arrays, 0, motions[0, 0], motions[0, 1]), times)
     return scan / ROBOTS, near
 
