@@ -11,7 +11,15 @@ import pytest
 
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
-from mpfa_envs import Policy, PolicyFileError, evaluate, export_policy, load_policy, save_policy
+from mpfa_envs import (
+    EpisodeResult,
+    Policy,
+    PolicyFileError,
+    evaluate,
+    export_policy,
+    load_policy,
+    save_policy,
+)
 from mpfa_envs.binning import Binning
 from mpfa_envs.deploy import CardError
 from mpfa_envs.layers import Choice, Linear, ReLU, Scale, Table, Tanh
@@ -42,7 +50,13 @@ def test_it_drives_a_hundred_tasks_to_the_same_results(tmp_path: Path) -> None:
         evaluate(each, "test", episodes=100, physics="kinematic")
         for each in (policy, load_policy(file))
     )
-    assert found == want
+    assert [ending(each) for each in found] == [ending(each) for each in want]
+    # An action in ten thousand differs in its last bit.
+    assert [each.path_length for each in found] == pytest.approx([e.path_length for e in want])
+
+
+def ending(result: EpisodeResult) -> tuple[bool, bool, bool, float]:
+    return result.success, result.collision, result.timeout, result.time_s
 
 
 def test_it_drives_to_the_same_results(tmp_path: Path) -> None:
