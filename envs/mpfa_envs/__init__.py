@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
     from mpfa_envs.evaluation import Driver, evaluate, run_tasks
     from mpfa_envs.export import export_policy
+    from mpfa_envs.gazebo import load_gazebo_world
     from mpfa_envs.generators import (
         GENERATORS,
         generate_world,
@@ -105,6 +106,7 @@ __all__ = [
     "export_policy",
     "generate_world",
     "generator_tasks",
+    "load_gazebo_world",
     "load_policy",
     "load_world",
     "make_navigation_env",
@@ -176,6 +178,7 @@ _MODULES = {
     "export_policy": "export",
     "generate_world": "generators",
     "generator_tasks": "generators",
+    "load_gazebo_world": "gazebo",
     "load_policy": "policy",
     "load_world": "world_file",
     "make_navigation_env": "torchrl_env",

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
+_GAZEBO: Final = (".world", ".sdf", ".world.gz", ".sdf.gz")
+"""Endings of files that are read as Gazebo's."""
+
+
 def _world(name: str, *boxes: tuple[float, float, float, float]) -> World:
     """Build a 10 x 10 m world from boxes given as (x_min, x_max, y_min, y_max) [m]."""
     return World(name=name, boxes=tuple(Box(x0, y0, x1, y1) for x0, x1, y0, y1 in boxes))
@@ -121,6 +125,10 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
         from mpfa_envs.world_file import load_world
 
         return load_world(world)
+    if isinstance(world, (str, os.PathLike)) and Path(world).name.lower().endswith(_GAZEBO):
+        from mpfa_envs.gazebo import load_gazebo_world
+
+        return load_gazebo_world(world)
     hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
     raise ValueError(
         "world must be a World, the path of a .yaml file, 'barn-0' to 'barn-19', a generator's "

@@ -1,0 +1,171 @@
+"""Worlds of Gazebo: what is read of them, what is left out, and what is refused."""
+
+import gzip
+import math
+
+import pytest
+
+from mpfa_envs import (
+    Box,
+    NavigationEnv,
+    WorldFileError,
+    barn_task,
+    barn_world,
+    load_gazebo_world,
+)
+from mpfa_envs.builtin_worlds import resolve_world
+
+BARN_CENTER = (-2.25, 7.0)
+CYLINDER = "<cylinder><radius>0.075</radius><length>1</length></cylinder>"
+
+
+def model(geometry, pose="0 0 0 0 0 0", *, static="<static>1</static>", link="", name="m"):
+    """A model of one link and one collision; the visual is larger and must not count."""
+    seen = "<visual><geometry><box><size>9 9 9</size></box></geometry></visual>"
+    collision = f"<collision name='c'>{link}<geometry>{geometry}</geometry></collision>"
+    link = f"<link name='l'>{seen}{collision}</link>"
+    return f"<model name='{name}'>{static}<pose frame=''>{pose}</pose>\n{link}</model>\n"
+
+
+def write(folder, content, head="", name="room.world"):
+    start = f"<?xml version='1.0'?>\n{head}<sdf version='1.6'>\n<world name='w'>\n"
+    text = f"{start}{content}</world></sdf>"
+    path = folder / name
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    return path
+
+
+def test_a_world_of_the_benchmark_is_the_same_by_its_file_and_by_its_numbers(tmp_path):
+    expected = barn_world(3)
+    models = "".join(
+        model(CYLINDER, f"{c.x + BARN_CENTER[0]:.6f} {c.y + BARN_CENTER[1]:.6f} 0 0 -0 0")
+        for c in expected.cylinders
+    )
+    path = write(tmp_path, models, name="world_50.world.gz")
+    world = load_gazebo_world(path, size=(10.0, 15.0), center=BARN_CENTER)
+    assert world.name == "world_50"
+    assert len(world.cylinders) == len(expected.cylinders)
+    for found, wanted in zip(world.cylinders, expected.cylinders, strict=True):
+        assert (found.x, found.y, found.radius) == pytest.approx((wanted.x, wanted.y, 0.075))
+    env = NavigationEnv(world=world, physics="kinematic", collision_distance="contact")
+    env.reset(options=barn_task()._asdict())
+
+
+def test_poses_of_model_link_and_collision_add_up(tmp_path):
+    turn = f"<pose>1 0 0 0 0 {math.pi / 2}</pose>"
+    inner = model("<box><size>2 1 1</size></box>", "1 0 0 0 0 0", link=turn, static="")
+    pose = f"<pose>5 5 0.5 0 0 {math.pi / 2}</pose>"
+    outer = f"<model name='o'><static>true</static>{pose}{inner}</model>"
+    straight = load_gazebo_world(write(tmp_path, outer), center=(0, 0)).boxes
+    # The box of 2 x 1 m lies two meters along the turned model's axis, turned twice by a quarter.
+    assert straight[0].bounds == pytest.approx((4.0, 6.5, 6.0, 7.5))
+    slanted = model("<box><size>2 1 1</size></box>", f"0 0 0 0 0 {math.pi / 4}")
+    world = load_gazebo_world(write(tmp_path, slanted))
+    assert not world.boxes
+    assert world.polygons[0].area == pytest.approx(2.0)
+    assert max(x for x, _ in world.polygons[0].vertices) == pytest.approx(1.5 * math.sqrt(0.5))
+
+
+def test_the_state_of_the_file_says_where_models_are(tmp_path):
+    state = "<state><model name='m'><pose>3 4 0 0 0 0</pose></model></state>"
+    world = load_gazebo_world(
+        write(tmp_path, model(CYLINDER) + state), size=(10, 10), center=(0, 0)
+    )
+    assert (world.cylinders[0].x, world.cylinders[0].y) == (3.0, 4.0)
+
+
+def test_the_room_is_as_large_as_the_obstacles(tmp_path):
+    models = model(CYLINDER, "-3 1 0 0 0 0") + model(CYLINDER, "5 7 0 0 0 0")
+    path = write(tmp_path, models)
+    world = resolve_world(path)
+    assert world.size == pytest.approx((8.15, 6.15), abs=0.003)
+    assert (world.cylinders[0].x, world.cylinders[1].y) == pytest.approx((-4.0, 3.0))
+    assert resolve_world(str(path)) == world
+
+
+def test_what_is_above_and_what_lies_flat_is_no_obstacle(tmp_path):
+    slab = "<box><size>1 1 0.1</size></box>"
+    models = "".join(model(slab, f"0 0 {z} 0 0 0") for z in (-0.045, 0.3, 0.6))
+    world = load_gazebo_world(write(tmp_path, models))
+    assert len(world.boxes) == 1
+    assert len(load_gazebo_world(write(tmp_path, models), height=1.0).boxes) == 2
+
+
+def test_what_is_left_out_is_counted(tmp_path):
+    content = "".join(
+        (
+            model(CYLINDER),
+            model(CYLINDER, static=""),
+            model(CYLINDER, static="<static>0</static>"),
+            model(CYLINDER, "0 0 0 0.3 0 0"),
+            model("<mesh><uri>x</uri></mesh>"),
+            model("<plane><normal>0 0 1</normal></plane>"),
+            model(CYLINDER).replace("frame=''", "relative_to='other'"),
+            "<include><uri>model://sun</uri></include>" * 3,
+        )
+    )
+    with pytest.warns(UserWarning) as caught:
+        world = load_gazebo_world(write(tmp_path, content))
+    assert len(world.cylinders) == 1
+    text = str(caught[0].message)
+    for part in (
+        "3 includes",
+        "2 models that may move",
+        "1 tilted parts",
+        "1 geometries of the kind mesh",
+        "1 poses in named frames",
+    ):
+        assert part in text
+    assert "plane" not in text
+
+
+@pytest.mark.parametrize(
+    ("content", "line", "reason"),
+    [
+        (model(CYLINDER, "0 0 0 0 0"), 4, "pose must be 6 numbers, got '0 0 0 0 0'"),
+        (model(CYLINDER, "0 0 nan 0 0 0"), 4, "pose must be 6 numbers"),
+        (model(CYLINDER.replace("0.075", "-1")), 5, "radius must be positive, got '-1'"),
+        (model("<box></box>"), 5, "box lacks size"),
+        ("<model>", 4, "is not XML: mismatched tag"),
+        ("", 3, "has no obstacle"),
+        ("<a>" * 200, 4, "nested too deeply"),
+    ],
+)
+def test_a_bad_file_is_refused_with_the_line_and_the_reason(content, line, reason, tmp_path):
+    with pytest.raises(WorldFileError, match=reason) as caught:
+        load_gazebo_world(write(tmp_path, content))
+    assert f"room.world:{line}: " in str(caught.value)
+
+
+def test_entities_are_refused_before_they_grow(tmp_path):
+    head = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;&a;">]>\n'
+    with pytest.raises(WorldFileError, match="must not have a document type"):
+        load_gazebo_world(write(tmp_path, "&b;", head))
+    outside = '<!DOCTYPE x SYSTEM "file:///etc/hostname">\n'
+    with pytest.raises(WorldFileError, match="must not have a document type"):
+        load_gazebo_world(write(tmp_path, model(CYLINDER), outside))
+
+
+def test_other_files_and_rooms_that_are_too_small_are_refused(tmp_path):
+    with pytest.raises(WorldFileError, match="cannot be read"):
+        load_gazebo_world(tmp_path / "none.world")
+    (tmp_path / "bad.world.gz").write_bytes(b"no gzip")
+    with pytest.raises(WorldFileError, match="cannot be read"):
+        load_gazebo_world(tmp_path / "bad.world.gz")
+    (tmp_path / "big.world.gz").write_bytes(gzip.compress(b" " * 30_000_000))
+    with pytest.raises(WorldFileError, match="more than 20000000 bytes"):
+        load_gazebo_world(tmp_path / "big.world.gz")
+    (tmp_path / "robot.sdf").write_text("<robot/>")
+    with pytest.raises(WorldFileError, match="must be an sdf element with a world"):
+        load_gazebo_world(tmp_path / "robot.sdf")
+    with pytest.raises(WorldFileError, match="cylinders must lie in the room"):
+        load_gazebo_world(
+            write(tmp_path, model(CYLINDER, "9 0 0 0 0 0")), size=(4, 4), center=(0, 0)
+        )
+
+
+def test_boxes_are_read_with_their_edges(tmp_path):
+    world = load_gazebo_world(
+        write(tmp_path, model("<box><size>2 1 1</size></box>", "1 2 0 0 0 0"))
+    )
+    assert world.boxes[0].bounds == pytest.approx(Box(-1.0, -0.5, 1.0, 0.5).bounds)
