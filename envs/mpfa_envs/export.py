@@ -140,7 +140,7 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
             "reduction": lidar.reduction,
             "max_range": lidar.max_range,
             "noise": lidar.noise,
-            "field": "the front 180 degrees, from the left to the right",
+            "field_of_view": lidar.field_of_view,
         },
         "memory": given["memory"],
         "history": given["history"],

@@ -41,6 +41,7 @@ def card(**changes: Any) -> Card:
         "observation_size": 24,
         "action_size": 2,
         "sectors": 18,
+        "field_of_view": 180.0,
         "reduction": "min",
         "max_range": 10.0,
         "closeness_distance": 0.25,

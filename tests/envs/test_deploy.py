@@ -43,6 +43,8 @@ def size_of(arguments: dict[str, Any]) -> int:
         {},
         {"history": 3, "robot": "burger"},
         {"memory": "map"},
+        {"lidar": {"field_of_view": 360.0, "sectors": 36}, "memory": "map"},
+        {"lidar": {"field_of_view": 110.0}},
         {"lidar": {"reduction": "median", "rays_per_sector": 4, "sectors": 9}},
         {"lidar": {"reduction": "single", "max_range": 3.0}, "memory": "map", "history": 1},
     ],

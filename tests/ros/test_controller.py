@@ -27,7 +27,9 @@ def scan(*ranges: float, free: float = 3.0) -> Scan:
     return Scan(-math.pi, math.pi / 180, values, 0.1, 8.0)
 
 
-def make(network: Any = None, **options: Any) -> tuple[Controller, list[np.ndarray]]:
+def make(
+    network: Any = None, *, field_of_view: float = 180.0, **options: Any
+) -> tuple[Controller, list[np.ndarray]]:
     """A controller that wants to drive straight ahead, and what its network is asked."""
     asked: list[np.ndarray] = []
 
@@ -35,7 +37,8 @@ def make(network: Any = None, **options: Any) -> tuple[Controller, list[np.ndarr
         asked.append(seen[0])
         return np.ones((1, 2), np.float32)
 
-    return Controller(Pilot(card(), network or ahead), **options), asked
+    seeing = card(field_of_view=field_of_view)
+    return Controller(Pilot(seeing, network or ahead), **options), asked
 
 
 def ready(**options: Any) -> tuple[Controller, list[np.ndarray]]:
@@ -146,8 +149,9 @@ def test_an_obstacle_inside_the_stop_distance_stops_it(nearest: float, stops: bo
         assert order.reason == "driving"
 
 
-def test_what_is_behind_does_not_stop_it() -> None:
-    controller, _ = ready()
+@pytest.mark.parametrize("field_of_view", [180.0, 360.0])
+def test_what_is_behind_does_not_stop_it(field_of_view: float) -> None:
+    controller, _ = ready(field_of_view=field_of_view)
     values = np.full(360, 3.0)
     values[:80] = 0.2
     controller.see(Scan(-math.pi, math.pi / 180, values), 10.0)

@@ -50,7 +50,9 @@ class Card:
     observation_size: int
     action_size: int
     sectors: int
-    """Equal sectors of the front 180 degrees, left to right."""
+    """Equal sectors of the field of view, left to right."""
+    field_of_view: float
+    """Angle that the sectors cover, which the robot's front halves [degrees]."""
     reduction: str
     """What a sector reports of its rays: ``min``, ``median``, or ``single``, the middle one."""
     max_range: float
@@ -98,6 +100,7 @@ class Card:
             observation_size=check_count("observation.size", document["observation"]["size"]),
             action_size=check_count("action.size", document["action"]["size"]),
             sectors=check_count("lidar.sectors", lidar["sectors"]),
+            field_of_view=check_positive("lidar.field_of_view", lidar["field_of_view"]),
             reduction=lidar["reduction"],
             max_range=check_positive("lidar.max_range", lidar["max_range"]),
             closeness_distance=check_positive(
@@ -111,6 +114,8 @@ class Card:
             env_arguments=dict(document["env_arguments"]),
             training=dict(document["training"]),
         )
+        if card.field_of_view > 360.0:
+            raise ValueError(f"lidar.field_of_view must be at most 360, got {card.field_of_view}")
         if card.reduction not in _REDUCTIONS:
             raise ValueError(f"lidar.reduction must be one of {_REDUCTIONS}: {card.reduction!r}")
         if card.memory not in ("none", "map"):

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Silent = Literal["refuse", "far"]
 """What to make of a sector whose rays have all measured nothing valid."""
 _EDGE = 1e-4
-"""By how much the outermost rays may miss the front half plane: messages are rounded [rad]."""
+"""By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
 
 
 class ScanError(ValueError):
@@ -45,10 +45,10 @@ class Scan(NamedTuple):
 
 
 class Points(NamedTuple):
-    """What was measured in front of the robot, around its center."""
+    """What was measured in the policy's field of view, around the robot's center."""
 
     angles: NDArray[np.float64]
-    """Directions in the robot's frame, in [-π/2, π/2] [rad], ``[P]``."""
+    """Directions in the robot's frame, in [-π, π] [rad], ``[P]``."""
     ranges: NDArray[np.float64]
     """Distances from the robot's center [m], ``[P]``; the card's ``max_range`` where nothing was
     met."""
@@ -89,9 +89,10 @@ class Sectors:
         self.mount = check_finite("mount", mount, 3)
         self.unseen = None if unseen is None else check_positive("unseen", unseen)
         self.silent = silent
-        width = math.pi / card.sectors
+        self._edge = 0.5 * math.radians(card.field_of_view)
+        width = 2.0 * self._edge / card.sectors
         self._width = width
-        self._middles = 0.5 * math.pi - width * (np.arange(card.sectors) + 0.5)
+        self._middles = self._edge - width * (np.arange(card.sectors) + 0.5)
 
     def read(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
         """Read a scan.
@@ -100,7 +101,7 @@ class Sectors:
             scan: What the lidar has measured.
 
         Returns:
-            Range of each sector, left to right [m], ``[sectors]``, and the points in front.
+            Range of each sector, left to right [m], ``[sectors]``, and the points in view.
 
         Raises:
             ScanError: If it is no scan, or does not tell the range of every sector.
@@ -128,12 +129,12 @@ class Sectors:
         return ranges, points
 
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Number of the sector of each angle in front."""
-        index = ((0.5 * math.pi - angles) / self._width).astype(np.int64)
+        """Number of the sector of each angle in view."""
+        index = ((self._edge - angles) / self._width).astype(np.int64)
         return np.clip(index, 0, self.card.sectors - 1)
 
     def _measured(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
-        """Directions of all rays in the robot's frame, ``[R]``, and the points in front."""
+        """Directions of all rays in the robot's frame, ``[R]``, and the points in view."""
         ranges = np.asarray(scan.ranges, dtype=np.float64)
         start, step = scan.angle_min, scan.angle_increment
         if ranges.ndim != 1 or not ranges.size:
@@ -156,7 +157,7 @@ class Sectors:
             angles = np.where(missed, directions, np.arctan2(met_y, met_x))
             distances = np.where(missed, far, np.hypot(met_x, met_y))
         with np.errstate(invalid="ignore"):
-            front = valid & (np.abs(angles) <= 0.5 * math.pi + _EDGE)
+            front = valid & (np.abs(angles) <= self._edge + _EDGE)
         return directions, Points(angles[front], np.minimum(distances[front], far))
 
     def _beside(
@@ -175,7 +176,7 @@ class Sectors:
         inside = bool((self._index(directions[off <= half + _EDGE]) == index).any())
         shifted = bool(self.mount[0] or self.mount[1])
         if points.angles.size and (shifted or not inside):
-            beside = np.abs(points.angles - middle)
+            beside = np.abs(_wrapped(points.angles - middle))
             nearest = int(beside.argmin())
             if beside[nearest] <= reach + shifted * half + _EDGE:
                 return float(points.ranges[nearest])

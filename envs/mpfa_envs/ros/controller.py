@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from mpfa_envs.checks import check_number, check_positive
 from mpfa_envs.deploy.sectors import Scan, ScanError
 
@@ -95,7 +97,8 @@ class Controller:
         nearest, fault = math.inf, ""
         try:
             _, points = self.pilot.sectors.read(scan)
-            nearest = float(points.ranges.min(initial=math.inf))
+            ahead = np.abs(points.angles) <= 0.5 * math.pi
+            nearest = float(points.ranges[ahead].min(initial=math.inf))
         except ScanError as error:
             fault = str(error)
         self._seen = _Seen(scan, nearest, fault, time)
