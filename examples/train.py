@@ -5,6 +5,7 @@
     python examples/train.py regime=paper                 Table 1, one robot, worlds A, B, C, D
     python examples/train.py regime=paper curriculum=A    world A alone
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
+    python examples/train.py ray.workers=8 robots=128 updates=32    robots on a Ray cluster
     python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    go on with a run that was stopped
 
 ``navigation/settings.py`` has every setting; ``--help`` prints them with their values. Ctrl-C,

@@ -64,6 +64,9 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         ['action_gradient', 'reward', 'td_error']
     """
 
+    takes_signals = True
+    """Priorities come back as signals, of several batches in one call."""
+
     def __init__(self, *, generator: torch.Generator | None = None, **kwargs: Any) -> None:
         self.stale_updates = 0
         self._unreturned = 0
@@ -258,6 +261,22 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
             )
         self.stale_updates += stale
         self._unreturned, self._handed_out = 0, None
+
+    def anneal(self, beta: float, fraction: float) -> None:
+        """Move what changes with the training; a sampler without priorities has nothing of it.
+
+        Args:
+            beta: Exponent of the importance weights, Eq. (10).
+            fraction: How much of the training is done, from 0 to 1.
+        """
+        if self._fuses:
+            self._sampler.beta = beta
+            self._sampler.anneal(fraction)
+
+    def rewards(self) -> Tensor:
+        """Rewards of all transitions, shape ``[N]``."""
+        found: Tensor = self._storage.signal_table.rewards
+        return found
 
     def stats(self) -> dict[str, Any]:
         """TorchRL's counters, and the sampler's statistics of signals and batch."""

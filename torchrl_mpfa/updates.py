@@ -16,7 +16,6 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.learners.base import Learner
-from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.selection import Draw, Selection, one_batch
 
@@ -120,7 +119,7 @@ def _together(
     for part in sampled.split(batch_size):
         batch, log = _learn(learner, Draw(part), prepare)
         learned.append(batch)
-    if isinstance(buffer, SignalReplayBuffer):
+    if getattr(buffer, "takes_signals", False):
         buffer.update_tensordict_priority(_joined(buffer, learned, home), batches=updates)
     elif isinstance(buffer.sampler, PrioritizedSampler):
         buffer.update_tensordict_priority(_joined(buffer, learned, home))

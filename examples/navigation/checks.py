@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from navigation.environment_settings import EnvironmentSettings
 from navigation.environments import make_training_env
 from navigation.settings import TrainSettings, is_discrete
 from navigation.worlds import is_of_a_test
+from torchrl_mpfa.methods import can_be_remote
 from torchrl_mpfa.methods.assembly import WORDS
 
 Rule = tuple[Callable[[Any], bool], str]
@@ -136,6 +138,8 @@ RULES: dict[str, Rule] = {
     "assessment.early_share": SHARE,
     "assessment.best_factor": SHARE,
     "assessment.by": choice("outcome", "return"),
+    "ray.workers": at_least(0),
+    "ray.steps": at_least(1),
     "tracking.mode": choice("offline", "online", "off"),
     "tracking.log_every": at_least(1),
 }
@@ -205,6 +209,7 @@ def check_settings(settings: TrainSettings) -> None:
         )
     if settings.assessment.episodes:
         _check_one_rule(settings)
+    _check_ray(settings)
     if settings.learner.compile and settings.learner.algorithm not in ("ddpg", "td3"):
         name = settings.learner.algorithm
         name = "SAC" if name == "sac" else name
@@ -225,6 +230,30 @@ def _check_one_rule(settings: TrainSettings) -> None:
                 f"{name} must be {str(only).lower()} with assessment.episodes="
                 f"{settings.assessment.episodes}, got {value}: two rules would decide the same"
             )
+
+
+def _check_ray(settings: TrainSettings) -> None:
+    """Refuse what needs the robots, or the buffer, in the process that learns."""
+    workers = settings.ray.workers
+    if not workers:
+        return
+    if find_spec("ray") is None:
+        raise ValueError(f"ray.workers={workers} needs Ray: pip install 'torchrl-mpfa[ray]'")
+    if settings.robots % workers:
+        raise ValueError(
+            f"robots must be a multiple of ray.workers={workers}, got {settings.robots}"
+        )
+    if not can_be_remote(settings.method):
+        raise ValueError(
+            f"ray.workers must be 0 with method={settings.method.name}, got {workers}: it needs "
+            "its buffer in the process that learns"
+        )
+    for name, value, only in (
+        ("assessment.episodes", settings.assessment.episodes, 0),
+        ("method.update_block", settings.method.update_block, 1),
+    ):
+        if value != only:
+            raise ValueError(f"{name} must be {only} with ray.workers={workers}, got {value}")
 
 
 def _check_values_alone(settings: TrainSettings) -> None:

@@ -16,6 +16,7 @@ from navigation.environments import INFO, make_training_env, vector_of
 from navigation.exploration import Explorer
 from navigation.records import EpisodeRecord
 from navigation.settings import TrainSettings, is_discrete
+from torchrl_mpfa.methods import Method, Replay, make_replay
 
 TRANSITION = (
     "observation",
@@ -48,6 +49,7 @@ class Robots:
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
+        self._everyone = torch.arange(self.count)
         self._rewards = torch.zeros(self.count, dtype=torch.double)
         self._steps = torch.zeros(self.count, dtype=torch.long)
         self._numbers = torch.zeros(self.count, 1, dtype=torch.long)
@@ -55,6 +57,16 @@ class Robots:
         self.ended: list[int] = []
         """Numbers of the episodes that ended with the last action."""
         self._begun = 0
+
+    def make_replay(self, method: Method, *, seed: int, **policy: Any) -> Replay:
+        """The buffer that their transitions go to, and what is drawn from it.
+
+        Args:
+            method: What is kept and how it is drawn.
+            seed: Of the buffer's randomness.
+            **policy: ``policy`` and ``sigma`` of :func:`torchrl_mpfa.methods.make_replay`.
+        """
+        return make_replay(method, generator=torch.Generator().manual_seed(seed), **policy)
 
     def environment(self, world: str) -> EnvBase:
         """The environment of a stage, kept for as long as its world stays the same."""
@@ -119,20 +131,39 @@ class Robots:
         )
         if "episode" in entries:
             state.set("episode", self._numbers.clone())
-        after = state["next"]
-        self._rewards += after["reward"].squeeze(-1)
-        self._steps += 1
+        total = actions + self.count
+        records = self._note(
+            state["next"], self._everyone, explorer, episode=episode, total_steps=total
+        )
+        return state.select(*TRANSITION, *entries), records
+
+    def _note(
+        self,
+        after: TensorDictBase,
+        robots: Tensor,
+        explorer: Explorer,
+        *,
+        episode: int,
+        total_steps: int,
+    ) -> list[EpisodeRecord]:
+        """Take note of what an action of some robots brought; their records if episodes ended."""
+        self._rewards[robots] += after["reward"].squeeze(-1)
+        self._steps[robots] += 1
         done = after["done"].squeeze(-1)
         records: list[EpisodeRecord] = []
-        self.ended = self._numbers[done, 0].tolist()
+        ended = robots[done]
+        self.ended = self._numbers[ended, 0].tolist()
         if self.ended:
-            for robot in done.nonzero().squeeze(-1).tolist():
-                number, total = episode + len(records), actions + self.count
-                records.append(self._record(after, robot, episode=number, total_steps=total))
-            self._begin_episodes(done, explorer)
-            self._rewards[done] = 0.0
-            self._steps[done] = 0
-        return state.select(*TRANSITION, *entries), records
+            for row in done.nonzero().squeeze(-1).tolist():
+                robot, number = int(robots[row]), episode + len(records)
+                record = self._record(after[row], robot, episode=number, total_steps=total_steps)
+                records.append(record)
+            begun = torch.zeros(self.count, dtype=torch.bool)
+            begun[ended] = True
+            self._begin_episodes(begun, explorer)
+            self._rewards[ended] = 0.0
+            self._steps[ended] = 0
+        return records
 
     @torch.no_grad()
     def _act(
@@ -156,7 +187,7 @@ class Robots:
         self, after: TensorDictBase, robot: int, *, episode: int, total_steps: int
     ) -> EpisodeRecord:
         reward, steps = self._rewards[robot].item(), int(self._steps[robot])
-        info: dict[str, Any] = {name: after["info", name][robot].item() for name in INFO}
+        info: dict[str, Any] = {name: after["info", name].item() for name in INFO}
         return EpisodeRecord(
             episode=episode,
             world=self._world or "",
@@ -198,6 +229,10 @@ class Robots:
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
         if "numbers" in state:
             self._numbers, self._begun = state["numbers"].clone(), state["begun"]
+
+    def can_go_on(self, state: dict[str, Any]) -> bool:
+        """Whether a state tells where the robots are, or episodes must begin anew."""
+        return state["environment"] is not None
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
         """Go on where :meth:`state_dict` was called.

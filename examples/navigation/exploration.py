@@ -36,6 +36,10 @@ class Explorer(Protocol):
         """From observations, shape ``[N, O]``, to actions, shape ``[N, A]``."""
         ...
 
+    def move_to(self, steps: int) -> None:
+        """Have the noise that it has after so many actions of its own."""
+        ...
+
     def behavior(self) -> tuple[Tensor, Tensor]:
         """Mean, ``[N, A]``, and standard deviation, ``[N, 1]``, of the actions that it gave last.
 
@@ -69,6 +73,7 @@ class NoisyPolicy:
     ) -> None:
         self.policy = policy
         self.varied = settings.varied
+        self.annealing_steps = settings.annealing_steps
         self.shares = torch.ones(action_spec.shape[0], 1)
         self.noise = AdditiveGaussianModule(
             action_spec,
@@ -97,6 +102,12 @@ class NoisyPolicy:
         action: Tensor = chosen.lerp(noisy, self.shares.to(chosen.device))
         return action
 
+    def move_to(self, steps: int) -> None:
+        """Have the noise that it has after so many actions of its own."""
+        start, end = float(self.noise.sigma_init), float(self.noise.sigma_end)
+        done = min(steps / self.annealing_steps, 1.0)
+        self.noise.sigma.fill_(start + (end - start) * done)
+
     def behavior(self) -> tuple[Tensor, Tensor]:
         """The policy's actions, and each robot's share of the noise."""
         return self._behavior
@@ -108,7 +119,9 @@ class NoisyPolicy:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave."""
         self.noise.load_state_dict(state_dict["noise"])
-        self.shares.copy_(state_dict["shares"])
+        # Where other robots drove, these begin episodes, with shares of their own.
+        if state_dict["shares"].shape == self.shares.shape:
+            self.shares.copy_(state_dict["shares"])
 
 
 class OftenGreedy:
@@ -150,6 +163,10 @@ class OftenGreedy:
         self.steps += len(best)
         return torch.where(at_random.unsqueeze(1).to(best.device), chosen, best)
 
+    def move_to(self, steps: int) -> None:
+        """Have the chance that it has after so many actions of its own."""
+        self.steps = steps
+
     def behavior(self) -> tuple[Tensor, Tensor]:
         """The best choices, and the chance of another one in the place of a spread."""
         return self._behavior
@@ -161,7 +178,9 @@ class OftenGreedy:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave."""
         self.steps = state_dict["steps"]
-        self.shares.copy_(state_dict["shares"])
+        # Where other robots drove, these begin episodes, with shares of their own.
+        if state_dict["shares"].shape == self.shares.shape:
+            self.shares.copy_(state_dict["shares"])
 
 
 class RandomPolicy:
@@ -188,6 +207,9 @@ class RandomPolicy:
         mean = found["preactivation"].tanh().cpu()
         self._behavior = mean, torch.full((len(mean), 1), self.sigma)
         return action
+
+    def move_to(self, steps: int) -> None:
+        """Nothing changes."""
 
     def behavior(self) -> tuple[Tensor, Tensor]:
         """The most likely actions, and what stands for their spread."""

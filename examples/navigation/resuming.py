@@ -19,6 +19,10 @@ LAWFUL = (
     "tracking.mode",
     "tracking.project",
     "tracking.log_every",
+    "ray.workers",
+    "ray.address",
+    "ray.steps",
+    "ray.sync",
 )
 """Settings that a run may change on its way, beside more episodes."""
 OF_THE_CALL = ("resume", "run_dir", "overwrite")

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from navigation.assessment import AssessmentSettings
 from navigation.environment_settings import EnvironmentSettings
+from navigation.ray_settings import RaySettings
 from torchrl_mpfa.methods import METHODS, Method
 
 
@@ -312,6 +313,7 @@ class TrainSettings:
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     assessment: AssessmentSettings = field(default_factory=AssessmentSettings)
+    ray: RaySettings = field(default_factory=RaySettings)
 
 
 REGIMES: dict[str, dict[str, Any]] = {

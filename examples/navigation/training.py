@@ -40,8 +40,7 @@ from navigation.settings import TrainSettings, is_discrete
 from navigation.stopping import Stop
 from navigation.tracking import Tracker
 from navigation.updates import UpdateLog
-from torchrl_mpfa import Draw, SignalSampler, run_updates, save_atomically
-from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa import Draw, run_updates, save_atomically
 from torchrl_mpfa.saving import write_text_atomically
 
 _RECENT = 100
@@ -71,7 +70,7 @@ class TrainingRun:
         self.schedule = Schedule(settings.curriculum.stages)
         self.stop = Stop()
         torch.manual_seed(settings.seed)
-        self.robots = Robots(settings)
+        self.robots = make_robots(settings)
         env = self.robots.environment(self.schedule.world)
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
@@ -86,7 +85,7 @@ class TrainingRun:
         self._build()
         self.updates = 0
         self._waiting = 0
-        """Iterations whose updates are still to be made."""
+        """Actions whose updates are still to be made."""
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
         self.assessments: list[AssessmentRecord] = []
@@ -105,13 +104,12 @@ class TrainingRun:
         settings, spec = self.settings, self._action_spec
         sizes = self._observation_size, spec.shape[-1]
         method, device = method_of(settings), settings.device
-        generator = torch.Generator().manual_seed(settings.seed)
         self.learner = make_learner(settings.learner, method, *sizes, device=device)
         self.curiosity = make_curiosity(method, *sizes, device=device)
         self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
-        replay = make_replay(
+        replay = self.robots.make_replay(
             method,
-            generator=generator,
+            seed=settings.seed,
             policy=self.learner.policy,
             sigma=lambda: self.explorer.sigma,
         )
@@ -123,8 +121,8 @@ class TrainingRun:
             pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
             self.buffer.append_transform(RandomMirror(**self._remembered, pairs=pairs))
 
-    def _begin_stage(self) -> None:
-        seed = self.settings.seed * 1_000_003 + self.schedule.stage
+    def _begin_stage(self, *, again: int = 0) -> None:
+        seed = self.settings.seed * 1_000_003 + self.schedule.stage + again
         # However many random numbers the parts were made of, the robots explore alike.
         torch.manual_seed(seed)
         self.robots.begin(self.schedule.world, self.explorer, seed=seed)
@@ -185,11 +183,15 @@ class TrainingRun:
             episode=self.schedule.episodes,
             entries=self.entries,
         )
-        self.log.wrote(self.buffer.extend(rows), rows["next", "reward"])
+        # Robots on other machines have written theirs.
+        slots = rows.get("slot", None)
+        slots = self.buffer.extend(rows) if slots is None else slots
+        self.log.wrote(slots, rows["next", "reward"])
         self.records += records
         self.schedule.count(actions=len(rows), episodes=len(records))
         self._assess(records)
         if len(self.buffer) >= (self.buffer.batch_size or 0):
+            self._waiting += len(rows)
             self._update(before)
         self._hold()
         if self._crossed(self.settings.tracking.log_every, before):
@@ -244,21 +246,24 @@ class TrainingRun:
 
     def _update(self, before: int) -> None:
         """The updates that are due: of this iteration, or all since the policy was held."""
-        self._waiting += 1
         block, assessment = self.settings.method.update_block, self.assessment
-        if not (self._crossed(block, before) if assessment is None else assessment.over):
+        due, left = divmod(self._waiting, self.settings.robots)
+        if not due or not (self._crossed(block, before) if assessment is None else assessment.over):
             return
-        begun = self.actions - self._waiting * self.settings.robots
-        for _ in range(self._waiting):
+        begun, updates = self.actions - self._waiting, self.settings.updates
+        if self.settings.ray.workers:
+            # A call to another process costs as much as an update: one for all that are due.
+            due, updates = 1, due * updates
+        for _ in range(due):
             losses, batch = run_updates(
                 self.buffer,
                 self.learner,
                 self.select,
-                updates=self.settings.updates,
+                updates=updates,
                 prepare=self._prepared,
             )
-            self.updates += self.settings.updates
-        self._waiting = 0
+            self.updates += updates
+        self._waiting = left
         self.log.learned(losses)
         if self._crossed(self.settings.tracking.log_every, begun):
             self.tracker.log_update(self.actions, {**losses, **self._bonus}, self.buffer, batch)
@@ -294,10 +299,8 @@ class TrainingRun:
     def _anneal(self) -> None:
         """Move what changes with the run: beta of Eq. (10), fusion and learning rates."""
         settings, done = self.settings, self.schedule.fraction
-        if isinstance(self.buffer.sampler, SignalSampler):
-            start, end = settings.method.beta, settings.method.beta_end
-            self.buffer.sampler.beta = start + (end - start) * done
-            self.buffer.sampler.anneal(done)
+        start, end = settings.method.beta, settings.method.beta_end
+        self.buffer.anneal(start + (end - start) * done, done)
         lowest, power = settings.learner.lr_end_factor, settings.learner.lr_power
         if power is None:
             few = self.schedule.unit == "episode" and self.schedule.total < _MANY_EPISODES
@@ -344,7 +347,8 @@ class TrainingRun:
             "wandb": self.tracker.run_id,
             "schedule": self.schedule.state_dict(),
             "updates": self.updates,
-            "waiting": self._waiting,
+            "waiting": self._waiting // self.settings.robots,
+            "waiting_actions": self._waiting % self.settings.robots,
             "random": random_state(self.settings.device),
             "robots": self.robots.state_dict(),
             "learner": self.learner.state_dict(),
@@ -382,7 +386,9 @@ class TrainingRun:
     def _load(self, state: dict[str, Any]) -> None:
         """Go on where a checkpoint was written."""
         self.schedule.load_state_dict(state["schedule"])
-        self.updates, self._waiting = state["updates"], state.get("waiting", 0)
+        self.updates = state["updates"]
+        self._waiting = state.get("waiting", 0) * self.settings.robots
+        self._waiting += state.get("waiting_actions", 0)
         self.learner.load_state_dict(state["learner"])
         self.buffer.load_state_dict(state["buffer"])
         self.explorer.load_state_dict(state["explorer"])
@@ -400,15 +406,28 @@ class TrainingRun:
             self.log.load_state_dict(state["log"])
         set_random_state(self.settings.device, state["random"])
         self.robots.recall(state["robots"])
-        if not self._advance():
+        if self._advance():
+            pass
+        elif self.robots.can_go_on(state["robots"]):
             self.robots.load_state_dict(self.schedule.world, state["robots"])
             set_random_state(self.settings.device, state["random"])
+        else:
+            self._begin_stage(again=self.actions)
         self._anneal()
 
     def close(self) -> None:
         """Release the simulation and finish the log."""
         self.robots.close()
         self.tracker.close()
+
+
+def make_robots(settings: TrainSettings) -> Robots:
+    """The robots of a run, in this process or on a Ray cluster."""
+    if not settings.ray.workers:
+        return Robots(settings)
+    from navigation.fleet import Fleet
+
+    return Fleet(settings)
 
 
 def prepare_process(settings: TrainSettings) -> None:

@@ -87,7 +87,7 @@ class UpdateLog:
             episode: Episodes of the run that have ended.
             buffer: What is sampled from.
         """
-        rewards = buffer.storage.signal_table.rewards
+        rewards = buffer.rewards()
         stats = buffer.stats()
         seen = self._learned_at[: len(rewards)]
         row: dict[str, float] = {

@@ -24,6 +24,12 @@ from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler, rank_share
 from torchrl_mpfa.methods.reaper import EPISODE, Reliability, reliability
 from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler, importance_ratio
+from torchrl_mpfa.methods.remote import (
+    MethodReplayBuffer,
+    RaySignalReplayBuffer,
+    can_be_remote,
+    make_ray_replay,
+)
 
 __all__ = [
     "ALIASES",
@@ -38,18 +44,22 @@ __all__ = [
     "LA3PSampler",
     "LowestDivergence",
     "Method",
+    "MethodReplayBuffer",
     "PriorityFloor",
     "RankSampler",
+    "RaySignalReplayBuffer",
     "Reliability",
     "RememberForget",
     "RememberingSampler",
     "Replay",
     "ReplayPenalty",
+    "can_be_remote",
     "gaussian_divergence",
     "geometric_age",
     "importance_ratio",
     "intrinsic_reward",
     "loss_options",
+    "make_ray_replay",
     "make_replay",
     "rank_share",
     "relative_error",

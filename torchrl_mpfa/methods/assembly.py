@@ -151,19 +151,35 @@ def make_replay(
     if made.candidates > 1 and (policy is None or sigma is None):
         missing = " and ".join(n for n, v in (("policy", policy), ("sigma", sigma)) if v is None)
         raise ValueError(f"method {made.name!r} needs {missing}: it chooses on-policy batches")
-    kept = [*signals_of(made), *([EPISODE] if made.reliability > 0 else [])]
-    if storage is None:
-        storage = SignalTensorStorage(made.capacity, signals=kept or MPFA_SIGNALS, device=device)
-    if made.reliability > 0:
-        signal_table_of(storage, kept, made.capacity)
-    buffer = SignalReplayBuffer(
-        storage=storage,
-        sampler=make_sampler(made),
-        batch_size=made.batch_size * made.candidates,
-        generator=generator,
-    )
-    select = _make_selection(made, policy, sigma)
+    parts = buffer_parts(made, storage=storage, device=device)
+    buffer = SignalReplayBuffer(**parts, generator=generator)
+    select = make_selection(made, policy, sigma)
     return Replay(buffer, select, tuple(learned_signals(made)), made, entries_of(made))
+
+
+def buffer_parts(
+    method: Method, *, storage: Storage | None = None, device: torch.device | str = "auto"
+) -> dict[str, Any]:
+    """Storage, sampler and batch size of a method, as arguments of a buffer.
+
+    Args:
+        method: The settings.
+        storage: See :func:`make_replay`.
+        device: See :func:`make_replay`.
+
+    Returns:
+        ``storage``, ``sampler`` and ``batch_size``.
+    """
+    kept = [*signals_of(method), *([EPISODE] if method.reliability > 0 else [])]
+    if storage is None:
+        storage = SignalTensorStorage(method.capacity, signals=kept or MPFA_SIGNALS, device=device)
+    if method.reliability > 0:
+        signal_table_of(storage, kept, method.capacity)
+    return {
+        "storage": storage,
+        "sampler": make_sampler(method),
+        "batch_size": method.batch_size * method.candidates,
+    }
 
 
 def loss_options(method: str | Method) -> dict[str, Any]:
@@ -274,9 +290,10 @@ def make_adjustments(method: Method) -> list[Adjustment]:
     return made
 
 
-def _make_selection(
+def make_selection(
     method: Method, policy: TensorDictModule | None, sigma: float | Callable[[], float] | None
 ) -> Selection:
+    """From the buffer to what the updates of a training step are made from."""
     if method.selection in _SELECTIONS:
         return _SELECTIONS[method.selection]
     if method.selection == "near_policy" and policy is not None:

@@ -1,0 +1,133 @@
+"""The replay of a method in a process of its own on a Ray cluster, for many that write in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.data import RayReplayBuffer
+
+from torchrl_mpfa.methods.assembly import (
+    Replay,
+    buffer_parts,
+    entries_of,
+    learned_signals,
+    make_sampler,
+    make_selection,
+)
+from torchrl_mpfa.methods.catalogue import Method
+from torchrl_mpfa.replay import SignalReplayBuffer
+
+
+class MethodReplayBuffer(SignalReplayBuffer):
+    """The buffer of a method, made of its settings, where it shall be.
+
+    Args:
+        method: The settings.
+        seed: Of all randomness, that of the transforms too.
+        **kwargs: Passed to :class:`~torchrl_mpfa.SignalReplayBuffer`.
+
+    Examples:
+        >>> from torchrl_mpfa.methods import METHODS
+        >>> MethodReplayBuffer(METHODS["per"], seed=3).batch_size
+        256
+    """
+
+    def __init__(self, method: Method, *, seed: int = 0, **kwargs: Any) -> None:
+        torch.manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
+        super().__init__(**buffer_parts(method), generator=generator, **kwargs)
+        # Batches of several updates are sampled in one call, of which TorchRL would warn.
+        self._warned_batch_size_conflict = True
+
+
+class RaySignalReplayBuffer(RayReplayBuffer):
+    """TorchRL's :class:`~torchrl.data.RayReplayBuffer` around a :class:`MethodReplayBuffer`.
+
+    Batches go out and signals come back as in the process: a row that was overwritten in between is
+    left out, whoever wrote it, and ``state_dict`` is that of a :class:`SignalReplayBuffer`.
+
+    Args:
+        method: The settings.
+        seed: Of all randomness of the buffer.
+        remote_config: What the process of the buffer asks of the cluster, as in ``ray.remote``.
+    """
+
+    takes_signals = True
+    priority_key = "td_error"
+
+    def __init__(
+        self, method: Method, *, seed: int = 0, remote_config: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__(
+            method,
+            seed=seed,
+            replay_buffer_cls=MethodReplayBuffer,
+            remote_config={"num_cpus": 0} if remote_config is None else remote_config,
+        )
+        self._rows = method.batch_size * method.candidates
+        self._like = make_sampler(method)
+
+    @property
+    def batch_size(self) -> int:
+        """Transitions of a batch."""
+        return self._rows
+
+    @property
+    def sampler(self) -> Any:
+        """A sampler with the settings of the one in use, and nothing of its state but beta."""
+        return self._like
+
+    def rewards(self) -> torch.Tensor:
+        """Rewards of all transitions, shape ``[N]``."""
+        found: torch.Tensor = self._client.rewards()
+        return found
+
+    def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
+        """See :meth:`SignalReplayBuffer.update_tensordict_priority`."""
+        self._client.update_tensordict_priority(data, batches=batches)
+
+    def anneal(self, beta: float, fraction: float) -> None:
+        """See :meth:`SignalReplayBuffer.anneal`."""
+        if hasattr(self._like, "beta"):
+            self._like.beta = beta
+        self._client.anneal(beta, fraction)
+
+
+def make_ray_replay(
+    method: Method,
+    *,
+    seed: int = 0,
+    policy: TensorDictModule | None = None,
+    sigma: float | Callable[[], float] | None = None,
+    remote_config: dict[str, Any] | None = None,
+) -> Replay:
+    """As :func:`make_replay`, with the buffer in a process of a Ray cluster.
+
+    Args:
+        method: The settings.
+        seed: Of all randomness of the buffer.
+        policy: See :func:`make_replay`.
+        sigma: See :func:`make_replay`.
+        remote_config: What that process asks of the cluster, as in ``ray.remote``.
+
+    Returns:
+        The replay, whose ``buffer.clients(W)`` are for those that write in it.
+
+    Raises:
+        ValueError: If the method chooses by what lies in the buffer, as LA3P and ReF-ER do, or
+            needs more of a transition than the usual.
+    """
+    if not can_be_remote(method):
+        raise ValueError(f"method {method.name!r} needs its buffer in the process that learns")
+    buffer = RaySignalReplayBuffer(method, seed=seed, remote_config=remote_config)
+    select = make_selection(method, policy, sigma)
+    return Replay(buffer, select, tuple(learned_signals(method)), method)
+
+
+def can_be_remote(method: Method) -> bool:
+    """Whether a method asks no more of its buffer than batches, and of transitions the usual."""
+    return method.selection not in ("split", "near_policy") and not entries_of(method)
