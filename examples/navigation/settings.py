@@ -123,6 +123,8 @@ class DQNSettings(LearnerSettings):
     name: str = "dqn"
     algorithm: str = "dqn"
     critic_lr: float = 3e-4
+    tau: float = 0.002
+    """With 0.01 the targets run ahead, and the robot circles until the time is up."""
 
 
 @dataclass
