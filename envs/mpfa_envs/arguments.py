@@ -104,6 +104,8 @@ class TaskArguments:
             else check_positive("closeness_distance", closeness_distance)
         )
         self.noise = resolve_noise(noise)
+        if not isinstance(lidar, Mapping | None):
+            raise ValueError(f"lidar must hold arguments of Lidar, got {lidar!r}")
         self._lidar_arguments: dict[str, Any] = dict(lidar or {})
         for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
             if value > 0.0:

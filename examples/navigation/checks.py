@@ -138,6 +138,7 @@ RULES: dict[str, Rule] = {
     "assessment.early_share": SHARE,
     "assessment.best_factor": SHARE,
     "assessment.by": choice("outcome", "return"),
+    "ray.address": (lambda value: bool(value.strip()), "no empty word"),
     "ray.workers": at_least(0),
     "ray.steps": at_least(1),
     "tracking.mode": choice("offline", "online", "off"),

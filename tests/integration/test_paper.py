@@ -18,6 +18,7 @@ from navigation.paper_figures import plot_claims, reward_of_blocks
 from navigation.paper_tables import trained_table, unseen_table
 from navigation.records import write_table
 from navigation.settings import GROUPS, Stage
+from navigation.studies import Job
 from tests.integration.test_figures import colored, heights
 from tests.integration.tiny_runs import tiny, train
 
@@ -69,7 +70,7 @@ def test_the_commands_that_are_named_make_the_runs_that_are_looked_for(tmp_path:
         assert words[:2] == ["python", "examples/compare.py"]
         options = compare.parse(words[2:])
         made = {
-            compare.Job(learner, method, seed, options.folder, arm).path
+            Job(learner, method, seed, options.folder, arm).path
             for learner in options.learners
             for method in options.methods
             for seed in options.seeds

@@ -36,14 +36,18 @@ def test_training_treats_denormal_numbers_as_zero() -> None:
     assert (torch.tensor([least]) / 2).item() > 0.0
 
 
-def test_no_program_is_compiled_to_see_which_instructions_the_compiler_knows(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for given, expected in ((None, True), (False, False)):
-        monkeypatch.setattr(torch._inductor.config.cpp, "vec_isa_ok", given)
-        prepare_process(TrainSettings(threads=1))
-        torch.set_flush_denormal(False)
-        assert torch._inductor.config.cpp.vec_isa_ok is expected
+def test_no_program_is_compiled_to_see_which_instructions_the_compiler_knows() -> None:
+    options = torch._inductor.config.cpp
+    before = options.vec_isa_ok
+    try:
+        for given, expected in ((None, True), (False, False)):
+            options.vec_isa_ok = given
+            prepare_process(TrainSettings(threads=1))
+            torch.set_flush_denormal(False)
+            assert options.vec_isa_ok is expected
+    finally:
+        # By hand: monkeypatch would leave PyTorch without this option.
+        options.vec_isa_ok = before
 
 
 def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -> None:
