@@ -35,11 +35,12 @@ if TYPE_CHECKING:
     from mpfa_envs.path import PathPlanner
     from mpfa_envs.planners import PLANNERS, DynamicWindow, MapPlanner, make_planner
     from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
-    from mpfa_envs.registration import ENV_IDS, VECTOR_ENV_IDS
+    from mpfa_envs.registration import ENV_IDS, ROOMS_TASK, VECTOR_ENV_IDS
     from mpfa_envs.render import render_trajectories
     from mpfa_envs.results import EpisodeResult, Interval, spl, summarize
     from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
     from mpfa_envs.robot import ROBOTS, RobotModel
+    from mpfa_envs.rooms import RoomsEnv
     from mpfa_envs.shapes import Box, Cylinder, Polygon
     from mpfa_envs.task_sets import WorldTask, world_tasks
     from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
@@ -63,6 +64,7 @@ __all__ = [
     "PAPER_TASK",
     "PLANNERS",
     "ROBOTS",
+    "ROOMS_TASK",
     "VECTOR_ENV_IDS",
     "WHEEL_PAIRS",
     "WORLDS",
@@ -91,6 +93,7 @@ __all__ = [
     "RewardTerms",
     "RobotModel",
     "RobotNoise",
+    "RoomsEnv",
     "StepOutcome",
     "Task",
     "VectorNavigationEnv",
@@ -135,6 +138,7 @@ _MODULES = {
     "PAPER_TASK": "arguments",
     "PLANNERS": "planners",
     "ROBOTS": "robot",
+    "ROOMS_TASK": "registration",
     "VECTOR_ENV_IDS": "registration",
     "WHEEL_PAIRS": "discrete",
     "WORLDS": "builtin_worlds",
@@ -163,6 +167,7 @@ _MODULES = {
     "RewardTerms": "reward",
     "RobotModel": "robot",
     "RobotNoise": "noise",
+    "RoomsEnv": "rooms",
     "StepOutcome": "reward",
     "Task": "tasks",
     "VectorNavigationEnv": "vector",

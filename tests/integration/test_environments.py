@@ -7,6 +7,7 @@ from argparse import ArgumentTypeError
 from dataclasses import asdict
 from pathlib import Path
 
+import gymnasium
 import pytest
 import torch
 
@@ -15,6 +16,7 @@ from mpfa_envs import Mirror, NavigationEnv, RandomMirror, RobotNoise, load_poli
 from mpfa_envs.reward import PROGRESS_SCALE
 from navigation.environment_settings import EnvironmentSettings, NoiseSettings
 from navigation.environments import env_arguments, make_training_env, vector_of
+from navigation.settings import REGIMES
 from tests.integration.tiny_runs import tiny, train
 
 
@@ -91,6 +93,32 @@ def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> N
         assert getattr(trained, name) == getattr(plain, name), name
     assert settings.progress_scale == PROGRESS_SCALE
     assert EnvironmentSettings().physics == "wheels"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "world", "changed"),
+    [
+        ("mpfa/Navigation-D-v1", "D", {"physics": "kinematic"}),
+        ("mpfa/Rooms-v1", "mixed", REGIMES["rooms"]["environment"]),
+    ],
+)
+def test_the_ids_are_the_tasks_that_the_regimes_learn(
+    env_id: str, world: str, changed: dict[str, object]
+) -> None:
+    trained = vector_of(make_training_env(world, EnvironmentSettings(**changed), robots=2))  # type: ignore[arg-type]
+    made = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")
+    for env in (trained, made):
+        env.reset(seed=1)
+    assert made.tasks == trained.tasks
+    assert made.worlds == trained.worlds
+    mine, theirs = (env.state_dict()["arguments"] for env in (made, trained))
+    assert mine == pytest.approx(theirs)
+    assert made.reward.keywords == trained.reward.keywords
+    for name in ("detour_chance", "min_goal_distance"):
+        assert getattr(made, name) == getattr(trained, name)
+    assert made._source._max_goal_distance == trained._source._max_goal_distance
+    trained.close()
+    made.close()
 
 
 def test_the_settings_of_noise_are_those_of_the_environment() -> None:

@@ -1,0 +1,128 @@
+"""One robot in worlds that are new in each episode, and the id of it."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+from mpfa_envs import (
+    INFO_TYPES,
+    ROOMS_TASK,
+    NavigationEnv,
+    RoomsEnv,
+    VectorNavigationEnv,
+    generate_world,
+    generator_tasks,
+)
+
+ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)
+
+
+@pytest.fixture
+def env():
+    made = gymnasium.make("mpfa/Rooms-v1").unwrapped
+    yield made
+    made.close()
+
+
+def test_the_id_passes_the_checker_without_a_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make("mpfa/Rooms-v1")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_the_id_makes_one_robot_or_many_of_one_task(env: RoomsEnv) -> None:
+    many = gymnasium.make_vec("mpfa/Rooms-v1", num_envs=3)
+    assert isinstance(env, RoomsEnv)
+    assert isinstance(many, VectorNavigationEnv)
+    for name, value in ROOMS_TASK.items():
+        if name not in ("world", "max_goal_distance"):
+            assert getattr(env.robots, name) == getattr(many, name) == value
+    assert env.observation_space == many.single_observation_space
+    # The same worlds, if each robot has the seed itself.
+    many.reset(seed=[5, 6, 7])
+    for robot, seed in enumerate((5, 6, 7)):
+        env.reset(seed=seed)
+        assert env.world == many.worlds[robot]
+        assert env.task == many.tasks[robot]
+    many.close()
+
+
+def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: RoomsEnv) -> None:
+    seen = []
+    for seed in (3, None, None, None, 3, None):
+        observation, info = env.reset(seed=seed)
+        assert env.observation_space.contains(observation)
+        assert tuple(info) == tuple(INFO_TYPES)
+        seen.append(env.world.name)
+    assert len(set(seen[:4])) == 4
+    assert seen[4:] == seen[:2]
+
+
+def test_in_one_world_it_is_the_environment_of_that_world() -> None:
+    arguments = {"world": "D", "physics": "kinematic", "max_steps": 60}
+    ours, plain = RoomsEnv(**arguments), NavigationEnv(**arguments)
+    first, second = ours.reset(seed=4), plain.reset(seed=4)
+    np.testing.assert_array_equal(first[0], second[0])
+    for action in ACTIONS:
+        first, second = ours.step(action), plain.step(action)
+        np.testing.assert_allclose(first[0], second[0], atol=1e-6)
+        assert first[1] == pytest.approx(second[1], abs=1e-6)
+        assert first[2:4] == second[2:4]
+        assert first[4] == pytest.approx(second[4], abs=1e-6)
+        assert [type(each) for each in first[4].values()] == list(INFO_TYPES.values())
+        if first[2] or first[3]:
+            break
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        ours.step(ACTIONS[0])
+    ours.close()
+    plain.close()
+
+
+def test_an_episode_can_be_fixed(env: RoomsEnv) -> None:
+    env.reset(seed=0, options={"world": "bars-7"})
+    assert env.world == generate_world("bars", 7)
+    ((world, task),) = generator_tasks("clutter", "validation", worlds=1, tasks=1)
+    env.reset(options={"world": world, **task._asdict()})
+    assert (env.world, env.task) == (world, task)
+    env.reset()
+    assert env.world != world
+    assert env.task != task
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reset_mask": True}, "got 'reset_mask'"),
+        ({"world": "A", "goal": (4.0, 4.0)}, "start and goal, or neither"),
+        ({"start": (0.0, 0.0, 0.0), "goal": (4.0, 4.0)}, "world must be given"),
+        ({"world": "A", "start": (99.0, 0.0, 0.0), "goal": (4.0, 4.0)}, "99"),
+    ],
+)
+def test_options_that_are_no_episode_are_refused_and_the_last_one_goes_on(
+    env: RoomsEnv, options: dict[str, object], message: str
+) -> None:
+    env.reset(seed=0)
+    before = env.world, env.task
+    with pytest.raises(ValueError, match=message):
+        env.reset(options=options)
+    assert (env.world, env.task) == before
+    env.step(ACTIONS[0])
+
+
+def test_it_is_rendered_on_demand() -> None:
+    env = gymnasium.make("mpfa/Rooms-v1", render_mode="rgb_array")
+    env.reset(seed=0)
+    assert max(env.render().shape) == 480
+    env.close()
+    plain = RoomsEnv(**ROOMS_TASK)
+    plain.reset(seed=0)
+    assert plain.render() is None
+    plain.close()
