@@ -29,6 +29,7 @@ from mpfa_envs import (
     evaluation_pairs,
     render_trajectories,
 )
+from mpfa_envs.render import tiled
 from mpfa_envs.simulation import Simulation
 
 ROUNDS = 5
@@ -295,8 +296,7 @@ def render_worlds(*, size: int = 320) -> np.ndarray[Any, Any]:
         render_trajectories(world, [], [], [], title=name, size=size)
         for name, world in WORLDS.items()
     ]
-    rows = [np.concatenate(pictures[i : i + 3], axis=1) for i in range(0, len(pictures), 3)]
-    return np.concatenate(rows)
+    return tiled(pictures, columns=3)
 
 
 def main() -> None:

@@ -29,6 +29,7 @@ from mpfa_envs import (
     render_trajectories,
     sample_task_on_grid,
 )
+from mpfa_envs.render import tiled
 
 DISTANCE = 0.25
 """What ways keep from obstacles: a TurtleBot2's radius and 0.07 m [m]."""
@@ -148,15 +149,10 @@ def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any
     for world in worlds:
         env = NavigationEnv(world=world, physics="kinematic")
         env.reset(seed=0)
-        picture = render_trajectories(
-            world, [], [], [], title=world.name, walkers=env.walkers, size=side
+        tiles.append(
+            render_trajectories(world, [], [], [], title=world.name, walkers=env.walkers, size=side)
         )
-        tile = np.full((side + 40, side + 12, 3), 255, dtype=np.uint8)
-        left = (tile.shape[1] - picture.shape[1]) // 2
-        tile[: picture.shape[0], left : left + picture.shape[1]] = picture
-        tiles.append(tile)
-    rows = [np.concatenate(tiles[i : i + 4], axis=1) for i in range(0, len(tiles), 4)]
-    return np.concatenate(rows)
+    return tiled(tiles, columns=4, gap=12)
 
 
 def save_pictures(folder: Path, names: Sequence[str] = ()) -> None:

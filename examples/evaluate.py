@@ -41,9 +41,9 @@ from mpfa_envs import (
     make_planner,
     render_trajectories,
 )
+from mpfa_envs.render import tiled, write_animation
 from navigation import files
 from navigation.evaluating import Drivable, Drives, drive, film, summary_row
-from navigation.figures import tiled, write_animation
 from navigation.records import as_table, write_table
 from navigation.stopping import end_with_parent
 from navigation.worlds import parse_worlds, world_name, worlds_label

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from PIL import Image
 
 Runs = Mapping[str, Mapping[str, pd.DataFrame]]
 """Tables by the name of their arm, then of their run."""
-_GIF_FRAMES = 120
 
 
 def plot_learning_curve(episodes: pd.DataFrame, path: Path, *, window: int = 20) -> None:
@@ -86,44 +83,6 @@ def plot_evaluations(runs: Runs, path: Path) -> None:
     axis.set(xlabel="step", ylabel="greedy success in the validation world", ylim=(-0.02, 1.02))
     axis.legend()
     finish(figure, [axis], path)
-
-
-def write_animation(frames: Sequence[NDArray[np.uint8]], path: Path) -> None:
-    """Write an animation of at most some hundred frames, twice as fast as real.
-
-    Args:
-        frames: Pictures, each of shape ``[height, width, 3]``.
-        path: The GIF file.
-    """
-    step = -(-len(frames) // _GIF_FRAMES)
-    chosen = [Image.fromarray(frame) for frame in [*frames[:-1:step], frames[-1]]]
-    # One palette of the whole episode and no dithering: what stands still is stored once. Ways and
-    # maps are longest at the end, scans differ in the middle.
-    samples = [np.asarray(chosen[place]) for place in (0, len(chosen) // 2, -1)]
-    palette = Image.fromarray(np.concatenate(samples)).quantize(64)
-    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chosen]
-    pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=50 * step, loop=0, optimize=True
-    )
-
-
-def tiled(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Pictures side by side, as many in a row as there are rows.
-
-    Args:
-        pictures: Each of shape ``[height, width, 3]``; smaller ones are filled up with white.
-
-    Returns:
-        One picture.
-    """
-    columns = math.ceil(math.sqrt(len(pictures)))
-    height, width = (max(each.shape[axis] for each in pictures) for axis in (0, 1))
-    lines = math.ceil(len(pictures) / columns)
-    whole = np.full((lines * height, columns * width, 3), 255, dtype=np.uint8)
-    for number, each in enumerate(pictures):
-        top, left = number // columns * height, number % columns * width
-        whole[top : top + each.shape[0], left : left + each.shape[1]] = each
-    return whole
 
 
 def running_mean(values: pd.Series[Any], window: int) -> NDArray[np.float64]:

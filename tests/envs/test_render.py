@@ -1,10 +1,28 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, render_trajectories
-from mpfa_envs.render import FLOOR, GOAL, OBSTACLE, OUTCOMES, TRAIL, WALL
+from mpfa_envs.render import (
+    FLOOR,
+    GOAL,
+    OBSTACLE,
+    OUTCOMES,
+    RIVAL,
+    TRAIL,
+    WALL,
+    render_methods,
+    render_scene,
+    shown_episodes,
+    tiled,
+    viridis,
+    write_animation,
+)
+from mpfa_envs.robot import ROBOTS
 from tests.envs.paper import paper_env
 
 
@@ -108,3 +126,138 @@ def test_a_picture_shows_boxes_cylinders_and_polygons() -> None:
         assert pixel(picture, x, y) == OBSTACLE[:3]
     for x, y in ((0.4, 0.7), (2.3, 2.5), (-1.5, 1.5)):
         assert pixel(picture, x, y) == FLOOR[:3]
+
+
+def test_a_goal_is_surrounded_by_the_disc_that_reaches_it() -> None:
+    near, far = (
+        render_trajectories("A", [[(-4, 0), (2, 0)]], [(2.5, 0.3)], ["success"], goal_radius=radius)
+        for radius in (0.3, 1.0)
+    )
+    for picture, inside, outside in ((near, 0.2, 0.4), (far, 0.9, 1.1)):
+        assert pixel(picture, 2.5, 0.3 + inside) not in (FLOOR[:3], GOAL[:3])
+        assert pixel(picture, 2.5, 0.3 + outside) == FLOOR[:3]
+
+
+def test_a_failure_ends_in_a_cross_or_in_a_hollow_square() -> None:
+    ways = [[(-4, 0), (0, 0)]] * 2
+    crossed, squared = (
+        render_trajectories("A", ways[:1], [(4.0, 4.0)], [outcome])
+        for outcome in ("collision", "timeout")
+    )
+    color = OUTCOMES["collision"][:3]
+    assert [pixel(crossed, x, y) == color for x, y in ((0.07, 0.07), (0.1, 0.0))] == [True, False]
+    color = OUTCOMES["timeout"][:3]
+    assert pixel(squared, 0.04, 0.04) == (255, 255, 255)
+    np.testing.assert_allclose(pixel(squared, 0.1, 0.0), color, atol=40)
+
+
+def test_of_many_episodes_twenty_are_shown_and_all_are_counted() -> None:
+    ways = [np.array([(-4.9 + 0.2 * n, -3.0), (-4.9 + 0.2 * n, 3.0)]) for n in range(48)]
+    goals = [(-4.9 + 0.2 * n, 4.0) for n in range(48)]
+    few, all_of_them = (
+        render_trajectories("A", ways, goals, ["success"] * 48, most=most, goal_radius=0.01)
+        for most in (20, 48)
+    )
+    blue = np.array(OUTCOMES["success"][:3])
+    row = int(5.2 * 480 / 10.4)
+
+    def lines(picture: np.ndarray) -> int:
+        there = (abs(picture[row, 12:-12].astype(int) - blue).sum(-1) < 200).astype(int)
+        return int((np.diff(there) == 1).sum())
+
+    assert lines(few) == 20
+    assert lines(all_of_them) == 48
+    with pytest.raises(ValueError, match=r"most must be .*got 0"):
+        render_trajectories("A", ways, goals, ["success"] * 48, most=0)
+
+
+def test_up_to_half_of_the_shown_episodes_are_failures() -> None:
+    outcomes = ["success", "collision"] * 50
+    shown = shown_episodes(outcomes, most=10)
+    assert len(shown) == 10
+    assert [outcomes[n] for n in shown].count("collision") == 5
+    rare = shown_episodes(["success"] * 99 + ["timeout"], most=10)
+    assert len(rare) == 10 and rare[-1] == 99
+    assert shown_episodes(["timeout"] * 30, most=4) == [0, 10, 19, 29]
+    assert shown_episodes(["timeout", "success"], most=10) == [0, 1]
+
+
+def test_methods_stand_side_by_side_with_the_same_episodes() -> None:
+    way, goals = [[(-4.0, 0.0), (4.0, 0.0)]], [(4.0, 0.0)]
+    picture = render_methods(
+        "A",
+        {"one": way, "two": way},
+        goals,
+        {"one": ["success"], "two": ["collision"]},
+        columns=2,
+        size=480,
+    )
+    assert picture.shape == (508, 2 * 480 + 8, 3)
+    left, right = pixel(picture, 0.0, 0.0), pixel(picture[:, 488:], 0.0, 0.0)
+    np.testing.assert_allclose(left, OUTCOMES["success"][:3], atol=90)
+    np.testing.assert_allclose(right, OUTCOMES["collision"][:3], atol=90)
+    with pytest.raises(ValueError, match=r"same methods, got .'one'. and .'two'."):
+        render_methods("A", {"one": way}, goals, {"two": ["success"]})
+
+
+def test_pictures_are_put_row_by_row_with_white_between_them() -> None:
+    blacks = [np.full((10, 20, 3), 20 * n, np.uint8) for n in range(3)]
+    whole = tiled(blacks, columns=2, gap=4)
+    assert whole.shape == (24, 44, 3)
+    assert whole[5, 5, 0] == 0 and whole[5, 30, 0] == 20 and whole[20, 5, 0] == 40
+    assert whole[5, 22, 0] == whole[12, 5, 0] == whole[20, 30, 0] == 255
+    with pytest.raises(ValueError, match="pictures must not be empty"):
+        tiled([])
+
+
+def test_a_small_goal_keeps_its_color_in_an_animation(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    frames = []
+    for step in range(3):
+        frame = rng.integers(0, 256, (120, 120, 1), dtype=np.uint8).repeat(3, axis=2)
+        frame[10:14, 10 + step : 14 + step] = GOAL[:3]
+        frames.append(frame)
+    write_animation(frames, tmp_path / "a.gif", frame_time=0.2, speed=2.0, palette_size=16)
+    with Image.open(tmp_path / "a.gif") as animation:
+        assert animation.n_frames == 3
+        assert animation.info["duration"] == 100
+        for step in range(3):
+            animation.seek(step)
+            shown = np.asarray(animation.convert("RGB"))
+            assert tuple(shown[12, 12 + step]) == GOAL[:3]
+
+
+def test_an_animation_is_thinned_and_keeps_its_last_frame(tmp_path: Path) -> None:
+    ramp = np.arange(40, dtype=np.uint8)[None, :, None].repeat(40, axis=0).repeat(3, axis=2) * 6
+    frames = [np.roll(ramp, 3 * n, axis=1) for n in range(50)]
+    write_animation(frames, tmp_path / "a.gif", frame_time=0.1, speed=1.0, most=10)
+    with Image.open(tmp_path / "a.gif") as animation:
+        assert animation.n_frames == 11
+        assert animation.info["duration"] == 500
+        animation.seek(10)
+        shown = np.asarray(animation.convert("RGB")).astype(int)
+        assert abs(shown - frames[-1]).max() <= 12
+    with pytest.raises(ValueError, match="frames must not be empty"):
+        write_animation([], tmp_path / "b.gif")
+    with pytest.raises(ValueError, match="palette_size must be at most 256, got 300"):
+        write_animation(frames, tmp_path / "b.gif", palette_size=300)
+    assert not (tmp_path / "b.gif").exists()
+
+
+def test_a_second_robot_has_another_color() -> None:
+    picture = render_scene(
+        WORLDS["A"],
+        robot=ROBOTS["turtlebot2"],
+        pose=(0.0, 0.0, 0.0),
+        goal=(4.0, 4.0),
+        goal_radius=0.5,
+        rival=((2.0, 0.0, np.pi), [(3.0, 0.0), (2.0, 0.0)]),
+    )
+    assert pixel(picture, 2.0, 0.15) == RIVAL[:3]
+    np.testing.assert_allclose(pixel(picture, 2.6, 0.02), RIVAL[:3], atol=60)
+
+
+def test_values_get_lighter_as_they_rise() -> None:
+    lightness = viridis(np.linspace(0, 1, 50)) @ np.array([0.299, 0.587, 0.114])
+    assert (np.diff(lightness) > 0).all()
+    assert viridis([[-1.0, 2.0]]).shape == (1, 2, 3)

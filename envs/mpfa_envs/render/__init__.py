@@ -1,0 +1,46 @@
+"""Pictures of rooms, episodes and studies: one function a picture, none needs a display.
+
+Names that begin with ``render_`` give a picture from above, an array of shape
+``[height, width, 3]``, by Pillow alone; those that begin with ``plot_`` write a chart to a file by
+matplotlib, which the extra ``pictures`` brings.
+"""
+
+from mpfa_envs.render.animation import write_animation
+from mpfa_envs.render.colors import (
+    FLOOR,
+    GOAL,
+    LINES,
+    OBSTACLE,
+    OUTCOMES,
+    RIVAL,
+    TRAIL,
+    WALL,
+    viridis,
+)
+from mpfa_envs.render.scene import render_scene
+from mpfa_envs.render.tiles import tiled
+from mpfa_envs.render.trajectories import (
+    Outcome,
+    render_methods,
+    render_trajectories,
+    shown_episodes,
+)
+
+__all__ = [
+    "FLOOR",
+    "GOAL",
+    "LINES",
+    "OBSTACLE",
+    "OUTCOMES",
+    "RIVAL",
+    "TRAIL",
+    "WALL",
+    "Outcome",
+    "render_methods",
+    "render_scene",
+    "render_trajectories",
+    "shown_episodes",
+    "tiled",
+    "viridis",
+    "write_animation",
+]

@@ -1,0 +1,92 @@
+"""Colors that color-blind eyes, gray printers and small palettes keep apart.
+
+Lines and marks have those of Okabe and Ito (2008), which differ for every common kind of color
+blindness; values have viridis, whose lightness rises with the value.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Color = tuple[int, int, int, int]
+"""Red, green, blue and opacity, each from 0 to 255."""
+
+BLACK: Final = (0, 0, 0)
+ORANGE: Final = (230, 159, 0)
+SKY: Final = (86, 180, 233)
+GREEN: Final = (0, 158, 115)
+YELLOW: Final = (240, 228, 66)
+BLUE: Final = (0, 114, 178)
+VERMILION: Final = (213, 94, 0)
+PURPLE: Final = (204, 121, 167)
+
+LINES: Final = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK)
+"""Of lines side by side, in the order in which they are taken; yellow is too pale on white."""
+
+PAPER: Final = (255, 255, 255, 255)
+FLOOR: Final = (250, 249, 246, 255)
+GRID: Final = (236, 234, 228, 255)
+WALL: Final = (52, 58, 70, 255)
+OBSTACLE: Final = (104, 114, 130, 255)
+OBSTACLE_EDGE: Final = (70, 78, 92, 255)
+TEXT: Final = (40, 44, 52, 255)
+GOAL: Final = (*GREEN, 255)
+GOAL_AREA: Final = (*GREEN, 46)
+GOAL_EDGE: Final = (*GREEN, 190)
+ROBOT: Final = (24, 26, 30, 255)
+ROBOT_FRONT: Final = (255, 255, 255, 255)
+RIVAL: Final = (*VERMILION, 255)
+RAY: Final = (*SKY, 190)
+RAY_AREA: Final = (*SKY, 34)
+TRAIL: Final = (*BLUE, 255)
+WAY: Final = (*PURPLE, 255)
+MET: Final = (*PURPLE, 70)
+WALKER: Final = (*ORANGE, 255)
+WALKER_EDGE: Final = (138, 92, 0, 255)
+ROUND: Final = (246, 217, 150, 255)
+OUTCOMES: Final[dict[str, Color]] = {
+    "success": (*BLUE, 190),
+    "collision": (*VERMILION, 235),
+    "timeout": (*PURPLE, 235),
+}
+"""Of the paths of episodes, by how they ended."""
+
+_VIRIDIS: Final = np.array(
+    [
+        (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141),
+        (39, 173, 129), (92, 200, 99), (170, 220, 50), (253, 231, 37),
+    ],
+    dtype=np.float64,
+)  # fmt: skip
+
+
+def viridis(shares: Any) -> NDArray[np.uint8]:
+    """Colors of values from 0 to 1, from dark violet over green to yellow.
+
+    Args:
+        shares: Values, any shape; those beyond are clipped.
+
+    Returns:
+        Red, green and blue, shape ``[..., 3]``.
+
+    Examples:
+        >>> from mpfa_envs.render import viridis
+        >>> viridis([0.0, 1.0]).tolist()
+        [[68, 1, 84], [253, 231, 37]]
+    """
+    values = np.clip(np.nan_to_num(np.asarray(shares, dtype=np.float64)), 0.0, 1.0)
+    places = np.linspace(0.0, 1.0, len(_VIRIDIS))
+    channels = [np.interp(values, places, channel) for channel in _VIRIDIS.T]
+    return np.stack(channels, axis=-1).round().astype(np.uint8)
+
+
+def shares_of(values: Any, low: float, high: float) -> NDArray[np.float64]:
+    """Where values lie between two ends, from 0 to 1; in the middle if the ends are the same."""
+    spread = high - low
+    numbers = np.asarray(values, dtype=np.float64)
+    return (numbers - low) / spread if spread > 0.0 else np.full(numbers.shape, 0.5)
