@@ -54,7 +54,7 @@ VOLUMES = {
 :data:`SPARSE` and :data:`DENSE` have 32.
 """
 GENERATORS = ("rooms", "clutter", "bars", "fields", "halls", "mazes")
-TEST = Evaluation(tuple(f"{name}:test" for name in GENERATORS), 50, "wheels")
+TEST = Evaluation(tuple(f"{name}:test" for name in GENERATORS), 20, "wheels")
 """What last policies are asked to do."""
 
 KEY = ("uniform", "per", "mpfa_per", "mpf_per", "mpfa_plus", "lap", "la3p", "uniform_halves")
