@@ -17,8 +17,8 @@ from navigation.environment_settings import EnvironmentSettings
 from navigation.environments import make_training_env
 from navigation.settings import TrainSettings, is_discrete
 from navigation.worlds import is_of_a_test
-from torchrl_mpfa.methods import can_be_remote
-from torchrl_mpfa.methods.assembly import WORDS
+from torchrl_mpfa.methods import Method, can_be_remote
+from torchrl_mpfa.methods.assembly import WORDS, unused_settings
 
 Rule = tuple[Callable[[Any], bool], str]
 
@@ -190,17 +190,7 @@ def check_settings(settings: TrainSettings) -> None:
         lambda word: world_tasks(word, episodes=1, robot=settings.environment.robot),
         settings.evaluation.world,
     )
-    method = settings.method
-    if method.combination == "mixture" and method.selection != "prioritized":
-        raise ValueError(
-            f"method.combination must be sum or product with method.selection={method.selection}, "
-            "got mixture"
-        )
-    if method.capacity < method.batch_size * method.candidates:
-        raise ValueError(
-            f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "
-            f"got {method.capacity}: it would never learn"
-        )
+    _check_method(settings.method)
     if settings.evaluation.choose and not settings.evaluation.every:
         raise ValueError("evaluation.choose needs evaluations: set evaluation.every, got 0")
     if settings.evaluation.choose and is_of_a_test(settings.evaluation.world):
@@ -218,6 +208,25 @@ def check_settings(settings: TrainSettings) -> None:
     if is_discrete(settings.learner):
         _check_values_alone(settings)
     _check_device(settings.device)
+
+
+def _check_method(method: Method) -> None:
+    """Refuse what does not go together, or has no effect."""
+    for name, cause in unused_settings(method):
+        raise ValueError(
+            f"method.{name} must be {getattr(Method(), name)} with method.{cause}="
+            f"{getattr(method, cause)}, which cannot use it, got {getattr(method, name)}"
+        )
+    if method.combination == "mixture" and method.selection != "prioritized":
+        raise ValueError(
+            f"method.combination must be sum or product with method.selection={method.selection}, "
+            "got mixture"
+        )
+    if method.capacity < method.batch_size * method.candidates:
+        raise ValueError(
+            f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "
+            f"got {method.capacity}: it would never learn"
+        )
 
 
 def _check_one_rule(settings: TrainSettings) -> None:

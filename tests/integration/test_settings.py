@@ -162,6 +162,21 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
         ("method.fusion=entropi", "method.fusion must be one of entropy"),
         ("method.alpha=inf", "method.alpha must be finite and not negative, got inf"),
+        (
+            "method=ddpg method.reliability=0.2",
+            "method.reliability must be 0.0 with method.selection=uniform, .* got 0.2",
+        ),
+        (
+            "method=geometric method.combination=mixture",
+            "method.combination must be sum with method.selection=geometric, .* got mixture",
+        ),
+        ("method=uniform_halves method.floor_quantile=0.5", "floor_quantile .*=halves.* got 0.5"),
+        ("method=cer method.priority_floor=1", "priority_floor .*=newest, which cannot use it"),
+        ("method=ref_er method.replay_penalty=1", "replay_penalty must be 0.0 .* got 1.0"),
+        (
+            "method=per method.floor_quantile=0.5",
+            "method.floor_quantile must be 0.0 with method.priority_floor=0.0, .* got 0.5",
+        ),
         ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
         ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
         ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),

@@ -94,6 +94,12 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"capacity": 0}, "capacity must be a positive integer, got 0"),
         ({"batch_size": 2.5}, "batch_size must be a positive integer, got 2.5"),
         ({"alpha": -1.0}, "alpha must be finite and at least 0, got -1"),
+        (
+            {"method": "uniform", "combination": "product"},
+            "combination must be 'sum' with selection='uniform', which cannot .* got 'product'",
+        ),
+        ({"method": "cer", "reliability": 0.2}, "reliability must be 0.0 with selection='newest'"),
+        ({"method": "per", "floor_quantile": 0.5}, "floor_quantile .* with priority_floor=0.0,"),
         ({"method": "klper"}, "method 'klper' needs policy and sigma"),
         ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
     ],

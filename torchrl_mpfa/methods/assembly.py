@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -208,6 +208,29 @@ def loss_options(method: str | Method) -> dict[str, Any]:
     }
 
 
+def unused_settings(method: Method) -> Iterator[tuple[str, str]]:
+    """What is set and has no effect.
+
+    Yields:
+        Name of a setting that must have its default, and of the setting that is why.
+    """
+    default = Method()
+    uniform = method.selection in _UNIFORM
+    for name in (
+        "combination",
+        "floor_quantile",
+        "priority_floor",
+        "reliability",
+        "replay_penalty",
+    ):
+        if getattr(method, name) == getattr(default, name):
+            continue
+        if uniform:
+            yield name, "selection"
+        elif name == "floor_quantile" and method.priority_floor == 0:
+            yield name, "priority_floor"
+
+
 def entries_of(method: Method) -> tuple[str, ...]:
     """What transitions must have beside the usual.
 
@@ -329,6 +352,11 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
     if made.combination == "mixture" and made.selection in set(_PRIORITIZED) - {"prioritized"}:
         raise ValueError(
             f"combination 'mixture' needs selection='prioritized', got {made.selection!r}"
+        )
+    for name, cause in unused_settings(made):
+        raise ValueError(
+            f"{name} must be {getattr(Method(), name)!r} with {cause}={getattr(made, cause)!r}, "
+            f"which cannot use it, got {getattr(made, name)!r}"
         )
     check_level(made.positive_above)
     counts = ("capacity", "batch_size", "candidates", "target_average", "update_block")
