@@ -8,8 +8,8 @@ import torch
 
 from benchmarks.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
 from benchmarks.timing import MICROSECONDS, Call, Entry, entry, take_turns
-from navigation.assembly import make_curiosity, make_learner
-from navigation.settings import LearnerSettings
+from navigation.settings.learners import LearnerSettings
+from navigation.training.assembly import make_curiosity, make_learner
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 
 BASELINE = "ddpg"

@@ -31,12 +31,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from navigation import files
-from navigation.arms import check_free, parse_arms
-from navigation.execution import Runs, Start
-from navigation.processes import Child
-from navigation.settings import GROUPS, register
+from navigation.settings.train import GROUPS, register
 from navigation.stopping import Stop
-from navigation.studies import TESTED, Evaluation, Study, collect, other_than_asked
+from navigation.studies.arms import check_free, parse_arms
+from navigation.studies.execution import Runs, Start
+from navigation.studies.jobs import TESTED, Evaluation, Study, collect, other_than_asked
+from navigation.studies.processes import Child
 from navigation.worlds import parse_worlds
 from torchrl_mpfa.spelling import unknown
 
@@ -120,7 +120,7 @@ def executor(address: str | None) -> Iterator[Start]:
         yield Child
         return
     try:
-        from navigation.clusters import RemoteChild, connected
+        from navigation.studies.clusters import RemoteChild, connected
     except ImportError as error:
         raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
     try:

@@ -10,7 +10,8 @@ Writes ``tables.md``, ``training.png`` (success and average reward over episodes
 ``evaluations.png`` (greedy success in the validation world over steps). The arms of a study
 (``compare.py --arm``) have rows and lines of their own, what was driven in other physics has tables
 of its own. What varies is the run, not the episode: intervals are for other runs, or for other runs
-and pairs of start and goal, and tests compare the means of runs (``navigation/intervals.py``).
+and pairs of start and goal, and tests compare the means of runs: see
+``navigation/report/intervals.py``.
 
 With ``--paper`` it makes, of what runs there are, ``paper.md`` with Tables 2 to 4 beside the
 paper's numbers, ``figure_3.png``, ``figure_5.png``, ``figure_8.png`` to ``figure_11.png``,
@@ -33,15 +34,12 @@ import pandas as pd
 
 from navigation import files
 from navigation.figures import Runs, plot_evaluations, plot_training
-from navigation.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
-from navigation.paper_figures import plot_paper
-from navigation.paper_tables import paper_tables
-from navigation.protocol import paper_studies, tables
 from navigation.records import read_table
-from navigation.studies import Study, run_name
-from navigation.study_report import write_study
-from navigation.study_rows import is_kept
-from navigation.tables import (
+from navigation.report.paper_figures import plot_paper
+from navigation.report.paper_tables import paper_tables
+from navigation.report.study_pages import write_study
+from navigation.report.study_rows import is_kept
+from navigation.report.tables import (
     comparison_table,
     interval_table,
     outcome_table,
@@ -50,6 +48,9 @@ from navigation.tables import (
     speed_table,
     success_table,
 )
+from navigation.studies.jobs import Study, run_name
+from navigation.studies.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
+from navigation.studies.protocol import paper_studies, tables
 from navigation.worlds import family
 from torchrl_mpfa.saving import write_text_atomically
 

@@ -8,8 +8,8 @@
 
 Every run is one of ``compare.py``, by the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is under way, and the same command goes on. Tables A to
-F are in ``navigation/protocol.py``, with a folder for each task in ``--folder``. The checkpoint of
-a run that is done is removed: thousands of them take tens of gigabytes.
+F are in ``navigation/studies/protocol.py``, with a folder for each task in ``--folder``. The
+checkpoint of a run that is done is removed: thousands of them take tens of gigabytes.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import compare
-from navigation.protocol import ROOT, Table, tables
-from navigation.remaining import counts, free_checkpoints, hours_left
-from navigation.study_rows import keep, read_runs
+from navigation.report.study_rows import keep, read_runs
+from navigation.studies.protocol import ROOT, Table, tables
+from navigation.studies.remaining import counts, free_checkpoints, hours_left
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -8,7 +8,7 @@
     python examples/train.py ray.workers=8 robots=128 updates=32    robots on a Ray cluster
     python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    go on with a run that was stopped
 
-``navigation/settings.py`` has every setting; ``--help`` prints them with their values. Ctrl-C,
+``navigation/settings/`` has every setting; ``--help`` prints them with their values. Ctrl-C,
 SIGTERM and SIGHUP let the iteration end and save. Exit status: 0; 1 after an error, the last
 iteration being saved; 2 if a setting is wrong; 128 and the number of the signal that stopped it.
 """
@@ -22,10 +22,10 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from navigation.command_line import composed, parse_overrides
-from navigation.running import Refused, resume, start
-from navigation.settings import as_settings, register
+from navigation.settings.command_line import composed, parse_overrides
+from navigation.settings.train import as_settings, register
 from navigation.stopping import end_with_parent
+from navigation.training.running import Refused, resume, start
 
 REFUSED = 2
 

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
 from mpfa_envs.robot import resolve_robot
-from navigation.environment_settings import EnvironmentSettings
+from navigation.settings.environment import EnvironmentSettings
 
 _AHEAD, _SECTOR = 180.0, 10.0
 """The lidar's field of view unless it is said, and that of a sector [deg]."""

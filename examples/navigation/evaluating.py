@@ -1,8 +1,7 @@
-"""A policy out of a training run as a function of its own, and how well it drives."""
+"""How well a policy drives: in the worlds of a command line, and as a film."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from tensordict.nn import TensorDictModule
 
 from mpfa_envs import (
     DynamicWindow,
@@ -21,20 +19,11 @@ from mpfa_envs import (
     RobotNoise,
     VectorNavigationEnv,
     WorldTask,
-    evaluate,
     run_tasks,
     summarize,
     world_tasks,
 )
 from mpfa_envs.evaluation import as_driver
-from navigation.assembly import policy_layers
-from navigation.environments import env_arguments
-from navigation.records import EvaluationRecord
-from navigation.settings import TrainSettings
-
-_SEED = 1
-"""Of the pairs of start and goal: others than those of ``evaluate.py``."""
-
 
 Drivable = Policy | MapPlanner | DynamicWindow
 """What drives, and knows by ``env_arguments`` what it must sense."""
@@ -130,67 +119,3 @@ def summary_row(results: Sequence[EpisodeResult]) -> dict[str, float]:
     for name, interval in summarize(results).items():
         row |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return row
-
-
-def exported_policy(
-    policy: TensorDictModule, settings: TrainSettings, *, episodes: int = 0, steps: int = 0
-) -> Policy:
-    """The policy without noise, with what is needed to use it and how it was trained.
-
-    Args:
-        policy: The policy in training.
-        settings: Of the run.
-        episodes: That it was trained for.
-        steps: Actions that it was trained for.
-
-    Returns:
-        The policy, whose weights are copies.
-    """
-    return Policy(
-        policy_layers(policy),
-        card={
-            "method": settings.method.name,
-            "learner": settings.learner.name,
-            "curriculum": settings.curriculum.name,
-            "seed": settings.seed,
-            "episodes": episodes,
-            "steps": steps,
-        },
-        env_arguments=env_arguments(settings.environment),
-    )
-
-
-def evaluate_policy(
-    settings: TrainSettings,
-    policy: TensorDictModule,
-    *,
-    total_steps: int,
-    episode: int,
-    trained_for: float,
-) -> EvaluationRecord:
-    """Drive the fixed tasks of the validation world, or of others that the settings name.
-
-    Args:
-        settings: Of the run.
-        policy: The policy as it is now.
-        total_steps: Actions so far.
-        episode: Episodes so far.
-        trained_for: Wall-clock time of the training so far [s].
-
-    Returns:
-        Rates of success, collision and timeout, and the mean SPL.
-    """
-    start = time.perf_counter()
-    wanted = settings.evaluation
-    results = evaluate(
-        exported_policy(policy, settings), wanted.world, episodes=wanted.episodes, seed=_SEED
-    )
-    names = ("success", "collision", "timeout", "spl")
-    return EvaluationRecord(
-        total_steps=total_steps,
-        episode=episode,
-        world=wanted.world,
-        seconds=time.perf_counter() - start,
-        trained_for=trained_for,
-        **{name: sum(getattr(r, name) for r in results) / len(results) for name in names},
-    )

@@ -12,10 +12,11 @@ from PIL import Image
 import evaluate
 from mpfa_envs import GENERATORS, EpisodeResult, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
-from navigation.assembly import make_learner
-from navigation.evaluating import exported_policy, film, summary_row
+from navigation.evaluating import film, summary_row
 from navigation.records import read_table
-from navigation.settings import GROUPS, TrainSettings
+from navigation.settings.train import GROUPS, TrainSettings
+from navigation.training.assembly import make_learner
+from navigation.training.evaluations import exported_policy
 from navigation.worlds import parse_worlds, worlds_label
 
 SHIPPED = Path(evaluate.__file__).parent / "policies" / "td3-mpfa_per.npz"

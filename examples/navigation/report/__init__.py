@@ -1,0 +1,1 @@
+"""What is said of many runs: statistics, tables and figures."""

@@ -1,0 +1,271 @@
+"""Tables of the study in Markdown: the measures of each arm, and its comparisons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from mpfa_envs import Interval
+from navigation.report.intervals import (
+    Array,
+    bootstrap_runs,
+    difference_interval,
+    improvement_interval,
+    interquartile_mean,
+    mean_interval,
+    mean_over_worlds,
+)
+from navigation.report.permutation import deal_p, flip_p, holm, rank_flip_p, rank_p
+from navigation.report.power import difference_found, paired_difference_found
+from navigation.report.study_rows import GOAL, Rows, kinds_of, scores_of, worlds_of
+from navigation.report.tables import table as markdown
+from navigation.studies.protocol import Pair, Table, short_names
+from navigation.worlds import family
+
+NOTES = f"""\
+The unit is the run. Area: mean height of the curve of greedy success in validation, from zero on.
+Actions to {GOAL:.0%}: those until the first evaluation with so much, median of the runs. Success is
+that of the last policy, each kind of worlds counting the same. Differences are between runs of the
+same seeds, where both arms have the same ones.
+
+Intervals: bootstrap over seeds, or over seeds and worlds, of a single world its pairs of start and
+goal. *p*: of all ways to choose the signs of the differences, or without common seeds to deal the
+runs to both sides; of actions with their ranks. Corrected by Holm's method, runs that are missing
+having p = 1. *Found with 80 %*: the true difference that so many runs would have found, at a level
+of 0.05 over the number of comparisons. *Better run*: chance that a run of the first arm is better
+than one of the second."""
+MEASURES = {
+    "area": "area under the curve of greedy success in validation",
+    "success": "success of the last policy",
+    "actions": f"actions until {GOAL:.0%} of greedy success in validation",
+}
+Scores = Mapping[str, pd.DataFrame]
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The runs of two arms, of the same seeds in the same order if there are no others."""
+
+    ours: Array
+    theirs: Array
+    paired: bool
+    seeds: tuple[list[int], list[int]]
+
+
+def sides_of(scores: Scores, pair: Pair, measure: str) -> Sides | None:
+    """The runs of two arms that have a measure; None where an arm has none."""
+    if any(label not in scores for label in pair):
+        return None
+    ours, theirs = (scores[label][measure].dropna().sort_index() for label in pair)
+    if not len(ours) or not len(theirs):
+        return None
+    seeds = list(map(int, ours.index)), list(map(int, theirs.index))
+    return Sides(ours.to_numpy(), theirs.to_numpy(), seeds[0] == seeds[1], seeds)
+
+
+def p_of(sides: Sides, measure: str) -> float:
+    """Seed by seed if both have the same, else of the means of runs; of ranks for actions."""
+    if measure == "actions":
+        test = rank_flip_p if sides.paired else rank_p
+        return float(test(sides.ours, sides.theirs))
+    if sides.paired:
+        return float(flip_p(sides.ours - sides.theirs))
+    return float(deal_p(sides.ours, sides.theirs))
+
+
+def comparison_lines(
+    scores: Scores, pairs: Sequence[Pair], measure: str, worlds: Mapping[str, pd.DataFrame]
+) -> str:
+    """A table of comparisons that are corrected for each other.
+
+    Args:
+        scores: The measures of each run, by arm.
+        pairs: Arms to compare; those that lack runs have empty cells, and count in the correction.
+        measure: Of :data:`MEASURES`.
+        worlds: Success in each world, by arm; it makes the interval for other runs and worlds.
+
+    Returns:
+        A table in Markdown; empty without a pair that has runs.
+    """
+    found = {pair: sides_of(scores, pair, measure) for pair in pairs}
+    known = {pair: sides for pair, sides in found.items() if sides is not None}
+    if not known:
+        return ""
+    p = {pair: p_of(sides, measure) for pair, sides in known.items()}
+    # Those that are still missing are not left out of the correction.
+    corrected = dict(zip(pairs, holm(np.array([p.get(pair, 1.0) for pair in pairs])), strict=True))
+    rng = np.random.default_rng(0)
+    lines = []
+    short = short_names([label for pair in pairs for label in pair])
+    for pair in pairs:
+        names = " − ".join(short[label] for label in pair)
+        if pair not in known:
+            lines.append([names, "0", *[""] * _width(measure)])
+            continue
+        sides = known[pair]
+        runs = str(len(sides.ours)) if sides.paired else f"{len(sides.ours)}, {len(sides.theirs)}"
+        better = _improvement(sides, measure, rng)
+        lines.append(
+            [
+                *(names, runs),
+                *_cells(sides, pair, measure, worlds, rng, level=0.05 / len(pairs)),
+                *(_p(p[pair]), _p(corrected[pair])),
+                f"{better.value:.2f} {_ends(better, '.2f')}",
+            ]
+        )
+    if measure == "actions":
+        head = ["median", "other median"]
+    else:
+        head = ["difference", "95 %, over runs", "found with 80 %"]
+    if measure == "success":
+        head.insert(2, "95 %, over runs and worlds")
+    head += ["p", f"corrected for {len(pairs)}", "better run, 95 %"]
+    return markdown(["", "runs", *head], lines)
+
+
+def arm_lines(
+    scores: Scores, labels: Sequence[str], primary: str, worlds: Mapping[str, pd.DataFrame]
+) -> str:
+    """A table of the measures of each arm, that with the highest primary measure first."""
+    rng = np.random.default_rng(0)
+    lines = []
+    short = short_names(labels)
+    there = [label for label in labels if label in scores]
+    for label in sorted(there, key=lambda each: -_mean(scores[each][primary])):
+        runs = scores[label]
+        area, success = runs["area"].to_numpy(), runs["success"].dropna().to_numpy()
+        of_area = mean_interval(area, rng=rng)
+        middle = bootstrap_runs(interquartile_mean, area[:, None], rng=rng)
+        never = int(np.isinf(runs["actions"]).sum())
+        cells = [short[label], str(len(runs))]
+        cells += [f"{of_area.value:.3f} {_ends(of_area)}", f"{middle.value:.3f} {_ends(middle)}"]
+        cells += [_median(runs["actions"]), f"{never} of {len(runs)}"]
+        if len(success):
+            rate = mean_interval(success, rng=rng)
+            both = mean_over_worlds(*_matrix(worlds[label]), rng=rng)
+            cells += [f"{rate.value:.1%} {_ends(rate, '.1%')}", _ends(both, ".1%")]
+        lines.append([*cells, *[""] * (8 - len(cells))])
+    head = ["runs", "area, 95 % over runs", "its interquartile mean", f"actions to {GOAL:.0%}"]
+    head += ["never", "success of the last policy, 95 % over runs", "over runs and worlds"]
+    return markdown(["", *head], lines) if lines else ""
+
+
+def kind_lines(rows: Rows, labels: Sequence[str]) -> str:
+    """A table of the success of last policies by kind of world, mean of the runs."""
+    kinds = rows.tests["world"].map(family).rename("kind")
+    of_runs = rows.tests.groupby(["arm", kinds, "seed"], sort=False)["success"].mean()
+    means = of_runs.groupby(level=[0, 1], sort=False).mean().unstack()
+    short = short_names(labels)
+    lines = [
+        [
+            short[label],
+            *(
+                "" if math.isnan(v) else f"{v:.1%}"
+                for v in np.asarray(means.loc[label], dtype=float)
+            ),
+        ]
+        for label in labels
+        if label in means.index
+    ]
+    return markdown(["", *means.columns], lines) if lines else ""
+
+
+def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
+    """Everything in words and numbers that the rows say on the question of a table.
+
+    Args:
+        table: The table.
+        rows: Its rows.
+        absent: What is missing.
+
+    Returns:
+        A page in Markdown.
+    """
+    scores, worlds = scores_of(rows, table), worlds_of(rows, table)
+    labels = list(dict.fromkeys([*(a for panel in table.panels.values() for a in panel), *scores]))
+    order = sorted(MEASURES, key=lambda name: name != table.primary)
+    arms = arm_lines(scores, labels, table.primary, worlds)
+    parts = [f"# {table.name}: {table.question}", NOTES, "## Arms", arms]
+    parts += ["## Success of the last policy by kind of world", kind_lines(rows, labels)]
+    for which, pairs in (("Planned", table.planned), ("Other", table.explored)):
+        for measure in order:
+            lines = comparison_lines(scores, pairs, measure, worlds)
+            title = "primary measure, " if measure == table.primary else ""
+            parts += [f"## {which} comparisons: {title}{MEASURES[measure]}", lines] * bool(lines)
+    if absent:
+        parts += ["## Missing", absent]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _cells(
+    sides: Sides,
+    pair: Pair,
+    measure: str,
+    worlds: Mapping[str, pd.DataFrame],
+    rng: np.random.Generator,
+    *,
+    level: float,
+) -> list[str]:
+    """Difference, intervals, and what could have been found; of actions the medians."""
+    ours, theirs = sides.ours, sides.theirs
+    if measure == "actions":
+        return [_median(ours), _median(theirs)]
+    if sides.paired:
+        gap = mean_interval(ours - theirs, rng=rng)
+        deviation = float((ours - theirs).std(ddof=1)) if len(ours) > 1 else math.nan
+        least = paired_difference_found(deviation, len(ours), level=level)
+    else:
+        gap = difference_interval(ours, theirs, rng=rng)
+        freedom = max(1, len(ours) + len(theirs) - 2)
+        squares = sum(float(((each - each.mean()) ** 2).sum()) for each in (ours, theirs))
+        deviation = math.sqrt(squares / freedom)
+        least = difference_found(deviation, len(ours), len(theirs), level=level)
+    cells = [f"{gap.value:+.3f}", _ends(gap, "+.3f"), f"{least:.3f}"]
+    if measure == "success":
+        a, b = (worlds[label] for label in pair)
+        both = ""
+        if sides.paired:
+            common = a.sort_index() - b.sort_index()[a.columns]
+            both = _ends(mean_over_worlds(*_matrix(common), rng=rng), "+.3f")
+        cells.insert(2, both)
+    return cells
+
+
+def _width(measure: str) -> int:
+    return {"area": 6, "success": 7, "actions": 5}[measure]
+
+
+def _improvement(sides: Sides, measure: str, rng: np.random.Generator) -> Interval:
+    sign = -1.0 if measure == "actions" else 1.0
+    return improvement_interval(
+        sign * sides.ours, sign * sides.theirs, paired=sides.paired, rng=rng
+    )
+
+
+def _matrix(success: pd.DataFrame) -> tuple[Array, list[str]]:
+    """Success by run and world, and the kind of each world."""
+    return success.to_numpy(dtype=float), kinds_of(success)
+
+
+def _mean(values: pd.Series) -> float:
+    found = float(values.mean())
+    return -math.inf if math.isnan(found) else found
+
+
+def _median(values: Array | pd.Series) -> str:
+    middle = float(np.quantile(np.asarray(values, dtype=float), 0.5, method="inverted_cdf"))
+    return "never" if math.isinf(middle) else f"{middle:,.0f}"
+
+
+def _ends(interval: Interval, form: str = ".3f") -> str:
+    if math.isnan(interval.low):
+        return "one run"
+    return f"[{interval.low:{form}}, {interval.high:{form}}]"
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"

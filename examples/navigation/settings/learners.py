@@ -1,0 +1,125 @@
+"""Settings of the learners, each with its default and its reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class LearnerSettings:
+    """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
+
+    name: str = "ddpg"
+    algorithm: str = "ddpg"
+    """``ddpg``, ``td3``, ``sac``, ``dqn`` or ``q_learning``; ``learner=td3`` chooses it with what
+    goes with it. The last two choose among seven pairs of wheel speeds."""
+    actor_lr: float = 1e-4
+    """Table 1."""
+    critic_lr: float = 1e-4
+    """Table 1."""
+    lr_end_factor: float = 0.0
+    """Learning rates fall with the episodes from Table 1's to this fraction; 1: constant. At a
+    constant rate DDPG forgets and relearns, and the last policy is a matter of luck."""
+    lr_power: float | None = None
+    """Shape of the fall: 1 is linear, right for a thousand episodes; 3 has halved the rates after a
+    fifth of them, right for a hundred. Null: 1 from 500 episodes on, 3 below."""
+    gamma: float = 0.99
+    """Table 1."""
+    tau: float = 0.01
+    """Table 1."""
+    width: int = 64
+    """Units of a hidden layer."""
+    layers: int = 2
+    """Hidden layers."""
+    layer_norm: bool = True
+    """Normalize hidden layers: features cannot grow without bound."""
+    late_action: bool = True
+    """The action joins the critic at its second layer, as in the original DDPG."""
+    final_init: float | None = 3e-3
+    """Last layers start within this, near the middle of the tanh; null: PyTorch's start."""
+    critic_weight_decay: float = 1e-4
+    """L2 decay of the critic. The original DDPG's 1e-2 holds Q well below the returns here."""
+    reward_scale: float = 0.1
+    """Factor of rewards in the loss, so that Q is of order one."""
+    saturation_penalty: float = 1.0
+    """Factor of the penalty on actions deep in the tanh's flat ends, where no gradient is."""
+    saturation_limit: float = 1.5
+    """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
+    compile: bool = False
+    """Make one program of an update with ``torch.compile``, which halves the time of a run. Needs a
+    C++ compiler, and half a minute at the start, a few seconds the next time."""
+    policy_delay: int = 1
+    """DDPG and TD3: updates of the critics for one of the actor and the targets."""
+    policy_noise: float = 0.0
+    """DDPG and TD3: standard deviation of the noise that smooths the target."""
+    noise_clip: float = 0.5
+    """DDPG and TD3: bound of that noise."""
+    alpha_init: float = 0.01
+    """SAC: temperature of the entropy at the start, of rewards that are scaled."""
+    alpha_lr: float = 3e-4
+    """SAC: learning rate of its logarithm."""
+    double: bool = True
+    """DQN: whether the next action is that of the network, and not of the target network."""
+    table_lr: float = 0.2
+    """Q learning: learning rate of the table, falling as the others do."""
+
+
+@dataclass
+class TD3Settings(LearnerSettings):
+    """TD3 with networks and rates of the DDPG learner: two critics, smoothed target, delay."""
+
+    name: str = "td3"
+    algorithm: str = "td3"
+    policy_delay: int = 2
+    policy_noise: float = 0.2
+
+
+@dataclass
+class SACSettings(LearnerSettings):
+    """SAC with networks and rates of the DDPG learner, and a stochastic policy."""
+
+    name: str = "sac"
+    algorithm: str = "sac"
+
+
+@dataclass
+class PlainSettings(LearnerSettings):
+    """DDPG without the recipe, as the paper's code most likely had it."""
+
+    name: str = "plain"
+    width: int = 256
+    layers: int = 3
+    layer_norm: bool = False
+    late_action: bool = True
+    final_init: float | None = None
+    lr_end_factor: float = 1.0
+    critic_weight_decay: float = 0.0
+    reward_scale: float = 1.0
+    saturation_penalty: float = 0.0
+
+
+@dataclass
+class DQNSettings(LearnerSettings):
+    """Double DQN with the critic's network and rate, of which an output is an action's value."""
+
+    name: str = "dqn"
+    algorithm: str = "dqn"
+    critic_lr: float = 3e-4
+    tau: float = 0.002
+    """With 0.01 the targets run ahead, and the robot circles until the time is up."""
+
+
+@dataclass
+class QLearningSettings(LearnerSettings):
+    """Q learning of a table over binned sensors; of the networks' settings it has none."""
+
+    name: str = "q_learning"
+    algorithm: str = "q_learning"
+    gamma: float = 0.9
+    """With 0.99 a cell as large as a meter, which leads to itself, is worth more than it should."""
+    reward_scale: float = 1.0
+
+
+def is_discrete(learner: LearnerSettings) -> bool:
+    """Whether the learner chooses among pairs of wheel speeds."""
+    return learner.algorithm in ("dqn", "q_learning")

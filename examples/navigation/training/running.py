@@ -1,0 +1,126 @@
+"""A run from its start to its end: who may write in its folder, and what its exit status says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from hydra.core.override_parser.types import Override
+
+from navigation import files
+from navigation.figures import plot_learning_curve
+from navigation.records import EpisodeRecord, as_table
+from navigation.settings.checks import check_settings
+from navigation.settings.resuming import changed, check_lawful
+from navigation.settings.train import TrainSettings, as_settings
+from navigation.training.assembly import method_of
+from navigation.training.checkpoints import read_checkpoint
+from navigation.training.loop import TrainingRun, prepare_process
+from torchrl_mpfa.saving import write_text_atomically
+
+
+class Refused(Exception):
+    """A run that is not begun, and why in one sentence."""
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Turn errors of what comes before the first step into :class:`Refused`."""
+    try:
+        yield
+    except (ValueError, OSError, files.FolderInUse) as error:
+        raise Refused(" ".join(str(error).split())) from error
+
+
+def start(settings: TrainSettings, folder: Path) -> int:
+    """Train anew.
+
+    Args:
+        settings: The settings, checked.
+        folder: Of the run.
+
+    Returns:
+        Exit status: 0, or 128 and the number of the signal that stopped the run.
+
+    Raises:
+        Refused: If the folder holds a run and ``overwrite`` is false, if another run is using
+            it, or if the parts refuse a setting.
+    """
+    with ExitStack() as held:
+        with refusing():
+            held.enter_context(files.lock(folder))
+            if (folder / files.CHECKPOINT).exists() and not settings.overwrite:
+                raise ValueError(
+                    f"{folder} holds a run: continue it with resume={folder}, or start anew with "
+                    "overwrite=true"
+                )
+            prepare_process(settings)
+            settings = replace(settings, run_dir=str(folder))
+            training = TrainingRun(settings, folder)
+            # Only now: a setting that the parts refuse leaves the old run in its place.
+            files.set_aside(folder)
+            write_settings(settings, folder / files.SETTINGS)
+        if method_of(settings) != settings.method:
+            print(f"learner={settings.learner.name} has no action gradient: it is left out")
+        return _train(training)
+
+
+def resume(folder: Path, overrides: list[Override]) -> int:
+    """Go on with a run where its checkpoint was written.
+
+    Args:
+        folder: Of the run.
+        overrides: Settings that shall be others from now on.
+
+    Returns:
+        As :func:`start`.
+
+    Raises:
+        Refused: If there is no checkpoint, if it cannot be read, if a setting may not change, or if
+            another run is using the folder.
+    """
+    with ExitStack() as held:
+        with refusing():
+            if not folder.is_dir():
+                raise FileNotFoundError(f"resume: there is no folder {folder}")
+            for name in (each.key_or_group for each in overrides):
+                if name in ("run_dir", "overwrite"):
+                    raise ValueError(f"resume: {name} is of no use, a run goes on in its folder")
+            held.enter_context(files.lock(folder))
+            state = read_checkpoint(folder)
+            settings = changed(state["settings"], overrides)
+            check_settings(settings)
+            check_lawful(as_settings(state["settings"]), settings, folder)
+            prepare_process(settings)
+            training = TrainingRun(settings, folder, state)
+            write_settings(settings, folder / files.SETTINGS)
+        return _train(training)
+
+
+def _train(training: TrainingRun) -> int:
+    folder = training.folder
+    try:
+        finished = training.train()
+    except KeyboardInterrupt:
+        finished = False
+    finally:
+        training.close()
+    curve = folder / files.CURVE
+    if training.records:
+        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
+    if finished:
+        print(f"policy: {folder / files.POLICY}   curve: {curve}")
+        return 0
+    saved = (folder / files.CHECKPOINT).exists()
+    how = f"continue with: train.py resume={folder}" if saved else "nothing of it was saved"
+    print(f"stopped after {training.actions} actions; {how}")
+    return training.stop.exit_status
+
+
+def write_settings(settings: TrainSettings, path: Path) -> None:
+    """Keep the settings of a run where people and studies can read them."""
+    values = {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}
+    write_text_atomically(json.dumps(values, indent=2) + "\n", path)

@@ -1,0 +1,1 @@
+"""Tests of statistics, tables and figures of many runs."""

@@ -1,0 +1,164 @@
+"""The paper's figures and tables, from runs of a smoke size and from rows that are made up."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+import compare
+import report
+from navigation.records import write_table
+from navigation.report.paper_figures import plot_claims, reward_of_blocks
+from navigation.report.paper_tables import trained_table, unseen_table
+from navigation.settings.train import GROUPS, Stage
+from navigation.studies.jobs import Job
+from navigation.studies.paper import NAMES, PHIS, TABLE_2, TABLE_4, missing, read_runs, studies
+from tests.integration.report.test_figures import colored, heights
+from tests.integration.tiny_runs import tiny, train
+
+FIGURES = ["claims", *(f"figure_{n}" for n in (3, 5, 8, 9, 10, 11, 13))]
+
+
+@pytest.fixture(scope="session")
+def paper_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of every name in the paper, some of which were tested."""
+    folder = tmp_path_factory.mktemp("paper")
+    first, second = studies(folder, seeds=1)
+    for name, (job,) in {**first.runs(), **second.runs()}.items():
+        settings = tiny(
+            name if name in NAMES else "mpfa_per", [Stage(world, 1) for world in "ABCD"]
+        )
+        settings.tracking.log_every = 5
+        if name in ("mw", "hvper"):
+            continue
+        train(job.path, settings)
+        if name != "klper":
+            tested = {"world": "test", "episode": range(4), "timeout": False, "time_s": 20.0}
+            rows = pd.DataFrame({**tested, "success": [True] * 3 + [False]})
+            rows["collision"] = ~rows["success"]
+            (job.path / "evaluation-test").mkdir()
+            write_table(rows, job.path / "evaluation-test" / "episodes.csv")
+    return folder
+
+
+def test_all_figures_and_tables_are_made_of_what_there_is(
+    paper_runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--output", str(tmp_path)]
+    assert report.main([str(paper_runs), "--paper", "--seeds", "1", *out]) == 0
+    assert sorted(path.stem for path in tmp_path.glob("*.png")) == sorted(FIGURES)
+    for path in tmp_path.glob("*.png"):
+        with Image.open(path) as picture:
+            assert len(set(picture.convert("RGB").get_flattened_data())) > 20
+    text = (tmp_path / "paper.md").read_text(encoding="utf-8")
+    assert "| MPFA-PER | 19 | 50.0 | 90.5% | 75.0% | 27.3 | 20.0 | 1 |" in text
+    assert "| HVPER | 27 |  | 86.5% |  | 34.2 |  | 0 |" in text
+    wanted = "3 runs are missing in .*: ddpg-klper-0, ddpg-hvper-0, ddpg-mw-0."
+    assert pd.Series([text]).str.contains(wanted).all()
+    assert text.strip() in capsys.readouterr().out
+
+
+def test_the_commands_that_are_named_make_the_runs_that_are_looked_for(tmp_path: Path) -> None:
+    for study in studies(tmp_path, seeds=2):
+        words = shlex.split(study.command)
+        assert words[:2] == ["python", "examples/compare.py"]
+        options = compare.parse(words[2:])
+        made = {
+            Job(learner, method, seed, options.folder, arm).path
+            for learner in options.learners
+            for method in options.methods
+            for seed in options.seeds
+            for arm in options.arms
+        }
+        assert made == {job.path for jobs in study.runs().values() for job in jobs}
+        assert len(missing(study)) == len(made)
+    assert set(NAMES) <= set(GROUPS["method"])
+
+
+def test_a_run_that_is_not_at_its_end_is_missing_and_in_no_table(tmp_path: Path) -> None:
+    first, _ = wanted = studies(tmp_path, seeds=1)
+    (job,) = first.runs()["per"]
+    (job.path / "evaluation-test").mkdir(parents=True)
+    for name in ("updates.csv", "episodes.csv", "evaluation-test/episodes.csv"):
+        write_table(pd.DataFrame({"total_steps": [1]}), job.path / name)
+    for finished in (False, True):
+        (job.path / "status.json").write_text(json.dumps({"finished": finished}))
+        assert (job.name in missing(first)) != finished
+        assert ("per" in read_runs(wanted, lambda path: path / "episodes.csv")) == finished
+
+
+def test_a_folder_without_runs_gets_the_commands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report.main([str(tmp_path), "--paper"]) == 1
+    said = capsys.readouterr().out
+    for study in studies(tmp_path):
+        assert study.command in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"), [(["b"], "one folder, got 2"), (["--seeds", "0"], "at least 1, got 0")]
+)
+def test_what_cannot_be_asked_for_is_refused(
+    wrong: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        report.main(["a", *wrong, "--paper"])
+    assert message in capsys.readouterr().err
+
+
+def test_the_paper_says_what_its_text_says_of_its_tables() -> None:
+    ours, theirs = TABLE_2["mpfa_per"], TABLE_2["per"]
+    assert 1 - ours.collisions / theirs.collisions == pytest.approx(0.3448, abs=1e-4)
+    assert 1 - ours.time / theirs.time == pytest.approx(0.1415, abs=1e-4)
+    fewer = {"klper": 0.2083, "ddpg_radam": 0.24, "hvper": 0.2963, "averaged_ddpg": 0.3214}
+    for name, share in fewer.items():
+        assert 1 - ours.collisions / TABLE_4[name].collisions == pytest.approx(share, abs=1e-4)
+    assert ours == TABLE_4["mpfa_per"]
+
+
+def test_tables_have_the_mean_over_runs() -> None:
+    first = pd.DataFrame({"success": [True, False], "collision": [False, True], "time_s": [9, 5]})
+    second = pd.DataFrame({"success": [True, True], "collision": False, "time_s": [4, 8]})
+    line = unseen_table({"per": {"0": first, "1": second}}, {"per": TABLE_2["per"]}).splitlines()[
+        -1
+    ]
+    # One of two, and none: a quarter of 200; 9 s, and the mean of 4 and 8.
+    assert line == "| PER | 29 | 50.0 | 85.5% | 75.0% | 31.8 | 7.5 | 2 |"
+    runs = {
+        str(minutes): pd.DataFrame({"seconds": [3.0, 60.0 * minutes], "total_steps": [5, steps]})
+        for minutes, steps in ((2, 1000), (3, 2001))
+    }
+    assert "| KLPER | 1,284 | 2.5 | 219,318 | 1,500 | 2 |" in trained_table({"klper": runs})
+
+
+def test_a_block_has_the_rewards_of_its_steps_and_the_last_one_is_whole() -> None:
+    steps = np.arange(4, 49, 4)
+    rows = pd.DataFrame({"total_steps": steps, "reward": 1.0 * steps})
+    found = reward_of_blocks(rows, steps=20)
+    assert found.to_dict() == {20: 4 + 8 + 12 + 16 + 20, 40: 24 + 28 + 32 + 36 + 40}
+
+
+def test_the_claims_have_a_line_for_each_method_where_its_values_are(tmp_path: Path) -> None:
+    steps = np.arange(0, 1000, 10)
+    flat = {"total_steps": steps, "positive_buffer": 0.5, "positive_batch": 0.5}
+    runs = {
+        name: {"0": pd.DataFrame({**flat, "td_error_age": slope * steps})}
+        for name, slope in (("per", 1.0), ("mpfa_per", 0.2))
+    }
+    plot_claims(runs, ("per", "mpfa_per"), tmp_path / "claims.png")
+    panel = slice(0, 520)
+    blue, pink = (31, 119, 180), (227, 119, 194)
+    high, low = (colored(tmp_path / "claims.png", color)[:, panel] for color in (blue, pink))
+    assert heights(high, quarter=3) > heights(low, quarter=3) + 0.3
+
+
+def test_the_phis_of_the_figure_are_the_arms() -> None:
+    assert [f"phi{phi}" for phi in PHIS] == [arm.name for arm in studies(Path("x"))[1].arms]

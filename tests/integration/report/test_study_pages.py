@@ -1,0 +1,290 @@
+"""Pages and figures of the study, from runs that are made up and from rows that are kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+import report
+import study
+from navigation import files
+from navigation.records import write_table
+from navigation.report import study_pages
+from navigation.report.study_figures import mean_curve, plot_curves, plot_volumes
+from navigation.report.study_rows import (
+    Rows,
+    keep,
+    missing,
+    read_kept,
+    read_runs,
+    scores_of,
+    worlds_of,
+)
+from navigation.report.study_tables import comparison_lines, study_tables
+from navigation.studies.arms import Arm
+from navigation.studies.jobs import Evaluation, Job, Study
+from navigation.studies.paper import NAMES, PHIS
+from navigation.studies.protocol import OF_VOLUMES, Table, paper_studies, tables
+from tests.integration.report.test_figures import BLUE, ORANGE, colored, heights
+
+TEST = Evaluation(("bars:test", "halls:test"), 4, "wheels")
+PAIRS = (("s/td3/per", "s/td3/uniform"), ("s/td3/uniform/wide", "s/td3/uniform"))
+
+
+def small_table(root: Path, *, seeds: int = 4) -> Table:
+    """Three arms, one of them by a name of its own."""
+    plain = Study(
+        root / "s", ("uniform", "per"), ("robots=2",), range(seeds), ("td3",), evaluation=TEST
+    )
+    wide = Arm("wide", ("learner.width=128",))
+    other = Study(root / "s", ("uniform",), (), range(seeds), ("td3",), (wide,), TEST)
+    arms = tuple(dict.fromkeys(label for pair in PAIRS for label in pair))
+    return Table(
+        *("C", "Which?", (plain, other), PAIRS[:1], PAIRS[1:], {"all": arms}), kinds=TEST.words
+    )
+
+
+def write_run(job: Job, heights: Sequence[float], outcomes: Sequence[Sequence[bool]]) -> None:
+    """A run as training and evaluation leave it behind, as far as the study reads it."""
+    folder = job.path / TEST.folder
+    folder.mkdir(parents=True)
+    (job.path / files.STATUS).write_text(json.dumps({"finished": True}))
+    (job.path / files.POLICY).write_bytes(b"policy")
+    curve = {"total_steps": 1000 * np.arange(1, len(heights) + 1), "success": heights}
+    write_table(pd.DataFrame(curve), job.path / files.EVALUATIONS)
+    rows = [
+        {
+            **{"episode": number, "success": good, "collision": not good and number == 0},
+            **{"spl": 0.123456 * good, "time_s": 12.345, "world": f"{kind}-test-{number}"},
+        }
+        for kind, of_kind in zip(("bars", "halls"), outcomes, strict=True)
+        for number, good in enumerate(of_kind)
+    ]
+    write_table(pd.DataFrame(rows), folder / files.EPISODES)
+    asked = {"words": list(TEST.words), "episodes": TEST.episodes, "physics": TEST.physics}
+    asked["sha256"] = files.digest(job.path / files.POLICY)
+    (folder / files.SETTINGS).write_text(json.dumps(asked))
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Four runs of each arm; PER is better by as much in each seed."""
+    root = tmp_path / "runs"
+    for each in small_table(root).studies:
+        for job in each.jobs:
+            first = 0.1 * job.seed + 0.4 * (job.method == "per")
+            outcomes = [[job.seed > 0] * 4, [True, True, job.method == "per", False]]
+            write_run(job, [first, first + 0.2], outcomes)
+
+    def one(folder: Path, *, most: int | None = None) -> dict[str, Table]:
+        return {"C": small_table(folder)}
+
+    monkeypatch.setattr(study, "tables", one)
+    monkeypatch.setattr(study_pages, "tables", one)
+    yield root
+
+
+def test_the_measures_of_a_run_are_those_of_its_rows(runs: Path) -> None:
+    table = small_table(runs)
+    scores = scores_of(read_runs(table, runs), table)
+    assert list(scores) == ["s/td3/uniform", "s/td3/per", "s/td3/uniform/wide"]
+    per = scores["s/td3/per"]
+    # From zero to 0.7 and to 0.9: half of each step and the mean of both.
+    assert per.loc[3, "area"] == pytest.approx((0.35 + 0.8) / 2)
+    assert per["actions"].tolist() == [np.inf, np.inf, np.inf, 2000]
+    # Of two kinds, one whole or not at all and the other three of four.
+    assert per["success"].tolist() == pytest.approx([0.375, 0.875, 0.875, 0.875])
+
+
+def test_kinds_of_worlds_count_the_same_and_a_run_that_lacks_one_has_no_success() -> None:
+    table = small_table(Path("x"))
+    curve = pd.DataFrame({"arm": "a", "seed": [0, 1], "total_steps": 10, "success": 1.0})
+    worlds = ["bars-test-1", "halls-test-1", "halls-test-2", "halls-test-3", "bars-test-1"]
+    good = [True, False, False, False, True]
+    tests = pd.DataFrame({"arm": "a", "seed": [0, 0, 0, 0, 1], "world": worlds, "success": good})
+    tests["episode"] = 0
+    found = scores_of(Rows(curve, tests), table)["a"]["success"]
+    assert found[0] == 0.5
+    assert np.isnan(found[1])
+
+
+def test_of_one_world_the_pairs_are_what_else_might_have_been_tested() -> None:
+    seeds, pairs = np.divmod(np.arange(3 * 50), 50)
+    good = np.random.default_rng(0).uniform(size=150) < 0.6
+    tests = pd.DataFrame({"arm": "a", "seed": seeds, "episode": pairs, "success": good})
+    table = tables(Path("x"))["A"]
+    found = worlds_of(Rows(pd.DataFrame(), tests.assign(world="test")), table)["a"]
+    assert found.to_numpy().tolist() == good.reshape(3, 50).tolist()
+    # In as many worlds with several pairs, a world is one.
+    worlds = tests.assign(world=[f"bars-test-{pair // 5}" for pair in pairs])
+    bars = replace(table, kinds=("bars:test",))
+    found = worlds_of(Rows(pd.DataFrame(), worlds), bars)["a"]
+    assert found.to_numpy() == pytest.approx(good.reshape(3, 10, 5).mean(axis=2))
+
+
+def test_what_is_kept_comes_back_and_is_the_same_bytes_each_time(
+    runs: Path, tmp_path: Path
+) -> None:
+    rows = read_runs(small_table(runs), runs)
+    paths = keep(rows, tmp_path / "a", "C")
+    again = read_kept(tmp_path / "a", "C")
+    pd.testing.assert_frame_equal(again.curves, rows.curves, check_dtype=False)
+    pd.testing.assert_frame_equal(again.tests, rows.tests, check_dtype=False)
+    assert len(rows.tests) == 3 * 4 * 8 and len(rows.curves) == 3 * 4 * 2
+    assert not rows.tests["collision"].all() and rows.tests["collision"].any()
+    for path, other in zip(paths, keep(again, tmp_path / "b", "C"), strict=True):
+        assert path.read_bytes() == other.read_bytes()
+    # No name and no date of the file.
+    assert paths[0].read_bytes()[3:8] == bytes(5)
+    assert not len(read_kept(tmp_path / "a", "D").curves)
+
+
+def test_the_pages_of_the_runs_and_of_what_is_kept_of_them_are_the_same(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = tmp_path / "kept"
+    assert study.main(["--folder", str(runs), "--keep", str(kept)]) == 0
+    assert "C-tests.csv.gz, 0.00 MB" in capsys.readouterr().out
+    for folder, output in ((runs, tmp_path / "one"), (kept, tmp_path / "two")):
+        assert report.main([str(folder), "--study", "--output", str(output)]) == 0
+    one, two = ((tmp_path / name / "C.md").read_text("utf-8") for name in ("one", "two"))
+    assert one == two
+    assert "## Missing" not in one
+    figures = {path.name for path in (tmp_path / "one").glob("*.png")}
+    assert figures == {"C_curves.png", "C_profiles.png", "C_arms.png"}
+    for name in figures:
+        with Image.open(tmp_path / "one" / name) as a, Image.open(tmp_path / "two" / name) as b:
+            assert a.tobytes() == b.tobytes()
+            assert len(set(a.convert("RGB").get_flattened_data())) > 20
+
+
+def test_the_page_says_what_the_rows_say(runs: Path) -> None:
+    table = small_table(runs)
+    text = study_tables(table, read_runs(table, runs), absent="")
+    # 0.3 and 0.4 of area more at every height, in each of four seeds: two of 16 ways.
+    assert "| per − uniform | 4 | +0.300 | [+0.300, +0.300] | 0.000 | 0.125 | 0.125 |" in text
+    assert (
+        "| uniform/wide − uniform | 4 | +0.000 | [+0.000, +0.000] | 0.000 | 1.000 | 1.000 |" in text
+    )
+    assert "| per | 75.0% | 75.0% |" in text
+    assert "| uniform | 75.0% | 50.0% |" in text
+    # Primary first.
+    area, success = (text.index(f"Planned comparisons: {w}") for w in ("primary", "success of"))
+    assert area < success
+    # Areas of 0.35, 0.425, 0.5 and 0.575.
+    assert "| per | 4 | 0.46" in text
+    assert "never | 3 of 4 |" in text
+
+
+def test_a_comparison_without_runs_counts_in_the_correction() -> None:
+    scores = {
+        name: pd.DataFrame({"area": values})
+        for name, values in (("a", np.arange(5.0)), ("b", np.arange(5.0) - 1), ("d", np.zeros(1)))
+    }
+    lines = comparison_lines(scores, [("a", "b"), ("a", "c")], "area", {}).splitlines()
+    # Five seeds: two of 32 ways, and of two comparisons.
+    assert lines[2].startswith("| a − b | 5 | +1.000 |")
+    assert "| 0.062 | 0.125 |" in lines[2]
+    assert lines[3].split("|")[1:4] == [" a − c ", " 0 ", "  "]
+    assert {line.count("|") for line in lines} == {lines[0].count("|")}
+    # Arms of other seeds are compared by the means of their runs.
+    (line,) = comparison_lines(scores, [("a", "d")], "area", {}).splitlines()[2:]
+    assert "| 5, 1 | +2.000 | one run |" in line
+    assert comparison_lines(scores, [("x", "c")], "area", {}) == ""
+
+
+def test_runs_that_are_missing_are_named_with_their_command(runs: Path, tmp_path: Path) -> None:
+    table = small_table(runs)
+    assert missing(table, read_runs(table, runs), runs) == ""
+    more = small_table(runs, seeds=7)
+    said = missing(more, read_runs(more, runs), runs)
+    assert "Missing: s/td3/uniform 4 to 6; s/td3/per 4 to 6." in said
+    assert more.studies[1].command in said
+    # Trained, and not tested in all its worlds.
+    rows = read_runs(table, runs)
+    fewer = rows.tests.query("arm != 's/td3/per' or seed != 2 or not world.str.startswith('halls')")
+    assert missing(table, Rows(rows.curves, fewer), runs).startswith("Missing: s/td3/per 2.")
+
+
+def test_a_folder_without_rows_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report.main([str(tmp_path), "--study"]) == 1
+    assert "no rows of the study" in capsys.readouterr().err
+    assert study.main(["--folder", str(tmp_path), "--keep", str(tmp_path / "k")]) == 0
+    assert "nothing is written" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        report.main(["a", "b", "--study"])
+    assert "--study takes one folder, got 2" in capsys.readouterr().err
+
+
+def test_the_figures_of_the_paper_are_made_of_table_a() -> None:
+    found: dict[str, list[Job]] = {}
+    for each in paper_studies(tables(Path("x"))["A"]):
+        assert "robots=16" in each.settings and "updates=16" in each.settings
+        for name, jobs in each.runs().items():
+            assert name not in found
+            found[name] = jobs
+    assert set(found) == {*NAMES, *(f"phi{phi}" for phi in PHIS)}
+    assert len(found["mpfa_per"]) == 10 and len(found["klper"]) == 5
+
+
+def test_a_mean_curve_begins_at_zero_and_ends_where_the_shortest_run_does() -> None:
+    curves = [pd.Series([0.4, 0.8], [100, 200]), pd.Series([0.2, 0.4, 1.0], [100, 180, 300])]
+    steps, mean, low, high = mean_curve(curves, np.random.default_rng(0))
+    assert steps.tolist() == [0, 100, 180, 200]
+    # At 200 the second one is a sixth of the way from 0.4 to 1.
+    assert mean == pytest.approx([0.0, 0.3, (0.72 + 0.4) / 2, (0.8 + 0.5) / 2])
+    assert (low <= mean).all() and (mean <= high).all()
+
+
+def test_a_curve_is_where_its_values_are(tmp_path: Path) -> None:
+    table = small_table(tmp_path)
+    steps = np.arange(1000, 10_001, 1000)
+    curves = [
+        pd.DataFrame({"arm": arm, "seed": seed, "total_steps": steps, "success": height})
+        for arm, height in (("s/td3/per", 0.9), ("s/td3/uniform", 0.3))
+        for seed in (0, 1)
+    ]
+    plot_curves(table, Rows(pd.concat(curves), pd.DataFrame()), tmp_path / "c.png")
+    per, uniform = (colored(tmp_path / "c.png", color) for color in (BLUE, ORANGE))
+    upper = slice(0, 330)
+    assert heights(per[upper], quarter=1) > heights(uniform[upper], quarter=1) + 0.3
+
+
+def test_where_a_method_is_better_than_uniform_replay_the_map_is_blue(tmp_path: Path) -> None:
+    scores = {
+        f"sparse/td3/{method}": pd.DataFrame({"area": [0.5 + 0.2 * (method == "per")]})
+        for method in OF_VOLUMES
+    }
+    scores["sparse/td3/lap"] = pd.DataFrame({"area": [0.3]})
+    plot_volumes(scores, tmp_path / "v.png")
+    # The ends of the color map, in the one column that has runs.
+    for color, row in (((5, 48, 97), 1), ((103, 0, 31), 4)):
+        lines, columns = np.nonzero(colored(tmp_path / "v.png", color)[:, :700])
+        assert 300 < np.median(columns) < 370
+        assert np.median(lines) == pytest.approx(60 + (row + 0.5) * 61, abs=15)
+
+
+def test_the_real_tables_are_made_of_rows_of_every_arm(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    table = tables(Path("x"))["D"]
+    arms = list(dict.fromkeys(label for panel in table.panels.values() for label in panel))
+    runs = [(arm, seed) for arm in arms for seed in (100, 101)]
+    curves = pd.DataFrame(runs, columns=["arm", "seed"])
+    curves["total_steps"], curves["success"] = 24_000, rng.uniform(size=len(curves))
+    tests = curves.drop(columns="total_steps").merge(
+        pd.DataFrame({"world": [word.replace(":", "-") + "-1" for word in table.kinds]}),
+        how="cross",
+    )
+    tests["success"], tests["episode"] = rng.uniform(size=len(tests)) < 0.5, 0
+    text = study_tables(table, Rows(curves, tests), absent="")
+    assert text.count("| sparse/td3/per/v8 − sparse/td3/uniform/v8 |") == 3
+    assert f"corrected for {len(table.planned)}" in text

@@ -1,0 +1,136 @@
+"""Where a run learns and where its policy is judged."""
+
+from __future__ import annotations
+
+import inspect
+from argparse import ArgumentTypeError
+from dataclasses import asdict
+from pathlib import Path
+
+import gymnasium
+import pytest
+import torch
+
+from evaluate import read_noise
+from mpfa_envs import Mirror, NavigationEnv, RandomMirror, RobotNoise, load_policy
+from mpfa_envs.reward import PROGRESS_SCALE
+from navigation.environments import env_arguments, make_training_env, vector_of
+from navigation.settings.environment import EnvironmentSettings, NoiseSettings
+from navigation.settings.train import REGIMES
+from tests.integration.tiny_runs import tiny, train
+
+
+@pytest.mark.parametrize(("robot", "radius"), [("turtlebot2", 0.18), ("burger", 0.105)])
+def test_a_robot_learns_with_a_clearance(robot: str, radius: float) -> None:
+    settings = EnvironmentSettings(
+        robot=robot, physics="kinematic", clearance=0.1, progress_scale=3.0
+    )
+    training = make_training_env("C", settings)
+    assert training.env.collision_distance == pytest.approx(radius + 0.1)
+    assert env_arguments(settings)["closeness_distance"] == pytest.approx(radius + 0.1)
+    training.close()
+
+
+def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
+    settings = EnvironmentSettings(
+        physics="kinematic", clearance=0.1, max_steps=40, action_repeat=3
+    )
+    training = make_training_env("D", settings)
+    judging = NavigationEnv(world="D", collision_distance="contact", **env_arguments(settings))
+    training.set_seed(1)
+    seen = training.reset()["observation"].numpy()[0]
+    task = training.env.tasks[0]
+    assert judging.reset(options=task._asdict())[0] == pytest.approx(seen)
+    for name in ("max_steps", "action_repeat", "closeness_distance", "physics"):
+        assert getattr(judging, name) == getattr(training.env, name)
+    assert judging.closeness_distance == pytest.approx(0.28)
+    training.close()
+    judging.close()
+
+
+def test_a_lidar_that_sees_a_whole_turn_is_asked_for_and_mirrored(tmp_path: Path) -> None:
+    assert "lidar" not in env_arguments(EnvironmentSettings())
+    settings = tiny()
+    settings.environment.field_of_view, settings.environment.history = 360.0, 1
+    run = train(tmp_path / "run", settings)
+    lidar = load_policy(run.folder / "policy.npz").env_arguments["lidar"]
+    assert lidar == {"field_of_view": 360.0, "sectors": 36}
+    batch = run.buffer[:40]["observation"]
+    assert batch.shape[-1] == 36 + 6 + 36
+    mirror = Mirror(sectors=36, history=1)
+    transform = next(each for each in run.buffer._transform if isinstance(each, RandomMirror))
+    assert torch.equal(transform.mirror.observation(batch), mirror.observation(batch))
+
+
+def test_the_defaults_are_those_of_the_environment_itself() -> None:
+    training = make_training_env("B", EnvironmentSettings(physics="kinematic"))
+    plain = NavigationEnv(world="B", physics="kinematic", render_mode=None)
+    ours = vars(training.env)
+    values = (bool, int, float, str, type(None))
+    same = {
+        name: each
+        for name, each in vars(plain).items()
+        if isinstance(each, values) and not name.startswith("_")
+    }
+    assert {"max_steps", "action_repeat", "collision_distance"} <= set(same)
+    assert {name: ours[name] for name in same} == same
+    assert ours["robot"] == plain.robot
+    assert ours["reward"].keywords == plain.reward.keywords
+    defaults = inspect.signature(NavigationEnv).parameters
+    for name in ("robot", "physics", "max_steps", "action_repeat", "detour_chance"):
+        assert getattr(EnvironmentSettings(), name) == defaults[name].default
+    training.close()
+    plain.close()
+
+
+def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> None:
+    settings = EnvironmentSettings(physics="kinematic")
+    trained, plain = make_training_env("D", settings).env, NavigationEnv(physics="kinematic")
+    for name in (
+        "max_steps", "time_step", "action_repeat", "goal_radius", "collision_distance",
+        "closeness_distance", "min_goal_distance", "detour_chance", "robot",
+    ):  # fmt: skip
+        assert getattr(trained, name) == getattr(plain, name), name
+    assert settings.progress_scale == PROGRESS_SCALE
+    assert EnvironmentSettings().physics == "wheels"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "world", "changed"),
+    [
+        ("mpfa/Navigation-D-v1", "D", {"physics": "kinematic"}),
+        ("mpfa/Rooms-v1", "mixed", REGIMES["rooms"]["environment"]),
+    ],
+)
+def test_the_ids_are_the_tasks_that_the_regimes_learn(
+    env_id: str, world: str, changed: dict[str, object]
+) -> None:
+    trained = vector_of(make_training_env(world, EnvironmentSettings(**changed), robots=2))  # type: ignore[arg-type]
+    made = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")
+    for env in (trained, made):
+        env.reset(seed=1)
+    assert made.tasks == trained.tasks
+    assert made.worlds == trained.worlds
+    mine, theirs = (env.state_dict()["arguments"] for env in (made, trained))
+    assert mine == pytest.approx(theirs)
+    assert made.reward.keywords == trained.reward.keywords
+    for name in ("detour_chance", "min_goal_distance"):
+        assert getattr(made, name) == getattr(trained, name)
+    assert made._source._max_goal_distance == trained._source._max_goal_distance
+    trained.close()
+    made.close()
+
+
+def test_the_settings_of_noise_are_those_of_the_environment() -> None:
+    assert asdict(NoiseSettings()) == asdict(RobotNoise())
+    settings = EnvironmentSettings(physics="kinematic", noise=NoiseSettings(slip=0.1, latency=2))
+    env = make_training_env("A", settings, robots=2)
+    assert vector_of(env).noise == RobotNoise(slip=0.1, latency=2)
+    env.close()
+
+
+def test_noise_on_the_command_line_is_read_or_refused() -> None:
+    assert read_noise("slip=0.1,latency=2") == RobotNoise(slip=0.1, latency=2)
+    for words in ("slip=2", "slip", "latency=0.5", "wind=1"):
+        with pytest.raises(ArgumentTypeError):
+            read_noise(words)

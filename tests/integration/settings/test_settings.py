@@ -1,0 +1,211 @@
+"""Settings: Hydra composes them, typed, and each mistake is one sentence."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from navigation.settings.checks import RULES, settings_by_name
+from navigation.settings.command_line import composed, parse_overrides
+from navigation.settings.train import GROUPS, Stage, TrainSettings, register
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
+    register()
+
+
+@pytest.fixture(autouse=True)
+def hydra_at_rest() -> None:
+    GlobalHydra.instance().clear()
+
+
+def one(*arguments: str) -> TrainSettings:
+    (settings,) = composed(arguments)
+    return settings
+
+
+def test_the_defaults_are_table_1_of_the_paper() -> None:
+    settings = one("regime=paper")
+    assert (settings.robots, settings.updates) == (1, 1)
+    assert (settings.learner.actor_lr, settings.learner.critic_lr) == (1e-4, 1e-4)
+    assert (settings.learner.gamma, settings.learner.tau) == (0.99, 0.01)
+    assert (settings.method.capacity, settings.method.batch_size) == (100_000, 256)
+
+
+def test_the_paper_curriculum_has_a_thousand_episodes() -> None:
+    stages = one("curriculum=paper").curriculum.stages
+    assert stages == [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)]
+    assert sum(stage.episodes for stage in stages) == 1000
+
+
+# The first choices of all groups together, the second ones, and so on.
+@pytest.mark.parametrize("choices", [*zip_longest(*GROUPS.values())], ids=str)
+def test_every_choice_of_every_group_passes_the_checks(choices: tuple[str | None, ...]) -> None:
+    one(*(f"{group}={each}" for group, each in zip(GROUPS, choices, strict=True) if each))
+
+
+def test_an_override_reaches_the_typed_settings() -> None:
+    settings = one("method=per", "method.alpha=0.7", "seed=5")
+    assert (settings.method.name, settings.method.alpha, settings.seed) == ("per", 0.7, 5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ([], "rooms"),
+        (["curriculum=A"], "A"),
+        (["regime=paper"], "paper"),
+        (["curriculum.stages=[{world: mixed, actions: 500}]"], "mixed500"),
+        (["curriculum.stages=[{world: D, episodes: 5}]"], "D5"),
+        (["curriculum=paper", "curriculum.stages=[{world: A, episodes: 2}]"], "A2"),
+        (["curriculum.stages=[{world: A, episodes: 3},{world: B, episodes: 4}]"], "A3+B4"),
+        (["curriculum.name=mine", "curriculum.stages=[{world: D, episodes: 5}]"], "mine"),
+    ],
+)
+def test_a_run_is_called_after_the_stages_that_it_has(arguments: list[str], name: str) -> None:
+    settings = one(*arguments)
+    assert settings.curriculum.name == name
+    assert settings.run_dir == f"runs/{name}-mpfa_per-ddpg-0"
+
+
+def test_two_long_curricula_have_two_short_names() -> None:
+    texts = [
+        "curriculum.stages=["
+        + ",".join(f"{{world: rooms-{n}, episodes: {last}}}" for n in range(20))
+        + "]"
+        for last in (1, 2)
+    ]
+    first, second = (one(text).curriculum.name or "" for text in texts)
+    assert first != second
+    assert len(first) < 60
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("sede=1", r"unknown setting 'sede': did you mean 'seed'\?"),
+        ("learner.widht=64", r"unknown setting 'learner.widht': did you mean 'learner.width'\?"),
+        ("alpha=0.5", r"unknown setting 'alpha': did you mean 'method.alpha'\?"),
+        ("method=prr", r"unknown choice 'prr' of 'method': did you mean 'per'\?"),
+        ("+extra=1", r"unknown setting 'extra'"),
+    ],
+)
+def test_an_unknown_setting_is_an_error_that_suggests_the_nearest(
+    argument: str, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_overrides([argument])
+
+
+def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
+    arguments = ["-m", "seed=0,1,2", "method=mpfa_per,per", "hydra.verbose=true", "--cfg", "job"]
+    found = [(s.seed, s.method.name) for s in composed(arguments)]
+    assert found == [(seed, method) for seed in (0, 1, 2) for method in ("mpfa_per", "per")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("learner.gamma=2", r"learner.gamma must be in \[0, 1\], got 2.0"),
+        ("learner.saturation_penalty=nan", "learner.saturation_penalty must be .*got nan"),
+        ("learner.width=0", "learner.width must be at least 1, got 0"),
+        ("learner.tau=0", r"learner.tau must be in \(0, 1\], got 0.0"),
+        ("seed=abc", "seed: Value 'abc'"),
+        ("seed=-1", "seed must be at least 0, got -1"),
+        ("threads=0", "threads must be at least 1"),
+        ("device=warp", "device must be one that PyTorch knows, got 'warp'"),
+        ("checkpoint_every=0", "checkpoint_every must be at least 1, got 0"),
+        ("tracking.log_every=0", "tracking.log_every must be at least 1, got 0"),
+        ("tracking.mode=of", "tracking.mode must be one of offline, online, off, got 'of'"),
+        ("evaluation.episodes=0", "evaluation.episodes must be at least 1, got 0"),
+        ("evaluation.world=X", "evaluation.world: world must be .*got 'X'"),
+        ("evaluation.world=rooms:7-9", "evaluation.world: world must be rooms:validation or .*7-9"),
+        ("curriculum.stages=[]", "curriculum.stages must name at least one world"),
+        ("curriculum.name=a/b", "curriculum.name must be letters"),
+        (
+            "curriculum.stages=[{world: A, episodes: -3}]",
+            r"curriculum.stages\[0\] must have episodes or actions, at least 1, got episodes=-3",
+        ),
+        (
+            "curriculum.stages=[{world: A, episodes: 2},{world: Q, episodes: 2}]",
+            r"curriculum.stages\[1\].world.*: world must be .*got 'Q'",
+        ),
+        (
+            "curriculum.stages=[{world: A, episodes: 2},{world: A, actions: 2}]",
+            r"curriculum.stages\[1\] must count what the others count, episodes or actions",
+        ),
+        ("curriculum.stages=[{world: bras, actions: 9}]", r"stages\[0\].world.*got 'bras'"),
+        ("robots=0", "robots must be from 1 to 4096, as a robot takes .* of memory, got 0"),
+        ("robots=3000000", "robots must be from 1 to 4096, .* got 3000000"),
+        (
+            "evaluation.choose=true evaluation.every=9 evaluation.world=mixed:test",
+            "evaluation.choose must be false with evaluation.world=mixed:test, .* nothing may be",
+        ),
+        ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
+        ("updates=0", "updates must be at least 1, got 0"),
+        ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
+        ("assessment.episodes=-1", "assessment.episodes must be at least 0, got -1"),
+        ("assessment.by=spl", "assessment.by must be one of outcome, return, got 'spl'"),
+        (
+            "assessment.episodes=20 method=rud",
+            "method.update_block must be 1 with assessment.episodes=20, got 1000: two rules",
+        ),
+        (
+            "assessment.episodes=20 evaluation.choose=true evaluation.every=9",
+            "evaluation.choose must be false with assessment.episodes=20, got True",
+        ),
+        ("environment.progress=none-at-all", "environment.progress must be one of straight_line"),
+        ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
+        ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
+        ("method.fusion=entropi", "method.fusion must be one of entropy"),
+        ("method.alpha=inf", "method.alpha must be finite and not negative, got inf"),
+        (
+            "method=ddpg method.reliability=0.2",
+            "method.reliability must be 0.0 with method.selection=uniform, .* got 0.2",
+        ),
+        (
+            "method=geometric method.combination=mixture",
+            "method.combination must be sum with method.selection=geometric, .* got mixture",
+        ),
+        ("method=uniform_halves method.floor_quantile=0.5", "floor_quantile .*=halves.* got 0.5"),
+        ("method=cer method.priority_floor=1", "priority_floor .*=newest, which cannot use it"),
+        ("method=ref_er method.replay_penalty=1", "replay_penalty must be 0.0 .* got 1.0"),
+        (
+            "method=per method.floor_quantile=0.5",
+            "method.floor_quantile must be 0.0 with method.priority_floor=0.0, .* got 0.5",
+        ),
+        ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
+        ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
+        ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
+        (
+            "curriculum=A environment.clearance=99",
+            r"stages\[0\].world, environment.clearance=99.0: world 'A' has no start",
+        ),
+        (
+            "curriculum=A environment.max_goal_distance=0.5",
+            r"stages\[0\].world, environment.max_goal_distance=0.5: max_goal_distance must be",
+        ),
+        ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
+        ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
+        ("seed=0,-1", "seed must be at least 0, got -1"),
+        ("learner.gamma=[", r"'learner.gamma=\[' is not NAME=VALUE"),
+        ("gamma", "'gamma' is not NAME=VALUE"),
+    ],
+)
+def test_a_value_that_cannot_be_is_one_sentence_with_its_name(arguments: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        list(composed(arguments.split(" ") if "{" not in arguments else [arguments]))
+    assert "\n" not in str(caught.value)
+
+
+def test_every_number_and_every_word_among_the_settings_has_a_rule() -> None:
+    looked_up = {"run_dir", "resume", "device", "regime", "environment.robot", "evaluation.world"}
+    free = {"tracking.project", "method.signals", "curriculum.stages"}
+    for name, value in settings_by_name(TrainSettings()):
+        if not isinstance(value, bool) and name not in looked_up | free:
+            assert name in RULES, name
+    names = {name for name, _ in settings_by_name(TrainSettings())}
+    assert set(RULES) <= names
