@@ -45,7 +45,6 @@ from mpfa_envs.render import tiled, write_animation
 from navigation import files
 from navigation.evaluating import Drivable, Drives, drive, film, summary_row
 from navigation.records import as_table, write_table
-from navigation.stopping import end_with_parent
 from navigation.worlds import parse_worlds, world_name, worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
@@ -259,7 +258,6 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     Returns:
         A row for each world, and the total.
     """
-    end_with_parent()
     options = parse(arguments)
     policy: Drivable = options.loaded
     folder = options.output or output_folder(options)

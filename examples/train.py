@@ -24,7 +24,6 @@ from omegaconf import DictConfig
 
 from navigation.settings.command_line import composed, parse_overrides
 from navigation.settings.train import as_settings, register
-from navigation.stopping import end_with_parent
 from navigation.training.running import Refused, resume, start
 
 REFUSED = 2
@@ -48,7 +47,6 @@ def refuse(error: Exception) -> None:
 
 def main() -> None:
     """Check the command line, then train."""
-    end_with_parent()
     register()
     arguments = sys.argv[1:]
     try:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
 from types import FrameType
 
 from tqdm import tqdm
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_LIFELINE = "NAVIGATION_LIFELINE"
 
 
 class Stop:
@@ -62,27 +62,13 @@ class Stop:
                 signal.signal(number, handler)
 
 
-def end_with_parent() -> None:
-    """End by SIGTERM when the process that gave :func:`lifeline` is gone, however it ended."""
-    number = os.environ.pop(_LIFELINE, None)
-    if number is None:
-        return
+def end_with(parent: Connection) -> None:
+    """End by SIGTERM when the process that holds the other end of a pipe is gone, however."""
 
-    def wait(descriptor: int = int(number)) -> None:
-        os.read(descriptor, 1)  # Nothing is ever written: it returns once the other end is closed.
+    def wait() -> None:
+        # Nothing is ever written: this returns once the other end is closed.
+        with suppress(OSError):
+            parent.poll(None)
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=wait, daemon=True, name="lifeline").start()
-
-
-def lifeline(descriptor: int) -> Mapping[str, str]:
-    """The environment of a child that calls :func:`end_with_parent`.
-
-    Args:
-        descriptor: The end of a pipe to read from, handed on to the child; this process keeps the
-            other one open.
-
-    Returns:
-        Environment variables.
-    """
-    return {**os.environ, _LIFELINE: str(descriptor)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -95,7 +94,7 @@ class Job:
 
     def trains(self, overrides: Sequence[str], *, anew: bool = False) -> list[str]:
         """The command that trains it, or goes on where a checkpoint lies."""
-        script = [sys.executable, str(SCRIPTS / "train.py")]
+        script = [str(SCRIPTS / "train.py")]
         if (self.path / files.CHECKPOINT).exists() and not anew:
             return [*script, f"resume={self.path}"]
         return [*script, *self.overrides(overrides), "overwrite=true"]
@@ -104,7 +103,7 @@ class Job:
         """The command that evaluates its policy."""
         physics = ["--physics", wanted.physics] if wanted.physics else []
         return [
-            *(sys.executable, str(SCRIPTS / "evaluate.py"), str(self.path)),
+            *(str(SCRIPTS / "evaluate.py"), str(self.path)),
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
             *(*physics, "--output", str(self.path / wanted.folder)),
         ]
