@@ -58,6 +58,30 @@ def test_a_robots_parameters_are_the_nodes_and_fit_the_shipped_policies(file: Pa
     Controller(pilot, stop_distance=values["stop_distance"])
 
 
+def test_parameters_are_addressed_to_the_node_by_its_name() -> None:
+    source = (FOLDER / "policy_node.py").read_text(encoding="utf-8")
+    (name,) = re.findall(r'super\(\).__init__\("(\w+)"\)', source)
+    for file in (FOLDER / "launch").glob("*.yaml"):
+        assert set(yaml.safe_load(file.read_text(encoding="utf-8"))) == {name}
+
+
+def test_commands_in_the_docs_name_files_arguments_and_parameters_that_exist() -> None:
+    root = ElementTree.parse(FOLDER / "launch" / "turtlebot.launch.xml").getroot()
+    declared = {each.get("name") for each in root.iter("arg")}
+    launches = re.findall(r"ros2 launch (\S+)((?: \w+:=\S+)+)", DOCS)
+    assert len(launches) >= 2
+    for file, words in launches:
+        assert (FOLDER / "launch" / file).exists()
+        assert set(re.findall(r"(\w+):=", words)) <= declared
+        for params in re.findall(r"params:=(\S+)", words):
+            assert (FOLDER / "launch" / params).exists()
+    runs = re.findall(r"-m mpfa_envs\.ros\.(\w+) --ros-args(.*)", DOCS)
+    assert len(runs) >= 3
+    for module, words in runs:
+        known = {*parameters(f"{module}.py"), "use_sim_time"}
+        assert set(re.findall(r"-p (\w+):=", words)) <= known
+
+
 @pytest.mark.parametrize("module", ["policy_node.py", "robot_node.py"])
 def test_every_parameter_is_in_the_docs(module: str) -> None:
     missing = [name for name in parameters(module) if f"`{name}`" not in DOCS]
