@@ -1,6 +1,7 @@
 """Train with Stable-Baselines3's SAC or TD3 on many robots at once.
 
     python examples/stable_baselines.py sac
+    python examples/stable_baselines.py sac --world rooms --actions 20000    two minutes
     python examples/stable_baselines.py td3 --world bars --robots 32 --actions 200000
 
 The policy goes to ``policy.npz`` in --output, runs/sb3-ALGORITHM by default, where
@@ -24,17 +25,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from torch import nn
 
-from mpfa_envs import Policy, VectorNavigationEnv, save_policy
+from mpfa_envs import ROOMS_TASK, Policy, VectorNavigationEnv, save_policy
 
-ENV_ARGUMENTS: dict[str, Any] = {
-    "robot": "turtlebot2",
-    "physics": "kinematic",
-    "action_repeat": 2,
-    "memory": "map",
-    "closeness_distance": 0.23,
-}
+SENSES = {name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")}
 """What a policy must find again wherever it drives."""
-REWARD: dict[str, Any] = {"collision_distance": 0.23, "progress": "shortest_path"}
 _NOISE = 0.2
 """Standard deviation of TD3's exploration."""
 
@@ -130,7 +124,7 @@ def policy_of(model: OffPolicyAlgorithm, *, card: dict[str, Any]) -> Policy:
     """The greedy policy of a model, which needs neither PyTorch nor Stable-Baselines3."""
     actor: Any = model.policy.actor
     layers = [*actor.latent_pi, actor.mu, nn.Tanh()] if isinstance(model, SAC) else [*actor.mu]
-    return Policy.from_layers(layers, card=card, env_arguments=ENV_ARGUMENTS)
+    return Policy.from_layers(layers, card=card, env_arguments=SENSES)
 
 
 def main(arguments: Sequence[str] | None = None) -> Path:
@@ -156,10 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     robots = VectorNavigationEnv(
         options.robots,
-        world=options.world,
         autoreset_mode=AutoresetMode.SAME_STEP,
-        **ENV_ARGUMENTS,
-        **REWARD,
+        **{**ROOMS_TASK, "world": options.world},
     )
     env = VecMonitor(Robots(robots))
     model = make_model(options.algorithm, env, seed=options.seed, verbose=1)
