@@ -72,7 +72,8 @@ def drive(
     arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
     if physics is not None:
         arguments["physics"] = physics
-    tasks = world_tasks(world, episodes=episodes, seed=seed, robot=arguments["robot"])
+    robot = arguments.get("robot", "turtlebot2")
+    tasks = world_tasks(world, episodes=episodes, seed=seed, robot=robot)
     trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
 
     def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
