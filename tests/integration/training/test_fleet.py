@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,9 @@ from navigation.settings.checks import check_settings
 from navigation.settings.train import RaySettings, Stage, TrainSettings
 from navigation.training.checkpoints import read_checkpoint
 from navigation.training.loop import TrainingRun
-from tests.integration.tiny_runs import tiny
+from tests.integration.tiny_runs import OVERRIDES, tiny
+
+TRAIN = Path(__file__).parents[3] / "examples" / "train.py"
 
 
 def on_ray(actions: int) -> TrainSettings:
@@ -111,3 +116,37 @@ def test_a_run_on_ray_loses_a_worker_keeps_its_files_and_goes_on_anywhere(tmp_pa
     finally:
         ray.shutdown()
         torch.set_flush_denormal(False)
+
+
+@pytest.mark.slow
+def test_a_run_on_ray_goes_on_at_its_last_checkpoint_after_its_learner_was_killed(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
+    folder = tmp_path / "run"
+    words = [
+        *OVERRIDES, "ray.workers=2", "ray.steps=8", "robots=8", "updates=2",
+        "checkpoint_every=500", "curriculum.stages=[{world: A, actions: 4000}]",
+        f"run_dir={folder}",
+    ]  # fmt: skip
+    learner = subprocess.Popen([sys.executable, TRAIN, *words])
+    while not (folder / files.CHECKPOINT).exists():
+        assert learner.poll() is None
+        time.sleep(0.01)
+    learner.kill()
+    assert learner.wait() == -9
+    state = read_checkpoint(folder)
+    # A report of a worker is 32 actions.
+    begun = state["schedule"]["actions"]
+    assert begun % 500 < 32 <= begun < 4000
+    assert state["updates"] == pytest.approx(begun / 4, abs=16)
+
+    subprocess.run([sys.executable, TRAIN, f"resume={folder}"], check=True)
+    after = read_checkpoint(folder)
+    assert 4000 <= after["schedule"]["actions"] < 4032
+    assert after["updates"] == pytest.approx(after["schedule"]["actions"] / 4, abs=16)
+    # Nothing that the checkpoint had was done again, or forgotten.
+    assert after["records"][: len(state["records"])] == state["records"]
+    assert len(after["records"]) > len(state["records"])
+    assert [record["episode"] for record in after["records"]] == list(range(len(after["records"])))
+    assert after["robots"]["given_up"] > state["robots"]["given_up"]
