@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks import method_steps, replay, run, timing, training, vector
+from benchmarks import method_steps, replay, run, scaling, timing, training, vector
 from benchmarks.timing import Entry, Timing, entry
+from navigation.settings.train import register
 from torchrl_mpfa.methods import METHODS
 
 
@@ -169,3 +170,12 @@ def test_robots_among_walkers_are_compared_with_robots_alone(
     assert found["vector_walkers"]["ratio"] == pytest.approx(1.5)
     assert found["vector_walkers"]["value"] == pytest.approx(vector.ROBOTS / 3.0)
     assert found["vector_kinematic"]["ratio"] is None
+
+
+def test_a_run_is_measured_once_it_updates() -> None:
+    register()
+    tiny = ["learner.width=8", "method.batch_size=32", "exploration.random_steps=16"]
+    actions, updates = scaling.measure(["robots=8", "updates=2", *tiny], seconds=0.2)
+    assert actions > 0
+    # Two updates for eight actions, whatever the time.
+    assert updates == pytest.approx(actions / 4)
