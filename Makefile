@@ -17,7 +17,7 @@
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo train paper test check lint types doctest format bench wheel-test clean
+.PHONY: help demo train paper test check lint types doctest format docs bench wheel-test clean
 
 PYTHON ?=
 TORCH_INSTALL_ARGS ?=
@@ -86,6 +86,10 @@ format: $(STAMP) ## Format the code and mend what ruff can mend
 	$(BIN)/python -m ruff format .
 	$(BIN)/python -m ruff check --fix .
 
+docs: $(STAMP) ## Build the documentation site; open site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+	@echo "written: site/index.html"
+
 bench: $(STAMP) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
 	$(BIN)/python -m benchmarks $(ARGS)
 
@@ -93,7 +97,7 @@ wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and u
 	$(BIN)/python .ci/wheel_test.py
 
 clean: ## Remove builds and caches; runs/ and .venv stay
-	rm -rf dist build .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/latest.json
+	rm -rf dist build site .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/latest.json
 	find . -name .venv -prune -o -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp is written last, so that an install which was interrupted is made again.

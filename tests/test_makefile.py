@@ -73,7 +73,8 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
     assert done.returncode == 0
     targets = [line.split()[0] for line in done.stdout.splitlines() if line.startswith("  ")]
     assert targets == [
-        "help", "demo", "train", "paper", "test", "check", "format", "bench", "wheel-test", "clean",
+        "help", "demo", "train", "paper", "test", "check", "format", "docs", "bench", "wheel-test",
+        "clean",
     ]  # fmt: skip
     assert not (copy / ".venv").exists()
 

@@ -1,0 +1,103 @@
+"""The documentation: its pages are found, its links lead somewhere, its code runs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import unicodedata
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+import mpfa_envs
+import torchrl_mpfa
+import torchrl_mpfa.methods
+from mpfa_envs import deploy, planners, render
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)(?:#([^)\s]+))?\)")
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"^(```+).*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def slugs(page: Path) -> set[str]:
+    """Anchors of a page that are the same in the repository and on the site."""
+    found = re.findall(r"^#+ (.+)$", without_code(page.read_text(encoding="utf-8")), re.MULTILINE)
+    shown = [re.sub(r"\[([^]]*)\]\([^)]*\)|[`*]", r"\1", title).lower() for title in found]
+    repository = {re.sub(r"\s", "-", re.sub(r"[^\w\s-]", "", title)) for title in shown}
+    plain = [unicodedata.normalize("NFKD", title).encode("ascii", "ignore") for title in shown]
+    words = [re.sub(r"[^\w\s-]", "", title.decode()).strip() for title in plain]
+    return repository & {re.sub(r"[-\s]+", "-", title) for title in words}
+
+
+def entries(nav: object) -> Iterator[str]:
+    """Pages of a part of the navigation."""
+    if isinstance(nav, str):
+        yield nav
+    elif isinstance(nav, dict):
+        for each in nav.values():
+            yield from entries(each)
+    else:
+        for each in nav:  # type: ignore[attr-defined]
+            yield from entries(each)
+
+
+def test_every_page_is_in_the_navigation_once() -> None:
+    nav = list(entries(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]))
+    # The first page is the README.
+    assert sorted(nav) == sorted([*PAGES, "index.md"])
+
+
+@pytest.mark.parametrize("page", ["../README.md", "../examples/policies/README.md", *PAGES])
+def test_every_link_of_a_page_leads_somewhere(page: str) -> None:
+    path = (DOCS / page).resolve()
+    for link, anchor in LINK.findall(without_code(path.read_text(encoding="utf-8"))):
+        target = (path.parent / link).resolve() if link else path
+        assert target.exists(), link
+        assert target.is_relative_to(ROOT), link
+        if anchor:
+            assert anchor in slugs(target), f"{link}#{anchor}"
+
+
+@pytest.mark.parametrize(
+    ("package", "names"),
+    [
+        ("torchrl_mpfa", torchrl_mpfa.__all__),
+        ("torchrl_mpfa.methods", torchrl_mpfa.methods.__all__),
+        ("mpfa_envs", mpfa_envs.__all__),
+        ("mpfa_envs.deploy", deploy.__all__),
+        ("mpfa_envs.planners", planners.__all__),
+    ],
+)
+def test_every_public_name_is_in_the_reference_once(package: str, names: list[str]) -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md"))
+    listed = re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE)
+    # What a package takes from one of its folders may be listed as that folder's.
+    counts = {
+        name: len([each for each in listed if re.search(rf"\.{name}$", each)]) for name in names
+    }
+    kit = set(render.__all__)
+    assert {name for name in names if counts[name] != 1 and name not in kit} == set()
+
+
+@pytest.mark.slow  # 40 s
+def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
+    tmp_path: Path,
+) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    loaded = re.compile(r'(?:src="|<link rel="stylesheet" href=")(https?://[^"]+)')
+    for page in tmp_path.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not loaded.findall(text), page
+        assert "arithmatex" not in text, page
+    for page in (tmp_path / "reference").glob("*.html"):
+        assert not re.search(r":(?:class|func|meth|attr|data):", page.read_text("utf-8")), page
