@@ -8,8 +8,9 @@
 
 Every run is one of ``compare.py``, by the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is under way, and the same command goes on. Tables A to
-F are in ``navigation/studies/protocol.py``, with a folder for each task in ``--folder``. The
-checkpoint of a run that is done is removed: thousands of them take tens of gigabytes.
+E are in ``navigation/studies/protocol.py``, with a folder for each task in ``--folder``; table F,
+off navigation, is made by ``gym_study.py``. The checkpoint of a run that is done is removed:
+thousands of them take tens of gigabytes.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from navigation.report.intervals import (
 )
 from navigation.report.study_rows import Rows, by_run, scores_of
 from navigation.report.study_tables import MEASURES
-from navigation.studies.protocol import OF_VOLUMES, VOLUMES, Table, short_names
+from navigation.studies.protocol import HEIGHT, OF_VOLUMES, VOLUMES, Table, short_names
 
 _LEVELS = np.linspace(0.0, 1.0, 201)
 _SIZE = (5.0, 3.6)
@@ -70,7 +70,7 @@ def mean_curve(curves: Sequence[pd.Series[Any]], rng: np.random.Generator) -> Ar
 
 
 def plot_curves(table: Table, rows: Rows, path: Path) -> None:
-    """Plot greedy success in validation over actions, the mean of the runs and its interval.
+    """Plot what a table has over actions, the mean of the runs and its interval.
 
     Args:
         table: Says which arms share a panel.
@@ -90,7 +90,7 @@ def plot_curves(table: Table, rows: Rows, path: Path) -> None:
             axis.plot(steps, mean, **style, label=f"{name} ({len(curves[label])})")
             if len(curves[label]) > 1:
                 axis.fill_between(steps, low, high, color=style["color"], alpha=0.15, lw=0)
-        axis.set(xlabel="actions", ylabel="greedy success, validation", ylim=(-0.02, 1.02))
+        axis.set(xlabel="actions", ylabel=table.height, ylim=(-0.02, 1.02))
         _legend(axis)
     finish(figure, axes, path)
 
@@ -178,7 +178,7 @@ def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
         axis.set(xlabel="replay volume", title=f"{reward} reward")
     axes[1].set_yticks([])
     figure.colorbar(image, ax=axes, label="area less that of uniform replay")
-    figure.suptitle(MEASURES["area"])
+    figure.suptitle(MEASURES["area"].format(height=HEIGHT))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
     pyplot().close(figure)

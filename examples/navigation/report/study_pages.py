@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from control import table as off_navigation
+from control.table import FOLDER, TABLE_F
 from navigation.report.study_figures import plot_study
-from navigation.report.study_rows import is_kept, missing, read_kept, read_runs
+from navigation.report.study_rows import Rows, is_kept, missing, read_kept, read_runs
 from navigation.report.study_tables import study_tables
-from navigation.studies.protocol import ROOT, tables
+from navigation.studies.protocol import ROOT, Table, tables
 from torchrl_mpfa.saving import write_text_atomically
 
 
@@ -27,10 +29,17 @@ def write_study(folder: Path, output: Path) -> list[Path]:
     made = []
     for name, table in tables(root).items():
         rows = read_kept(folder, name) if kept else read_runs(table, root)
-        if not len(rows.curves):
-            continue
-        output.mkdir(parents=True, exist_ok=True)
-        text = study_tables(table, rows, absent=missing(table, rows, root))
-        write_text_atomically(text + "\n", output / f"{name}.md")
-        made += [output / f"{name}.md", *plot_study(table, rows, output)]
+        if len(rows.curves):
+            made += _write(table, rows, output, absent=missing(table, rows, root))
+    rows = read_kept(folder, TABLE_F.name) if kept else off_navigation.read_runs(folder / FOLDER)
+    if len(rows.curves):
+        absent = off_navigation.missing(rows, root / FOLDER)
+        made += _write(TABLE_F, off_navigation.with_mean(rows), output, absent=absent)
     return made
+
+
+def _write(table: Table, rows: Rows, output: Path, *, absent: str) -> list[Path]:
+    output.mkdir(parents=True, exist_ok=True)
+    page = output / f"{table.name}.md"
+    write_text_atomically(study_tables(table, rows, absent=absent) + "\n", page)
+    return [page, *plot_study(table, rows, output)]

@@ -6,7 +6,7 @@ import gzip
 import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,9 @@ class Rows:
     """What the tables and figures of a table of the study are made of."""
 
     curves: pd.DataFrame
-    """A row for each evaluation during training: arm, seed, total_steps, success."""
-    tests: pd.DataFrame
+    """A row for each evaluation during training: arm, seed, total_steps, success; of table F
+    success is the score, and the return is beside it."""
+    tests: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=_TESTS))
     """A row for each episode of a last policy; what neither succeeded nor collided ran out of time.
     """
 

@@ -26,11 +26,10 @@ from navigation.report.tables import table as markdown
 from navigation.studies.protocol import Pair, Table, short_names
 from navigation.worlds import family
 
-NOTES = f"""\
-The unit is the run. Area: mean height of the curve of greedy success in validation, from zero on.
-Actions to {GOAL:.0%}: those until the first evaluation with so much, median of the runs. Success is
-that of the last policy, each kind of worlds counting the same. Differences are between runs of the
-same seeds, where both arms have the same ones.
+NOTES = """\
+The unit is the run. Area: mean height of the curve of {height}, from zero on.
+Actions to {goal}: those until the first evaluation with so much, median of the runs. {note}
+Differences are between runs of the same seeds, where both arms have the same ones.
 
 Intervals: bootstrap over seeds, or over seeds and worlds, of a single world its pairs of start and
 goal. *p*: of all ways to choose the signs of the differences, or without common seeds to deal the
@@ -39,10 +38,11 @@ having p = 1. *Found with 80 %*: the true difference that so many runs would hav
 of 0.05 over the number of comparisons. *Better run*: chance that a run of the first arm is better
 than one of the second."""
 MEASURES = {
-    "area": "area under the curve of greedy success in validation",
+    "area": "area under the curve of {height}",
     "success": "success of the last policy",
-    "actions": f"actions until {GOAL:.0%} of greedy success in validation",
+    "actions": "actions until {goal} of {height}",
 }
+"""What they are called, with what is over actions in a table, and how much of it is the goal."""
 Scores = Mapping[str, pd.DataFrame]
 
 
@@ -135,6 +135,7 @@ def arm_lines(
     lines = []
     short = short_names(labels)
     there = [label for label in labels if label in scores]
+    tested = any(scores[label]["success"].notna().any() for label in there)
     for label in sorted(there, key=lambda each: -_mean(scores[each][primary])):
         runs = scores[label]
         area, success = runs["area"].to_numpy(), runs["success"].dropna().to_numpy()
@@ -148,14 +149,18 @@ def arm_lines(
             rate = mean_interval(success, rng=rng)
             both = mean_over_worlds(*_matrix(worlds[label]), rng=rng)
             cells += [f"{rate.value:.1%} {_ends(rate, '.1%')}", _ends(both, ".1%")]
-        lines.append([*cells, *[""] * (8 - len(cells))])
+        lines.append([*cells, *[""] * (8 - len(cells))] if tested else cells)
     head = ["runs", "area, 95 % over runs", "its interquartile mean", f"actions to {GOAL:.0%}"]
-    head += ["never", "success of the last policy, 95 % over runs", "over runs and worlds"]
+    head += ["never"]
+    if tested:
+        head += ["success of the last policy, 95 % over runs", "over runs and worlds"]
     return markdown(["", *head], lines) if lines else ""
 
 
 def kind_lines(rows: Rows, labels: Sequence[str]) -> str:
     """A table of the success of last policies by kind of world, mean of the runs."""
+    if not len(rows.tests):
+        return ""
     kinds = rows.tests["world"].map(family).rename("kind")
     of_runs = rows.tests.groupby(["arm", kinds, "seed"], sort=False)["success"].mean()
     means = of_runs.groupby(level=[0, 1], sort=False).mean().unstack()
@@ -189,13 +194,16 @@ def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
     labels = list(dict.fromkeys([*(a for panel in table.panels.values() for a in panel), *scores]))
     order = sorted(MEASURES, key=lambda name: name != table.primary)
     arms = arm_lines(scores, labels, table.primary, worlds)
-    parts = [f"# {table.name}: {table.question}", NOTES, "## Arms", arms]
-    parts += ["## Success of the last policy by kind of world", kind_lines(rows, labels)]
+    words = {"height": table.height, "goal": f"{GOAL:.0%}", "note": table.note}
+    parts = [f"# {table.name}: {table.question}", NOTES.format(**words), "## Arms", arms]
+    if kinds := kind_lines(rows, labels):
+        parts += ["## Success of the last policy by kind of world", kinds]
     for which, pairs in (("Planned", table.planned), ("Other", table.explored)):
         for measure in order:
             lines = comparison_lines(scores, pairs, measure, worlds)
             title = "primary measure, " if measure == table.primary else ""
-            parts += [f"## {which} comparisons: {title}{MEASURES[measure]}", lines] * bool(lines)
+            title += MEASURES[measure].format(**words)
+            parts += [f"## {which} comparisons: {title}", lines] * bool(lines)
     if absent:
         parts += ["## Missing", absent]
     return "\n\n".join(part for part in parts if part)

@@ -1,4 +1,6 @@
-"""The study as data: tables A to F, each a question, its runs, and what is compared in it.
+"""The study as data: tables A to E, each a question, its runs, and what is compared in it.
+
+Table F, off navigation, is in ``control/table.py``.
 
 Arms that two tables have in common are trained once: runs with the same task and settings have one
 folder, whatever table asks for them. Settings were chosen with seeds from 1000 on and validation
@@ -29,7 +31,7 @@ COMMON = (
     "evaluation.every=2000",
     "evaluation.episodes=40",
 )
-"""Settings of all tables but A and F."""
+"""Settings of all tables but A."""
 SPARSE = (
     *COMMON,
     "curriculum.stages=[{world: mixed, actions: 24000}]",
@@ -100,6 +102,8 @@ PARTS = (
 )
 """MPFA-PER with one thing changed."""
 
+HEIGHT = "greedy success in validation"
+"""What is over actions in the curves of all tables but F."""
 Pair = tuple[str, str]
 """Labels of two arms: the first less the second."""
 
@@ -121,6 +125,10 @@ class Table:
     """The measure by which it is decided: ``area`` or ``success``."""
     kinds: tuple[str, ...] = TEST.words
     """Kinds of worlds in which the success of last policies counts, each of them the same."""
+    height: str = HEIGHT
+    """What is over actions in its curves, between 0 and 1."""
+    note: str = "Success is that of the last policy, each kind of worlds counting the same."
+    """What else its page says of the measures."""
 
 
 def label_of(job: Job, root: Path) -> str:
