@@ -113,5 +113,4 @@ def _run(command: list[str], log: str, parent: Connection) -> None:
         os.dup2(output, stream)
     os.close(output)
     sys.argv = command
-    sys.path.insert(0, str(Path(command[0]).resolve().parent))
     runpy.run_path(command[0], run_name="__main__")
