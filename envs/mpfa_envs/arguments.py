@@ -12,6 +12,7 @@ from gymnasium.spaces import Box as BoxSpace
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 from mpfa_envs.lidar import Lidar
+from mpfa_envs.live_view import LiveView, RenderMode
 from mpfa_envs.noise import NoisyMotion, RobotNoise, resolve_noise
 from mpfa_envs.observation import Memory, observation_bounds, observation_slices
 from mpfa_envs.reward import RewardFunction, navigation_reward
@@ -38,10 +39,8 @@ The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, 
 """
 
 
-class TaskArguments:
+class TaskArguments(LiveView):
     """Checks the arguments of :class:`~mpfa_envs.NavigationEnv` and keeps them as attributes."""
-
-    render_mode: str | None
 
     def _set_arguments(
         self,
@@ -63,14 +62,12 @@ class TaskArguments:
         closeness_distance: float | None,
         min_goal_distance: float,
         detour_chance: float,
-        render_mode: Literal["rgb_array"] | None,
+        render_mode: RenderMode | None,
     ) -> None:
         """Check them all; the first that is out of its range is named."""
         self.robot = resolve_robot(robot)
         if physics not in get_args(Physics):
             raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         if reward is not None and not callable(reward):
             raise ValueError(f"reward must be callable or None, got {reward!r}")
         if progress not in get_args(Progress):
@@ -85,10 +82,10 @@ class TaskArguments:
             raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")
         self.memory: Memory = memory
         self.history = check_count("history", history, least=0)
-        self.render_mode = render_mode
         self.max_steps = check_count("max_steps", max_steps)
         self.time_step = check_positive("time_step", time_step)
         self.action_repeat = check_count("action_repeat", action_repeat)
+        self._set_view(render_mode, self.time_step, self.action_repeat)
         self.goal_radius = check_positive("goal_radius", goal_radius)
         self.min_goal_distance = check_positive("min_goal_distance", min_goal_distance)
         if not self.min_goal_distance > self.goal_radius:

@@ -16,6 +16,7 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
 from mpfa_envs.episodes import distance_field
+from mpfa_envs.live_view import RenderMode
 from mpfa_envs.noise import RobotNoise
 from mpfa_envs.observation import INFO_TYPES, Memory
 from mpfa_envs.path import shortest_length
@@ -128,7 +129,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             collision_distance, whatever that is.
         min_goal_distance: Least distance between a sampled start and goal [m].
         detour_chance: Chance that a sampled task must have an obstacle in its way; 0: as it comes.
-        render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
+        render_mode: ``"rgb_array"`` to get pictures from :meth:`render`; ``"human"`` for a live
+            window in real time, which needs pygame.
 
     The defaults are the task that the study trains on. :data:`PAPER_TASK` holds what the paper says
     or suggests where that differs: ``NavigationEnv(world="D", **PAPER_TASK)``.
@@ -149,7 +151,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
 
     # Gymnasium declares it as an instance variable.
     metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": ["rgb_array"],
+        "render_modes": ["human", "rgb_array"],
         "render_fps": 10,
     }
 
@@ -174,7 +176,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         closeness_distance: float | None = None,
         min_goal_distance: float = 2.0,
         detour_chance: float = 0.8,
-        render_mode: Literal["rgb_array"] | None = None,
+        render_mode: RenderMode | None = None,
     ) -> None:
         self.world = resolve_world(world)
         self._set_arguments(
@@ -278,7 +280,10 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         if self._noise is not None:
             self._noise.begin(0, self._motion[:3], self.np_random)
         self._senses.begin(self.world)
-        return self._observe(), self._info(False, False, False, RewardTerms())
+        observation = self._observe()
+        if self.render_mode == "human":
+            self.render()
+        return observation, self._info(False, False, False, RewardTerms())
 
     def step(
         self, action: NDArray[np.float32]
@@ -340,6 +345,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         terms = self.reward(outcome)
         truncated = not (success or collision) and self._steps >= self.max_steps
         self._running = not (success or collision or truncated)
+        if self.render_mode == "human":
+            self.render()
         return success, collision, truncated, terms
 
     def _to_obstacle(self, x: float, y: float) -> float:
@@ -355,7 +362,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         """Render the room from above.
 
         Returns:
-            Picture of shape ``[480, 480, 3]``, or None without a render mode.
+            Picture of shape ``[480, 480, 3]``, or None without a render mode or in a window.
 
         Raises:
             ResetNeeded: If no episode has started.
@@ -369,7 +376,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
 
         motion, walkers = self._motion, self.walkers
         ranges = self.lidar.cast(*motion[:3], moving=walkers[:, [0, 1, 4]])
-        return render_scene(
+        picture = render_scene(
             self.world,
             robot=self.robot,
             pose=motion[:3],
@@ -380,10 +387,12 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             sketch=self._senses.sketch(motion.x, motion.y),
             walkers=walkers,
         )
+        return self._show(picture)
 
     def close(self) -> None:
-        """Release the physics server; a second call does nothing."""
+        """Release the physics server and the window; a second call does nothing."""
         self._running = False
+        self._close_window()
         self._drive.close()
 
     def _make_walkers(self) -> WalkerBatch:

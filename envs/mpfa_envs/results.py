@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -50,6 +50,13 @@ class EpisodeResult:
     time_to_collision: float | None = None
     """Least time after which robot and walker would have touched had both gone on as they went, at
     most 10 s [s]."""
+
+    @property
+    def outcome(self) -> Literal["success", "collision", "timeout"]:
+        """How it ended, in a word."""
+        if self.success:
+            return "success"
+        return "collision" if self.collision else "timeout"
 
 
 def spl(success: bool, *, path_length: float, shortest_path: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -10,6 +10,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.live_view import LiveView, RenderMode
 from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.vector import VectorNavigationEnv
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds import World
 
 
-class RoomsEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
+class RoomsEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
     """One robot drives to goals by lidar, each in a world that it has never seen.
 
     It is a :class:`~mpfa_envs.VectorNavigationEnv` of one robot behind the interface of
@@ -31,7 +32,8 @@ class RoomsEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
     Args:
         world: The name of a generator; or a world, or several, as in
             :class:`~mpfa_envs.VectorNavigationEnv`.
-        render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
+        render_mode: ``"rgb_array"`` to get pictures from :meth:`render`; ``"human"`` for a live
+            window in real time, which needs pygame.
         **kwargs: Further arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Raises:
@@ -51,7 +53,7 @@ class RoomsEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
 
     # Gymnasium declares it as an instance variable.
     metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": ["rgb_array"],
+        "render_modes": ["human", "rgb_array"],
         "render_fps": 10,
     }
 
@@ -59,14 +61,19 @@ class RoomsEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
         self,
         *,
         world: WorldChoice = "mixed",
-        render_mode: Literal["rgb_array"] | None = None,
+        render_mode: RenderMode | None = None,
         **kwargs: Any,
     ) -> None:
         self.robots = VectorNavigationEnv(
-            1, world=world, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED, **kwargs
+            1,
+            world=world,
+            render_mode="rgb_array" if render_mode == "human" else render_mode,
+            autoreset_mode=AutoresetMode.DISABLED,
+            **kwargs,
         )
         """The robot."""
-        self.render_mode = render_mode
+        # The robots show themselves once for each action.
+        self._set_view(render_mode, self.robots.time_step * self.robots.action_repeat, 1)
         self.observation_space = self.robots.single_observation_space
         self.action_space = self.robots.single_action_space
         self._running = False
@@ -106,6 +113,8 @@ class RoomsEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
             seed=None if seed is None else [seed], options=given
         )
         self._running = True
+        if self.render_mode == "human":
+            self.render()
         return observations[0], _first(infos)
 
     def _read(self, options: dict[str, Any]) -> dict[str, Any]:
@@ -143,23 +152,27 @@ class RoomsEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
         observations, rewards, *ends, infos = self.robots.step(np.asarray(action)[None])
         terminated, truncated = (bool(ended[0]) for ended in ends)
         self._running = not (terminated or truncated)
+        if self.render_mode == "human":
+            self.render()
         return observations[0], float(rewards[0]), terminated, truncated, _first(infos)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Render the room from above.
 
         Returns:
-            Picture of shape ``[H, W, 3]``, the longer side 480, or None without a render mode.
+            Picture of shape ``[H, W, 3]``, the longer side 480, or None without a render
+            mode or in a window.
 
         Raises:
             ResetNeeded: If no episode has started.
         """
         pictures = self.robots.render()
-        return None if pictures is None else pictures[0]
+        return None if pictures is None else self._show(pictures[0])
 
     def close(self) -> None:
-        """Release the physics server; a second call does nothing."""
+        """Release the physics server and the window; a second call does nothing."""
         self._running = False
+        self._close_window()
         self.robots.close()
 
 

@@ -108,6 +108,8 @@ class VectorNavigationEnv(
         >>> env.close()
     """
 
+    # Gymnasium declares it as an instance variable.
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
     single_observation_space: BoxSpace[np.float32]
 
     def __init__(
@@ -175,7 +177,6 @@ class VectorNavigationEnv(
             episodes_per_world=episodes_per_world,
             max_goal_distance=max_goal_distance,
         )
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
         self.metadata["autoreset_mode"] = self.autoreset_mode
         self.single_observation_space, self.single_action_space = self._make_spaces(
             self.lidar.sectors, self._source.diagonal

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
-from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
 from mpfa_envs import (
     DynamicWindow,
@@ -23,7 +18,6 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
-from mpfa_envs.evaluation import as_driver
 
 Drivable = Policy | MapPlanner | DynamicWindow
 """What drives, and knows by ``env_arguments`` what it must sense."""
@@ -81,37 +75,6 @@ def drive(
 
     results = run_tasks(policy, tasks, progress=progress, on_end=keep, **arguments)
     return Drives(tasks, results, trails)
-
-
-def film(
-    policy: Drivable,
-    episode: WorldTask,
-    *,
-    physics: str | None,
-    noise: RobotNoise | None = None,
-    seed: int = 0,
-) -> list[NDArray[np.uint8]]:
-    """Pictures of an episode, each of shape ``[height, width, 3]``."""
-    arguments = {**policy.env_arguments, "collision_distance": "contact", "world": episode.world}
-    arguments["noise"] = noise
-    if physics is not None:
-        arguments["physics"] = physics
-    if episode.max_steps is not None:
-        arguments["max_steps"] = episode.max_steps
-    frames: list[Any] = []
-    driver = as_driver(policy)
-    arguments |= {"render_mode": "rgb_array", "autoreset_mode": AutoresetMode.DISABLED}
-    with closing(VectorNavigationEnv(1, **arguments)) as env:
-        observations, _ = env.reset(seed=[seed], options={"tasks": [episode.task]})
-        driver.begin(env, 0)
-        ended = False
-        while not ended:
-            frames += env.render() or ()
-            actions = driver.drive(env, np.arange(1), observations)
-            observations, _, terminated, truncated, _ = env.step(actions)
-            ended = bool(terminated[0] or truncated[0])
-        frames += env.render() or ()
-    return frames
 
 
 def summary_row(results: Sequence[EpisodeResult]) -> dict[str, float]:

@@ -324,7 +324,7 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
         ("collision_distance", 0.1, "collision_distance must be .*0.18, got 0.1"),
         ("collision_distance", "touch", "collision_distance must be .*got 'touch'"),
         ("reward", 3, "reward must be callable or None, got 3"),
-        ("render_mode", "human", "render_mode must be None or 'rgb_array', got 'human'"),
+        ("render_mode", "ansi", "render_mode must be None or 'human' or 'rgb_array', got 'ansi'"),
         ("lidar", {"sectors": 0}, "sectors must be a positive integer, got 0"),
         ("lidar", {"reduction": "mean"}, "reduction must be one of .*got 'mean'"),
         ("lidar", {"max_range": -1.0}, r"max_range must be positive, got -1\.0"),

@@ -152,6 +152,10 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             for network in self._held_critics(""):
                 self.past_critics.append(PastCritics(network.module, target_average - 1))
 
+    def current_critics(self) -> list[TensorDictModule]:
+        """The critics as modules of their own, for looking at Q: they get no gradient."""
+        return self._held_critics("")
+
     # What each loss has of its own.
 
     def _held_critics(self, prefix: str) -> list[TensorDictModule]:

@@ -17,14 +17,19 @@ from mpfa_envs.render.colors import (
     WALL,
     viridis,
 )
+from mpfa_envs.render.film import Film, film_episode
+from mpfa_envs.render.grids import observe_room
+from mpfa_envs.render.samples import render_samples
 from mpfa_envs.render.scene import render_scene
 from mpfa_envs.render.tiles import tiled
+from mpfa_envs.render.traces import Panel, render_traces
 from mpfa_envs.render.trajectories import (
     Outcome,
     render_methods,
     render_trajectories,
     shown_episodes,
 )
+from mpfa_envs.render.values import render_values
 
 __all__ = [
     "FLOOR",
@@ -35,10 +40,17 @@ __all__ = [
     "RIVAL",
     "TRAIL",
     "WALL",
+    "Film",
     "Outcome",
+    "Panel",
+    "film_episode",
+    "observe_room",
     "render_methods",
+    "render_samples",
     "render_scene",
+    "render_traces",
     "render_trajectories",
+    "render_values",
     "shown_episodes",
     "tiled",
     "viridis",

@@ -83,6 +83,13 @@ class Canvas:
             self.line([(x, room.y_min), (x, room.y_max)], GRID, 1.0)
         for y in range(math.ceil(room.y_min), math.floor(room.y_max) + 1):
             self.line([(room.x_min, y), (room.x_max, y)], GRID, 1.0)
+        self.obstacles(world)
+        for walker in world.walkers:
+            for leg in walker.legs:
+                self.line(leg, ROUND, 1.2)
+
+    def obstacles(self, world: World) -> None:
+        """Draw what stands in a room, above what was drawn before."""
         for box in world.boxes:
             self.rectangle(
                 box.x_min, box.y_min, box.x_max, box.y_max, fill=OBSTACLE, outline=OBSTACLE_EDGE
@@ -93,9 +100,6 @@ class Canvas:
             self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
         if world.occupancy is not None:
             self._draw_cells(world.occupancy)
-        for walker in world.walkers:
-            for leg in walker.legs:
-                self.line(leg, ROUND, 1.2)
 
     def _draw_cells(self, grid: OccupancyGrid) -> None:
         """Fill the occupied cells; a pixel with any is an obstacle."""

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from mpfa_envs.render.canvas import FINE, Canvas, font
-from mpfa_envs.render.colors import ROBOT_FRONT, TEXT, Color, viridis
+from mpfa_envs.render.colors import ROBOT, ROBOT_FRONT, TEXT, Color, viridis
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -98,7 +98,33 @@ class Title(NamedTuple):
         _write(canvas, x, middle, self.text)
 
 
-Entry = Key | Scale | Title
+class Facing(NamedTuple):
+    """Where all robots of a picture face."""
+
+    heading: float
+
+    @property
+    def width(self) -> float:
+        """In fine pixels."""
+        return _BEFORE_LABEL + 6 * FINE + font().getlength("all face this way") + _AFTER_LABEL
+
+    def write(self, canvas: Canvas, x: float, middle: float) -> None:
+        """Write it where it begins."""
+        r = 8 * FINE
+        canvas.draw.ellipse([(x, middle - r), (x + 2 * r, middle + r)], fill=ROBOT)
+        arrow = [
+            (x + r + reach * r * math.cos(angle), middle - reach * r * math.sin(angle))
+            for reach, angle in (
+                (0.8, self.heading),
+                (0.6, self.heading + 2.5),
+                (0.6, self.heading - 2.5),
+            )
+        ]
+        canvas.draw.polygon(arrow, fill=ROBOT_FRONT)
+        _write(canvas, x + _BEFORE_LABEL + 6 * FINE, middle, "all face this way")
+
+
+Entry = Facing | Key | Scale | Title
 
 
 def strip_width(entries: Sequence[Entry]) -> int:

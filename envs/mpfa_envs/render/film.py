@@ -1,0 +1,137 @@
+"""An episode as pictures, with what the robot sees, thinks and does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.checks import check_count
+from mpfa_envs.render.traces import Panel, render_traces
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.evaluation import Action, Driver
+    from mpfa_envs.task_sets import WorldTask
+
+_RECENT = 10.0
+"""Time for which speeds are seen [s]."""
+
+
+class Film(NamedTuple):
+    """Pictures of an episode."""
+
+    frames: list[NDArray[np.uint8]]
+    """Each of shape ``[height, width, 3]``."""
+    frame_time: float
+    """Time between two of them [s]."""
+
+
+def film_episode(
+    policy: Action | Driver,
+    episode: WorldTask,
+    *,
+    values: Callable[[NDArray[np.float32]], Any] | None = None,
+    traces: bool = True,
+    most: int = 120,
+    seed: int = 0,
+    **env_arguments: Any,
+) -> Film:
+    """Drive one episode and picture it.
+
+    The robot, its lidar and its trail are seen from above, as
+    :meth:`~mpfa_envs.NavigationEnv.render` gives them. Beside them are the speeds of its wheels in
+    the last ten seconds and, if it is known, the value of what the robot sensed so far.
+
+    Args:
+        policy: What :func:`~mpfa_envs.run_tasks` takes; with ``env_arguments`` of its own, these
+            hold where none are given here.
+        episode: The task and its world.
+        values: From observations, ``[1, O]``, to their value, ``[1]``, such as Q.
+        traces: Whether speeds and values are beside the picture.
+        most: How many pictures to take at most, and a last one: of a long episode every second
+            step, every fourth, and so on.
+        seed: Of the lidar's noise and the walkers.
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
+
+    Returns:
+        Pictures, which :func:`write_animation` takes, and the time between two of them.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import world_tasks
+        >>> from mpfa_envs.render import film_episode
+        >>> ahead = lambda observations: np.ones((len(observations), 2), np.float32)
+        >>> task = world_tasks("A", episodes=1)[0]
+        >>> film = film_episode(ahead, task, physics="kinematic", max_steps=4)
+        >>> len(film.frames), film.frames[0].shape, film.frame_time
+        (3, (480, 720, 3), 0.2)
+    """
+    # Imported here because gymnasium takes a moment, and other pictures do without it.
+    from gymnasium.vector import AutoresetMode
+
+    from mpfa_envs.evaluation import as_driver
+    from mpfa_envs.vector import VectorNavigationEnv
+
+    check_count("most", most, least=2)
+    arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
+    if episode.max_steps is not None:
+        arguments["max_steps"] = episode.max_steps
+    arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}
+    arguments["autoreset_mode"] = AutoresetMode.DISABLED
+    driver = as_driver(policy)
+    pictures: dict[int, NDArray[np.uint8]] = {}
+    stride = 1
+    wheels: list[tuple[float, float]] = []
+    worth: list[float] = []
+    with closing(VectorNavigationEnv(1, **arguments)) as env:
+        observations, _ = env.reset(seed=[seed], options={"tasks": [episode.task]})
+        driver.begin(env, 0)
+        step_time = env.time_step * env.action_repeat
+        step, ended = 0, False
+        while True:
+            if step % stride == 0 or ended:
+                (pictures[step],) = env.render() or ()
+            if len(pictures) > most and not ended:
+                stride *= 2
+                pictures = {at: each for at, each in pictures.items() if at % stride == 0}
+            if values is not None:
+                worth.append(float(np.asarray(values(observations)).reshape(-1)[0]))
+            if ended:
+                break
+            actions = driver.drive(env, np.arange(1), observations)
+            wheels.append(env.robot.wheel_speeds(actions[0]))
+            observations, _, terminated, truncated, _ = env.step(actions)
+            step, ended = step + 1, bool(terminated[0] or truncated[0])
+    frames = list(pictures.values())
+    if traces:
+        panels = panels_of(wheels, worth, step_time=step_time)
+        frames = [
+            np.concatenate(
+                (each, render_traces(panels, at, step_time=step_time, height=len(each))), 1
+            )
+            for at, each in pictures.items()
+        ]
+    return Film(frames, step_time * stride)
+
+
+def panels_of(
+    wheels: Sequence[tuple[float, float]], worth: Sequence[float], *, step_time: float
+) -> list[Panel]:
+    """The panels of an episode: the value, if it is known, and the speeds of the wheels.
+
+    Args:
+        wheels: Speeds of the left and the right wheel at each step [m/s].
+        worth: Values at each step and at the end; empty: not known.
+        step_time: Time of a step [s].
+
+    Returns:
+        The panels, the last speeds twice: the last picture shows where they led.
+    """
+    left, right = zip(*[*wheels, wheels[-1]], strict=True)
+    last = max(round(_RECENT / step_time), 2)
+    speeds = Panel("wheels [m/s]", {"left": left, "right": right}, last)
+    return [Panel("Q", {"": worth}), speeds] if worth else [speeds]

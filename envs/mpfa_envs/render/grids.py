@@ -1,0 +1,120 @@
+"""Cells of a room: where they are, what a robot senses in them, and how they are colored."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.checks import check_number, check_positive
+from mpfa_envs.drives import Motion
+from mpfa_envs.render.canvas import Canvas
+from mpfa_envs.render.colors import viridis
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import World
+
+    Array = NDArray[np.float64]
+
+Heading = float | Literal["goal"]
+"""Where robots face [rad], or that each of them faces the goal."""
+
+
+def cell_centers(world: World, spacing: float) -> Array:
+    """Centers of the square cells that fill a room.
+
+    Args:
+        world: The room.
+        spacing: Side of a cell [m].
+
+    Returns:
+        Positions (x, y) [m], row by row from below, ``[N, 2]``.
+
+    Raises:
+        ValueError: If the spacing is not positive.
+    """
+    check_positive("spacing", spacing)
+    room = world.room
+    sides = []
+    for low, high in ((room.x_min, room.x_max), (room.y_min, room.y_max)):
+        count = max(math.floor((high - low) / spacing + 1e-9), 1)
+        sides.append((low + high - (count - 1) * spacing) / 2 + spacing * np.arange(count))
+    x, y = np.meshgrid(*sides)
+    return np.stack((x.reshape(-1), y.reshape(-1)), axis=1)
+
+
+def observe_room(
+    world: str | os.PathLike[str] | World,
+    *,
+    goal: tuple[float, float],
+    heading: Heading = 0.0,
+    spacing: float = 0.2,
+    **env_arguments: Any,
+) -> tuple[Array, NDArray[np.float32]]:
+    """What a robot senses that stands here and there in a room.
+
+    Args:
+        world: A name, the path of a YAML file or a world.
+        goal: Where it should go (x, y) [m].
+        heading: Where it faces [rad]; ``"goal"``: the goal, from everywhere.
+        spacing: Distance between two places [m].
+        **env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv`, those that the policy was
+            trained with: ``policy.env_arguments``.
+
+    Returns:
+        Poses (x, y, heading), ``[N, 3]``, where the robot fits and has not reached the goal, and
+        observations, ``[N, O]``. It has seen nothing before and nobody walks.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from mpfa_envs.render import observe_room
+        >>> poses, observations = observe_room("A", goal=(3.0, 3.0), spacing=1.0)
+        >>> poses.shape, observations.shape
+        ((97, 3), (97, 24))
+    """
+    # Imported here because gymnasium takes a moment, and other pictures do without it.
+    from mpfa_envs.navigation import NavigationEnv
+    from mpfa_envs.senses import Senses
+
+    if heading != "goal":
+        check_number("heading", heading)
+    world = resolve_world(world)
+    env = NavigationEnv(**{**env_arguments, "world": world, "physics": "kinematic"})
+    senses = Senses(env, env.lidar)
+    places = cell_centers(world, spacing)
+    offset = np.asarray(goal, dtype=np.float64) - places
+    chosen = (world.clearances(places) > env.robot.radius) & (np.hypot(*offset.T) > env.goal_radius)
+    places, offset = places[chosen], offset[chosen]
+    facing = np.arctan2(offset[:, 1], offset[:, 0])
+    if heading != "goal":
+        facing = np.full(len(places), float(heading))
+    poses = np.column_stack((places, facing))
+    found = np.zeros((len(poses), *(env.observation_space.shape or ())), dtype=np.float32)
+    for row, pose in zip(found, poses.tolist(), strict=True):
+        senses.begin(world)
+        motion = Motion(pose[0], pose[1], pose[2], 0.0, 0.0)
+        row[:] = senses.observe(motion, motion, goal, walkers=None, rng=env.np_random)
+    env.close()
+    return poses, found
+
+
+def fill_cells(canvas: Canvas, centers: Array, spacing: float, shares: Array) -> None:
+    """Color cells by values from 0 to 1.
+
+    Args:
+        canvas: The picture of the room.
+        centers: Of the cells (x, y) [m], ``[N, 2]``.
+        spacing: Side of a cell [m].
+        shares: Their values, ``[N]``.
+    """
+    half = spacing / 2
+    for (x, y), color in zip(centers.tolist(), viridis(shares).tolist(), strict=True):
+        canvas.rectangle(x - half, y - half, x + half, y + half, fill=(*color, 255))

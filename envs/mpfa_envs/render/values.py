@@ -1,0 +1,161 @@
+"""What a critic thinks a room is worth, and what an actor does there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.checks import check_positive
+from mpfa_envs.render.canvas import FINE, Canvas, Point
+from mpfa_envs.render.colors import ROBOT_FRONT, TEXT, shares_of
+from mpfa_envs.render.grids import Heading, fill_cells, observe_room
+from mpfa_envs.render.strip import HEIGHT, Entry, Facing, Scale, strip_width, titled, write_strip
+from mpfa_envs.robot import RobotModel, resolve_robot
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import World
+
+    Observations = NDArray[np.float32]
+
+_ARROW_TIME = 1.0
+"""An arrow is as long as the way of so much time [s]."""
+
+
+def render_values(
+    world: str | os.PathLike[str] | World,
+    *,
+    goal: Point,
+    heading: Heading = 0.0,
+    values: Callable[[Observations], Any] | None = None,
+    actions: Callable[[Observations], Any] | None = None,
+    spacing: float = 0.2,
+    arrow_spacing: float = 0.6,
+    name: str = "Q",
+    title: str = "",
+    size: int = 480,
+    **env_arguments: Any,
+) -> NDArray[np.uint8]:
+    """Render a value and the actions of a policy all over a room, for one goal.
+
+    In every cell stands a robot that faces the same way and has not moved. The cell has the color
+    of its value, the scale leaves out the highest and lowest two per cent; an arrow is the way that
+    the robot would go in the next second.
+
+    Args:
+        world: A name, the path of a YAML file or a world.
+        goal: Where robots should go (x, y) [m].
+        heading: Where they face [rad]; ``"goal"``: the goal, each from its place.
+        values: From observations, ``[N, O]``, to numbers, ``[N]``, such as Q of the policy's own
+            actions; None: no colors.
+        actions: From observations to actions, ``[N, 2]``, as a :class:`~mpfa_envs.Policy`; None: no
+            arrows.
+        spacing: Side of a cell [m].
+        arrow_spacing: Distance between two arrows [m].
+        name: Of the value.
+        title: What to write in the strip.
+        size: Longer side of the picture without the strip [px].
+        **env_arguments: As in :func:`observe_room`.
+
+    Returns:
+        Picture of shape ``[height, width, 3]``.
+
+    Raises:
+        ValueError: If an argument is out of its range, or a function gives no number or action for
+            each observation.
+
+    Examples:
+        >>> from mpfa_envs.render import render_values
+        >>> nearness = lambda observations: 1.0 - observations[:, 21]
+        >>> render_values("A", goal=(3.0, 3.0), values=nearness, spacing=1.0).shape
+        (508, 480, 3)
+    """
+    world = resolve_world(world)
+    check_positive("arrow_spacing", arrow_spacing)
+    where: dict[str, Any] = {"goal": goal, "heading": heading, **env_arguments}
+    entries: list[Entry] = titled(title)
+    cells: NDArray[np.float64] | None = None
+    low = high = 0.0
+    numbers = np.zeros(0)
+    if values is not None:
+        poses, observations = observe_room(world, spacing=spacing, **where)
+        cells = poses[:, :2]
+        numbers = np.asarray(values(observations), dtype=np.float64).reshape(-1)
+        if numbers.shape != (len(cells),) or not np.isfinite(numbers).all():
+            raise ValueError(
+                f"values must give a finite number for each of {len(cells)} observations, got "
+                f"shape {numbers.shape}"
+            )
+        low, high = np.quantile(numbers, (0.02, 0.98)).tolist()
+        entries.append(Scale(name, low, high))
+    if heading != "goal":
+        entries.append(Facing(float(heading)))
+    canvas = Canvas(world, size=size, footer=HEIGHT, least_width=strip_width(entries))
+    if cells is not None:
+        fill_cells(canvas, cells, spacing, shares_of(numbers, low, high))
+    canvas.goal(*goal, env_arguments.get("goal_radius", 0.5))
+    if actions is not None:
+        poses, observations = observe_room(world, spacing=arrow_spacing, **where)
+        chosen = np.asarray(actions(observations), dtype=np.float64)
+        if chosen.shape != (len(poses), 2):
+            raise ValueError(f"actions must have shape {(len(poses), 2)}, got {chosen.shape}")
+        robot = resolve_robot(env_arguments.get("robot", "turtlebot2"))
+        for pose, action in zip(poses.tolist(), chosen, strict=True):
+            draw_arrow(canvas, way_of(robot, pose, action, seconds=_ARROW_TIME))
+    write_strip(canvas, entries)
+    return canvas.pixels()
+
+
+def way_of(
+    robot: RobotModel,
+    pose: tuple[float, float, float],
+    action: NDArray[np.float64],
+    *,
+    seconds: float,
+    points: int = 9,
+) -> list[Point]:
+    """The arc that a robot drives while it holds an action.
+
+    Args:
+        robot: The robot.
+        pose: Where it begins (x, y, heading) [m, m, rad].
+        action: Speeds of its wheels, ``[2]``, in [-1, 1].
+        seconds: For how long [s].
+        points: Positions on the arc.
+
+    Returns:
+        Positions (x, y) [m], the first one that of the pose.
+    """
+    left, right = robot.wheel_speeds(action.astype(np.float32))
+    speed, turn = (left + right) / 2, (right - left) / robot.wheel_base
+    x, y, heading = pose
+    way = []
+    for time in np.linspace(0.0, seconds, points).tolist():
+        half = turn * time / 2
+        chord = speed * time * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+        way.append((x + chord * math.cos(heading + half), y + chord * math.sin(heading + half)))
+    return way
+
+
+def draw_arrow(canvas: Canvas, way: list[Point]) -> None:
+    """Draw a way with a head at its end, white with a dark edge: it is seen on every color."""
+    (x, y), (before_x, before_y) = way[-1], way[-2]
+    angle = math.atan2(y - before_y, x - before_x)
+    tip, wings = canvas.at(x, y), []
+    for side in (2.6, -2.6):
+        reach = 6.5 * FINE
+        # Pixels count from above.
+        wings.append(
+            (tip[0] + reach * math.cos(angle + side), tip[1] - reach * math.sin(angle + side))
+        )
+    for color, width in ((TEXT, 4.0), (ROBOT_FRONT, 1.6)):
+        canvas.line(way, color, width)
+        edge = round(2 * FINE) if color is TEXT else 0
+        canvas.draw.polygon([tip, *wings], fill=color, outline=color, width=edge)
