@@ -23,6 +23,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from mpfa_envs.render.charts import finish, new_figure
 from torchrl_mpfa.cliffwalk import (
     Cliffwalk,
     Features,
@@ -41,7 +42,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "MPFA-PER": {"method": "mpfa_per", "signals": ["reward", "td_error"]},
     ORACLE: {},
 }
-COLORS = ("0.45", "tab:blue", "tab:cyan", "tab:red", "black")
+COLORS = ("0.45", "#0072b2", "#56b4e9", "#d55e00", "black")
 EPS = 1e-4
 """Of all methods. Rewards are one at most here, and most TD errors a tenth of that."""
 _UNIFORM_BATCH = 256
@@ -130,12 +131,7 @@ def write_rows(rows: Sequence[Row], path: Path) -> None:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """Plot the medians over the length of the cliff, and the least and most of the seeds."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(6.4, 4.2), layout="constrained")
+    figure, (axes,) = new_figure(panel=(6.4, 4.2))
     for (arm, by_length), color in zip(medians(rows).items(), COLORS, strict=True):
         lengths = list(by_length)
         spread = [
@@ -153,10 +149,8 @@ def plot(rows: Sequence[Row], path: Path) -> None:
         xticks=list(sizes),
         title=f"Blind cliffwalk, {rows[0].features} Q",
     )
-    axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    finish(figure, [axes], path, dpi=110)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -27,6 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
+from mpfa_envs.render.charts import finish, look, new_figure
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 from torchrl_mpfa.spelling import unknown
@@ -43,7 +44,8 @@ EPISODE_LENGTH = 50
 SIGMA = 0.2
 OBSERVATION_SIZE, ACTION_SIZE = 8, 2
 KINDS = ("approaching", "moving away", "goal", "collision")
-COLORS = ("tab:blue", "0.6", "tab:green", "tab:red")
+COLORS = ("#0072b2", "0.6", "#009e73", "#d55e00")
+"""Of the kinds: those of :mod:`mpfa_envs.render`, and gray."""
 Array = NDArray[np.float64]
 
 
@@ -162,13 +164,8 @@ def plot(name: str, path: Path) -> None:
         name: The method.
         path: The PNG file.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     transitions, found = count_samples(METHODS[name])
-    figure, axes = pyplot.subplots(1, 3, figsize=(10, 2.8), layout="constrained")
+    figure, axes = new_figure(1, 3, panel=(10 / 3, 2.8))
     error = transitions.signals["td_error"].numpy()
     for number, (kind, color) in enumerate(zip(KINDS, COLORS, strict=True)):
         chosen = transitions.kind == number
@@ -185,21 +182,17 @@ def plot(name: str, path: Path) -> None:
         shade = 1.0 if place == 0 else 0.45
         axes[1].bar(where, by_kind, width, color=COLORS, alpha=shade)
         by_age = [often[a:b].mean() for a, b in pairwise(edges)]
-        axes[2].plot(np.arange(10) + 0.5, by_age, "o-", ms=3, color=f"C{place}", label=who)
+        axes[2].plot(np.arange(10) + 0.5, by_age, "o-", ms=3, color=look(place)["color"], label=who)
     axes[1].set_xticks(np.arange(len(KINDS)), KINDS, fontsize=7)
     axes[1].set_xlabel("kind" if len(found) == 1 else "kind; pale: the actor's batches")
     low, high = axes[2].get_ylim()
     axes[2].set(xlabel="tenth of the buffer, oldest first", ylim=(min(low, 0.8), max(high, 1.2)))
     if len(found) > 1:
         axes[2].legend(fontsize=7)
-    for axis in axes:
-        axis.grid(alpha=0.3)
     for axis in axes[1:]:
         axis.axhline(1.0, color="0.3", lw=0.8, ls=":")
     figure.suptitle(name)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=80)
-    pyplot.close(figure)
+    finish(figure, axes, path, dpi=80)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from torchrl_mpfa.adjustment import (
     PositiveDecay,
 )
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
+from torchrl_mpfa.history import ReplayHistory
 from torchrl_mpfa.learners import (
     DDPGLearner,
     DQNLearner,
@@ -73,6 +74,7 @@ __all__ = [
     "PositiveBoost",
     "PositiveDecay",
     "QLearner",
+    "ReplayHistory",
     "SACLearner",
     "ScaledFusion",
     "ScheduledFusion",

@@ -18,13 +18,14 @@ EVALUATIONS = "evaluations.csv"
 ASSESSMENTS = "assessments.csv"
 UPDATES = "updates.csv"
 CURVE = "learning_curve.png"
+HISTOGRAMS = "histograms.png"
 STATUS = "status.json"
 PREVIOUS = "previous"
 """Where the files of a run go that is started anew."""
 _LOCK = ".lock"
 _TABLES = (EPISODES, EVALUATIONS, ASSESSMENTS, UPDATES)
 # The checkpoint first: once it is gone, nothing can go on with the old run.
-_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, STATUS)
+_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, HISTOGRAMS, STATUS)
 
 
 class FolderInUse(RuntimeError):

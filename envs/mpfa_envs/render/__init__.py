@@ -6,6 +6,7 @@ matplotlib, which the extra ``pictures`` brings.
 """
 
 from mpfa_envs.render.animation import write_animation
+from mpfa_envs.render.charts import draw_seeds, plot_histograms, plot_seeds
 from mpfa_envs.render.colors import (
     FLOOR,
     GOAL,
@@ -17,7 +18,7 @@ from mpfa_envs.render.colors import (
     WALL,
     viridis,
 )
-from mpfa_envs.render.film import Film, film_episode
+from mpfa_envs.render.film import Film, drive_episode, film_episode
 from mpfa_envs.render.grids import observe_room
 from mpfa_envs.render.samples import render_samples
 from mpfa_envs.render.scene import render_scene
@@ -43,8 +44,12 @@ __all__ = [
     "Film",
     "Outcome",
     "Panel",
+    "draw_seeds",
+    "drive_episode",
     "film_episode",
     "observe_room",
+    "plot_histograms",
+    "plot_seeds",
     "render_methods",
     "render_samples",
     "render_scene",

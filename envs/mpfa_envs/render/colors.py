@@ -56,7 +56,7 @@ OUTCOMES: Final[dict[str, Color]] = {
 }
 """Of the paths of episodes, by how they ended."""
 
-_VIRIDIS: Final = np.array(
+VIRIDIS: Final = np.array(
     [
         (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141),
         (39, 173, 129), (92, 200, 99), (170, 220, 50), (253, 231, 37),
@@ -80,8 +80,8 @@ def viridis(shares: Any) -> NDArray[np.uint8]:
         [[68, 1, 84], [253, 231, 37]]
     """
     values = np.clip(np.nan_to_num(np.asarray(shares, dtype=np.float64)), 0.0, 1.0)
-    places = np.linspace(0.0, 1.0, len(_VIRIDIS))
-    channels = [np.interp(values, places, channel) for channel in _VIRIDIS.T]
+    places = np.linspace(0.0, 1.0, len(VIRIDIS))
+    channels = [np.interp(values, places, channel) for channel in VIRIDIS.T]
     return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 

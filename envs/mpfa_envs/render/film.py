@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from mpfa_envs.evaluation import Action, Driver
     from mpfa_envs.task_sets import WorldTask
+    from mpfa_envs.vector import VectorNavigationEnv
 
 _RECENT = 10.0
 """Time for which speeds are seen [s]."""
@@ -70,42 +71,23 @@ def film_episode(
         >>> len(film.frames), film.frames[0].shape, film.frame_time
         (3, (480, 720, 3), 0.2)
     """
-    # Imported here because gymnasium takes a moment, and other pictures do without it.
-    from gymnasium.vector import AutoresetMode
-
-    from mpfa_envs.evaluation import as_driver
-    from mpfa_envs.vector import VectorNavigationEnv
-
     check_count("most", most, least=2)
-    arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
-    if episode.max_steps is not None:
-        arguments["max_steps"] = episode.max_steps
-    arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}
-    arguments["autoreset_mode"] = AutoresetMode.DISABLED
-    driver = as_driver(policy)
     pictures: dict[int, NDArray[np.uint8]] = {}
-    stride = 1
+    stride, step_time = 1, 0.0
     wheels: list[tuple[float, float]] = []
     worth: list[float] = []
-    with closing(VectorNavigationEnv(1, **arguments)) as env:
-        observations, _ = env.reset(seed=[seed], options={"tasks": [episode.task]})
-        driver.begin(env, 0)
+    for moment in drive_episode(policy, episode, seed=seed, **env_arguments):
+        env, step, ended = moment.env, moment.step, moment.wheels is None
         step_time = env.time_step * env.action_repeat
-        step, ended = 0, False
-        while True:
-            if step % stride == 0 or ended:
-                (pictures[step],) = env.render() or ()
-            if len(pictures) > most and not ended:
-                stride *= 2
-                pictures = {at: each for at, each in pictures.items() if at % stride == 0}
-            if values is not None:
-                worth.append(float(np.asarray(values(observations)).reshape(-1)[0]))
-            if ended:
-                break
-            actions = driver.drive(env, np.arange(1), observations)
-            wheels.append(env.robot.wheel_speeds(actions[0]))
-            observations, _, terminated, truncated, _ = env.step(actions)
-            step, ended = step + 1, bool(terminated[0] or truncated[0])
+        if step % stride == 0 or ended:
+            (pictures[step],) = env.render() or ()
+        if len(pictures) > most and not ended:
+            stride *= 2
+            pictures = {at: each for at, each in pictures.items() if at % stride == 0}
+        if values is not None:
+            worth.append(float(np.asarray(values(moment.observations)).reshape(-1)[0]))
+        if moment.wheels is not None:
+            wheels.append(moment.wheels)
     frames = list(pictures.values())
     if traces:
         panels = panels_of(wheels, worth, step_time=step_time)
@@ -116,6 +98,60 @@ def film_episode(
             for at, each in pictures.items()
         ]
     return Film(frames, step_time * stride)
+
+
+class Moment(NamedTuple):
+    """One decision of an episode, or its end."""
+
+    env: VectorNavigationEnv
+    """Where the robot is, which can render it."""
+    step: int
+    """Decisions before."""
+    observations: NDArray[np.float32]
+    """What it senses, ``[1, O]``."""
+    wheels: tuple[float, float] | None
+    """What it decides, speeds of the left and the right wheel [m/s]; None at the end."""
+    info: dict[str, Any]
+    """As the environment gives it, arrays of length one."""
+
+
+def drive_episode(
+    policy: Action | Driver, episode: WorldTask, *, seed: int = 0, **env_arguments: Any
+) -> Iterator[Moment]:
+    """Drive one episode decision by decision.
+
+    Args:
+        policy: As in :func:`film_episode`.
+        episode: The task and its world.
+        seed: Of the lidar's noise and the walkers.
+        **env_arguments: As in :func:`film_episode`.
+
+    Yields:
+        Each decision before it is carried out, and the end.
+    """
+    # Imported here because gymnasium takes a moment, and other pictures do without it.
+    from gymnasium.vector import AutoresetMode
+
+    from mpfa_envs.evaluation import as_driver
+    from mpfa_envs.vector import VectorNavigationEnv
+
+    arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
+    if episode.max_steps is not None:
+        arguments["max_steps"] = episode.max_steps
+    arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}
+    arguments["autoreset_mode"] = AutoresetMode.DISABLED
+    driver = as_driver(policy)
+    with closing(VectorNavigationEnv(1, **arguments)) as env:
+        observations, info = env.reset(seed=[seed], options={"tasks": [episode.task]})
+        driver.begin(env, 0)
+        step, ended = 0, False
+        while not ended:
+            actions = driver.drive(env, np.arange(1), observations)
+            wheels = env.robot.wheel_speeds(actions[0])
+            yield Moment(env, step, observations, wheels, info)
+            observations, _, terminated, truncated, info = env.step(actions)
+            step, ended = step + 1, bool(terminated[0] or truncated[0])
+        yield Moment(env, step, observations, None, info)
 
 
 def panels_of(

@@ -9,7 +9,8 @@ from typing import Any
 
 import pandas as pd
 
-from navigation.figures import Runs, finish, look, pyplot, running_mean
+from mpfa_envs.render.charts import finish, look, new_figure
+from navigation.figures import Runs, running_mean
 from navigation.studies.paper import CLAIMS, CURVES, NAMES, PHIS, TABLE_4
 
 MAPS = "ABCD"
@@ -66,18 +67,18 @@ def plot_figure_3(updates: Runs, episodes: Runs, path: Path, *, method: str = "p
         path: The PNG file.
         method: Whose runs.
     """
-    figure, axes = pyplot().subplots(2, 2, figsize=(10, 6), sharey="row", layout="constrained")
+    figure, axes = new_figure(2, 2, panel=(5, 3), sharey="row")
     for column, x in enumerate(("episode", "total_steps")):
         errors = [_by(each, x, "td_error") for each in updates[method].values()]
         rewards = [_by(each, x, "average_reward") for each in episodes[method].values()]
-        for axis, runs in zip(axes[:, column], (errors, rewards), strict=True):
+        for axis, runs in zip(axes[column::2], (errors, rewards), strict=True):
             _plot_runs(axis, runs, 0, NAMES[method], single=True)
-    axes[0, 0].set(ylabel="|TD error| of the batch", title="every run, and their mean")
-    axes[1, 0].set(ylabel=f"reward per step, mean of {_EPISODES}", xlabel="episode")
-    axes[1, 1].set(xlabel="step")
-    axes[1, 1].locator_params(axis="x", nbins=5)
-    axes[0, 1].locator_params(axis="x", nbins=5)
-    finish(figure, axes.flat, path)
+    axes[0].set(ylabel="|TD error| of the batch", title="every run, and their mean")
+    axes[2].set(ylabel=f"reward per step, mean of {_EPISODES}", xlabel="episode")
+    axes[3].set(xlabel="step")
+    axes[3].locator_params(axis="x", nbins=5)
+    axes[1].locator_params(axis="x", nbins=5)
+    finish(figure, axes, path)
 
 
 def plot_figure_5(episodes: Runs, path: Path) -> None:
@@ -87,7 +88,7 @@ def plot_figure_5(episodes: Runs, path: Path) -> None:
         episodes: Training episodes of each run by ``phi2``, ``phi3``, ``phi4``.
         path: The PNG file.
     """
-    figure, axis = pyplot().subplots(figsize=(7, 4), layout="constrained")
+    figure, (axis,) = new_figure(panel=(7, 4))
     for place, phi in enumerate(PHIS):
         runs = _rewards(episodes.get(f"phi{phi}", {}), MAPS[0])
         _plot_runs(axis, runs, place, f"φ = {phi}")
@@ -104,17 +105,17 @@ def plot_rewards_by_map(episodes: Runs, methods: Sequence[str], path: Path) -> N
         methods: Those of the figure; one without runs has no line.
         path: The PNG file.
     """
-    figure, axes = pyplot().subplots(2, 2, figsize=(10, 7), sharey=True, layout="constrained")
-    for axis, world in zip(axes.flat, MAPS, strict=True):
+    figure, axes = new_figure(2, 2, panel=(5, 3.5), sharey=True)
+    for axis, world in zip(axes, MAPS, strict=True):
         # A method has one color in all four figures.
         for method in methods:
             runs = _rewards(episodes.get(method, {}), world)
             _plot_runs(axis, runs, list(NAMES).index(method), NAMES[method])
         axis.set(title=f"map {world}", xlabel="episode in this map")
-    for axis in axes[:, 0]:
+    for axis in axes[::2]:
         axis.set_ylabel(f"reward per step, mean of {_EPISODES}")
-    axes[0, 0].legend()
-    finish(figure, axes.flat, path)
+    axes[0].legend()
+    finish(figure, axes, path)
 
 
 def plot_figure_13(updates: Runs, methods: Sequence[str], path: Path) -> None:
@@ -125,7 +126,7 @@ def plot_figure_13(updates: Runs, methods: Sequence[str], path: Path) -> None:
         methods: Those of the figure; one without runs has no line.
         path: The PNG file.
     """
-    figure, axis = pyplot().subplots(figsize=(8, 5), layout="constrained")
+    figure, (axis,) = new_figure(panel=(8, 5))
     for method in methods:
         runs = [reward_of_blocks(each) for each in updates.get(method, {}).values()]
         _plot_runs(axis, runs, list(NAMES).index(method), NAMES[method], marker=".")
@@ -147,7 +148,7 @@ def plot_claims(updates: Runs, methods: Sequence[str], path: Path) -> None:
         "positive_buffer": "positive transitions in the buffer",
         "positive_batch": "positive transitions in the batch",
     }
-    figure, axes = pyplot().subplots(1, 3, figsize=(13, 4), layout="constrained")
+    figure, axes = new_figure(1, 3, panel=(13 / 3, 4))
     for axis, (column, label) in zip(axes, panels.items(), strict=True):
         for method in methods:
             runs = [_by(each, "total_steps", column) for each in updates.get(method, {}).values()]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from navigation.figures import finish, look, pyplot
+from mpfa_envs.render.charts import finish, look, new_figure
 from navigation.report.intervals import (
     Array,
     mean_interval,
@@ -155,9 +155,7 @@ def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
     """
     volumes = {"sparse": tuple(VOLUMES), "dense": (32, 256)}
     widths = [len(each) for each in volumes.values()]
-    figure, axes = pyplot().subplots(
-        1, 2, figsize=(10, 4), width_ratios=widths, layout="constrained"
-    )
+    figure, axes = new_figure(1, 2, panel=(5, 4), width_ratios=widths)
     for axis, (reward, of) in zip(axes, volumes.items(), strict=True):
         areas = np.full((len(OF_VOLUMES), len(of)), np.nan)
         for row, method in enumerate(OF_VOLUMES):
@@ -179,9 +177,7 @@ def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
     axes[1].set_yticks([])
     figure.colorbar(image, ax=axes, label="area less that of uniform replay")
     figure.suptitle(MEASURES["area"].format(height=HEIGHT))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-    pyplot().close(figure)
+    finish(figure, [], path)
 
 
 def _panels(table: Table, *, tall: float = _SIZE[1]) -> tuple[Any, list[Any]]:
@@ -189,10 +185,7 @@ def _panels(table: Table, *, tall: float = _SIZE[1]) -> tuple[Any, list[Any]]:
     count = len(table.panels)
     columns = count if count < 4 else -(-count // 2)
     lines = -(-count // columns)
-    figure, axes = pyplot().subplots(
-        lines, columns, figsize=(columns * _SIZE[0], lines * tall), layout="constrained"
-    )
-    axes = list(np.atleast_1d(axes).flat)
+    figure, axes = new_figure(lines, columns, panel=(_SIZE[0], tall))
     for axis, title in zip(axes, table.panels, strict=False):
         axis.set_title(title)
     for axis in axes[count:]:

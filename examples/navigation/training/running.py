@@ -10,6 +10,7 @@ from pathlib import Path
 
 from hydra.core.override_parser.types import Override
 
+from mpfa_envs.render import plot_histograms
 from navigation import files
 from navigation.figures import plot_learning_curve
 from navigation.records import EpisodeRecord, as_table
@@ -111,6 +112,8 @@ def _train(training: TrainingRun) -> int:
     curve = folder / files.CURVE
     if training.records:
         plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
+    if histograms := training.log.history.histograms():
+        plot_histograms(histograms, folder / files.HISTOGRAMS)
     if finished:
         print(f"policy: {folder / files.POLICY}   curve: {curve}")
         return 0

@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from torchrl_mpfa import SignalReplayBuffer
+from torchrl_mpfa import ReplayHistory, SignalReplayBuffer
 
 _NEVER = -1
 COLUMNS = (
@@ -44,6 +44,8 @@ class UpdateLog:
 
     def __init__(self, capacity: int, *, reward_scale: float) -> None:
         self.rows: list[dict[str, float]] = []
+        self.history = ReplayHistory()
+        """Histograms of signals, priorities and weights at the time of each row."""
         self._scale = reward_scale
         self._reward, self._actions, self._updates = 0.0, 0, 0
         self.forget(capacity)
@@ -112,6 +114,7 @@ class UpdateLog:
         weights = {name: value for name, value in stats.items() if name.startswith("weight/")}
         row |= {name.replace("/", "_"): value for name, value in weights.items()}
         self.rows.append(row)
+        self.history.add(total_steps, buffer)
         self._reward, self._actions, self._squares = 0.0, 0, None
 
     def table(self) -> pd.DataFrame:
@@ -124,6 +127,7 @@ class UpdateLog:
         """Everything that the next row depends on, and the rows."""
         return {
             "rows": self.rows,
+            "history": self.history.state_dict(),
             "learned_at": self._learned_at,
             "last": (self._index, self._before, self._squares),
             "updates": self._updates,
@@ -134,6 +138,7 @@ class UpdateLog:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where :meth:`state_dict` was called."""
         self.rows = list(state["rows"])
+        self.history.load_state_dict(state.get("history", {}))
         self._learned_at, self._updates = state["learned_at"].clone(), state["updates"]
         self._index, self._before, self._squares = state["last"]
         self._reward, self._actions = state["reward"], state["actions"]

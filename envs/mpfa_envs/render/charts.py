@@ -1,0 +1,327 @@
+"""Charts of runs and of what they replay; matplotlib is imported where one is made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from mpfa_envs.checks import check_count
+from mpfa_envs.render.colors import LINES, VIRIDIS
+
+if TYPE_CHECKING:
+    import os
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+Curve = tuple[Any, Any]
+"""Steps and values of one run, each of shape ``[T]``."""
+Band = Literal["interval", "range"]
+"""What surrounds a mean: its 95 % interval for other runs, or all runs."""
+
+_LEVEL = 0.95
+
+
+def plot_seeds(
+    runs: Mapping[str, Sequence[Curve]],
+    path: str | os.PathLike[str],
+    *,
+    xlabel: str = "actions",
+    ylabel: str = "success",
+    level: float | None = 0.9,
+    band: Band = "interval",
+    limits: tuple[float, float] | None = (0.0, 1.0),
+    title: str = "",
+) -> None:
+    """Plot the mean of runs with a band around it, and when each first reached a level.
+
+    The mean goes to the end of the shortest run. On the line of the level, a tick marks the step at
+    which a run first reached it, a triangle the median of all runs, if at least half of them did.
+
+    Args:
+        runs: Curves of the seeds of each method, by name.
+        path: The PNG file.
+        xlabel: What steps are.
+        ylabel: What values are.
+        level: The level; None: no marks.
+        band: ``"interval"``: Student's 95 % interval of the mean; ``"range"``: from the lowest to
+            the highest run. A single run has neither.
+        limits: What values lie within, which cuts the band; None: anything.
+        title: Of the chart.
+
+    Raises:
+        ValueError: If there is no run, or the steps of one do not rise or are not as many as its
+            values.
+
+    Examples:
+        >>> import tempfile
+        >>> from mpfa_envs.render import plot_seeds
+        >>> runs = {"PER": [([0, 100, 200], [0.0, 0.7, 0.95]), ([0, 100, 200], [0.1, 0.9, 1.0])]}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_seeds(runs, f"{folder}/seeds.png")
+    """
+    figure, axes = new_figure()
+    draw_seeds(axes[0], runs, level=level, band=band, limits=limits)
+    axes[0].set(xlabel=xlabel, ylabel=ylabel, title=title)
+    finish(figure, axes, path)
+
+
+def draw_seeds(
+    axis: Any,
+    runs: Mapping[str, Sequence[Curve]],
+    *,
+    level: float | None = None,
+    band: Band = "interval",
+    limits: tuple[float, float] | None = None,
+    places: Mapping[str, int] | None = None,
+) -> None:
+    """Draw what :func:`plot_seeds` plots, into axes of matplotlib.
+
+    Args:
+        axis: The axes.
+        runs: As in :func:`plot_seeds`.
+        level: As in :func:`plot_seeds`.
+        band: As in :func:`plot_seeds`.
+        limits: As in :func:`plot_seeds`.
+        places: Number of each method's color; None: in their order.
+    """
+    if not any(runs.values()):
+        raise ValueError("runs must hold a curve at least")
+    if level is not None:
+        axis.axhline(level, color="0.6", lw=0.8, ls=":")
+    for number, (name, curves) in enumerate(runs.items()):
+        if not curves:
+            continue
+        style = look(number if places is None else places[name])
+        steps, mean, low, high = seed_band(curves, band=band)
+        if limits is not None:
+            low, high = low.clip(*limits), high.clip(*limits)
+        if len(curves) > 1:
+            axis.fill_between(steps, low, high, color=style["color"], alpha=0.18, lw=0)
+        label = name if len(curves) == 1 else f"{name} ({len(curves)})"
+        axis.plot(steps, mean, **style, lw=1.8, label=label)
+        if level is not None:
+            _mark_level(axis, [first_step(curve, level) for curve in curves], level, number, style)
+    if limits is not None:
+        pad = 0.02 * (limits[1] - limits[0])
+        axis.set_ylim(limits[0] - pad, limits[1] + pad)
+    axis.xaxis.set_major_formatter(_thousands)
+    axis.legend(frameon=False)
+
+
+def seed_band(
+    curves: Sequence[Curve], *, band: Band = "interval"
+) -> tuple[Array, Array, Array, Array]:
+    """Steps, mean and the two ends of the band of some runs, each of shape ``[T]``.
+
+    Args:
+        curves: Steps and values of each run.
+        band: As in :func:`plot_seeds`.
+
+    Returns:
+        At all steps of all runs to the end of the shortest, from the latest beginning.
+
+    Raises:
+        ValueError: As :func:`plot_seeds`.
+
+    Examples:
+        >>> steps, mean, low, high = seed_band([([0, 4], [0, 4]), ([0, 2, 4], [2, 2, 2])])
+        >>> steps.tolist(), mean.tolist()
+        ([0.0, 2.0, 4.0], [1.0, 2.0, 3.0])
+    """
+    if band not in ("interval", "range"):
+        raise ValueError(f"band must be 'interval' or 'range', got {band!r}")
+    checked = [_checked(curve) for curve in curves]
+    first = max(steps[0] for steps, _ in checked)
+    last = min(steps[-1] for steps, _ in checked)
+    steps = np.unique(np.concatenate([each for each, _ in checked]))
+    steps = steps[(steps >= first) & (steps <= last)]
+    values = np.stack([np.interp(steps, *each) for each in checked])
+    mean = values.mean(axis=0)
+    if band == "range" or len(values) == 1:
+        return steps, mean, values.min(axis=0), values.max(axis=0)
+    count = len(values)
+    reach = stats.t.ppf(0.5 + _LEVEL / 2, count - 1) / math.sqrt(count) * values.std(axis=0, ddof=1)
+    return steps, mean, mean - reach, mean + reach
+
+
+def first_step(curve: Curve, level: float) -> float:
+    """Step at which a run first has a value of a level or more; infinite if it never has."""
+    steps, values = _checked(curve)
+    reached = np.flatnonzero(values >= level)
+    return float(steps[reached[0]]) if len(reached) else math.inf
+
+
+def _checked(curve: Curve) -> tuple[Array, Array]:
+    steps, values = (np.asarray(each, dtype=np.float64) for each in curve)
+    if steps.ndim != 1 or steps.shape != values.shape or not len(steps):
+        raise ValueError(
+            f"steps and values of a run must be equally many, got {steps.shape} and {values.shape}"
+        )
+    if (np.diff(steps) <= 0).any():
+        raise ValueError("steps of a run must rise")
+    return steps, values
+
+
+def _mark_level(
+    axis: Any, steps: Sequence[float], level: float, number: int, style: Mapping[str, str]
+) -> None:
+    """Mark when runs reached the level, and the median of them with its step in words."""
+    reached = [step for step in steps if math.isfinite(step)]
+    axis.plot(reached, [level] * len(reached), "|", color=style["color"], ms=9, mew=1.2)
+    median = float(np.median(steps))
+    if not math.isfinite(median):
+        return
+    axis.plot(median, level, "v", color=style["color"], ms=7, mec="white", mew=0.7)
+    # Each method writes one line lower than the one before it, so that none is written over.
+    axis.annotate(
+        _thousands(median, None),
+        (median, level),
+        xytext=(4, -12 - 11 * number),
+        textcoords="offset points",
+        color=style["color"],
+        fontsize="small",
+    )
+
+
+def plot_histograms(
+    histories: Mapping[str, tuple[Any, Any, Any]],
+    path: str | os.PathLike[str],
+    *,
+    columns: int = 2,
+    xlabel: str = "actions",
+) -> None:
+    """Plot how the distribution of some numbers changes with time, a panel each.
+
+    The darker a place, the larger the share of the numbers there at that time; the line is their
+    median. Bins are on a logarithmic scale.
+
+    Args:
+        histories: Steps ``[T]``, edges of the bins ``[E + 1]`` and counts ``[T, E]`` of each kind
+            of number by its name, as ``torchrl_mpfa.ReplayHistory.histograms()`` gives them.
+        path: The PNG file.
+        columns: Panels in a row.
+        xlabel: What steps are.
+
+    Raises:
+        ValueError: If there is nothing to plot, or arrays of a history do not fit together.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from mpfa_envs.render import plot_histograms
+        >>> counts = np.array([[1, 4, 1], [0, 2, 4]])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     history = [100, 200], [0.1, 1.0, 10.0, 100.0], counts
+        ...     plot_histograms({"priority": history}, f"{folder}/histograms.png")
+    """
+    if not histories:
+        raise ValueError("histories must not be empty")
+    check_count("columns", columns)
+    for name, (steps, edges, counts) in histories.items():
+        shape = len(steps), len(edges) - 1
+        if np.shape(counts) != shape or 0 in shape:
+            raise ValueError(f"counts of {name!r} must have shape {shape}, got {np.shape(counts)}")
+    columns = min(columns, len(histories))
+    figure, axes = new_figure(-(-len(histories) // columns), columns, panel=(4.6, 2.7))
+    from matplotlib.colors import LinearSegmentedColormap
+
+    paled = LinearSegmentedColormap.from_list(
+        "paled", ["white", *(np.array(VIRIDIS[::-1]) / 255.0)]
+    )
+    for axis, (name, (steps, edges, counts)) in zip(axes, histories.items(), strict=False):
+        times = np.asarray(steps, dtype=np.float64)
+        shares = np.asarray(counts, dtype=np.float64)
+        shares = shares / np.maximum(shares.sum(axis=1, keepdims=True), 1.0)
+        heat = axis.pcolormesh(_ends(times), edges, shares.T, cmap=paled, vmin=0.0, rasterized=True)
+        axis.plot(times, _medians(np.asarray(edges, dtype=np.float64), shares), color="black", lw=1)
+        used = np.flatnonzero(shares.max(axis=0) > 1e-3)
+        axis.set(yscale="log", title=name, xlabel=xlabel)
+        axis.set_ylim(edges[used[0]], edges[used[-1] + 1])
+        axis.xaxis.set_major_formatter(_thousands)
+        figure.colorbar(heat, ax=axis, format=lambda share, _: f"{share:.0%}")
+    for axis in axes[len(histories) :]:
+        axis.remove()
+    finish(figure, [], path)
+
+
+def _ends(times: Array) -> Array:
+    """Where the columns of a heat map begin and end, in the middle between two times."""
+    middles = (times[1:] + times[:-1]) / 2
+    width = float(np.diff(times).mean()) if len(times) > 1 else 1.0
+    return np.concatenate(([times[0] - width / 2], middles, [times[-1] + width / 2]))
+
+
+def _medians(edges: Array, shares: Array) -> Array:
+    """Median of each histogram, within its bin by the logarithm."""
+    logs = np.log(edges)
+    risen = np.concatenate((np.zeros((len(shares), 1)), shares.cumsum(axis=1)), axis=1)
+    return np.exp([np.interp(0.5, each, logs) for each in risen])
+
+
+def new_figure(
+    rows: int = 1, columns: int = 1, *, panel: tuple[float, float] = (7.0, 4.0), **kwargs: Any
+) -> tuple[Any, list[Any]]:
+    """A figure of matplotlib and its axes, row by row.
+
+    Args:
+        rows: Panels below each other.
+        columns: Panels beside each other.
+        panel: Width and height of a panel [inch].
+        **kwargs: Passed to matplotlib.
+
+    Returns:
+        Figure and axes.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(columns * panel[0], rows * panel[1]), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, **kwargs)
+    return figure, list(np.atleast_1d(axes).flat)
+
+
+def finish(
+    figure: Any, axes: Iterable[Any], path: str | os.PathLike[str], *, dpi: int = 120
+) -> None:
+    """Give axes their grids, and write their figure to a file whose folder is made.
+
+    Args:
+        figure: The figure.
+        axes: Those that get a grid.
+        path: The PNG file.
+        dpi: Pixels of an inch.
+    """
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    file = Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=dpi)
+
+
+def look(place: int) -> dict[str, str]:
+    """Color of a line by its number, and another dash once all colors are taken.
+
+    Args:
+        place: Number of the line, from zero.
+
+    Returns:
+        Arguments of matplotlib's ``plot``.
+    """
+    color = "#" + "".join(f"{channel:02x}" for channel in LINES[place % len(LINES)])
+    return {"color": color, "linestyle": ("-", "--", ":", "-.")[place // len(LINES) % 4]}
+
+
+def _thousands(value: float, _: object) -> str:
+    """A number of steps in few letters."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if abs(value) >= size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.3g}"

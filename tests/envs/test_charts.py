@@ -1,0 +1,104 @@
+"""Charts, looked at: where lines, bands and marks are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import stats
+
+from mpfa_envs.render import LINES, plot_histograms, plot_seeds
+from mpfa_envs.render.charts import first_step, seed_band
+
+STEPS = np.arange(0, 101, 10)
+
+
+def colored(path: Path, color: tuple[int, ...], *, spread: int = 12) -> np.ndarray:
+    """Which pixels of a picture have about this color, shape ``[height, width]``."""
+    with Image.open(path) as picture:
+        found = np.asarray(picture.convert("RGB")).astype(int)
+    return (abs(found - color) <= spread).all(-1)
+
+
+def test_a_band_is_the_interval_of_the_mean_of_runs() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.random((5, 11))
+    steps, mean, low, high = seed_band([(STEPS, each) for each in values])
+    np.testing.assert_array_equal(steps, STEPS)
+    expected = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    np.testing.assert_allclose(mean, values.mean(0))
+    np.testing.assert_allclose(low, expected.low)
+    np.testing.assert_allclose(high, expected.high)
+    _, _, low, high = seed_band([(STEPS, each) for each in values], band="range")
+    np.testing.assert_array_equal((low, high), (values.min(0), values.max(0)))
+
+
+def test_a_mean_ends_with_the_shortest_run_and_begins_with_the_last_one() -> None:
+    curves = [([0, 10, 30], [0.0, 1.0, 1.0]), ([5, 20], [0.5, 0.5])]
+    steps, mean, _, _ = seed_band(curves)
+    assert steps.tolist() == [5, 10, 20]
+    assert mean.tolist() == [0.5, 0.75, 0.75]
+
+
+def test_a_level_is_reached_when_it_first_is() -> None:
+    assert first_step(([10, 20, 30], [0.2, 0.9, 0.1]), 0.9) == 20
+    assert first_step(([10, 20], [0.2, 0.8]), 0.9) == np.inf
+
+
+def test_the_median_of_the_runs_is_marked_on_the_level(tmp_path: Path) -> None:
+    steps = np.arange(0, 101)
+    curves = [(steps, (steps >= at) * 1.0) for at in (20, 50, 80)]
+    path = tmp_path / "seeds.png"
+    plot_seeds({"one": curves}, path, band="range")
+    plot_seeds({"one": curves}, tmp_path / "plain.png", band="range", level=None)
+    marks = colored(path, LINES[0]) & ~colored(tmp_path / "plain.png", LINES[0], spread=60)
+    rows, columns = np.nonzero(marks[: marks.shape[0] // 3])
+    # Ticks of three runs and the triangle of the median, on the line at nine tenths.
+    assert len(rows) > 60
+    width = marks.shape[1]
+    groups = 1 + (np.diff(np.unique(columns)) > 0.1 * width).sum()
+    assert groups == 3
+    assert abs(np.median(columns) / width - 0.54) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ({}, "runs must hold a curve"),
+        ({"one": [([0, 1], [0.0])]}, "must be equally many"),
+        ({"one": [([0, 0], [0.0, 1.0])]}, "steps of a run must rise"),
+    ],
+)
+def test_runs_that_are_none_are_refused(runs: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        plot_seeds(runs, tmp_path / "no.png")
+    assert not (tmp_path / "no.png").exists()
+
+
+def test_a_histogram_is_darkest_where_the_numbers_are(tmp_path: Path) -> None:
+    edges = np.geomspace(1e-2, 1e2, 5)
+    counts = np.zeros((20, 4))
+    counts[:10, 0], counts[10:, 3] = 5, 5
+    path = tmp_path / "h.png"
+    plot_histograms({"priority": (np.arange(20), edges, counts)}, path)
+    with Image.open(path) as picture:
+        gray = np.asarray(picture.convert("L")).astype(int)
+    height, width = gray.shape
+    panel = gray[int(0.15 * height) : int(0.78 * height), int(0.15 * width) : int(0.78 * width)]
+    tall, wide = panel.shape
+    corner = {
+        (up, left): panel[
+            slice(0, tall // 5) if up else slice(4 * tall // 5, tall),
+            slice(0, wide // 4) if left else slice(3 * wide // 4, wide),
+        ].mean()
+        for up in (True, False)
+        for left in (True, False)
+    }
+    assert corner[True, False] < 90 and corner[False, True] < 90
+    assert corner[True, True] > 200 and corner[False, False] > 200
+    with pytest.raises(ValueError, match=r"counts of 'priority' must have shape \(2, 4\)"):
+        plot_histograms({"priority": ([0, 1], edges, counts)}, tmp_path / "no.png")
+    with pytest.raises(ValueError, match="histories must not be empty"):
+        plot_histograms({}, tmp_path / "no.png")

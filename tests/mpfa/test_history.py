@@ -1,0 +1,84 @@
+"""Histograms of a buffer over time."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import RandomSampler
+
+from torchrl_mpfa import MPFASampler, ReplayHistory, SignalReplayBuffer, SignalTensorStorage
+
+
+def filled(sampler, rows=200):
+    torch.manual_seed(0)
+    buffer = SignalReplayBuffer(storage=SignalTensorStorage(rows), sampler=sampler, batch_size=rows)
+    buffer.extend(TensorDict({"next": {"reward": torch.rand(rows, 1) - 0.5}}, [rows]))
+    return buffer
+
+
+def learn(buffer):
+    batch = buffer.sample()
+    count = len(batch)
+    batch["signals"] = TensorDict(
+        {"td_error": 10.0 * torch.rand(count), "action_gradient": torch.rand(count)}, [count]
+    )
+    buffer.update_tensordict_priority(batch)
+
+
+def test_histograms_count_what_the_buffer_holds():
+    buffer = filled(MPFASampler(200, alpha=0.6, beta=0.4))
+    history = ReplayHistory()
+    history.add(0, buffer)
+    learn(buffer)
+    history.add(1000, buffer)
+    found = history.histograms()
+    assert sorted(found) == ["action_gradient", "priority", "reward", "td_error", "weight"]
+    steps, edges, counts = found["td_error"]
+    table = buffer.storage.signal_table
+    known = table.rows[:, table.column["td_error"]]
+    known = known[known.isfinite()].numpy()
+    # At first no transition has an error.
+    assert steps.tolist() == [1000]
+    np.testing.assert_array_equal(counts[0], np.histogram(known, edges)[0])
+    for name in ("priority", "weight", "reward"):
+        steps, _, counts = found[name]
+        assert steps.tolist() == [0, 1000]
+        assert counts.sum(1).tolist() == [200, 200]
+    priorities = buffer.sampler.priorities()
+    weight = (priorities / priorities.min()) ** (-0.6 * 0.4)
+    np.testing.assert_array_equal(found["weight"][2][1], np.histogram(weight, edges)[0])
+
+
+def test_what_lies_beyond_the_bins_counts_to_the_outermost():
+    buffer = filled(MPFASampler(4), rows=4)
+    table = buffer.storage.signal_table
+    table.rows[:, table.column["td_error"]] = torch.tensor([0.0, 1e-9, 1e9, torch.nan])
+    history = ReplayHistory(bins=1)
+    history.add(0, buffer)
+    _, edges, counts = history.histograms()["td_error"]
+    assert len(edges) == 13
+    assert counts[0, 0] == 2 and counts[0, -1] == 1 and counts.sum() == 3
+
+
+def test_a_buffer_without_priorities_adds_nothing():
+    history = ReplayHistory()
+    history.add(0, filled(RandomSampler()))
+    history.add(
+        0,
+        SignalReplayBuffer(storage=SignalTensorStorage(9), sampler=MPFASampler(9), batch_size=2),
+    )
+    assert history.histograms() == {}
+
+
+def test_a_history_goes_on_where_it_was_saved():
+    buffer = filled(MPFASampler(200))
+    history, other = ReplayHistory(), ReplayHistory()
+    history.add(0, buffer)
+    other.load_state_dict(history.state_dict())
+    for each in (history, other):
+        each.add(5, buffer)
+    for name, (steps, _, counts) in history.histograms().items():
+        np.testing.assert_array_equal(steps, other.histograms()[name][0])
+        np.testing.assert_array_equal(counts, other.histograms()[name][2])
+    with pytest.raises(ValueError, match="counts of 'priority' must have shape"):
+        ReplayHistory(bins=3).load_state_dict({"priority": history.state_dict()["priority"]})
