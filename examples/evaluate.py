@@ -5,13 +5,16 @@
     python examples/evaluate.py runs/demo --worlds all        all test worlds in which nothing moves
     python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
     python examples/evaluate.py --policy dwa --worlds bars:validation    a planner in its place
+    python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, nothing kept
 
 Prints a row for each world or generator and their total. Writes to the folder
 ``evaluation-WORLDS`` in that of the run, for another file or a planner to runs/evaluation-NAME, or
 to --output:
 summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (a row
-an episode), settings.json (what was asked for, and a policy's card), trajectories.png (the
-ways in up to nine worlds) and episode.gif (the longest one from above).
+an episode), settings.json (what was asked for, and a policy's card), trajectories.png (paths in up
+to nine worlds, at most twenty in each), episode.gif (the longest one from above, with the speeds
+of the wheels) and, of a policy, values.png (its actions all over the room). Q is in the last two
+where path is the folder of a run, whose checkpoint has the critic.
 """
 
 from __future__ import annotations
@@ -21,14 +24,10 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from PIL import Image
 
 from mpfa_envs import (
     GENERATORS,
@@ -36,21 +35,19 @@ from mpfa_envs import (
     EpisodeResult,
     Policy,
     RobotNoise,
-    World,
     load_policy,
     make_planner,
-    render_trajectories,
 )
-from mpfa_envs.render import tiled, write_animation
 from navigation import files
-from navigation.evaluating import Drivable, Drives, drive, film, summary_row
+from navigation.evaluating import Drivable, Drives, drive, summary_row, tasks_of
+from navigation.live import watch
+from navigation.pictures import Values, write_pictures
 from navigation.records import as_table, write_table
+from navigation.training.values import load_values
 from navigation.worlds import parse_worlds, world_name, worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
 EVALUATION = "evaluation.json"
-_PICTURED = 9
-"""Worlds in a picture at most."""
 _DOCUMENTED = (
     *("success", "collision", "timeout", "spl", "time_s"),
     *("path_length", "plan_s", "decision_s"),
@@ -104,6 +101,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         type=read_noise,
         metavar="NAME=VALUE,...",
         help="errors of a robot: range_noise, dropout, slip, latency, drift (default: none)",
+    )
+    parser.add_argument(
+        "--live", action="store_true", help="watch the episodes in a window, and write nothing"
     )
     parser.add_argument("--no-pictures", action="store_true", help="write tables alone")
     options = parser.parse_args(arguments)
@@ -176,58 +176,6 @@ def printed(summary: pd.DataFrame) -> str:
     return table.to_string(index=False)
 
 
-def write_pictures(policy: Drivable, driven: Sequence[Drives], folder: Path, **how: Any) -> None:
-    """Nine worlds with the ways in them, and one episode as an animation.
-
-    Args:
-        policy: The policy, or a planner.
-        driven: What it did, one for each row of the table.
-        folder: Where the pictures go.
-        **how: Passed to :func:`navigation.evaluating.film`.
-    """
-    # One world of each row, then a second one of each, and so on.
-    in_turn = zip_longest(*map(worlds_in, driven))
-    worlds = [each for nth in in_turn for each in nth if each is not None]
-    size = 640 if len(worlds) == 1 else 360
-    pictures = [picture_of(world, drives, size=size) for world, drives in worlds[:_PICTURED]]
-    Image.fromarray(tiled(pictures)).save(folder / "trajectories.png")
-    # The success with the longest way shows most; any episode if there is none.
-    episodes = [
-        (result, task, number)
-        for each in driven
-        for number, (result, task) in enumerate(zip(each.results, each.tasks, strict=True))
-    ]
-    reached = [each for each in episodes if each[0].success]
-    _, shown, number = max(reached or episodes, key=lambda each: each[0].path_length)
-    # The number of a task is the seed of its walkers, and of the noise.
-    write_animation(film(policy, shown, seed=number, **how), folder / "episode.gif")
-
-
-def worlds_in(drives: Drives) -> list[tuple[World, Drives]]:
-    """Each world of some drives, with the drives."""
-    return [(world, drives) for world in {e.world.name: e.world for e in drives.tasks}.values()]
-
-
-def picture_of(world: World, drives: Drives, *, size: int) -> NDArray[np.uint8]:
-    """The ways in one world, shape ``[size, size, 3]``."""
-    numbers = drives.of_world(world.name)
-    return render_trajectories(
-        world,
-        [drives.trails[n] for n in numbers],
-        [drives.tasks[n].task.goal for n in numbers],
-        [end_of(drives.results[n]) for n in numbers],
-        title=f"world {world.name}",
-        size=size,
-    )
-
-
-def end_of(result: EpisodeResult) -> Literal["success", "collision", "timeout"]:
-    """How an episode ended, in a word."""
-    if result.success:
-        return "success"
-    return "collision" if result.collision else "timeout"
-
-
 def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The rows as one document: the total, and each generator and each world under its name."""
 
@@ -249,6 +197,27 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return document
 
 
+def critic(options: argparse.Namespace) -> Values | None:
+    """What the critic of a run thinks, if there is a run."""
+    if options.path is None or not (options.path / files.CHECKPOINT).exists():
+        return None
+    try:
+        return load_values(options.path, options.loaded)
+    except ValueError as error:
+        print(f"no picture of Q: {error}")
+        return None
+
+
+def show_live(options: argparse.Namespace, how: Mapping[str, Any]) -> pd.DataFrame:
+    """Show the episodes in a window, one after another, and tell how each ended."""
+    rows = []
+    tasks = tasks_of(options.loaded, options.names, episodes=options.episodes, seed=options.seed)
+    for end in watch(options.loaded, tasks, **how):
+        print(f"{end.world}: {end.outcome} after {end.time_s:.1f} s")
+        rows.append(end._asdict())
+    return pd.DataFrame(rows)
+
+
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     """Evaluate, print, write.
 
@@ -262,6 +231,11 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     policy: Drivable = options.loaded
     folder = options.output or output_folder(options)
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": options.physics}
+    how = {"noise": options.noise}
+    if options.physics is not None:
+        how["physics"] = options.physics
+    if options.live:
+        return show_live(options, how)
     results: list[EpisodeResult] = []
     driven: list[Drives] = []
     rows = []
@@ -274,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             driven.append(drives)
             rows.append({"world": world_name(world), **summary_row(drives.results)})
         if not options.no_pictures:
-            write_pictures(policy, driven, folder, physics=options.physics, noise=options.noise)
+            write_pictures(policy, driven, folder, values=critic(options), **how)
         if len(rows) > 1:
             rows.append({"world": "total", **summary_row(results)})
         summary = pd.DataFrame(rows)

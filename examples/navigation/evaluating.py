@@ -1,4 +1,4 @@
-"""How well a policy drives: in the worlds of a command line, and as a film."""
+"""How well a policy drives in the worlds of a command line."""
 
 from __future__ import annotations
 
@@ -37,6 +37,28 @@ class Drives:
         return [n for n, each in enumerate(self.tasks) if each.world.name == name]
 
 
+def tasks_of(
+    policy: Drivable, worlds: Sequence[str], *, episodes: int | None, seed: int
+) -> list[WorldTask]:
+    """The fixed tasks of some worlds, for the robot of a policy.
+
+    Args:
+        policy: The policy, or a planner.
+        worlds: What :func:`mpfa_envs.world_tasks` takes, each.
+        episodes: Number of tasks in each; None: as many as there usually are.
+        seed: Seed of the tasks in a world.
+
+    Returns:
+        The tasks, world by world.
+    """
+    robot = policy.env_arguments.get("robot", "turtlebot2")
+    return [
+        task
+        for world in worlds
+        for task in world_tasks(world, episodes=episodes, seed=seed, robot=robot)
+    ]
+
+
 def drive(
     policy: Drivable,
     world: str,
@@ -66,8 +88,7 @@ def drive(
     arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
     if physics is not None:
         arguments["physics"] = physics
-    robot = arguments.get("robot", "turtlebot2")
-    tasks = world_tasks(world, episodes=episodes, seed=seed, robot=robot)
+    tasks = tasks_of(policy, [world], episodes=episodes, seed=seed)
     trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
 
     def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:

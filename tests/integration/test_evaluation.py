@@ -12,7 +12,8 @@ from PIL import Image
 import evaluate
 from mpfa_envs import GENERATORS, EpisodeResult, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
-from navigation.evaluating import film, summary_row
+from mpfa_envs.render import film_episode
+from navigation.evaluating import summary_row
 from navigation.records import read_table
 from navigation.settings.train import GROUPS, TrainSettings
 from navigation.training.assembly import make_learner
@@ -166,8 +167,8 @@ def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
 
 def test_the_animation_ends_with_the_episode_that_it_shows(run: Path) -> None:
     (drive,) = world_tasks("halls:validation", episodes=1)
-    frames = film(load_policy(run), drive._replace(max_steps=6), physics="kinematic")
-    assert len(frames) == 1 + 6 // 2
+    film = film_episode(load_policy(run), drive._replace(max_steps=6), physics="kinematic")
+    assert len(film.frames) == 1 + 6 // 2
 
 
 def test_the_policy_that_comes_with_the_project_reaches_its_goals(

@@ -1,0 +1,185 @@
+"""Race a policy by keyboard: both robots in the same room, and who arrives first wins.
+
+    python examples/play.py                                the policy that comes with the project
+    python examples/play.py runs/demo --worlds mazes:test
+    python examples/play.py --worlds D --speed 2           twice as fast as real
+
+Arrow keys or WASD drive: up is full speed ahead, left and right turn, both curve; without a key
+the robot rolls on at its slowest, for it cannot stop. Yours is black with its lidar, the policy's
+vermilion; they do not feel each other. N goes on with the next room, Escape ends. It needs pygame
+(extra ``live``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium.error import DependencyNotInstalled
+from numpy.typing import NDArray
+
+from mpfa_envs import NavigationEnv, Policy, WorldTask, load_policy
+from mpfa_envs.render import render_scene
+from mpfa_envs.render.window import Window
+from navigation.evaluating import tasks_of
+from navigation.worlds import parse_worlds
+
+POLICY = Path(__file__).parent / "policies" / "td3-mpfa_per-rooms.npz"
+LETTERS = {"w": "up", "a": "left", "s": "down", "d": "right"}
+_PAUSE = 2.0
+"""For which the end of a race is shown [s]."""
+Winner = Literal["you", "policy", "nobody"]
+
+
+def action_of(keys: Iterable[str]) -> NDArray[np.float32]:
+    """The action of some held keys.
+
+    Args:
+        keys: Their names.
+
+    Returns:
+        Speeds of the left and the right wheel, ``[2]``, in [-1, 1].
+    """
+    held = {LETTERS.get(key, key) for key in keys}
+    ahead = 1.0 if "up" in held else -1.0
+    turn = ("right" in held) - ("left" in held)
+    if not turn:
+        return np.array([ahead, ahead], dtype=np.float32)
+    # Ahead and a turn is a wide curve; a turn alone is as narrow as it can be.
+    slower = 0.3 if "up" in held else -1.0
+    return np.array([1.0, slower] if turn > 0 else [slower, 1.0], dtype=np.float32)
+
+
+class Racer:
+    """One robot on its way.
+
+    Args:
+        episode: The task and its world.
+        **env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv`.
+    """
+
+    def __init__(self, episode: WorldTask, **env_arguments: Any) -> None:
+        limit = {} if episode.max_steps is None else {"max_steps": episode.max_steps}
+        self.env = NavigationEnv(**{**env_arguments, **limit, "world": episode.world})
+        self.observation, self.info = self.env.reset(seed=0, options=episode.task._asdict())
+        self.running = True
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """Where it is (x, y, heading) [m, m, rad]."""
+        return self.info["x"], self.info["y"], self.info["heading"]
+
+    @property
+    def arrival(self) -> float:
+        """When it was at the goal [s]; infinite if it was not."""
+        return float(self.info["sim_time"]) if self.info["success"] else math.inf
+
+    def drive(self, action: NDArray[np.float32]) -> None:
+        """Hold an action for one step; nothing happens once its way has ended."""
+        if self.running:
+            self.observation, _, terminated, truncated, self.info = self.env.step(action)
+            self.running = not (terminated or truncated)
+
+
+def race(policy: Policy, episode: WorldTask, window: Window, **env_arguments: Any) -> Winner | None:
+    """Drive one race.
+
+    Args:
+        policy: The rival.
+        episode: The task and its world.
+        window: Where it is seen, and whose keys are the player's.
+        **env_arguments: Arguments of both environments in place of the policy's.
+
+    Returns:
+        Who was at the goal first; None if the race was left.
+    """
+    arguments = {**policy.env_arguments, "collision_distance": "contact", **env_arguments}
+    you, rival = Racer(episode, **arguments), Racer(episode, **arguments)
+    with closing(you.env), closing(rival.env):
+        while you.running or rival.running:
+            if not window.show(picture_of(you, rival)) or "n" in window.pressed:
+                return None
+            you.drive(action_of(window.keys))
+            rival.drive(policy(rival.observation))
+            # Whoever arrives ends the race for the other, unless both do in this step.
+            if min(you.arrival, rival.arrival) < math.inf:
+                break
+        window.show(picture_of(you, rival))
+        if you.arrival == rival.arrival:
+            return "nobody"
+        return "you" if you.arrival < rival.arrival else "policy"
+
+
+def picture_of(you: Racer, rival: Racer) -> NDArray[np.uint8]:
+    """The room with both robots, shape ``[height, width, 3]``."""
+    env = you.env
+    walkers = env.walkers
+    ranges = env.lidar.cast(*you.pose, moving=walkers[:, [0, 1, 4]])
+    assert env.task is not None
+    return render_scene(
+        env.world,
+        robot=env.robot,
+        pose=you.pose,
+        goal=env.task.goal,
+        goal_radius=env.goal_radius,
+        trail=env.trail,
+        rays=(env.lidar.angles, ranges),
+        walkers=walkers,
+        rival=(rival.pose, rival.env.trail),
+        size=640,
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
+    """Race until the rooms or the player's patience end, and print the score.
+
+    Args:
+        arguments: The command line.
+
+    Returns:
+        Races won by each.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "path", type=Path, nargs="?", default=POLICY, help="policy.npz, or the folder of a run"
+    )
+    parser.add_argument(
+        "--worlds",
+        nargs="+",
+        default=["rooms:test"],
+        help="as of evaluate.py (default: rooms:test)",
+    )
+    parser.add_argument("--races", type=int, default=10, help="at most (default: 10)")
+    parser.add_argument("--seed", type=int, default=0, help="of starts and goals (default: 0)")
+    parser.add_argument("--speed", type=float, default=1.0, help="over real (default: 1)")
+    options = parser.parse_args(arguments)
+    try:
+        policy = load_policy(options.path)
+        names = parse_worlds(options.worlds)
+        tasks = tasks_of(policy, names, episodes=options.races, seed=options.seed)
+        step = policy.env_arguments.get("action_repeat", 2) * 0.1
+        window = Window("arrows or WASD: drive   N: next room   Esc: end", fps=options.speed / step)
+    except (ValueError, OSError, DependencyNotInstalled) as error:
+        parser.error(str(error))
+    score = {"you": 0, "policy": 0, "nobody": 0}
+    with closing(window):
+        for task in tasks[: options.races]:
+            winner = race(policy, task, window, physics="kinematic")
+            if window.closed:
+                break
+            if winner is not None:
+                score[winner] += 1
+                print(f"{task.world.name}: {winner} first")
+    print(", ".join(f"{name} {count}" for name, count in score.items()))
+    return score
+
+
+if __name__ == "__main__":
+    main()
