@@ -338,3 +338,15 @@ def test_page_and_figures_are_made_of_runs_and_of_kept_rows(
     rows = read_kept(kept, "F")
     pd.testing.assert_frame_equal(rows.curves, read_runs(folder).curves)
     assert isinstance(rows, Rows) and rows.curves["return"].eq(-1.5).all()
+
+
+@pytest.mark.slow
+def test_pendulum_is_learned() -> None:
+    regime = Regime(actions=8_000, every=8_000, episodes=10)
+    training.prepare_process()
+    try:
+        found = train(Settings("Pendulum-v1", "mpfa_plus", 1000, regime))
+    finally:
+        torch.set_flush_denormal(False)
+    # Untrained actors have about -1,200.
+    assert found["return"].iloc[-1] > -300.0
