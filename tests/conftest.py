@@ -1,5 +1,6 @@
 """What holds for all tests: no log lines of TorchRL, one thread, a fixed global seed."""
 
+import gc
 import logging
 import os
 
@@ -12,6 +13,12 @@ from torchrl import torchrl_logger
 
 # TorchRL tells of every storage that it allocates.
 torchrl_logger.setLevel(logging.WARNING)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was imported out of later garbage collections, each of which takes 0.3 s of it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

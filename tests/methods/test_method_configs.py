@@ -13,6 +13,7 @@ from torchrl_mpfa.methods import METHODS, Method, Replay
 
 SMALL = ["capacity=32", "batch_size=4"]
 CHOOSY = {"la3p", "klper", "ref_er", "uniform_halves"}
+OF_ONE_BATCH = sorted(set(METHODS) - CHOOSY)
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +27,27 @@ def composed(registered):
         yield lambda *overrides: compose(overrides=list(overrides))
 
 
+@pytest.fixture(scope="module")
+def at_once(registered):
+    """All methods, each in a package of its own; one at a time, Hydra takes seconds."""
+    with initialize(version_base=None, config_path=None):
+        return compose(
+            overrides=[
+                *(f"+replay@{name}={name}" for name in METHODS),
+                *(f"+replay_buffer@one.{name}=signal_{name}" for name in OF_ONE_BATCH),
+                *(f"{name}.{each}" for name in METHODS for each in SMALL),
+                *(
+                    f"one.{name}.{each}"
+                    for name in OF_ONE_BATCH
+                    for each in (*SMALL, "alpha=0.3", "positive_above=mean")
+                ),
+            ]
+        )
+
+
 @pytest.mark.parametrize("name", METHODS)
-def test_every_method_is_made_by_its_name(composed, name):
-    config = composed(f"+replay={name}", *(f"replay.{each}" for each in SMALL)).replay
+def test_every_method_is_made_by_its_name(at_once, name):
+    config = at_once[name]
     more = (
         {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if name in {"klper", "ref_er"} else {}
     )
@@ -38,10 +57,9 @@ def test_every_method_is_made_by_its_name(composed, name):
     assert vars(replay.method) == expected
 
 
-@pytest.mark.parametrize("name", sorted(set(METHODS) - CHOOSY))
-def test_a_method_of_one_batch_is_a_buffer_in_torchrls_group(composed, name):
-    overrides = [f"replay_buffer.{each}" for each in (*SMALL, "alpha=0.3", "positive_above=mean")]
-    buffer = instantiate(composed(f"+replay_buffer=signal_{name}", *overrides).replay_buffer)
+@pytest.mark.parametrize("name", OF_ONE_BATCH)
+def test_a_method_of_one_batch_is_a_buffer_in_torchrls_group(at_once, name):
+    buffer = instantiate(at_once.one[name])
     assert isinstance(buffer, SignalReplayBuffer)
     assert buffer.batch_size == 4
     if hasattr(buffer.sampler, "alpha"):

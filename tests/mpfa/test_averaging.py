@@ -102,6 +102,7 @@ def test_averaged_targets_go_on_from_a_state_that_is_loaded(name):
     assert torch.equal(target_of(first, batch.clone()), target_of(second, batch.clone()))
 
 
+@pytest.mark.slow
 def test_a_traced_learner_averages_as_well():
     plain, traced = make_learner("ddpg", 3), make_learner("ddpg", 3, compile={"backend": "eager"})
     for seed in range(4):

@@ -54,7 +54,9 @@ def snapshot(learner):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [*ALL[:3], ("ddpg", TRACED)], ids=[*IDS[:3], "ddpg traced"]
+    ("name", "options"),
+    [*ALL, pytest.param("ddpg", TRACED, marks=pytest.mark.slow)],
+    ids=[*IDS, "ddpg traced"],
 )
 def test_a_batch_with_a_number_that_is_none_changes_nothing_and_is_named(name, options):
     learner = make_learner(name, **options)

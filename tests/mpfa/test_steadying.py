@@ -308,6 +308,7 @@ def test_a_categorical_critic_is_the_same_compiled(name, loss_function):
     assert_same_steps(learners)
 
 
+@pytest.mark.slow
 def test_a_traced_categorical_critic_is_the_same():
     learners = [
         make_learner("ddpg", make_categorical("ddpg"), compile=compile)

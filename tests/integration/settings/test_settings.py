@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import reduce
 from itertools import zip_longest
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from navigation.settings.checks import RULES, settings_by_name
+from navigation.settings.checks import RULES, check_settings, settings_by_name
 from navigation.settings.command_line import composed, parse_overrides
 from navigation.settings.train import GROUPS, Stage, TrainSettings, register
 
@@ -106,14 +108,18 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
     assert found == [(seed, method) for seed in (0, 1, 2) for method in ("mpfa_per", "per")]
 
 
+@pytest.fixture(scope="module")
+def usual() -> TrainSettings:
+    GlobalHydra.instance().clear()
+    return one()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("learner.gamma=2", r"learner.gamma must be in \[0, 1\], got 2.0"),
         ("learner.saturation_penalty=nan", "learner.saturation_penalty must be .*got nan"),
         ("learner.width=0", "learner.width must be at least 1, got 0"),
         ("learner.tau=0", r"learner.tau must be in \(0, 1\], got 0.0"),
-        ("seed=abc", "seed: Value 'abc'"),
         ("seed=-1", "seed must be at least 0, got -1"),
         ("threads=0", "threads must be at least 1"),
         ("device=warp", "device must be one that PyTorch knows, got 'warp'"),
@@ -123,8 +129,53 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
         ("evaluation.episodes=0", "evaluation.episodes must be at least 1, got 0"),
         ("evaluation.world=X", "evaluation.world: world must be .*got 'X'"),
         ("evaluation.world=rooms:7-9", "evaluation.world: world must be rooms:validation or .*7-9"),
-        ("curriculum.stages=[]", "curriculum.stages must name at least one world"),
         ("curriculum.name=a/b", "curriculum.name must be letters"),
+        ("robots=0", "robots must be from 1 to 4096, as a robot takes .* of memory, got 0"),
+        ("robots=3000000", "robots must be from 1 to 4096, .* got 3000000"),
+        (
+            "evaluation.choose=true evaluation.every=9 evaluation.world=mixed:test",
+            "evaluation.choose must be false with evaluation.world=mixed:test, .* nothing may be",
+        ),
+        ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
+        ("updates=0", "updates must be at least 1, got 0"),
+        ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
+        ("assessment.episodes=-1", "assessment.episodes must be at least 0, got -1"),
+        ("assessment.by=spl", "assessment.by must be one of outcome, return, got 'spl'"),
+        (
+            "assessment.episodes=20 evaluation.choose=true evaluation.every=9",
+            "evaluation.choose must be false with assessment.episodes=20, got True",
+        ),
+        ("environment.progress=none-at-all", "environment.progress must be one of straight_line"),
+        ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
+        ("method.fusion=entropi", "method.fusion must be one of entropy"),
+        ("method.alpha=inf", "method.alpha must be finite and not negative, got inf"),
+        ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
+        ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
+        ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
+        ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
+    ],
+)
+def test_a_value_that_cannot_be_is_one_sentence_with_its_name(
+    usual: TrainSettings, arguments: str, message: str
+) -> None:
+    # Set by hand, as Hydra takes most of the time.
+    settings = deepcopy(usual)
+    for name, text in (each.split("=") for each in arguments.split(" ")):
+        *groups, last = name.split(".")
+        group = reduce(getattr, groups, settings)
+        kind = type(getattr(group, last))
+        setattr(group, last, text == "true" if kind is bool else kind(text))
+    with pytest.raises(ValueError, match=message) as caught:
+        check_settings(settings)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("learner.gamma=2", r"learner.gamma must be in \[0, 1\], got 2.0"),
+        ("seed=abc", "seed: Value 'abc'"),
+        ("curriculum.stages=[]", "curriculum.stages must name at least one world"),
         (
             "curriculum.stages=[{world: A, episodes: -3}]",
             r"curriculum.stages\[0\] must have episodes or actions, at least 1, got episodes=-3",
@@ -138,30 +189,10 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
             r"curriculum.stages\[1\] must count what the others count, episodes or actions",
         ),
         ("curriculum.stages=[{world: bras, actions: 9}]", r"stages\[0\].world.*got 'bras'"),
-        ("robots=0", "robots must be from 1 to 4096, as a robot takes .* of memory, got 0"),
-        ("robots=3000000", "robots must be from 1 to 4096, .* got 3000000"),
-        (
-            "evaluation.choose=true evaluation.every=9 evaluation.world=mixed:test",
-            "evaluation.choose must be false with evaluation.world=mixed:test, .* nothing may be",
-        ),
-        ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
-        ("updates=0", "updates must be at least 1, got 0"),
-        ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
-        ("assessment.episodes=-1", "assessment.episodes must be at least 0, got -1"),
-        ("assessment.by=spl", "assessment.by must be one of outcome, return, got 'spl'"),
         (
             "assessment.episodes=20 method=rud",
             "method.update_block must be 1 with assessment.episodes=20, got 1000: two rules",
         ),
-        (
-            "assessment.episodes=20 evaluation.choose=true evaluation.every=9",
-            "evaluation.choose must be false with assessment.episodes=20, got True",
-        ),
-        ("environment.progress=none-at-all", "environment.progress must be one of straight_line"),
-        ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
-        ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
-        ("method.fusion=entropi", "method.fusion must be one of entropy"),
-        ("method.alpha=inf", "method.alpha must be finite and not negative, got inf"),
         (
             "method=ddpg method.reliability=0.2",
             "method.reliability must be 0.0 with method.selection=uniform, .* got 0.2",
@@ -177,9 +208,6 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
             "method=per method.floor_quantile=0.5",
             "method.floor_quantile must be 0.0 with method.priority_floor=0.0, .* got 0.5",
         ),
-        ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
-        ("environment.physics=magic", "environment.physics must be one of wheels, kinematic"),
-        ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
         (
             "curriculum=A environment.clearance=99",
             r"stages\[0\].world, environment.clearance=99.0: world 'A' has no start",
@@ -188,14 +216,16 @@ def test_known_settings_sweeps_and_flags_pass_the_check() -> None:
             "curriculum=A environment.max_goal_distance=0.5",
             r"stages\[0\].world, environment.max_goal_distance=0.5: max_goal_distance must be",
         ),
-        ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
+        ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
         ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
         ("seed=0,-1", "seed must be at least 0, got -1"),
         ("learner.gamma=[", r"'learner.gamma=\[' is not NAME=VALUE"),
         ("gamma", "'gamma' is not NAME=VALUE"),
     ],
 )
-def test_a_value_that_cannot_be_is_one_sentence_with_its_name(arguments: str, message: str) -> None:
+def test_what_cannot_be_on_a_command_line_is_one_sentence_with_its_name(
+    arguments: str, message: str
+) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         list(composed(arguments.split(" ") if "{" not in arguments else [arguments]))
     assert "\n" not in str(caught.value)
