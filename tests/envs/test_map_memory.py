@@ -20,7 +20,7 @@ from mpfa_envs import (
     observation_slices,
 )
 from mpfa_envs.map_memory import RESOLUTION
-from mpfa_envs.render import WAY
+from mpfa_envs.render.colors import WAY
 from mpfa_envs.robot import ROBOTS
 from tests.envs.shapes import random_shapes
 

@@ -25,7 +25,7 @@ from mpfa_envs import (
     summarize,
 )
 from mpfa_envs.kernels.walkers import time_to_collision
-from mpfa_envs.render import WALKER
+from mpfa_envs.render.colors import WALKER
 from mpfa_envs.robot import ROBOTS
 from mpfa_envs.walker_batch import WalkerBatch
 from mpfa_envs.world_batch import WorldBatch
