@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,12 +21,14 @@ UPDATES = "updates.csv"
 CURVE = "learning_curve.png"
 HISTOGRAMS = "histograms.png"
 STATUS = "status.json"
+CSV = "csv"
+TENSORBOARD = "tensorboard"
 PREVIOUS = "previous"
 """Where the files of a run go that is started anew."""
 _LOCK = ".lock"
 _TABLES = (EPISODES, EVALUATIONS, ASSESSMENTS, UPDATES)
 # The checkpoint first: once it is gone, nothing can go on with the old run.
-_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, HISTOGRAMS, STATUS)
+_OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, HISTOGRAMS, STATUS, CSV, TENSORBOARD)
 
 
 class FolderInUse(RuntimeError):
@@ -87,6 +90,8 @@ def set_aside(folder: Path) -> None:
     previous = folder / PREVIOUS
     previous.mkdir(exist_ok=True)
     for name in _OF_A_RUN:
+        if (previous / name).is_dir():
+            shutil.rmtree(previous / name)
         (previous / name).unlink(missing_ok=True)
     for name in _OF_A_RUN:
         if (folder / name).exists():

@@ -143,6 +143,7 @@ RULES: dict[str, Rule] = {
     "ray.workers": at_least(0),
     "ray.steps": at_least(1),
     "tracking.mode": choice("offline", "online", "off"),
+    "tracking.group": (lambda value: 0 < len(value) <= 128, "a word of at most 128 letters"),
     "tracking.log_every": at_least(1),
 }
 """By dotted name; a setting that is null is not looked at."""
@@ -209,6 +210,10 @@ def check_settings(settings: TrainSettings) -> None:
     if is_discrete(settings.learner):
         _check_values_alone(settings)
     _check_device(settings.device)
+    if settings.tracking.tensorboard and find_spec("tensorboard") is None:
+        raise ValueError(
+            "tracking=tensorboard needs TensorBoard: pip install 'torchrl-mpfa[tensorboard]'"
+        )
 
 
 def _check_method(method: Method) -> None:

@@ -15,7 +15,8 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from navigation.settings.checks import check_settings
-from navigation.settings.train import GROUPS, TrainSettings, as_settings
+from navigation.settings.resuming import choices_of
+from navigation.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
 
 _WITH_A_WORD = ("--cfg", "-c", "--package", "-p", "--info", "-i")
 """Options of Hydra that are followed by a word of their own."""
@@ -64,13 +65,29 @@ def parse_overrides(arguments: Sequence[str]) -> list[Override]:
         if key not in known:
             raise ValueError(f"unknown setting {key!r}{_nearest(key, known)}")
         if key in GROUPS and not override.is_sweep_override():
-            value = str(override.value())
-            if value not in GROUPS[key]:
-                raise ValueError(
-                    f"unknown choice {value!r} of {key!r}{_nearest(value, GROUPS[key])}; "
-                    f"there are: {', '.join(GROUPS[key])}"
-                )
+            _check_choices(key, choices_of(override))
     return overrides
+
+
+def _check_choices(group: str, words: Sequence[str]) -> None:
+    """Refuse unknown choices of a group, and several that exclude each other."""
+    for word in words:
+        if word not in GROUPS[group]:
+            raise ValueError(
+                f"unknown choice {word!r} of {group!r}{_nearest(word, GROUPS[group])}; "
+                f"there are: {', '.join(GROUPS[group])}"
+            )
+    given = ",".join(words)
+    if group != SEVERAL and len(words) != 1:
+        raise ValueError(f"{group} must be one of {', '.join(GROUPS[group])}, got [{given}]")
+    if group != SEVERAL:
+        return
+    keys = [key for word in words for key in GROUPS[group][word]]
+    if not words or len(keys) < len(words) > 1 or len(set(keys)) < len(keys):
+        raise ValueError(
+            f"{group} must be off, or one or several of wandb (or online), tensorboard and csv, "
+            f"got [{given}]"
+        )
 
 
 def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:

@@ -12,7 +12,9 @@ from navigation.settings.checks import settings_by_name
 from navigation.settings.train import (
     GROUPS,
     REGIMES,
+    SEVERAL,
     Stage,
+    TrackingSettings,
     TrainSettings,
     as_settings,
     curriculum_name,
@@ -24,7 +26,10 @@ LAWFUL = (
     "checkpoint_every",
     "threads",
     "tracking.mode",
+    "tracking.csv",
+    "tracking.tensorboard",
     "tracking.project",
+    "tracking.group",
     "tracking.log_every",
     "ray.workers",
     "ray.address",
@@ -56,9 +61,11 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
         if key in OF_THE_CALL:
             continue
         if key in GROUPS and key != "regime":
-            chosen = OmegaConf.structured(GROUPS[key][str(value)])
+            chosen = [GROUPS[key][word] for word in choices_of(override)]
+            if key == SEVERAL:
+                chosen.insert(0, TrackingSettings)
             # As at the start of the run, its regime has values of its own for any choice.
-            config[key] = OmegaConf.merge(chosen, REGIMES[before.regime].get(key, {}))
+            config[key] = OmegaConf.merge(*chosen, REGIMES[before.regime].get(key, {}))
         else:
             OmegaConf.update(config, key, value)
     was_derived = before.curriculum.name == curriculum_name(before.curriculum.stages)
@@ -66,6 +73,12 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
     if was_derived and not named:
         config.curriculum.name = None
     return as_settings(config)
+
+
+def choices_of(override: Override) -> list[str]:
+    """What a command line chooses of a group: one word or several in brackets."""
+    value = override.value()
+    return [str(word) for word in (value if isinstance(value, list) else [value])]
 
 
 def check_lawful(before: TrainSettings, after: TrainSettings, folder: Path) -> None:

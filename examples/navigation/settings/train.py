@@ -133,11 +133,18 @@ class EvaluationSettings:
 
 @dataclass
 class TrackingSettings:
-    """Where the run is logged."""
+    """Where the run is logged; ``tracking=[wandb,csv]`` names several places."""
 
-    mode: str = "offline"
+    mode: str = "off"
     """wandb: ``offline`` (no account), ``online`` or ``off``."""
+    csv: bool = False
+    """Whether TorchRL's CSVLogger writes a file for each number, to ``csv/`` of the folder."""
+    tensorboard: bool = False
+    """Whether TorchRL's TensorboardLogger writes to ``tensorboard/`` of the folder."""
     project: str = "torchrl-mpfa"
+    """wandb: the project."""
+    group: str | None = None
+    """wandb: what the runs of a kind have in common; null: CURRICULUM-METHOD-LEARNER."""
     log_every: int = 200
     """Actions between two entries of losses, weights and priorities."""
 
@@ -185,7 +192,7 @@ class TrainSettings:
             {"method": "mpfa_per"},
             {"learner": "ddpg"},
             {"curriculum": "A"},
-            {"tracking": "offline"},
+            {"tracking": "wandb"},
             # After the learner: it has its values for all learners.
             {"regime": "rooms"},
             {"override hydra/job_logging": "none"},
@@ -267,6 +274,8 @@ REGIMES: dict[str, dict[str, Any]] = {
 }
 """The paper's task and numbers, and what one would do today."""
 
+SEVERAL = "tracking"
+"""The group of which a run may have several choices: each says what it has beyond the others."""
 GROUPS: dict[str, dict[str, Any]] = {
     "method": METHODS,
     "learner": {
@@ -279,9 +288,12 @@ GROUPS: dict[str, dict[str, Any]] = {
     },
     "curriculum": {name: CurriculumSettings(stages=stages) for name, stages in CURRICULA.items()},
     "tracking": {
-        "offline": TrackingSettings,
-        "online": TrackingSettings(mode="online"),
-        "off": TrackingSettings(mode="off"),
+        "wandb": {"mode": "offline"},
+        "offline": {"mode": "offline"},
+        "online": {"mode": "online"},
+        "tensorboard": {"tensorboard": True},
+        "csv": {"csv": True},
+        "off": {},
     },
     "regime": REGIMES,
 }

@@ -75,7 +75,10 @@ class Job:
     def overrides(self, overrides: Sequence[str]) -> list[str]:
         """Its settings on the command line of ``train.py``."""
         own = [f"learner={self.learner}", f"method={self.method}", f"seed={self.seed}"]
-        return [*own, f"run_dir={self.path}", *with_defaults(self.arm.over(overrides))]
+        # The runs that differ by their seeds alone are one group in wandb.
+        group = f"{self.folder.name}/{self.name.removesuffix(f'-{self.seed}')}"
+        own += [f"run_dir={self.path}", f"tracking.group={group[:128]}"]
+        return [*own, *with_defaults(self.arm.over(overrides))]
 
     def asked(self, overrides: Sequence[str]) -> TrainSettings:
         """Its settings.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import logging
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -13,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch._inductor.config as inductor
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from tqdm import tqdm
@@ -98,7 +95,8 @@ class TrainingRun:
             self._begin_stage()
         else:
             self._load(state)
-        self.tracker = Tracker(settings, folder, run_id=None if state is None else state["wandb"])
+        run_id = None if state is None else state["wandb"]
+        self.tracker = Tracker(settings, folder, run_id=run_id, actions=self.actions)
 
     def _build(self) -> None:
         """Make the parts that learn, and the buffer."""
@@ -342,6 +340,8 @@ class TrainingRun:
 
     def save(self) -> None:
         """Write checkpoint, policy and records, each of them whole or not at all."""
+        # What was logged until now is not logged again by a run that goes on from here.
+        self.tracker.flush()
         state = {
             "format": FORMAT,
             "settings": asdict(self.settings),
@@ -429,19 +429,3 @@ def make_robots(settings: TrainSettings) -> Robots:
     from navigation.training.fleet import Fleet
 
     return Fleet(settings)
-
-
-def prepare_process(settings: TrainSettings) -> None:
-    """Set threads, arithmetic and logging."""
-    torch.set_num_threads(settings.threads)
-    # Weights that no gradient reaches decay until they are denormal numbers; after some five
-    # thousand updates a CPU takes twice as long for each because of them.
-    torch.set_flush_denormal(True)
-    # By default a pool of processes would wait for programs to compile, of which there are two.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
-    # Nor need it compile a program for each set of vector instructions that the processor has, a
-    # quarter of the time: a compiler that takes PyTorch's C++20 knows them.
-    if inductor.cpp.vec_isa_ok is None:
-        inductor.cpp.vec_isa_ok = True
-    # TorchRL announces each storage in the middle of the progress bar.
-    logging.getLogger("torchrl").setLevel(logging.WARNING)

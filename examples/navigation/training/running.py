@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import logging
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import torch
+import torch._inductor.config as inductor
 from hydra.core.override_parser.types import Override
 
 from mpfa_envs.render import plot_histograms
@@ -19,7 +23,7 @@ from navigation.settings.resuming import changed, check_lawful
 from navigation.settings.train import TrainSettings, as_settings
 from navigation.training.assembly import method_of
 from navigation.training.checkpoints import read_checkpoint
-from navigation.training.loop import TrainingRun, prepare_process
+from navigation.training.loop import TrainingRun
 from torchrl_mpfa.saving import write_text_atomically
 
 
@@ -101,6 +105,22 @@ def resume(folder: Path, overrides: list[Override]) -> int:
         return _train(training)
 
 
+def prepare_process(settings: TrainSettings) -> None:
+    """Set threads, arithmetic and logging."""
+    torch.set_num_threads(settings.threads)
+    # Weights that no gradient reaches decay until they are denormal numbers; after some five
+    # thousand updates a CPU takes twice as long for each because of them.
+    torch.set_flush_denormal(True)
+    # By default a pool of processes would wait for programs to compile, of which there are two.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
+    # Nor need it compile a program for each set of vector instructions that the processor has, a
+    # quarter of the time: a compiler that takes PyTorch's C++20 knows them.
+    if inductor.cpp.vec_isa_ok is None:
+        inductor.cpp.vec_isa_ok = True
+    # TorchRL announces each storage in the middle of the progress bar.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
 def _train(training: TrainingRun) -> int:
     folder = training.folder
     try:
@@ -114,6 +134,8 @@ def _train(training: TrainingRun) -> int:
         plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
     if histograms := training.log.history.histograms():
         plot_histograms(histograms, folder / files.HISTOGRAMS)
+    if training.tracker.upload is not None:
+        print(f"wandb: upload with: {training.tracker.upload}")
     if finished:
         print(f"policy: {folder / files.POLICY}   curve: {curve}")
         return 0

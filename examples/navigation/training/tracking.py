@@ -1,9 +1,14 @@
-"""Logging to wandb: offline by default, online or off by one setting. All of wandb is here."""
+"""What a run logs, and to wandb: offline by default, online or off by one setting.
+
+All of wandb is here; TorchRL's loggers that may be beside it are in ``loggers.py``.
+"""
 
 from __future__ import annotations
 
 import os
 import secrets
+import shlex
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,42 +19,39 @@ import wandb
 from tensordict import TensorDictBase
 
 from navigation.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
-from navigation.settings.train import TrainSettings
+from navigation.settings.train import TrackingSettings, TrainSettings
+from navigation.training.loggers import CSVLog, Log, TensorboardLog
 from torchrl_mpfa import SignalReplayBuffer
 
 AXIS = "actions"
 """What every entry is plotted over: actions of all robots so far."""
-_MODES = {"offline": "offline", "online": "online", "off": "disabled"}
 
 
 class Tracker:
-    """A wandb run; every key is explained in ``docs/metrics.md``.
+    """The logs of a run; every name is explained in ``docs/metrics.md``.
 
     Args:
         settings: The settings, logged as the run's configuration.
-        folder: Where an offline run is kept.
-        run_id: Of the run that is gone on with; it stays one run.
+        folder: Of the run, where logs are kept.
+        run_id: wandb's of the run that is gone on with; it stays one run.
+        actions: After which the run goes on; 0: it begins.
     """
 
-    def __init__(self, settings: TrainSettings, folder: Path, *, run_id: str | None) -> None:
-        os.environ.setdefault("WANDB_SILENT", "true")
-        parts = [settings.curriculum.name or "", settings.method.name, settings.learner.name]
-        self.run_id = run_id or secrets.token_hex(4)
-        self._run: Any = wandb.init(
-            project=settings.tracking.project,
-            id=self.run_id,
-            resume="allow",
-            name=folder.name,
-            group="-".join(parts),
-            job_type="train",
-            tags=[part[:64] for part in parts],
-            mode=_MODES[settings.tracking.mode],  # type: ignore[arg-type]
-            dir=folder,
-            config=asdict(settings),
-            allow_val_change=True,
-        )
-        # wandb's own step takes one value of a key, and several episodes may end at one action.
-        self._run.define_metric("*", step_metric=AXIS)
+    def __init__(
+        self, settings: TrainSettings, folder: Path, *, run_id: str | None, actions: int = 0
+    ) -> None:
+        # A sweep has given its run an id.
+        self.run_id = run_id or os.environ.get("WANDB_RUN_ID") or secrets.token_hex(4)
+        wanted = settings.tracking
+        self._logs: list[Log] = []
+        self.upload = upload_command(wanted, folder, self.run_id)
+        """What uploads the run to wandb, if it is kept offline."""
+        if wanted.mode != "off":
+            self._logs.append(WandbLog(settings, folder, run_id=self.run_id))
+        if wanted.csv:
+            self._logs.append(CSVLog(folder, actions=actions))
+        if wanted.tensorboard:
+            self._logs.append(TensorboardLog(folder, actions=actions))
 
     def log_episode(self, record: EpisodeRecord) -> None:
         """Log one episode."""
@@ -83,8 +85,8 @@ class Tracker:
         batch: TensorDictBase,
     ) -> None:
         """Log losses, values, and what the priorities are made of."""
-        if self._run.disabled:
-            return  # The histograms would take their time.
+        if not self._logs:
+            return  # The statistics would take their time.
         entries: dict[str, Any] = {
             f"loss/{name}": value.float().mean().item() for name, value in losses.items()
         }
@@ -93,18 +95,106 @@ class Tracker:
                 entries[f"replay/{name}"] = value
         if "priority_weight" in batch.keys():  # noqa: SIM118 - a TensorDict iterates over rows
             entries["replay/beta"] = buffer.sampler.beta
-            entries["priorities/importance_weight"] = _histogram(batch["priority_weight"])
+            entries["priorities/importance_weight"] = batch["priority_weight"].detach().cpu()
             for name, value in batch["signals"].items():
-                entries[f"priorities/{name}"] = _histogram(value)
+                entries[f"priorities/{name}"] = value.detach().cpu()
         self._log(entries, step)
 
-    def _log(self, entries: dict[str, Any], actions: int) -> None:
-        self._run.log({**entries, AXIS: actions})
+    def _log(self, entries: Mapping[str, Any], actions: int) -> None:
+        for log in self._logs:
+            log.log(entries, actions)
+
+    def flush(self) -> None:
+        """See that what was logged is kept, however this process ends."""
+        for log in self._logs:
+            log.flush()
+
+    def close(self) -> None:
+        """Finish the logs."""
+        for log in self._logs:
+            log.close()
+
+
+class WandbLog:
+    """A run of wandb, the same one however often it goes on.
+
+    What a run does again after a checkpoint is logged once: how far it was logged is in a file,
+    since wandb does not tell it of an offline run.
+
+    Args:
+        settings: Of the run, its configuration.
+        folder: Of the run, where wandb keeps it.
+        run_id: Of the run.
+    """
+
+    def __init__(self, settings: TrainSettings, folder: Path, *, run_id: str) -> None:
+        os.environ.setdefault("WANDB_SILENT", "true")
+        parts = [settings.curriculum.name or "", settings.method.name, settings.learner.name]
+        try:
+            self._run: Any = wandb.init(
+                project=settings.tracking.project,
+                id=run_id,
+                resume="allow",
+                name=folder.name,
+                group=settings.tracking.group or "-".join(parts)[:128],
+                job_type="train",
+                tags=[part[:64] for part in (*parts, settings.regime)],
+                mode=settings.tracking.mode,  # type: ignore[arg-type]
+                dir=folder,
+                config=asdict(settings),
+                allow_val_change=True,
+            )
+        except wandb.Error as error:
+            raise ValueError(
+                f"tracking.mode={settings.tracking.mode}: wandb says {str(error).rstrip('.')}; "
+                "tracking=wandb keeps the run on this machine"
+            ) from error
+        # wandb's own step takes one value of a key, and several episodes may end at one action.
+        self._run.define_metric("*", step_metric=AXIS)
+        self._path = folder / "wandb" / f"logged-{run_id}.txt"
+        self._path.parent.mkdir(exist_ok=True)
+        self._path.touch()
+        words = self._path.read_text().split() or (self._run.step, -1)
+        self._entries, self._before = map(int, words)
+        self._actions = self._before
+
+    def log(self, entries: Mapping[str, Any], actions: int) -> None:
+        """Log entries, unless that was done before the run was stopped."""
+        if actions <= self._before:
+            return
+        shown = {name: _as_wandb(value) for name, value in entries.items()}
+        self._run.log({**shown, AXIS: actions}, step=self._entries, commit=True)
+        self._entries, self._actions = self._entries + 1, max(self._actions, actions)
+        # Not emptied first: the new numbers are as long as the old ones, or longer.
+        with self._path.open("r+") as file:
+            file.write(f"{self._entries} {self._actions}")
+
+    def flush(self) -> None:
+        """Do nothing: wandb has a process of its own, which outlives this one."""
 
     def close(self) -> None:
         """Finish the run."""
         self._run.finish()
 
 
-def _histogram(values: torch.Tensor) -> Any:
-    return wandb.Histogram(np.asarray(values.detach().cpu()))
+def _as_wandb(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        return wandb.Histogram(np.asarray(value))
+    return value
+
+
+def upload_command(wanted: TrackingSettings, folder: Path, run_id: str) -> str | None:
+    """The command line that uploads all parts of an offline run, as one run.
+
+    Args:
+        wanted: Of the run.
+        folder: Of the run.
+        run_id: wandb's.
+
+    Examples:
+        >>> upload_command(TrackingSettings(mode="offline"), Path("runs/demo"), "1a2b3c4d")
+        'wandb sync runs/demo/wandb/offline-run-*-1a2b3c4d'
+    """
+    if wanted.mode != "offline":
+        return None
+    return f"wandb sync {shlex.quote(str(folder))}/wandb/offline-run-*-{run_id}"

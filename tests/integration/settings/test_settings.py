@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import asdict
 from functools import reduce
 from itertools import zip_longest
 
@@ -11,7 +12,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from navigation.settings.checks import RULES, check_settings, settings_by_name
 from navigation.settings.command_line import composed, parse_overrides
-from navigation.settings.train import GROUPS, Stage, TrainSettings, register
+from navigation.settings.resuming import changed
+from navigation.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings, register
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -47,6 +49,27 @@ def test_the_paper_curriculum_has_a_thousand_episodes() -> None:
 @pytest.mark.parametrize("choices", [*zip_longest(*GROUPS.values())], ids=str)
 def test_every_choice_of_every_group_passes_the_checks(choices: tuple[str | None, ...]) -> None:
     one(*(f"{group}={each}" for group, each in zip(GROUPS, choices, strict=True) if each))
+
+
+@pytest.mark.parametrize(
+    ("words", "places"),
+    [
+        ((), ("offline", False, False)),
+        (("tracking=offline",), ("offline", False, False)),
+        (("tracking=[wandb,csv]",), ("offline", True, False)),
+        (("tracking=[csv,tensorboard,online]",), ("online", True, True)),
+        (("tracking=off", "tracking.mode=online"), ("online", False, False)),
+    ],
+)
+def test_tracking_is_one_place_or_several(
+    words: tuple[str, ...], places: tuple[str, bool, bool]
+) -> None:
+    found = one("regime=paper", *words).tracking
+    assert (found.mode, found.csv, found.tensorboard) == places
+    if words:
+        # A run that goes on is logged where it is told, not where it was.
+        before = asdict(TrainSettings(tracking=TrackingSettings(tensorboard=True)))
+        assert changed(before, parse_overrides(words)).tracking == found
 
 
 def test_an_override_reaches_the_typed_settings() -> None:
@@ -221,6 +244,13 @@ def test_a_value_that_cannot_be_is_one_sentence_with_its_name(
         ("seed=0,-1", "seed must be at least 0, got -1"),
         ("learner.gamma=[", r"'learner.gamma=\[' is not NAME=VALUE"),
         ("gamma", "'gamma' is not NAME=VALUE"),
+        ("tracking=wand", "unknown choice 'wand' of 'tracking': did you mean 'wandb'"),
+        ("tracking=[csv,wand]", "unknown choice 'wand' of 'tracking': did you mean 'wandb'"),
+        ("tracking=[off,csv]", r"tracking must be off, or one or several of .*got \[off,csv\]"),
+        ("tracking=[wandb,online]", r"tracking must be off, .*, got \[wandb,online\]"),
+        ("tracking=[csv,csv]", r"tracking must be off, .*, got \[csv,csv\]"),
+        ("tracking=[]", r"tracking must be off, .*, got \[\]"),
+        ("method=[per,lap]", r"method must be one of .*, got \[per,lap\]"),
     ],
 )
 def test_what_cannot_be_on_a_command_line_is_one_sentence_with_its_name(

@@ -196,7 +196,7 @@ def test_one_wandb_run_stays_one_through_resuming(
     assert len({each["id"] for each in started}) == 1
     assert [each["resume"] for each in started] == ["allow"] * 3
     assert started[0]["group"] == "A1-mpfa_per-ddpg"
-    assert started[0]["tags"] == ["A1", "mpfa_per", "ddpg"]
+    assert started[0]["tags"] == ["A1", "mpfa_per", "ddpg", "paper"]
     assert started[0]["job_type"] == "train"
     assert read_checkpoint(tmp_path)["wandb"] == started[0]["id"]
 

@@ -19,7 +19,8 @@ from navigation.records import EvaluationRecord
 from navigation.settings.train import GROUPS, Stage, TrainSettings
 from navigation.training import loop
 from navigation.training.checkpoints import random_state, read_checkpoint, set_random_state
-from navigation.training.loop import TrainingRun, prepare_process
+from navigation.training.loop import TrainingRun
+from navigation.training.running import prepare_process
 from tests.integration.tiny_runs import rows, tiny, train
 from torchrl_mpfa import SignalSampler, save_atomically
 from torchrl_mpfa.methods import ALIASES
