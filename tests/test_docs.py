@@ -8,8 +8,10 @@ import sys
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 import yaml
 
 import mpfa_envs
@@ -101,3 +103,41 @@ def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
         assert "arithmatex" not in text, page
     for page in (tmp_path / "reference").glob("*.html"):
         assert not re.search(r":(?:class|func|meth|attr|data):", page.read_text("utf-8")), page
+
+
+SMALL = {
+    "24_000": "1_280",
+    "100_000": "2_000",
+    "6_400": "640",
+    "width=64": "width=8",
+    "episodes=40": "episodes=2",
+    "episodes=12": "episodes=2",
+}
+"""The tutorial's sizes, and those at which the tests run it."""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", ["tutorial.md", *(p for p in PAGES if p.startswith("howto/"))])
+def test_the_code_of_a_page_runs_in_its_order(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    text = (DOCS / page).read_text(encoding="utf-8")
+    if page == "tutorial.md":
+        for size, small in SMALL.items():
+            assert size in text
+            text = text.replace(size, small)
+    try:
+        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+            exec(block, names)
+    finally:
+        torch.set_flush_denormal(False)
+    if page == "tutorial.md":
+        assert names["learner"].updates == 256
+        assert set(names["paths"]) == {0, 1}
+        assert (tmp_path / "policy.npz").exists()
+        assert (tmp_path / "paths.png").exists()
+    elif "buffer" in names:
+        # The last buffer of a page was learned from.
+        assert names["buffer"].sampler.weights
