@@ -43,7 +43,7 @@ from navigation.evaluating import Drivable, Drives, drive, summary_row, tasks_of
 from navigation.live import watch
 from navigation.pictures import Values, write_pictures
 from navigation.records import as_table, write_table
-from navigation.training.values import load_values
+from navigation.training.values import load_learner, values_of
 from navigation.worlds import parse_worlds, world_name, worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
@@ -202,10 +202,11 @@ def critic(options: argparse.Namespace) -> Values | None:
     if options.path is None or not (options.path / files.CHECKPOINT).exists():
         return None
     try:
-        return load_values(options.path, options.loaded)
+        learner, settings = load_learner(options.path, options.loaded)
     except ValueError as error:
         print(f"no picture of Q: {error}")
         return None
+    return values_of(learner, options.loaded, settings)
 
 
 def show_live(options: argparse.Namespace, how: Mapping[str, Any]) -> pd.DataFrame:

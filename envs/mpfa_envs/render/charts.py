@@ -42,7 +42,8 @@ def plot_seeds(
     """Plot the mean of runs with a band around it, and when each first reached a level.
 
     The mean goes to the end of the shortest run. On the line of the level, a tick marks the step at
-    which a run first reached it, a triangle the median of all runs, if at least half of them did.
+    which a run first reached it, a triangle the median of all runs, if at least half of them did;
+    the legend has its step.
 
     Args:
         runs: Curves of the seeds of each method, by name.
@@ -105,9 +106,10 @@ def draw_seeds(
         if len(curves) > 1:
             axis.fill_between(steps, low, high, color=style["color"], alpha=0.18, lw=0)
         label = name if len(curves) == 1 else f"{name} ({len(curves)})"
-        axis.plot(steps, mean, **style, lw=1.8, label=label)
         if level is not None:
-            _mark_level(axis, [first_step(curve, level) for curve in curves], level, number, style)
+            median = _mark_level(axis, [first_step(each, level) for each in curves], level, style)
+            label += f": {level:g} at {_thousands(median, None)}" if math.isfinite(median) else ""
+        axis.plot(steps, mean, **style, lw=1.8, label=label)
     if limits is not None:
         pad = 0.02 * (limits[1] - limits[0])
         axis.set_ylim(limits[0] - pad, limits[1] + pad)
@@ -169,32 +171,21 @@ def _checked(curve: Curve) -> tuple[Array, Array]:
     return steps, values
 
 
-def _mark_level(
-    axis: Any, steps: Sequence[float], level: float, number: int, style: Mapping[str, str]
-) -> None:
-    """Mark when runs reached the level, and the median of them with its step in words."""
+def _mark_level(axis: Any, steps: Sequence[float], level: float, style: Mapping[str, str]) -> float:
+    """Mark when runs reached the level, and the median of them, which it returns."""
     reached = [step for step in steps if math.isfinite(step)]
-    axis.plot(reached, [level] * len(reached), "|", color=style["color"], ms=9, mew=1.2)
+    axis.plot(reached, [level] * len(reached), "|", color=style["color"], ms=9, mew=1.2, zorder=3)
     median = float(np.median(steps))
-    if not math.isfinite(median):
-        return
-    axis.plot(median, level, "v", color=style["color"], ms=7, mec="white", mew=0.7)
-    # Each method writes one line lower than the one before it, so that none is written over.
-    axis.annotate(
-        _thousands(median, None),
-        (median, level),
-        xytext=(4, -12 - 11 * number),
-        textcoords="offset points",
-        color=style["color"],
-        fontsize="small",
-    )
+    if math.isfinite(median):
+        axis.plot(median, level, "v", color=style["color"], ms=8, mec="white", mew=0.7, zorder=4)
+    return median
 
 
 def plot_histograms(
     histories: Mapping[str, tuple[Any, Any, Any]],
     path: str | os.PathLike[str],
     *,
-    columns: int = 2,
+    columns: int = 3,
     xlabel: str = "actions",
 ) -> None:
     """Plot how the distribution of some numbers changes with time, a panel each.

@@ -89,7 +89,7 @@ def render_samples(
     pictures = {
         (title, "transitions"): there[shown],
         ("", "mean priority"): per_cell(weights)[shown] / there[shown],
-        ("", "sampled, uniform = 1"): per_cell(rate)[shown] / there[shown],
+        ("", "times as often as uniformly"): per_cell(rate)[shown] / there[shown],
     }
     return tiled(
         [

@@ -69,7 +69,7 @@ class Scale(NamedTuple):
         return words + _BAR + _AFTER_LABEL
 
     def _words(self) -> tuple[str, str, str]:
-        return self.name, f"{self.low:.3g}", f"{self.high:.3g}"
+        return f"{self.name}:", f"{self.low:.3g}", f"{self.high:.3g}"
 
     def write(self, canvas: Canvas, x: float, middle: float) -> None:
         """Write it where it begins."""

@@ -18,19 +18,19 @@ from navigation.training.checkpoints import read_checkpoint
 from torchrl_mpfa import Learner, SignalLoss
 
 
-def load_values(folder: Path, policy: Policy) -> Values:
-    """Read the critic of a run.
+def load_learner(folder: Path, policy: Policy) -> tuple[Learner, TrainSettings]:
+    """Read the learner of a run, with its critic.
 
     Args:
         folder: Of the run, with its checkpoint.
-        policy: Whose actions are valued.
+        policy: That of the run.
 
     Returns:
-        Q of the policy's actions; of two critics the smaller one.
+        The learner, which is not compiled, and the settings of the run.
 
     Raises:
         FileNotFoundError: If there is no checkpoint.
-        ValueError: If it is damaged, of another version, or its critic is of another policy.
+        ValueError: If it is damaged, of another version, or its learner is of another policy.
     """
     state = read_checkpoint(folder)
     settings = as_settings(state["settings"])
@@ -38,7 +38,7 @@ def load_values(folder: Path, policy: Policy) -> Values:
     sizes = policy.observation_size, policy.action_size
     learner = make_learner(settings.learner, method_of(settings), *sizes)
     learner.load_state_dict(state["learner"])
-    return values_of(learner, policy, settings)
+    return learner, settings
 
 
 def values_of(learner: Learner, policy: Policy, settings: TrainSettings) -> Values:
