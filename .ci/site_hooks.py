@@ -7,6 +7,7 @@ becomes a page with its text. Formulas become MathML, which browsers show withou
 from __future__ import annotations
 
 import html
+import json
 import posixpath
 import re
 from pathlib import Path, PurePosixPath
@@ -75,10 +76,21 @@ def source_page(path: str) -> str:
         names = sorted(each.name for each in file.iterdir() if not each.name.startswith(("_", ".")))
         return f"# {path}/\n\n" + "".join(f"- `{name}`\n" for name in names)
     text = file.read_text(encoding="utf-8")
-    if path.endswith(".md"):
+    if path.endswith(".ipynb"):
+        text = notebook_text(text)
+    if path.endswith((".md", ".ipynb")):
         return relinked(text, posixpath.dirname(path), place(path))
     language = _LANGUAGES.get(PurePosixPath(path).suffix, "text")
     return f"# {path}\n\n````{language}\n{text}````\n"
+
+
+def notebook_text(text: str) -> str:
+    """The cells of a notebook as Markdown."""
+    parts = []
+    for cell in json.loads(text)["cells"]:
+        source = "".join(cell["source"])
+        parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
+    return "\n\n".join(parts)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -89,9 +101,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         wanted |= linked_files(file.content_string, posixpath.join("docs", _folder(file.src_uri)))
     text = relinked(readme, ".", "index.md")
     files.append(File.generated(config, "index.md", content=text))
-    for path in sorted(wanted - {"README.md"}):
-        name = place(path)
-        files.append(File.generated(config, name, content=source_page(path)))
+    made = {"README.md"}
+    while new := sorted(wanted - made):
+        for path in new:
+            files.append(File.generated(config, place(path), content=source_page(path)))
+            if path.endswith(".md"):
+                text = (ROOT / path).read_text(encoding="utf-8")
+                wanted |= linked_files(text, posixpath.dirname(path))
+        made |= set(new)
     return files
 
 

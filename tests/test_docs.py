@@ -57,7 +57,9 @@ def test_every_page_is_in_the_navigation_once() -> None:
     assert sorted(nav) == sorted([*PAGES, "index.md"])
 
 
-@pytest.mark.parametrize("page", ["../README.md", "../examples/policies/README.md", *PAGES])
+@pytest.mark.parametrize(
+    "page", ["../README.md", "../CONTRIBUTING.md", "../examples/policies/README.md", *PAGES]
+)
 def test_every_link_of_a_page_leads_somewhere(page: str) -> None:
     path = (DOCS / page).resolve()
     for link, anchor in LINK.findall(without_code(path.read_text(encoding="utf-8"))):
