@@ -51,10 +51,19 @@ NAME: Rule = (
     "letters, digits and any of . _ + -, as it names a folder",
 )
 
+SIGNALS = (
+    *("reward", "td_error", "action_gradient", "value"),
+    *("relative_value", "relative_td_error"),
+)
+"""What the losses of ``train.py`` write; a script of your own may have others."""
 MOST_ROBOTS = 4096
 """On wheels these take 6.4 GB."""
 
+WORD: Rule = (lambda value: bool(value.strip()), "no empty word")
+
 RULES: dict[str, Rule] = {
+    "run_dir": WORD,
+    "tracking.project": WORD,
     "seed": at_least(0),
     "threads": at_least(1),
     "checkpoint_every": at_least(1),
@@ -139,12 +148,13 @@ RULES: dict[str, Rule] = {
     "assessment.early_share": SHARE,
     "assessment.best_factor": SHARE,
     "assessment.by": choice("outcome", "return"),
-    "ray.address": (lambda value: bool(value.strip()), "no empty word"),
+    "ray.address": WORD,
     "ray.workers": at_least(0),
     "ray.steps": at_least(1),
     "tracking.mode": choice("offline", "online", "off"),
     "tracking.group": (lambda value: 0 < len(value) <= 128, "a word of at most 128 letters"),
     "tracking.log_every": at_least(1),
+    "tracking.pictures_every": at_least(0),
 }
 """By dotted name; a setting that is null is not looked at."""
 
@@ -223,6 +233,9 @@ def _check_method(method: Method) -> None:
             f"method.{name} must be {getattr(Method(), name)} with method.{cause}="
             f"{getattr(method, cause)}, which cannot use it, got {getattr(method, name)}"
         )
+    for name in method.signals:
+        if name not in SIGNALS:
+            raise ValueError(f"method.signals must be of {', '.join(SIGNALS)}, got {name!r}")
     if method.combination == "mixture" and method.selection != "prioritized":
         raise ValueError(
             f"method.combination must be sum or product with method.selection={method.selection}, "

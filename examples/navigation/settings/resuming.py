@@ -31,6 +31,7 @@ LAWFUL = (
     "tracking.project",
     "tracking.group",
     "tracking.log_every",
+    "tracking.pictures_every",
     "ray.workers",
     "ray.address",
     "ray.steps",

@@ -147,6 +147,9 @@ class TrackingSettings:
     """wandb: what the runs of a kind have in common; null: CURRICULUM-METHOD-LEARNER."""
     log_every: int = 200
     """Actions between two entries of losses, weights and priorities."""
+    pictures_every: int | None = 0
+    """Actions between two sets of pictures of the policy in the worlds of ``evaluation.world``,
+    for wandb and TensorBoard; 0: at the end alone, null: none."""
 
 
 @dataclass

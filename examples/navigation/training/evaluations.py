@@ -12,7 +12,7 @@ from navigation.records import EvaluationRecord
 from navigation.settings.train import TrainSettings
 from navigation.training.assembly import policy_layers
 
-_SEED = 1
+SEED = 1
 """Of the pairs of start and goal: others than those of ``evaluate.py``."""
 
 
@@ -67,7 +67,7 @@ def evaluate_policy(
     start = time.perf_counter()
     wanted = settings.evaluation
     results = evaluate(
-        exported_policy(policy, settings), wanted.world, episodes=wanted.episodes, seed=_SEED
+        exported_policy(policy, settings), wanted.world, episodes=wanted.episodes, seed=SEED
     )
     names = ("success", "collision", "timeout", "spl")
     return EvaluationRecord(

@@ -36,6 +36,7 @@ from navigation.training.driving import Robots
 from navigation.training.evaluations import evaluate_policy, exported_policy
 from navigation.training.exploration import make_explorer
 from navigation.training.schedule import Schedule
+from navigation.training.showing import show_policy
 from navigation.training.tracking import Tracker
 from navigation.training.updates import UpdateLog
 from torchrl_mpfa import Draw, run_updates, save_atomically
@@ -153,6 +154,7 @@ class TrainingRun:
             unit=self.schedule.unit,
             smoothing=0.05,
         )
+        begun = self.actions
         with self.stop.listening(), bar:
             try:
                 while not self.schedule.finished and not self.stop:
@@ -171,6 +173,8 @@ class TrainingRun:
                 raise
             bar.set_postfix_str(self._tell())
         self.save()
+        if self.schedule.finished and self.actions > begun:
+            self._show()
         return self.schedule.finished
 
     def _iterate(self) -> None:
@@ -200,6 +204,8 @@ class TrainingRun:
             self.tracker.log_episode(record)
         if self._crossed(self.settings.evaluation.every, before):
             self._evaluate()
+        if self._crossed(self.settings.tracking.pictures_every or 0, before):
+            self._show()
         # Last: a run that an error ends before here begins the stage when it goes on.
         self._advance()
         self._anneal()
@@ -294,6 +300,19 @@ class TrainingRun:
             self._best = copy.deepcopy(policy)
         self.evaluations.append(found)
         self.tracker.log_evaluation(found)
+
+    def _show(self) -> None:
+        """Log what the policy of the run does in the worlds of the evaluations."""
+        seconds = show_policy(
+            self.tracker,
+            self.settings,
+            self._exported(),
+            self.learner,
+            folder=self.folder,
+            actions=self.actions,
+        )
+        # As of an evaluation.
+        self.robots.seconds -= seconds
 
     def _anneal(self) -> None:
         """Move what changes with the run: beta of Eq. (10), fusion and learning rates."""

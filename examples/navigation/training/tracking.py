@@ -6,6 +6,7 @@ All of wandb is here; TorchRL's loggers that may be beside it are in ``loggers.p
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shlex
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 import wandb
 from tensordict import TensorDictBase
@@ -100,6 +102,27 @@ class Tracker:
                 entries[f"priorities/{name}"] = value.detach().cpu()
         self._log(entries, step)
 
+    @property
+    def shows(self) -> bool:
+        """Whether there is a log for pictures."""
+        return any(not isinstance(log, CSVLog) for log in self._logs)
+
+    def log_policy(
+        self, entries: Mapping[str, Any], *, file: Path, card: Mapping[str, Any], actions: int
+    ) -> None:
+        """Log pictures and tables of what a policy does, and to wandb the policy.
+
+        Args:
+            entries: Pictures, the file of an animation and tables, by their names.
+            file: The policy's.
+            card: How it was trained.
+            actions: Of all robots so far.
+        """
+        self._log(entries, actions)
+        for log in self._logs:
+            if isinstance(log, WandbLog):
+                log.keep(file, card)
+
     def _log(self, entries: Mapping[str, Any], actions: int) -> None:
         for log in self._logs:
             log.log(entries, actions)
@@ -169,6 +192,13 @@ class WandbLog:
         with self._path.open("r+") as file:
             file.write(f"{self._entries} {self._actions}")
 
+    def keep(self, file: Path, card: Mapping[str, Any]) -> None:
+        """Keep a policy as an artifact, whose versions are those of runs with the same name."""
+        name = re.sub(r"[^\w.-]", "-", f"policy-{file.parent.name}")[:128]
+        artifact = wandb.Artifact(name, type="policy", metadata=dict(card))
+        artifact.add_file(str(file))
+        self._run.log_artifact(artifact)
+
     def flush(self) -> None:
         """Do nothing: wandb has a process of its own, which outlives this one."""
 
@@ -180,6 +210,12 @@ class WandbLog:
 def _as_wandb(value: Any) -> Any:
     if isinstance(value, torch.Tensor):
         return wandb.Histogram(np.asarray(value))
+    if isinstance(value, np.ndarray):
+        return wandb.Image(value)
+    if isinstance(value, pd.DataFrame):
+        return wandb.Table(dataframe=value)
+    if isinstance(value, Path):
+        return wandb.Video(str(value), format="gif")
     return value
 
 

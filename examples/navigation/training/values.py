@@ -34,7 +34,7 @@ def load_learner(folder: Path, policy: Policy) -> tuple[Learner, TrainSettings]:
     """
     state = read_checkpoint(folder)
     settings = as_settings(state["settings"])
-    settings.learner = replace(settings.learner, compile=False)
+    settings.learner, settings.device = replace(settings.learner, compile=False), "cpu"
     sizes = policy.observation_size, policy.action_size
     learner = make_learner(settings.learner, method_of(settings), *sizes)
     learner.load_state_dict(state["learner"])
@@ -52,19 +52,21 @@ def values_of(learner: Learner, policy: Policy, settings: TrainSettings) -> Valu
     Returns:
         The values, in units of the reward.
     """
+    device = settings.device
     scale, loss = settings.learner.reward_scale, getattr(learner, "loss", None)
 
     def worth(observations: NDArray[np.float32]) -> NDArray[np.float64]:
-        seen: dict[Any, torch.Tensor] = {"observation": torch.as_tensor(observations)}
+        seen: dict[Any, torch.Tensor] = {}
+        seen["observation"] = torch.as_tensor(observations, device=device)
         with torch.no_grad():
             if isinstance(loss, SignalLoss):
-                seen["action"] = torch.as_tensor(policy(observations))
+                seen["action"] = torch.as_tensor(policy(observations), device=device)
                 found = [
                     critic.outputs(seen)["state_action_value"] for critic in loss.current_critics()
                 ]
                 best = torch.stack(found).amin(0)
             else:
                 best = learner.policy.outputs(seen)["chosen_action_value"]
-        return best.squeeze(-1).double().numpy() / scale
+        return best.squeeze(-1).double().cpu().numpy() / scale
 
     return worth

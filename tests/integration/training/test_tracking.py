@@ -10,10 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from navigation import files
 from navigation.records import EpisodeRecord, EvaluationRecord
-from navigation.settings.train import AssessmentSettings, Stage, TrackingSettings, TrainSettings
+from navigation.settings.command_line import composed
+from navigation.settings.train import (
+    AssessmentSettings,
+    Stage,
+    TrackingSettings,
+    TrainSettings,
+    register,
+)
 from navigation.training import tracking
 from navigation.training.checkpoints import read_checkpoint
 from navigation.training.loop import TrainingRun
@@ -33,6 +41,7 @@ class Kept:
         self.rows: dict[int, dict[str, Any]] = {}
         self.axes: dict[str, str] = {}
         self.finished = 0
+        self.artifacts: list[Any] = []
 
     def log(self, entries: dict[str, Any], step: int | None = None, commit: bool = True) -> None:
         step = max(self.rows, default=-1) + 1 if step is None else step
@@ -40,6 +49,9 @@ class Kept:
 
     def define_metric(self, name: str, *, step_metric: str) -> None:
         self.axes[name] = step_metric
+
+    def log_artifact(self, artifact: Any) -> None:
+        self.artifacts.append(artifact)
 
     def finish(self) -> None:
         self.finished += 1
@@ -192,6 +204,70 @@ def test_a_run_that_is_begun_anew_begins_new_logs(tmp_path: Path) -> None:
     assert not list((tmp_path / files.PREVIOUS / files.CSV).iterdir())
 
 
+def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
+    tmp_path: Path, kept: Kept
+) -> None:
+    settings = tiny(episodes=[Stage("A", 1)])
+    settings.tracking = replace(OFFLINE)
+    settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
+    whole(tmp_path / "run +1", settings)
+    (row,) = [row for row in kept.rows.values() if "policy/paths" in row]
+    kinds = {name: type(row[f"policy/{name}"]).__name__ for name in ("paths", "values")}
+    assert kinds == {"paths": "Image", "values": "Image"}
+    assert type(row["policy/episode"]).__name__ == "Video"
+    table = row["policy/episodes"]
+    assert len(table.data) == 2 and "spl" in table.columns
+    (artifact,) = kept.artifacts
+    assert (artifact.name, artifact.type) == ("policy-run--1", "policy")
+    assert artifact.metadata["method"] == "mpfa_per"
+    assert artifact.metadata["episodes"] == 1
+    assert list(artifact.manifest.entries) == [files.POLICY]
+
+
+@pytest.mark.parametrize("every", [None, 0, 20])
+def test_pictures_are_shown_at_the_end_or_more_often_or_never(
+    every: int | None, tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[int] = []
+
+    def show(tracker: Any, *_: Any, actions: int, **__: Any) -> float:
+        shown.append(actions)
+        return 0.0
+
+    settings = tiny(episodes=[Stage("A", 2)])
+    settings.tracking = replace(OFFLINE, pictures_every=every)
+    monkeypatch.setattr("navigation.training.loop.show_policy", show)
+    whole(tmp_path / "run", settings)
+    (end,) = {row["actions"] for row in kept.rows.values() if row.get("train/episode") == 1}
+    assert shown == [*(range(20, end, 20) if every else ()), end]
+
+
+def test_a_run_of_wandb_s_sweep_is_what_its_file_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    from wandb.sdk.launch.sweeps.utils import create_sweep_command, create_sweep_command_args
+
+    sweep = yaml.safe_load((ROOT / "examples/sweep.yaml").read_text())
+    assert (ROOT / sweep["program"]).exists()
+    chosen = {
+        name: {"value": each["values"][-1] if "values" in each else each["min"]}
+        for name, each in sweep["parameters"].items()
+    }
+    macros = create_sweep_command_args({"args": chosen})
+    words: list[str] = []
+    for part in create_sweep_command(sweep["command"]):
+        # A macro is all of a word; other words are handed on as they are.
+        macro = part[2:-1] if part.startswith("${") and part.endswith("}") else None
+        words += [part] if macro is None else macros.get(macro, [macro])
+    assert words[:3] == ["env", "interpreter", "program"]
+    monkeypatch.setenv("WANDB_RUN_ID", "1a2b3c4d")
+    register()
+    (settings,) = composed(words[3:])
+    assert (settings.method.name, settings.updates, settings.seed) == ("uniform", 8, 1002)
+    assert (settings.learner.actor_lr, settings.learner.tau) == (1e-4, 0.01)
+    assert settings.run_dir == "runs/sweep/1a2b3c4d"
+    # The metric that is searched by is logged.
+    assert sweep["metric"]["name"] == "evaluation/success" and settings.evaluation.every
+
+
 # Names ---------------------------------------------------------------------------------------
 
 
@@ -201,6 +277,7 @@ def of_curiosity(settings: TrainSettings) -> None:
 
 def of_evaluations(settings: TrainSettings) -> None:
     settings.evaluation = replace(settings.evaluation, every=30, world="A", episodes=1)
+    settings.tracking.pictures_every = 0
 
 
 def of_assessments(settings: TrainSettings) -> None:
@@ -232,7 +309,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     ]
     for method, learner, change in kinds:
         settings = tiny(method, [Stage("A", 3)], learner)
-        settings.tracking.log_every = 1
+        settings.tracking.log_every, settings.tracking.pictures_every = 1, None
         change(settings)
         run = TrainingRun(settings, tmp_path_factory.mktemp(method))
         run.tracker._logs.append(Names())
@@ -246,7 +323,7 @@ def documented() -> set[str]:
     """The names on the page, as patterns."""
     text = (ROOT / "docs/metrics.md").read_text()
     names = re.findall(
-        r"`((?:train|time|loss|replay|priorities|evaluation|assessment)/[^`]+)`", text
+        r"`((?:train|time|policy|loss|replay|priorities|evaluation|assessment)/[^`]+)`", text
     )
     return {name.replace("SIGNAL", "[a-z_]+") for name in names if not name.endswith("/")}
 
