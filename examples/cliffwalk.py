@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
+import math
 import statistics
 import sys
 from collections.abc import Iterator, Sequence
@@ -24,6 +25,7 @@ import torch
 from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, new_figure
+from navigation.files import check_folder
 from torchrl_mpfa.cliffwalk import (
     Cliffwalk,
     Features,
@@ -179,8 +181,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--lengths: {error}")
     if options.seeds < 1:
         parser.error(f"--seeds must be at least 1, got {options.seeds}")
-    if not options.eps > 0:
-        parser.error(f"--eps must be positive, got {options.eps}")
+    if not 0 < options.eps < math.inf:
+        parser.error(f"--eps must be positive and finite, got {options.eps}")
+    try:
+        check_folder(options.output)
+    except ValueError as error:
+        parser.error(f"--output: {error}")
     torch.set_num_threads(1)
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)

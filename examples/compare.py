@@ -83,6 +83,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         check_free(options.overrides)
         options.arms = parse_arms(options.arm)
+        files.check_folder(options.folder)
     except ValueError as error:
         parser.error(str(error))
     for group in ("method", "learner", "seed"):

@@ -118,6 +118,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         options.names = parse_worlds(options.worlds)
         options.loaded = load_driver(options)
+        files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
     return options

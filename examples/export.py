@@ -54,6 +54,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options.output = options.output or options.source.with_suffix(".onnx")
     if options.output.suffix != ".onnx":
         parser.error(f"--output must end in .onnx, got {options.output}")
+    try:
+        files.check_folder(options.output.parent)
+    except ValueError as error:
+        parser.error(f"--output: {error}")
+    if options.output.is_dir():
+        parser.error(f"--output must be a file, got the folder {options.output}")
     if not options.policy.layers:
         parser.error(f"{options.path} is an ONNX file: export the policy.npz that it came from")
     return options

@@ -28,6 +28,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, look, new_figure
+from navigation.files import check_folder
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 from torchrl_mpfa.spelling import unknown
@@ -213,6 +214,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.methods:
         if name not in METHODS:
             parser.error(unknown("method", name, METHODS))
+    try:
+        check_folder(options.output)
+    except ValueError as error:
+        parser.error(f"--output: {error}")
     names = options.methods or [name for name in METHODS if name not in ALIASES]
     torch.set_num_threads(1)
     # TorchRL announces each storage in the middle of the progress bar.

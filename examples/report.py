@@ -72,6 +72,12 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
         found = read_table(folder / files.EPISODES)
         if not len(found):
             continue
+        missing = [name for name in ("learner", "method", "seed", "world") if name not in found]
+        if missing:
+            raise ValueError(
+                f"{folder / files.EPISODES} has no column {missing[0]}: name the folder of a "
+                "study, which compare.py made, not that of a run"
+            )
         for column in ("arm", "physics"):
             found[column] = found[column].fillna("") if column in found else ""
         names = found[["learner", "method", "arm", "seed"]]
@@ -172,6 +178,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("paper", "study"):
         if getattr(options, name) and len(options.folders) > 1:
             parser.error(f"--{name} takes one folder, got {len(options.folders)}")
+    try:
+        files.check_folder(output)
+        return report(options, output)
+    except ValueError as error:
+        parser.error(" ".join(str(error).split()))
+
+
+def report(options: argparse.Namespace, output: Path) -> int:
+    """Write what the command line asks for.
+
+    Args:
+        options: The command line.
+        output: Where it goes.
+
+    Returns:
+        Exit status.
+
+    Raises:
+        ValueError: If there are no rows, or none that can be read.
+    """
     if options.paper:
         return write_paper(studies(options.folders[0], seeds=options.seeds), output)
     if options.study:
@@ -179,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = read_studies(options.folders)
     if not len(rows):
         folders = ", ".join(str(folder) for folder in options.folders)
-        parser.error(f"{folders}: no {files.EPISODES} with rows, which compare.py writes")
+        raise ValueError(f"{folders}: no {files.EPISODES} with rows, which compare.py writes")
     output.mkdir(parents=True, exist_ok=True)
     parts = []
     for physics, driven in rows.groupby("physics", sort=False):

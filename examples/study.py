@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import compare
+from navigation import files
 from navigation.report.study_rows import keep, read_runs
 from navigation.studies.protocol import ROOT, Table, tables
 from navigation.studies.remaining import counts, free_checkpoints, hours_left
@@ -50,6 +51,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         value = getattr(options, option)
         if value is not None and value < 1:
             parser.error(f"--{option} must be at least 1, got {value}")
+    for folder in (options.folder, options.keep or options.folder):
+        try:
+            files.check_folder(folder)
+        except ValueError as error:
+            parser.error(str(error))
     found = tables(options.folder, most=options.seeds)
     options.tables = [found[name] for name in options.tables or names]
     return options

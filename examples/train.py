@@ -22,6 +22,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from navigation.files import check_folder
 from navigation.settings.command_line import composed, parse_overrides
 from navigation.settings.train import as_settings, register
 from navigation.training.running import Refused, resume, start
@@ -54,8 +55,8 @@ def main() -> None:
         folders = [o.value() for o in overrides if o.key_or_group == "resume"]
         if folders and folders[-1] is not None:
             raise SystemExit(resume(Path(str(folders[-1])), overrides))
-        for _ in composed(arguments):
-            pass
+        for settings in composed(arguments):
+            check_folder(Path(settings.run_dir))
     except (ValueError, Refused) as error:
         refuse(error)
     hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()

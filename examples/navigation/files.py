@@ -40,6 +40,22 @@ def digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written in, before anything is computed for it.
+
+    Args:
+        folder: The folder, which need not be there.
+
+    Raises:
+        ValueError: With the folder, and what is in its way.
+    """
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise ValueError(f"{folder} cannot be a folder, as {there} is a file: name another one")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder} cannot be written, as {there} is not yours: name another one")
+
+
 @contextmanager
 def lock(folder: Path) -> Iterator[None]:
     """Hold a folder, so that no other run or study writes in it.
@@ -52,7 +68,9 @@ def lock(folder: Path) -> Iterator[None]:
 
     Raises:
         FolderInUse: If another process holds it.
+        ValueError: If it cannot be made or written in.
     """
+    check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     held = FileLock(folder / _LOCK, timeout=0)
     try:

@@ -104,8 +104,15 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read a table; one without rows if there is no such file."""
+    """Read a table; one without rows if there is no such file.
+
+    Raises:
+        ValueError: If the file is damaged.
+    """
     if not path.exists():
         return pd.DataFrame()
     # An arm may be called 3 or None: only an empty cell has no value.
-    return pd.read_csv(path, dtype={"arm": str}, keep_default_na=False, na_values=[""])
+    try:
+        return pd.read_csv(path, dtype={"arm": str}, keep_default_na=False, na_values=[""])
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is damaged, its rows cannot be read: remove it") from error

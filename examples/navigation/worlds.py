@@ -13,6 +13,10 @@ _LONGEST = 60
 _OF_MANY = re.compile(r"([a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
 
 
+_LONGEST = 10_000
+"""Worlds of a span at most."""
+
+
 def parse_worlds(words: Sequence[str]) -> list[str]:
     """What some words stand for.
 
@@ -43,6 +47,10 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
             first, last = int(span[2]), int(span[3])
             if last < first:
                 raise ValueError(f"{word} ends before it begins")
+            if last - first >= _LONGEST:
+                raise ValueError(
+                    f"{word} must be at most {_LONGEST} worlds, got {last - first + 1}"
+                )
             worlds += [f"{span[1]}-{number}" for number in range(first, last + 1)]
     for number, world in enumerate(worlds):
         if world in worlds[:number]:

@@ -263,4 +263,7 @@ def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
 
 
 def _read_json(path: Path) -> Mapping[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: remove it, and the run is made anew") from error

@@ -1,0 +1,131 @@
+"""Wrong command lines: one sentence that says the way out, and exit status 2."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cliffwalk
+import compare
+import evaluate
+import export
+import plot_sampling
+import report
+import study
+import train
+
+POLICY = str(Path(__file__).parents[2] / "examples/policies/td3-mpfa_per.npz")
+A_FILE = r"file cannot be a folder, as .*file is a file: name another one"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the commands are run: files that are none of theirs, and damaged ones."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and no more")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    (tmp_path / "damaged.yaml").write_text("room: [1, 2\n")
+    contents = {
+        "rows": b"a,b\n1\n2,3,4\n",
+        "bytes": bytes(range(128, 255)),
+        "nothing": b"",
+        "run": b"success,world\n1,A\n",
+    }
+    for name, content in contents.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "episodes.csv").write_bytes(content)
+    run = tmp_path / "study" / "ddpg-per-0"
+    run.mkdir(parents=True)
+    (run / "settings.json").write_text("{")
+    (tmp_path / "checkpoint").mkdir()
+    (tmp_path / "checkpoint/checkpoint.pt").write_bytes(b"123")
+    return tmp_path
+
+
+def status_of(main: Callable[..., object], arguments: list[str]) -> object:
+    try:
+        return main() if main is train.main else main(arguments)
+    except SystemExit as error:
+        return error.code
+
+
+@pytest.mark.parametrize(
+    ("main", "line", "message"),
+    [
+        (train.main, "resume=nowhere", "resume: there is no folder nowhere"),
+        (train.main, "resume=file", "resume: there is no folder file"),
+        (train.main, "resume=rows", "there is no checkpoint.pt in rows"),
+        (train.main, "resume=checkpoint", "checkpoint.pt is damaged or not a checkpoint"),
+        (train.main, "run_dir=file", A_FILE),
+        (train.main, "run_dir=file/run", r"file/run cannot be a folder, as .*file is a file"),
+        (train.main, "run_dir=", "run_dir must be no empty word, got ''"),
+        (train.main, "tracking.project=", "tracking.project must be no empty word, got ''"),
+        (train.main, "tracking.group=", "tracking.group must be a word of at most 128 letters"),
+        (train.main, "method.signals=[rewad]", "method.signals must be of .*, got 'rewad'"),
+        (train.main, "curriculum.stages=3", "curriculum.stages"),
+        (
+            train.main,
+            "curriculum.stages=[{world:damaged.yaml,episodes:1}]",
+            r"curriculum.stages\[0\].world: damaged.yaml:2: is not YAML",
+        ),
+        (evaluate.main, "", "give either the path of a trained policy or --policy"),
+        (evaluate.main, "nowhere", "nowhere"),
+        (evaluate.main, "rows", "rows"),
+        (evaluate.main, "damaged.npz", "damaged.npz"),
+        (evaluate.main, "other.npz", "other.npz"),
+        (evaluate.main, f"{POLICY} --output file", A_FILE),
+        (evaluate.main, f"{POLICY} --worlds damaged.yaml", "damaged.yaml:2: is not YAML"),
+        (evaluate.main, f"{POLICY} --worlds rooms:5-2", "rooms:5-2 ends before it begins"),
+        (evaluate.main, f"{POLICY} --worlds rooms:1-999999999", "at most 10000 worlds"),
+        (evaluate.main, f"{POLICY} --noise slop=1", "slop"),
+        (compare.main, "--folder file", A_FILE),
+        (compare.main, "--methods pr", "did you mean 'per'"),
+        (compare.main, "--worlds nowhere", "nowhere"),
+        (
+            compare.main,
+            "--folder study --methods per --seeds 0",
+            "settings.json is damaged: remove it, and the run is made anew",
+        ),
+        (report.main, "nowhere", "nowhere: no episodes.csv with rows, which compare.py writes"),
+        (report.main, "rows", "episodes.csv is damaged, its rows cannot be read"),
+        (report.main, "bytes", "episodes.csv is damaged, its rows cannot be read"),
+        (report.main, "nothing", "episodes.csv is damaged, its rows cannot be read"),
+        (report.main, "run", "has no column learner: name the folder of a study"),
+        (report.main, "run --output file", A_FILE),
+        (report.main, "run --seeds 0", "--seeds must be at least 1, got 0"),
+        (study.main, "Z", "there is no table Z"),
+        (study.main, "C --folder file", A_FILE),
+        (study.main, "C --keep file", A_FILE),
+        (export.main, "damaged.npz", "damaged.npz"),
+        (export.main, f"{POLICY} --output file/policy.onnx", f"--output: {A_FILE}"),
+        (export.main, f"{POLICY} --output rows", "--output must end in .onnx, got rows"),
+        (cliffwalk.main, "--lengths 1", "--lengths"),
+        (cliffwalk.main, "--eps inf", "--eps must be positive and finite, got inf"),
+        (cliffwalk.main, "--output file", f"--output: {A_FILE}"),
+        (plot_sampling.main, "pr", "did you mean 'per'"),
+        (plot_sampling.main, "per --output file", f"--output: {A_FILE}"),
+    ],
+)
+def test_a_wrong_command_line_is_one_sentence_and_status_2(
+    main: Callable[..., object],
+    line: str,
+    message: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = sorted(folder.rglob("*"))
+    monkeypatch.setattr(sys, "argv", [f"{main.__module__}.py", *line.split()])
+    assert status_of(main, line.split()) == 2
+    # The usage may be before it.
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(message, said), said
+    # Nothing was begun.
+    made = [path for path in folder.rglob("*") if path not in before and path.name != ".lock"]
+    assert not made
