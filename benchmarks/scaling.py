@@ -17,7 +17,8 @@ from pathlib import Path
 
 from navigation.settings.command_line import composed
 from navigation.settings.train import register
-from navigation.training.loop import TrainingRun, prepare_process
+from navigation.training.loop import TrainingRun
+from navigation.training.running import prepare_process
 
 _WARM = 4
 """Iterations with updates that are not counted: programs are compiled, and workers fall in step."""
