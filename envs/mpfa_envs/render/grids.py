@@ -78,7 +78,7 @@ def observe_room(
         >>> from mpfa_envs.render import observe_room
         >>> poses, observations = observe_room("A", goal=(3.0, 3.0), spacing=1.0)
         >>> poses.shape, observations.shape
-        ((97, 3), (97, 24))
+        ((100, 3), (100, 24))
     """
     # Imported here because gymnasium takes a moment, and other pictures do without it.
     from mpfa_envs.navigation import NavigationEnv
