@@ -171,11 +171,15 @@ def test_a_folder_without_rows_is_refused(
     assert "no episodes.csv with rows" in capsys.readouterr().err
 
 
-def test_runs_on_other_pairs_are_not_compared(study: Path) -> None:
+def test_runs_on_other_pairs_are_not_compared(
+    study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rows = pd.read_csv(study / "episodes.csv")
     write_table(rows.iloc[:-1], study / "episodes.csv")
-    with pytest.raises(ValueError, match="not tested on the same pairs"):
+    with pytest.raises(SystemExit) as ended:
         report.main([str(study)])
+    assert ended.value.code == 2
+    assert "not tested on the same pairs" in capsys.readouterr().err
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:

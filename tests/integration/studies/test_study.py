@@ -177,7 +177,8 @@ def test_the_settings_of_each_task_are_those_of_the_design() -> None:
     # In all else they are alike.
     dense.environment, dense.curriculum = sparse.environment, sparse.curriculum
     dense.learner.tau, dense.learner.gamma = sparse.learner.tau, sparse.learner.gamma
-    dense.run_dir = sparse.run_dir
+    assert (dense.tracking.group, sparse.tracking.group) == ("dense/td3-per", "sparse/td3-per")
+    dense.run_dir, dense.tracking = sparse.run_dir, sparse.tracking
     assert dense == sparse
     assert sparse.evaluation.world == "mixed:validation"
     paper = settings_of(found["A"], "paper/plain/per/letter")

@@ -194,6 +194,7 @@ def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Pa
     assert len(run.buffer) == min(of_second_world, settings.method.capacity)
     assert run.buffer.write_count == of_second_world
 
+    (tmp_path / "part").mkdir()
     part = TrainingRun(settings, tmp_path / "part")
     # Stopped between the worlds.
     part.train(lambda: part.schedule.stage == 1 and part.stop.ask())
