@@ -219,6 +219,8 @@ def test_a_killed_study_leaves_no_training_behind_and_goes_on_to_the_same_rows(
     while any(map(alive, started)):
         assert time.monotonic() < deadline, "a training outlived the study"
         time.sleep(0.05)
+    # It was stopped: one that nobody stops comes to its end, and is gone as well.
+    assert not json.loads((checkpoint.parent / files.STATUS).read_text())["finished"]
     assert not (tmp_path / "killed" / files.EPISODES).exists()
 
     request.getfixturevalue("in_this_process")
