@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
+from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -104,7 +104,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {"README.md"}
     while new := sorted(wanted - made):
         for path in new:
-            files.append(File.generated(config, place(path), content=source_page(path)))
+            page = File.generated(
+                config,
+                place(path),
+                content=source_page(path),
+                inclusion=InclusionLevel.NOT_IN_NAV,
+            )
+            files.append(page)
             if path.endswith(".md"):
                 text = (ROOT / path).read_text(encoding="utf-8")
                 wanted |= linked_files(text, posixpath.dirname(path))
