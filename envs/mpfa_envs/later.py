@@ -31,18 +31,25 @@ class _Waiting(MetaPathFinder):
     def __init__(self, awaited: str, module: str) -> None:
         self.awaited = awaited
         self.module = module
+        self._searching = False
 
     def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
         """Leave the search to the other finders."""
-        if fullname != self.awaited:
+        if fullname != self.awaited or self._searching:
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(fullname)
+        self._searching = True
+        try:
+            spec = find_spec(fullname)
+        finally:
+            self._searching = False
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
             def execute_and_import(loaded: Any) -> None:
                 execute(loaded)
+                # Only now: who asks whether a module is there need not import it.
+                if self in sys.meta_path:
+                    sys.meta_path.remove(self)
                 import_module(self.module)
 
             setattr(spec.loader, "exec_module", execute_and_import)  # noqa: B010

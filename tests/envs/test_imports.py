@@ -28,3 +28,9 @@ def test_the_package_alone_brings_nothing() -> None:
 def test_gymnasium_knows_the_ids_whichever_is_imported_first(order: str) -> None:
     code = f"import {order}; print(gymnasium.spec('mpfa/Navigation-D-v1').kwargs)"
     assert run(code).strip() == "{'world': 'D'}"
+
+
+def test_asking_for_gymnasium_before_its_import_keeps_the_ids() -> None:
+    asked = "import importlib.util, mpfa_envs; importlib.util.find_spec('gymnasium'); "
+    code = f"{asked}import gymnasium; print(gymnasium.spec('mpfa/Rooms-v1').id)"
+    assert run(code).strip() == "mpfa/Rooms-v1"
