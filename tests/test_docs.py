@@ -8,8 +8,10 @@ import sys
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -17,7 +19,7 @@ import yaml
 import mpfa_envs
 import torchrl_mpfa
 import torchrl_mpfa.methods
-from mpfa_envs import deploy, planners, render
+from mpfa_envs import World, deploy, export_policy, load_policy, planners, render
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -118,28 +120,91 @@ SMALL = {
 """The tutorial's sizes, and those at which the tests run it."""
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("page", ["tutorial.md", *(p for p in PAGES if p.startswith("howto/"))])
-def test_the_code_of_a_page_runs_in_its_order(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+EPISODES = {
+    "planners.md": {"episodes=5": "episodes=1"},
+    "worlds.md": {"episodes=50": "episodes=1"},
+    "../examples/policies/README.md": {'"test")))': '"test", episodes=1)))'},
+}
+"""The episodes that other pages evaluate, and those that the tests do."""
+
+BOX = """<sdf><world name="w"><model name="m"><static>1</static><link name="l"><collision name="c">
+<geometry><box><size>1 1 1</size></box></geometry></collision></link></model></world></sdf>"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the code of a page runs, with the files that it reads."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    (tmp_path / "world_1.world").write_text(BOX)
+    World(name="office").to_map(tmp_path / "office.yaml", resolution=0.1)
+    return tmp_path
+
+
+def run(page: str, changes: dict[str, str]) -> dict[str, Any]:
+    """Run the code of a page in its order, with smaller sizes; the names that it leaves."""
     names: dict[str, Any] = {}
     text = (DOCS / page).read_text(encoding="utf-8")
-    if page == "tutorial.md":
-        for size, small in SMALL.items():
-            assert size in text
-            text = text.replace(size, small)
+    for size, small in changes.items():
+        assert size in text
+        text = text.replace(size, small)
     try:
-        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             exec(block, names)
     finally:
         torch.set_flush_denormal(False)
-    if page == "tutorial.md":
-        assert names["learner"].updates == 256
-        assert set(names["paths"]) == {0, 1}
-        assert (tmp_path / "policy.npz").exists()
-        assert (tmp_path / "paths.png").exists()
-    elif "buffer" in names:
+    return names
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_code_of_the_tutorial_runs(folder: Path) -> None:
+    names = run("tutorial.md", SMALL)
+    assert names["learner"].updates == 256
+    assert set(names["paths"]) == {0, 1}
+    assert (folder / "policy.npz").exists()
+    assert (folder / "paths.png").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", [p for p in PAGES if p.startswith("howto/")])
+@pytest.mark.usefixtures("folder")
+def test_the_code_of_a_page_runs_in_its_order(page: str) -> None:
+    names = run(page, {})
+    if "buffer" in names:
         # The last buffer of a page was learned from.
         assert names["buffer"].sampler.weights
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "page",
+    [
+        "cliffwalk.md",
+        "discrete.md",
+        "maps.md",
+        "moving.md",
+        "noise.md",
+        "planners.md",
+        "vector.md",
+        "worlds.md",
+        "../examples/policies/README.md",
+    ],
+)
+@pytest.mark.usefixtures("folder")
+def test_the_code_of_a_page_on_the_task_runs(page: str) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    run(page, EPISODES.get(page, {}))
+
+
+def test_the_pilot_on_the_page_on_robots_decides_by_scans(folder: Path) -> None:
+    pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
+    export_policy(load_policy("examples/policies/td3-mpfa_per.npz"), folder / "policy.onnx")
+    control = run("robot.md", {})["control"]
+    message = SimpleNamespace(
+        angle_min=-np.pi, angle_increment=0.01, ranges=np.full(629, 3.0), range_min=0.1
+    )
+    message.range_max = 12.0
+    command = control(message, (0.0, 0.0, 0.0), (0.0, 0.0))
+    # The goal lies to the left.
+    assert command.right > command.left > 0.0
+    assert control(message, (3.0, 0.8, 0.0), (0.3, 0.0)) is None
