@@ -127,6 +127,20 @@ EPISODES = {
 }
 """The episodes that other pages evaluate, and those that the tests do."""
 
+TASK_PAGES = [
+    "cliffwalk.md",
+    "discrete.md",
+    "maps.md",
+    "moving.md",
+    "noise.md",
+    "planners.md",
+    "vector.md",
+    "worlds.md",
+    "../examples/policies/README.md",
+]
+ELSEWHERE = ["methods/README.md", "methods/mpfa_per.md", "torchrl_trainer.md"]
+"""Pages whose code is run by the tests of what they are about."""
+
 BOX = """<sdf><world name="w"><model name="m"><static>1</static><link name="l"><collision name="c">
 <geometry><box><size>1 1 1</size></box></geometry></collision></link></model></world></sdf>"""
 
@@ -176,20 +190,7 @@ def test_the_code_of_a_page_runs_in_its_order(page: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "page",
-    [
-        "cliffwalk.md",
-        "discrete.md",
-        "maps.md",
-        "moving.md",
-        "noise.md",
-        "planners.md",
-        "vector.md",
-        "worlds.md",
-        "../examples/policies/README.md",
-    ],
-)
+@pytest.mark.parametrize("page", TASK_PAGES)
 @pytest.mark.usefixtures("folder")
 def test_the_code_of_a_page_on_the_task_runs(page: str) -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
@@ -208,3 +209,9 @@ def test_the_pilot_on_the_page_on_robots_decides_by_scans(folder: Path) -> None:
     # The goal lies to the left.
     assert command.right > command.left > 0.0
     assert control(message, (3.0, 0.8, 0.0), (0.3, 0.0)) is None
+
+
+def test_no_page_has_code_that_is_not_run() -> None:
+    have = {page for page in PAGES if "```python\n" in (DOCS / page).read_text(encoding="utf-8")}
+    howto = {page for page in have if page.startswith("howto/")}
+    assert have - howto - {*TASK_PAGES, *ELSEWHERE} == {"tutorial.md", "robot.md"}

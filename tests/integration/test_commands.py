@@ -1,0 +1,131 @@
+"""The commands on the pages are ones that the scripts understand: none of them is run."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import cliffwalk
+import compare
+import evaluate
+import export
+import gym_study
+import play
+import report
+import stable_baselines
+import study
+import torchrl_sac
+import torchrl_trainer
+from benchmarks import environment, scaling, worlds
+from navigation.settings.command_line import parse_overrides
+from navigation.settings.train import register
+from navigation.worlds import parse_worlds
+
+ROOT = Path(__file__).parents[2]
+PAGES = ["README.md", "CONTRIBUTING.md", *(p.relative_to(ROOT) for p in ROOT.glob("docs/**/*.md"))]
+OLD = "first_study.md"
+"""Its commands are those of an old commit, as it says."""
+OTHERS = ("make", "pip", "python3", "ray", "ros2", "source", "wandb")
+"""Programs that are not ours."""
+SHELL = (
+    'python() { printf "%s\\n" "$@"; echo "--end--"; }; '
+    + "".join(f"{name}() {{ :; }}; " for name in OTHERS)
+    + "set -e; "
+)
+"""Prints the words of each command after ``python``, in place of running it."""
+
+
+MAINS: dict[str, Callable[[], object]] = {
+    "cliffwalk": cliffwalk.main,
+    "compare": compare.main,
+    "evaluate": evaluate.main,
+    "export": export.main,
+    "gym_study": gym_study.main,
+    "play": play.main,
+    "report": report.main,
+    "stable_baselines": stable_baselines.main,
+    "study": study.main,
+    "torchrl_sac": torchrl_sac.main,
+    "torchrl_trainer": torchrl_trainer.main,
+    "benchmarks.environment": environment.main,
+    "benchmarks.scaling": scaling.main,
+    "benchmarks.worlds": worlds.main,
+}
+
+
+class Parsed(Exception):
+    """Raised once a script has read its command line."""
+
+
+def scripts(text: str) -> Iterator[str]:
+    """The blocks of a page that one would paste into a shell."""
+    yield from re.findall(r"^```bash\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    plain = re.sub(r"^( *)(```+).*?^\1\2", "", text, flags=re.DOTALL | re.MULTILINE)
+    for block in re.findall(r"(?:^    .*\n)+", plain, re.MULTILINE):
+        if re.search(r"^ +(?:\.venv/bin/)?python ", block, re.MULTILINE):
+            yield block
+
+
+def commands() -> list[tuple[str, ...]]:
+    """Words after ``python`` of all commands on the pages, each once."""
+    texts = [(ROOT / page).read_text(encoding="utf-8") for page in PAGES if OLD not in str(page)]
+    code = "".join(f"({block.replace('.venv/bin/', '')})\n" for t in texts for block in scripts(t))
+    shell = subprocess.run(["sh", "-c", SHELL + code], capture_output=True, text=True, check=False)
+    assert (shell.returncode, shell.stderr) == (0, "")
+    found = [tuple(words.splitlines()) for words in shell.stdout.split("--end--\n")]
+    return sorted({words for words in found if words})
+
+
+def main_of(words: Sequence[str]) -> tuple[str, list[str]]:
+    """The script or module of a command, and what follows it."""
+    if words[0] == "-m":
+        return words[1], list(words[2:])
+    assert (ROOT / words[0]).exists()
+    return Path(words[0]).stem, list(words[1:])
+
+
+def understand(words: Sequence[str]) -> None:
+    """Let a script read its command line, and no more."""
+    script, arguments = main_of(words)
+    if script == "train":
+        parse_overrides(arguments)
+    if script in ("train", "quickstart", "torchrl_config"):
+        return
+    sys.argv = [script, *arguments]
+    with pytest.raises(Parsed) as found:
+        MAINS[script]()
+    options = found.value.args[0]
+    if script == "compare":
+        parse_overrides(options.overrides)
+    if script in ("compare", "evaluate"):
+        known = [word for word in options.worlds if not word.endswith(".yaml")]
+        assert len(parse_worlds(known)) >= len(known)
+
+
+def test_every_command_on_the_pages_is_understood(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parse = argparse.ArgumentParser.parse_args
+
+    def parsed(self: argparse.ArgumentParser, *arguments: Any) -> None:
+        raise Parsed(parse(self, *arguments))
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parsed)
+    monkeypatch.setattr(sys, "argv", [])
+    register()
+    found = commands()
+    assert len(found) > 100
+    wrong = {}
+    for words in found:
+        try:
+            understand(words)
+        except (Exception, SystemExit) as error:
+            wrong[" ".join(words)] = str(error) + capsys.readouterr().err
+    assert wrong == {}
