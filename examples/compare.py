@@ -31,6 +31,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from navigation import files
+from navigation.environments import check_physics
 from navigation.settings.train import GROUPS, register
 from navigation.stopping import Stop
 from navigation.studies.arms import check_free, parse_arms
@@ -83,6 +84,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         check_free(options.overrides)
         options.arms = parse_arms(options.arm)
+        check_physics(options.physics or "kinematic")
         files.check_folder(options.folder)
     except ValueError as error:
         parser.error(str(error))

@@ -39,6 +39,7 @@ from mpfa_envs import (
     make_planner,
 )
 from navigation import files
+from navigation.environments import check_physics
 from navigation.evaluating import Drivable, Drives, drive, summary_row, tasks_of
 from navigation.live import watch
 from navigation.pictures import Values, write_pictures
@@ -118,6 +119,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         options.names = parse_worlds(options.worlds)
         options.loaded = load_driver(options)
+        check_physics(options.physics or options.loaded.env_arguments.get("physics", "wheels"))
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))

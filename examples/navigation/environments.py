@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from importlib import import_module
 from typing import Any
 
 from torchrl.envs import EnvBase, TransformedEnv
@@ -15,6 +16,22 @@ from navigation.settings.environment import EnvironmentSettings
 _AHEAD, _SECTOR = 180.0, 10.0
 """The lidar's field of view unless it is said, and that of a sector [deg]."""
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
+
+
+def check_physics(physics: str) -> None:
+    """Refuse simulated wheels where there is no PyBullet.
+
+    Args:
+        physics: ``wheels`` or ``kinematic``.
+
+    Raises:
+        ValueError: Then, with the way out.
+    """
+    if physics == "wheels":
+        try:
+            import_module("mpfa_envs.simulation")
+        except ImportError as error:
+            raise ValueError(str(error)) from error
 
 
 def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:

@@ -129,3 +129,28 @@ def test_a_wrong_command_line_is_one_sentence_and_status_2(
     # Nothing was begun.
     made = [path for path in folder.rglob("*") if path not in before and path.name != ".lock"]
     assert not made
+
+
+@pytest.mark.parametrize(
+    ("main", "line"),
+    [
+        (train.main, "environment.physics=wheels run_dir=new"),
+        (evaluate.main, POLICY),
+        (compare.main, "--physics wheels"),
+    ],
+)
+def test_without_pybullet_simulated_wheels_are_refused_before_anything_has_begun(
+    main: Callable[..., object],
+    line: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)  # As where it is not installed.
+    monkeypatch.delitem(sys.modules, "mpfa_envs.simulation", raising=False)
+    monkeypatch.setattr(sys, "argv", [f"{main.__module__}.py", *line.split()])
+    before = sorted(folder.rglob("*"))
+    assert status_of(main, line.split()) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "physics='wheels' needs PyBullet" in said, said
+    assert sorted(folder.rglob("*")) == before

@@ -13,7 +13,7 @@ import torch
 
 from mpfa_envs import world_tasks
 from mpfa_envs.robot import resolve_robot
-from navigation.environments import make_training_env
+from navigation.environments import check_physics, make_training_env
 from navigation.settings.environment import EnvironmentSettings
 from navigation.settings.learners import is_discrete
 from navigation.settings.train import TrainSettings
@@ -220,6 +220,7 @@ def check_settings(settings: TrainSettings) -> None:
     if is_discrete(settings.learner):
         _check_values_alone(settings)
     _check_device(settings.device)
+    check_physics(settings.environment.physics)
     if settings.tracking.tensorboard and find_spec("tensorboard") is None:
         raise ValueError(
             "tracking=tensorboard needs TensorBoard: pip install 'torchrl-mpfa[tensorboard]'"
