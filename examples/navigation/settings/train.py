@@ -86,7 +86,7 @@ CURRICULA = {
     "C": [Stage("C", episodes=300)],
     "D": [Stage("D", episodes=400)],
     "paper": [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)],
-    "rooms": [Stage("mixed", actions=100_000)],
+    "rooms": [Stage("mixed", actions=50_000)],
 }
 """The paper's episodes in each of its worlds, all of them one after the other, and new worlds."""
 _LONGEST_NAME = 60
@@ -257,7 +257,7 @@ REGIMES: dict[str, dict[str, Any]] = {
         "learner": {
             "actor_lr": 3e-4,
             "critic_lr": 3e-4,
-            "tau": 0.002,
+            "tau": 0.005,
             # Without both a single critic's targets run ahead, and the robot circles.
             "policy_delay": 2,
             "policy_noise": 0.2,

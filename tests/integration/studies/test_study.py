@@ -171,7 +171,7 @@ def test_the_settings_of_each_task_are_those_of_the_design() -> None:
     assert (dense.environment.progress, dense.environment.max_goal_distance) == (
         *("shortest_path", 20.0),
     )
-    assert (dense.updates, dense.learner.tau, dense.learner.gamma) == (2, 0.002, 0.99)
+    assert (dense.updates, dense.learner.tau, dense.learner.gamma) == (2, 0.005, 0.99)
     lengths = [each.curriculum.stages[0].actions for each in (sparse, dense)]
     assert lengths == [24_000, 40_000]
     # In all else they are alike.
