@@ -10,11 +10,10 @@ from pathlib import Path
 from mpfa_envs import GENERATORS, world_tasks
 
 _LONGEST = 60
-_OF_MANY = re.compile(r"([a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
-
-
-_LONGEST = 10_000
+"""Characters of a label, without the number that is put in place of the rest."""
+_MOST_WORLDS = 10_000
 """Worlds of a span at most."""
+_OF_MANY = re.compile(r"([a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
 
 
 def parse_worlds(words: Sequence[str]) -> list[str]:
@@ -47,9 +46,9 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
             first, last = int(span[2]), int(span[3])
             if last < first:
                 raise ValueError(f"{word} ends before it begins")
-            if last - first >= _LONGEST:
+            if last - first >= _MOST_WORLDS:
                 raise ValueError(
-                    f"{word} must be at most {_LONGEST} worlds, got {last - first + 1}"
+                    f"{word} must be at most {_MOST_WORLDS} worlds, got {last - first + 1}"
                 )
             worlds += [f"{span[1]}-{number}" for number in range(first, last + 1)]
     for number, world in enumerate(worlds):

@@ -219,3 +219,4 @@ def test_worlds_and_their_label_agree() -> None:
     assert len({worlds_label(each) for each in words}) == 4
     many = [f"rooms-{number}" for number in range(51)]
     assert worlds_label(many) != worlds_label(many[:50])
+    assert len(worlds_label(many)) < 80
