@@ -204,7 +204,10 @@ def check_settings(settings: TrainSettings) -> None:
     )
     _check_method(settings.method)
     if settings.evaluation.choose and not settings.evaluation.every:
-        raise ValueError("evaluation.choose needs evaluations: set evaluation.every, got 0")
+        raise ValueError(
+            "evaluation.choose needs evaluations: set evaluation.every, got 0, or "
+            "evaluation.choose=false"
+        )
     if settings.evaluation.choose and is_of_a_test(settings.evaluation.world):
         raise ValueError(
             f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "

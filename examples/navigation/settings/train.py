@@ -17,6 +17,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
+from mpfa_envs import GENERATORS
 from navigation.settings.environment import EnvironmentSettings
 from navigation.settings.learners import (
     DQNSettings,
@@ -124,7 +125,7 @@ class EvaluationSettings:
     """Actions between two evaluations; 0: none."""
     world: str = "validation"
     """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
-    which nothing may be chosen, are refused with ``choose``."""
+    which nothing may be chosen, are refused with ``choose``. ``same``: where the last stage is."""
     episodes: int = 20
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
     choose: bool = False
@@ -247,6 +248,8 @@ class TrainSettings:
     ray: RaySettings = field(default_factory=RaySettings)
 
 
+SAME = "same"
+"""Evaluations in worlds such as those of the training."""
 REGIMES: dict[str, dict[str, Any]] = {
     "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
     "rooms": {
@@ -272,7 +275,13 @@ REGIMES: dict[str, dict[str, Any]] = {
             # Less than the paper's, as mazes and fields are narrow.
             "clearance": 0.05,
         },
-        "evaluation": {"world": "mixed:validation", "episodes": 100},
+        # A single critic may run away after it was good: one seed of ten ended at half.
+        "evaluation": {
+            "world": SAME,
+            "episodes": 100,
+            "every": 5_000,
+            "choose": True,
+        },
     },
 }
 """The paper's task and numbers, and what one would do today."""
@@ -324,7 +333,7 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
         config: The values; those that it lacks are the defaults.
 
     Returns:
-        The settings, with the curriculum named.
+        The settings, with the curriculum and the worlds of the evaluations named.
 
     Raises:
         omegaconf.errors.OmegaConfBaseException: If a value is of another type, or unknown.
@@ -339,4 +348,7 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     assert isinstance(settings, TrainSettings)
     curriculum = settings.curriculum
     curriculum.name = curriculum.name or curriculum_name(curriculum.stages)
+    if settings.evaluation.world == SAME and curriculum.stages:
+        last = curriculum.stages[-1].world
+        settings.evaluation.world = f"{last}:validation" if last in GENERATORS else last
     return settings

@@ -30,6 +30,7 @@ COMMON = (
     "tracking=off",
     "evaluation.every=2000",
     "evaluation.episodes=40",
+    "evaluation.choose=false",
 )
 """Settings of all tables but A."""
 SPARSE = (

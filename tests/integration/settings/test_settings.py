@@ -96,6 +96,29 @@ def test_a_run_is_called_after_the_stages_that_it_has(arguments: list[str], name
     assert settings.run_dir == f"runs/{name}-mpfa_per-ddpg-0"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "world"),
+    [
+        ([], "mixed:validation"),
+        (
+            ["curriculum.stages=[{world: A, actions: 5},{world: crowd, actions: 5}]"],
+            "crowd:validation",
+        ),
+        (["curriculum=A"], "A"),
+        (["curriculum=A", "evaluation.world=bars:validation"], "bars:validation"),
+        (["regime=paper"], "validation"),
+    ],
+)
+def test_policies_are_chosen_in_worlds_such_as_those_of_the_training(
+    arguments: list[str], world: str
+) -> None:
+    evaluation = one(*arguments).evaluation
+    assert evaluation.world == world
+    assert (evaluation.choose, evaluation.every) == (
+        (False, 0) if world == "validation" else (True, 5_000)
+    )
+
+
 def test_two_long_curricula_have_two_short_names() -> None:
     texts = [
         "curriculum.stages=["
@@ -161,7 +184,7 @@ def usual() -> TrainSettings:
         ),
         ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
         ("updates=0", "updates must be at least 1, got 0"),
-        ("evaluation.choose=true", "evaluation.choose needs evaluations: set evaluation.every"),
+        ("evaluation.every=0", "evaluation.choose needs evaluations: set evaluation.every"),
         ("assessment.episodes=-1", "assessment.episodes must be at least 0, got -1"),
         ("assessment.by=spl", "assessment.by must be one of outcome, return, got 'spl'"),
         (
