@@ -1,18 +1,18 @@
-# Everything that one types here. `make` alone lists it.
+# All commands of the project. `make` alone lists them.
 #
-# The first use makes .venv and installs the project in it; later ones only when pyproject.toml
-# changed. On the command line:
-#   PYTHON=/path/to/python3.11     what .venv is made with; by default the first one that fits
-#   TORCH_INSTALL_ARGS='...'       what `pip install` gets for PyTorch before the project is
-#                                  installed, for another build of it: a wheel file of a CPU
+# The first use creates .venv and installs the project in it; later uses do so only if
+# pyproject.toml has changed. Variables on the command line:
+#   PYTHON=/path/to/python3.11     the Python for .venv; by default the first suitable one
+#   TORCH_INSTALL_ARGS='...'       arguments of `pip install` for another build of PyTorch, which
+#                                  is installed before the project: the wheel file of a CPU
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
-#   COMPILE=false                  demo, train: no compiled updates; by default if a C++ compiler is found
-#   REGIME=paper                   train: the paper's task and numbers; by default today's, rooms
-#   DEMO_ACTIONS=40000             actions that demo trains for
-#   EPISODES=100                   episodes that demo drives in the worlds of each generator
-#   SLOW=1                         test: the slow tests as well
-#   WORKERS=4                      test: processes, 2 by default; 0: one, with its output as it comes
+#   COMPILE=false                  demo, train: no compiled updates; default: true if a C++ compiler is found
+#   REGIME=paper                   train: the paper's task and numbers; default: rooms
+#   DEMO_ACTIONS=40000             length of demo's training, in actions
+#   EPISODES=100                   evaluation episodes of demo in the worlds of each generator
+#   SLOW=1                         test: include the slow tests
+#   WORKERS=4                      test: number of processes, 2 by default; 0: one, with live output
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
@@ -34,16 +34,16 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest
 
-# This project needs Python 3.10 and PyBullet has wheels up to 3.11; on later ones all runs but the
-# simulated wheels. An interpreter is asked rather than trusted by its name: the shims of version
-# managers may exist and not run.
+# This project needs Python 3.10, and PyBullet has wheels up to 3.11; on later versions everything
+# but the simulated wheels works. Interpreters are run to find their version rather than trusted by
+# name: shims of version managers may exist but not work.
 CANDIDATES := python3.11 python3.10 python3 python python3.13 python3.12
 FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))
 LATER := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 12))
 HOME_OF := import sys; print(sys.base_prefix)
 WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
 NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simulated wheels; demo and train use physics=kinematic
-# What the scripts get there, evaluated when they are called: before, there may be no .venv.
+# Arguments of the scripts on such a Python, evaluated when they are called: there may be no .venv before.
 WHEELS = `$(BIN)/python -c "import sys; print('--physics ' + ('kinematic' if sys.version_info >= (3, 12) else 'wheels'))"`
 PHYSICS = `$(BIN)/python -c "import sys; print('environment.physics=kinematic' * (sys.version_info >= (3, 12)))"`
 
@@ -53,7 +53,7 @@ help: ## Print this list
 	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
 	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, REGIME, DEMO_ACTIONS, EPISODES, SLOW, WORKERS; see the top of the Makefile"
 
-demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute and drive through rooms that no training saw
+demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unseen rooms
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
 	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true learner.compile=$(COMPILE) 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
 	@echo "== driving through test worlds of every generator"
@@ -61,13 +61,13 @@ demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute and drive through rooms 
 	@cp runs/demo/evaluation-all/evaluation.json runs/demo/evaluation-all/trajectories.png runs/demo/evaluation-all/episode.gif runs/demo/
 	@echo "written: runs/demo/evaluation.json, trajectories.png, episode.gif"
 
-train: $(STAMP) ## Train in rooms that are new each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
+train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
 	$(BIN)/python examples/train.py regime=$(REGIME) learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
 
-paper: $(STAMP) ## Make the paper's figures and tables of the runs in runs/paper, and name those that are missing
+paper: $(STAMP) ## Make the paper's figures and tables from runs/paper, and name missing runs
 	$(BIN)/python examples/report.py runs/paper --paper $(ARGS)
 
-test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' chooses
+test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)
 
 check: lint types doctest test ## Check format, lint, types, doctests and tests
@@ -82,7 +82,7 @@ types: $(STAMP)
 doctest: $(STAMP)
 	$(PYTEST) --doctest-modules torchrl_mpfa envs
 
-format: $(STAMP) ## Format the code and mend what ruff can mend
+format: $(STAMP) ## Format the code and fix what ruff can fix
 	$(BIN)/python -m ruff format .
 	$(BIN)/python -m ruff check --fix .
 
@@ -93,14 +93,14 @@ docs: $(STAMP) ## Build the documentation site; open site/index.html
 bench: $(STAMP) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
 	$(BIN)/python -m benchmarks $(ARGS)
 
-wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and use it
+wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and test it
 	$(BIN)/python .ci/wheel_test.py
 
 clean: ## Remove builds and caches; runs/ and .venv stay
 	rm -rf dist build site .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/latest.json
 	find . -name .venv -prune -o -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamp is written last, so that an install which was interrupted is made again.
+# The stamp is written last, so that an interrupted installation is repeated.
 $(STAMP): pyproject.toml
 	@rm -f $(STAMP); \
 	if [ -n "$(PYTHON)" ]; then \

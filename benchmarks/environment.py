@@ -1,4 +1,4 @@
-"""Steps per second of the navigation task, and what its worlds ask of a robot.
+"""Steps per second of the navigation task, and how hard its worlds are.
 
     python -m benchmarks.environment                     # speed
     python -m benchmarks.environment --worlds            # table of the worlds

@@ -1,9 +1,9 @@
 """Run the benchmarks: print one table, write one file.
 
-    python -m benchmarks                 all of them, some minutes
+    python -m benchmarks                 all of them, a few minutes
     python -m benchmarks --quick         all of them, with fewer and shorter rounds
     python -m benchmarks --only loss     one of them
-    python -m benchmarks --check         exit with 1 if a ratio is above its target
+    python -m benchmarks --check         exit with status 1 if a ratio is above its target
 
 The file, ``benchmarks/latest.json``, holds what this run measured: a list of objects with ``name``,
 ``value``, ``unit``, ``ratio`` and ``baseline``. A ratio is this package's time over TorchRL's, both

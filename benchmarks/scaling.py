@@ -1,9 +1,9 @@
-"""Actions and updates a second of a run, against the workers that drive its robots on Ray.
+"""Actions and updates per second of a run, by the number of Ray workers that run its robots.
 
     python -m benchmarks.scaling --workers 0 1 2 4 --robots 32 --updates 8 --seconds 20
 
-0 workers are a run without Ray, which the ratios are to if it is the first row. Anything else of
-``train.py`` can be set after ``--``. What happens before the first updates is not counted.
+0 workers means a run without Ray; ratios are to the first row. Other settings of
+``train.py`` go after ``--``. Time before the first updates is not counted.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def main() -> None:
     )
     parser.add_argument("--workers", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--robots", type=int, default=32)
-    parser.add_argument("--updates", type=int, default=8, help="for an action of each robot")
+    parser.add_argument("--updates", type=int, default=8, help="per action of each robot")
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args()

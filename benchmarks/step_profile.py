@@ -1,10 +1,10 @@
-"""Where the time of a training step goes, as a table in Markdown.
+"""Where the time of a training step goes, as a Markdown table.
 
     python -m benchmarks.step_profile             networks of 2 x 64 and 2 x 256, eager and compiled
     python -m benchmarks.step_profile --widths 128
 
-MPFA-PER on an environment that does nothing. CPU time of one thread; each part is the median of as
-many steps as are asked for.
+MPFA-PER on an environment that does nothing. CPU time of one thread; each part is the median over
+the steps.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def profile(*, width: int, compile: bool, steps: int) -> dict[str, float]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--widths", nargs="+", type=int, default=[64, 256], help="units a layer")
+    parser.add_argument("--widths", nargs="+", type=int, default=[64, 256], help="units per layer")
     parser.add_argument("--steps", type=int, default=300, help="steps to measure (default: 300)")
     options = parser.parse_args(arguments)
     logging.getLogger("torchrl").setLevel(logging.WARNING)

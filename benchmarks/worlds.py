@@ -1,4 +1,4 @@
-"""What a new world costs, how far its field is off, and what the worlds look like.
+"""What a new world costs, the error of its distance field, and what the worlds look like.
 
 python -m benchmarks.worlds                         # a table of the generators
 python -m benchmarks.worlds --pictures docs/images  # twelve worlds of each, from easy to hard
@@ -178,7 +178,7 @@ def main() -> None:
     """Print the table, or write the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pictures", type=Path, help="render the worlds into this folder instead")
-    parser.add_argument("--names", nargs="+", choices=GENERATORS, default=[], help="of these alone")
+    parser.add_argument("--names", nargs="+", choices=GENERATORS, default=[], help="only these")
     arguments = parser.parse_args()
     if arguments.pictures:
         save_pictures(arguments.pictures, arguments.names)

@@ -4,8 +4,8 @@
     python examples/cliffwalk.py --lengths 4,8,16 --seeds 3   other lengths
     python examples/cliffwalk.py --eps 0.05                   with MPFA-PER's constant
 
-Writes ``cliffwalk.csv``, a row for each run, and ``cliffwalk.png``, the medians over the seeds.
-``docs/cliffwalk.md`` says what is measured, and what was found.
+Writes ``cliffwalk.csv``, one row per run, and ``cliffwalk.png``, the medians over the seeds.
+``docs/cliffwalk.md`` explains the measure and the results.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--lengths", default="2,4,6,8,10,12", help="numbers of states, 2 to 20")
-    parser.add_argument("--seeds", type=int, default=10, help="runs for each")
+    parser.add_argument("--seeds", type=int, default=10, help="runs of each")
     parser.add_argument("--features", choices=("tabular", "linear"), default="tabular")
     parser.add_argument("--eps", type=float, default=EPS, help="added to every priority")
     parser.add_argument("--output", type=Path, default=Path("runs/cliffwalk"), help="folder")

@@ -1,21 +1,20 @@
 """Train several methods with several seeds, evaluate the last policy of each, keep every episode.
 
     python examples/compare.py                             three methods, three seeds, two at a time
-    python examples/compare.py --learners ddpg td3         two learners, too
-    python examples/compare.py --worlds test mazes:test --episodes 40    a world, a generator's
+    python examples/compare.py --learners ddpg td3         two learners
+    python examples/compare.py --worlds test mazes:test --episodes 40    a world and a generator's
     python examples/compare.py --physics wheels           evaluated on wheels, however trained
     python examples/compare.py --arm default: --arm phi2:method.boost_factor=2    two arms of each
     python examples/compare.py --folder runs/paper -- regime=paper    the paper's task
     python examples/compare.py --ray HEAD:6379            on all machines of a Ray cluster
 
-What follows ``--`` goes to ``train.py``; an arm has settings of its own on top, for every learner,
-method and seed. Stopped at any moment, the same command goes on: finished
-runs are left alone, others continue at their last checkpoint. So does a run whose machine is gone
-(``docs/scaling.md`` has what ``--ray`` needs). A run that was trained with other
-settings is an error, or with ``--anew`` trained again. ``report.py`` makes tables and figures of
-the folder. Files in it:
+What follows ``--`` goes to ``train.py``; an arm adds settings of its own, for every learner, method
+and seed. It can be stopped at any moment and continued by the same command: finished runs are left
+alone, others resume from their last checkpoint, also if their machine was lost (``docs/scaling.md``
+has the requirements of ``--ray``). A run that was trained with other settings is an error, or with
+``--anew`` is trained again. ``report.py`` makes tables and figures from the folder. Its files:
 
-    LEARNER-METHOD-SEED/   a run of train.py, and what evaluate.py wrote of it; with arms
+    LEARNER-METHOD-SEED/   a run of train.py, with the output of evaluate.py; with arms
                            LEARNER-METHOD-ARM-SEED/
     episodes.csv           every evaluation episode of every run
     settings.json          what was evaluated, and the settings of the runs
@@ -57,14 +56,14 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--folder", type=Path, default=Path("runs/compare"))
     parser.add_argument(
-        "--jobs", type=int, help=f"runs at a time (default: {_JOBS}; with --ray all that fit)"
+        "--jobs", type=int, help=f"runs at a time (default: {_JOBS}; with --ray as many as fit)"
     )
     parser.add_argument(
         "--ray",
         nargs="?",
         const="",
         metavar="ADDRESS",
-        help="run on a Ray cluster; without an address on that of RAY_ADDRESS or of this machine",
+        help="run on a Ray cluster (default: that of RAY_ADDRESS, or of this machine)",
     )
     parser.add_argument("--worlds", nargs="+", default=TESTED.words, help="(default: test)")
     parser.add_argument(
@@ -76,9 +75,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         action="append",
         default=[],
         metavar="NAME:SETTING=VALUE,...",
-        help="other settings by a name, for every run; may be given several times",
+        help="a name and its settings, added to every run; may be given several times",
     )
-    parser.add_argument("--anew", action="store_true", help="train runs of other settings again")
+    parser.add_argument("--anew", action="store_true", help="train runs with other settings again")
     parser.add_argument("overrides", nargs="*", help="settings of train.py, after --")
     options = parser.parse_args(arguments)
     try:
@@ -184,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 job, found = next(iter(others.items()))
                 raise ValueError(
                     f"{job.path} was trained with {'; '.join(found)}: name another --folder, or "
-                    "train it again by --anew"
+                    "train it again with --anew"
                 )
             waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
             print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {options.folder}")

@@ -1,20 +1,20 @@
-"""Evaluate a policy or a planner between fixed starts and goals, in worlds or those of generators.
+"""Evaluate a policy or a planner between fixed starts and goals, in given or generated worlds.
 
     python examples/evaluate.py runs/demo --worlds A --episodes 100
     python examples/evaluate.py runs/demo --worlds test rooms:100-109 bars:test barn
-    python examples/evaluate.py runs/demo --worlds all        all test worlds in which nothing moves
-    python examples/evaluate.py examples/policies/td3-mpfa_per.npz    comes with the project
-    python examples/evaluate.py --policy dwa --worlds bars:validation    a planner in its place
-    python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, nothing kept
+    python examples/evaluate.py runs/demo --worlds all        all test worlds without walkers
+    python examples/evaluate.py examples/policies/td3-mpfa_per.npz    shipped with the project
+    python examples/evaluate.py --policy dwa --worlds bars:validation    a planner
+    python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, not kept
 
-Prints a row for each world or generator and their total. Writes to the folder
-``evaluation-WORLDS`` in that of the run, for another file or a planner to runs/evaluation-NAME, or
-to --output:
-summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (a row
-an episode), settings.json (what was asked for, and a policy's card), trajectories.png (paths in up
-to nine worlds, at most twenty in each), episode.gif (the longest one from above, with the speeds
-of the wheels) and, of a policy, values.png (its actions all over the room). Q is in the last two
-where path is the folder of a run, whose checkpoint has the critic.
+Prints one row per world or generator, and the total. Writes to --output; by default to
+``evaluation-WORLDS`` in the folder of the run, or, for other files and planners, to
+runs/evaluation-NAME:
+summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (one row
+per episode), settings.json (the arguments, and a policy's card), trajectories.png (paths in up to
+nine worlds, at most twenty in each), episode.gif (the longest one from above, with the speeds of
+the wheels) and, for a policy, values.png (its actions over the whole room). The last two show Q if
+path is the folder of a run, whose checkpoint has the critic.
 """
 
 from __future__ import annotations
@@ -75,11 +75,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--policy",
         choices=list(PLANNERS),
-        help="a planner in its place: "
+        help="a planner instead: "
         + "; ".join(f"{name}, {what}" for name, what in PLANNERS.items()),
     )
     parser.add_argument(
-        "--memory", choices=["none", "map"], default="none", help="map: dwa sees the way on its map"
+        "--memory", choices=["none", "map"], default="none", help="map: dwa has a map of its own"
     )
     parser.add_argument(
         "--worlds",
@@ -88,25 +88,25 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="names, world files, spans (rooms:100-109), splits (bars:test), barn, or all",
     )
     parser.add_argument(
-        "--episodes", type=int, help="for each (default: 200 in a world, 400 of a generator)"
+        "--episodes", type=int, help="for each (default: 200 in a world, 400 for a generator)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of pairs and ants (default: 0)")
-    parser.add_argument("--output", type=Path, help="folder (default: in that of the run)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of pairs and ants (default: 0)")
+    parser.add_argument("--output", type=Path, help="folder (default: in the folder of the run)")
     parser.add_argument(
         "--physics",
         choices=["wheels", "kinematic"],
-        help="default: as trained; of a planner kinematic",
+        help="default: as trained; kinematic for planners",
     )
     parser.add_argument(
         "--noise",
         type=read_noise,
         metavar="NAME=VALUE,...",
-        help="errors of a robot: range_noise, dropout, slip, latency, drift (default: none)",
+        help="errors of the robot: range_noise, dropout, slip, latency, drift (default: none)",
     )
     parser.add_argument(
-        "--live", action="store_true", help="watch the episodes in a window, and write nothing"
+        "--live", action="store_true", help="watch the episodes in a window; write nothing"
     )
-    parser.add_argument("--no-pictures", action="store_true", help="write tables alone")
+    parser.add_argument("--no-pictures", action="store_true", help="write only tables")
     options = parser.parse_args(arguments)
     for name, least in (("episodes", 1), ("seed", 0)):
         value = getattr(options, name)

@@ -2,12 +2,12 @@
 
     python examples/export.py runs/demo                             writes runs/demo/policy.onnx
     python examples/export.py examples/policies/td3-mpfa_per.npz --output turtle.onnx
-    python examples/export.py runs/demo --quantize --output small.onnx    weights of eight bits
+    python examples/export.py runs/demo --quantize --output small.onnx    eight-bit weights
 
-The card beside it, ``policy.json``, says what the policy senses and in which units, what its robot
-may do, how it was trained, how well it drives (the evaluations in the run's folder) and which file
-it belongs to. The file is compared with the policy on a thousand observations, and both drive
-through the same tasks; what that shows is printed, and goes on the card.
+The card, ``policy.json``, says what the policy senses and in which units, what its robot may do,
+how it was trained, how well it performs (the evaluations in the run's folder) and which file it
+belongs to. The file is compared with the policy on a thousand observations and on the same tasks;
+the result is printed and added to the card.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Train table F of the study, TD3 on tasks of Gymnasium; it goes on where it was stopped.
+"""Train table F of the study, TD3 on Gymnasium tasks; it continues where it was stopped.
 
     python examples/gym_study.py                              120 runs, two at a time
     python examples/gym_study.py --seeds 100 101 --jobs 4     two of each arm, four at a time
-    python examples/gym_study.py --tasks Pendulum-v1 --methods per uniform    of one task
-    python examples/gym_study.py --keep docs/results/study    keep the rows of what is done
+    python examples/gym_study.py --tasks Pendulum-v1 --methods per uniform    one task
+    python examples/gym_study.py --keep docs/results/study    copy the rows of what is done
 
-A run that is done is left alone; one that was interrupted is trained again. Ctrl-C waits for the
-runs that are under way, a second one stops at once. Reacher-v5 needs MuJoCo:
+A finished run is left alone; an interrupted one is trained again. Ctrl-C waits for the runs in
+progress, a second one stops at once. Reacher-v5 needs MuJoCo:
 ``pip install 'torchrl-mpfa[mujoco]'``. ``report.py --study`` makes page and figures of the table
-beside those of ``study.py``. Of each run, in TASK-METHOD-SEED/:
+along with those of ``study.py``. For each run, in TASK-METHOD-SEED/:
 
     evaluations.csv    total reward of greedy episodes over actions, and the same between 0 and 1
-    settings.json      all that the run depends on
+    settings.json      everything that the run depends on
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     folder = ROOT / FOLDER
     parser.add_argument("--folder", type=Path, default=folder, help=f"(default: {folder})")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
-    parser.add_argument("--actions", type=int, help="of each run (default: as in the table)")
+    parser.add_argument("--actions", type=int, help="actions per run (default: as in the table)")
     parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="write the rows there, and run nothing"
+        "--keep", type=Path, metavar="FOLDER", help="write the rows there; run nothing"
     )
     options = parser.parse_args(arguments)
     if options.jobs < 1:

@@ -4,7 +4,7 @@
     python examples/pictures.py RUN values episode       some
     python examples/pictures.py RUN --output runs/pictures
 
-RUN is the folder of a run whose checkpoint is there: it has the critic.
+RUN is the folder of a run with its checkpoint, which has the critic.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Race a policy by keyboard: both robots in the same room, and who arrives first wins.
+"""Race a policy by keyboard: both robots start in the same room, and the first to arrive wins.
 
-    python examples/play.py                                the policy that comes with the project
+    python examples/play.py                                the policy shipped with the project
     python examples/play.py runs/demo --worlds mazes:test
-    python examples/play.py --worlds D --speed 2           twice as fast as real
+    python examples/play.py --worlds D --speed 2           twice as fast as real time
 
-Arrow keys or WASD drive: up is full speed ahead, left and right turn, both curve; without a key
-the robot rolls on at its slowest, for it cannot stop. Yours is black with its lidar, the policy's
-vermilion; they do not feel each other. N goes on with the next room, Escape ends. It needs pygame
-(extra ``live``).
+Drive with the arrow keys or WASD: up is full speed ahead, left and right turn, both together make
+a curve. Without a key the robot drives on at its lowest speed, as it cannot stop. Your robot is
+black, with its lidar; the policy's is vermilion; they pass through each other. N starts the next
+room, Escape ends. It needs pygame (extra ``live``).
 """
 
 from __future__ import annotations
@@ -157,8 +157,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
         help="as of evaluate.py (default: rooms:test)",
     )
     parser.add_argument("--races", type=int, default=10, help="at most (default: 10)")
-    parser.add_argument("--seed", type=int, default=0, help="of starts and goals (default: 0)")
-    parser.add_argument("--speed", type=float, default=1.0, help="over real (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of starts and goals (default: 0)")
+    parser.add_argument("--speed", type=float, default=1.0, help="times real time (default: 1)")
     options = parser.parse_args(arguments)
     try:
         policy = load_policy(options.path)

@@ -1,12 +1,12 @@
-"""Plot what each method trains on: how often it samples which transitions of one common buffer.
+"""Plot what each method trains on: how often it samples which transitions of a common buffer.
 
     python examples/plot_sampling.py                       all methods, to docs/methods/images
     python examples/plot_sampling.py per mpfa_per --output runs/figures
 
-The buffer is made up: a quarter of a navigation run, with few goals and collisions, TD errors and
-gradients of a wide spread, and actions that are the further from the policy the older they are.
-Its signals stay as they are, while batches are sampled and priorities updated until these have
-settled; then every sample counts.
+The buffer is synthetic: a quarter of a navigation run, with few goals and collisions, widely spread
+TD errors and gradients, and actions that are farther from the policy the older they are. Its
+signals are constant. Batches are sampled and priorities updated until these have settled; then
+samples are counted.
 """
 
 from __future__ import annotations

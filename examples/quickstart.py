@@ -1,4 +1,4 @@
-"""The parts, composed by hand: fill, sample, learn, update, look. Runs in seconds.
+"""The parts, put together by hand: fill, sample, learn, update, look. Runs in seconds.
 
 python examples/quickstart.py
 """

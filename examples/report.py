@@ -1,26 +1,26 @@
 """Make tables and figures of studies, from the rows that ``compare.py`` kept; trains nothing.
 
     python examples/report.py runs/compare
-    python examples/report.py runs/compare runs/more           the runs of both, together
+    python examples/report.py runs/compare runs/more           the runs of both together
     python examples/report.py docs/results --output runs/results
     python examples/report.py runs/paper --paper          the paper's figures and tables
-    python examples/report.py docs/results/study --study --output runs/pages    those of the study
+    python examples/report.py docs/results/study --study --output runs/pages    pages of the study
 
 Writes ``tables.md``, ``training.png`` (success and average reward over episodes and steps) and
 ``evaluations.png`` (greedy success in the validation world over steps). The arms of a study
-(``compare.py --arm``) have rows and lines of their own, what was driven in other physics has tables
-of its own. What varies is the run, not the episode: intervals are for other runs, or for other runs
-and pairs of start and goal, and tests compare the means of runs: see
+(``compare.py --arm``) have rows and lines of their own, and evaluations with other physics have
+tables of their own. The unit is the run, not the episode: intervals are over runs, or over runs and
+pairs of start and goal, and tests compare the means of runs; see
 ``navigation/report/intervals.py``.
 
-With ``--paper`` it makes, of what runs there are, ``paper.md`` with Tables 2 to 4 beside the
+With ``--paper`` it makes, from the runs there are, ``paper.md`` with Tables 2 to 4 next to the
 paper's numbers, ``figure_3.png``, ``figure_5.png``, ``figure_8.png`` to ``figure_11.png``,
-``figure_13.png``, and ``claims.png`` with what Section 2.4 says of PER. Runs that are missing are
-named, with the command that makes them.
+``figure_13.png``, and ``claims.png`` on what Section 2.4 says about PER. Missing runs are named,
+with the command that makes them.
 
-With ``--study`` it makes, of the runs of ``study.py`` or of what its ``--keep`` wrote, a page and
-the figures of each table: curves, performance profiles, arms side by side, of table D replay volume
-by method; of table A, in ``paper/``, what ``--paper`` makes, for which the runs are needed.
+With ``--study`` it makes, from the runs of ``study.py`` or the rows that its ``--keep`` wrote, a
+page and figures for each table: curves, performance profiles, arms side by side, for table D replay
+volume by method; for table A, in ``paper/``, the output of ``--paper``, which needs the runs.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
-    parser.add_argument("--output", type=Path, help="folder (default: that of the first study)")
+    parser.add_argument("--output", type=Path, help="folder (default: the first study's)")
     parser.add_argument("--paper", action="store_true", help="the paper's figures and tables")
     parser.add_argument("--study", action="store_true", help="the pages of the study")
     parser.add_argument(

@@ -5,7 +5,7 @@
     python examples/stable_baselines.py td3 --world bars --robots 32 --actions 200000
 
 The policy goes to ``policy.npz`` in --output, runs/sb3-ALGORITHM by default, where
-``examples/evaluate.py`` and ``examples/export.py`` take it as one of this project. It needs
+``examples/evaluate.py`` and ``examples/export.py`` read it. It needs
 ``pip install stable-baselines3``.
 """
 
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("algorithm", choices=["sac", "td3"])
-    parser.add_argument("--world", default="mixed", help="of a generator, or one (default: mixed)")
+    parser.add_argument("--world", default="mixed", help="a generator or a world (default: mixed)")
     parser.add_argument("--robots", type=int, default=16)
     parser.add_argument("--actions", type=int, default=100_000, help="of all robots together")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,16 +1,16 @@
-"""Train and evaluate the runs of the study, table by table; it goes on where it was stopped.
+"""Train and evaluate the runs of the study, table by table; it continues where it was stopped.
 
     python examples/study.py --list                   each table: its question, runs, commands
     python examples/study.py                          all of them
     python examples/study.py C D --jobs 4             two tables, four runs at a time
     python examples/study.py --seeds 3                three runs of each arm first
-    python examples/study.py --keep docs/results/study    keep the rows of what is done
+    python examples/study.py --keep docs/results/study    copy the rows of what is done
 
-Every run is one of ``compare.py``, by the commands that ``--list`` shows. What is trained and
-evaluated is left alone; Ctrl-C saves what is under way, and the same command goes on. Tables A to
-E are in ``navigation/studies/protocol.py``, with a folder for each task in ``--folder``; table F,
-off navigation, is made by ``gym_study.py``. The checkpoint of a run that is done is removed:
-thousands of them take tens of gigabytes.
+Every run is made by ``compare.py``, with the commands that ``--list`` shows. What is trained and
+evaluated is left alone; Ctrl-C saves what is in progress, and the same command continues it. Tables
+A to E are in ``navigation/studies/protocol.py``, with one folder per task in ``--folder``; table F,
+which is not about navigation, is made by ``gym_study.py``. The checkpoint of a finished run is
+removed: thousands of them take tens of gigabytes.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--folder", type=Path, default=ROOT, help=f"(default: {ROOT})")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     parser.add_argument("--seeds", type=int, help="runs of each arm at most (default: all)")
-    parser.add_argument("--list", action="store_true", help="say what there is, and run nothing")
+    parser.add_argument("--list", action="store_true", help="list what there is; run nothing")
     parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="write the rows there, and run nothing"
+        "--keep", type=Path, metavar="FOLDER", help="write the rows there; run nothing"
     )
     options = parser.parse_args(arguments)
     for name in options.tables:

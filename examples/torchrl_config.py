@@ -1,4 +1,4 @@
-"""The pipeline of ``torchrl_trainer.py``, composed out of Hydra's groups, TorchRL's and our own.
+"""The pipeline of ``torchrl_trainer.py``, composed from Hydra's groups, TorchRL's and our own.
 
     python examples/torchrl_config.py
     python examples/torchrl_config.py sampler=signal sampler.alpha=0.7 storage=signal_memmap

@@ -1,10 +1,10 @@
-"""TorchRL's own SAC on many robots, as TorchRL's script for it trains elsewhere.
+"""TorchRL's own SAC on many robots, in the loop of TorchRL's SAC script.
 
     python examples/torchrl_sac.py
     python examples/torchrl_sac.py --replay mpfa --world rooms --actions 50000
 
 The policy goes to ``policy.npz`` in --output, runs/torchrl-sac by default, where
-``examples/evaluate.py`` and ``examples/export.py`` take it as one of this project.
+``examples/evaluate.py`` and ``examples/export.py`` read it.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--replay", choices=["uniform", "mpfa"], default="uniform")
-    parser.add_argument("--world", default="mixed", help="of a generator, or one (default: mixed)")
+    parser.add_argument("--world", default="mixed", help="a generator or a world (default: mixed)")
     parser.add_argument("--robots", type=int, default=16)
     parser.add_argument("--actions", type=int, default=100_000, help="of all robots together")
     parser.add_argument("--seed", type=int, default=0)

@@ -2,9 +2,9 @@
 
     python examples/torchrl_trainer.py
     python examples/torchrl_trainer.py --frames 20000 --seed 1
-    python examples/torchrl_trainer.py --world mixed --num-envs 20    many robots, ever new worlds
+    python examples/torchrl_trainer.py --world mixed --num-envs 20    many robots, new worlds
 
-``torchrl_config.py`` composes the same out of Hydra's groups.
+``torchrl_config.py`` composes the same from Hydra's groups.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=Sizes.frames)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--world", default="A", help="of a world or a generator (default: A)")
+    parser.add_argument("--world", default="A", help="a world or a generator (default: A)")
     parser.add_argument("--num-envs", type=int, help="robots (default: one, not in a batch)")
     parser.add_argument("--no-progress", action="store_true", help="show no progress bar")
     options = parser.parse_args(arguments)

@@ -1,16 +1,16 @@
 """Train a navigation policy with any method and learner.
 
-    python examples/train.py                              MPFA-PER, 16 robots, ever new worlds
+    python examples/train.py                              MPFA-PER, 16 robots, new worlds
     python examples/train.py method=per seed=3            another method, another seed
     python examples/train.py regime=paper                 Table 1, one robot, worlds A, B, C, D
-    python examples/train.py regime=paper curriculum=A    world A alone
+    python examples/train.py regime=paper curriculum=A    only world A
     python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
     python examples/train.py ray.workers=8 robots=128 updates=32    robots on a Ray cluster
-    python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    go on with a run that was stopped
+    python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    resume a run that was stopped
 
 ``navigation/settings/`` has every setting; ``--help`` prints them with their values. Ctrl-C,
-SIGTERM and SIGHUP let the iteration end and save. Exit status: 0; 1 after an error, the last
-iteration being saved; 2 if a setting is wrong; 128 and the number of the signal that stopped it.
+SIGTERM and SIGHUP let the iteration end and save. Exit status: 0; 1 after an error, with the last
+iteration saved; 2 if a setting is wrong; 128 plus the number of the signal that stopped it.
 """
 
 from __future__ import annotations

@@ -390,13 +390,13 @@ def sample_task_on_grid(
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a way of at most {max_goal_distance} m between them "
+        f"{min_goal_distance} m apart with a path of at most {max_goal_distance} m between them "
         f"that keeps {grid.distance} m"
     )
 
 
 def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
-    """Tell whether there is a start and a goal with a way between them.
+    """Tell whether there is a start and a goal with a path between them.
 
     It looks for a part of the free cells that hangs together and is wide enough in x or in y.
 

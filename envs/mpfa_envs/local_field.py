@@ -230,7 +230,7 @@ def sample_task_in_map(
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a way of at most {longest} m between them that keeps "
+        f"{min_goal_distance} m apart with a path of at most {longest} m between them that keeps "
         f"{grid.distance} m"
     )
 

@@ -240,7 +240,7 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
         True
     """
     if world.occupancy is not None:
-        raise ValueError(f"world {world.name!r} must be written by to_map, as it is a map's")
+        raise ValueError(f"world {world.name!r} must be written by to_map, as it comes from a map")
     content: dict[str, object] = {
         "name": world.name,
         "size": [float(side) for side in world.size],

@@ -120,7 +120,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
             return world.renamed(_world_name(name, int(seed), difficulty))
     raise ValueError(
         f"world {_world_name(name, seed, difficulty)!r} cannot be made: none of {_ATTEMPTS} "
-        "attempts has a start and a goal with a way between them"
+        "attempts has a start and a goal with a path between them"
     )
 
 

@@ -211,7 +211,7 @@ def check_settings(settings: TrainSettings) -> None:
     if settings.evaluation.choose and is_of_a_test(settings.evaluation.world):
         raise ValueError(
             f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "
-            "got True: nothing may be chosen by the worlds of a test"
+            "got True: nothing may be chosen in the worlds of a test"
         )
     if settings.assessment.episodes:
         _check_one_rule(settings)
@@ -261,7 +261,7 @@ def _check_one_rule(settings: TrainSettings) -> None:
         if value != only:
             raise ValueError(
                 f"{name} must be {str(only).lower()} with assessment.episodes="
-                f"{settings.assessment.episodes}, got {value}: two rules would decide the same"
+                f"{settings.assessment.episodes}, got {value}: two rules would make the same choice"
             )
 
 
@@ -306,7 +306,7 @@ def _check_values_alone(settings: TrainSettings) -> None:
         if wrong:
             raise ValueError(
                 f"method={method.name} is not for learner={algorithm}, which has neither an actor "
-                f"nor actions that are numbers: method.{name}={getattr(method, name)}"
+                f"nor continuous actions: method.{name}={getattr(method, name)}"
             )
     if algorithm == "q_learning" and settings.learner.reward_scale != 1:
         raise ValueError(
