@@ -8,6 +8,7 @@ import pytest
 
 import report
 
+pytestmark = pytest.mark.usefixtures("tables_alone")
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {
     "results": "results.md",

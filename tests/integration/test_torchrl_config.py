@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
@@ -72,10 +71,14 @@ TINY = [
 ]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
+    register()
+
+
 @pytest.fixture(autouse=True)
 def hydra_at_work() -> Iterator[None]:
     GlobalHydra.instance().clear()
-    register()
     with initialize_config_dir(str(EXAMPLES), version_base="1.3"):
         yield
 
@@ -358,15 +361,6 @@ def test_the_script_trains_by_its_command_line(
     assert "updates of priorities   9" in printed
     assert "signal td_error         weight 1.000" in printed
     assert list(tmp_path.iterdir()) == []
-
-
-def test_importing_the_package_does_not_import_hydra() -> None:
-    code = "import sys, torchrl_mpfa, torchrl_mpfa.trainer; print('hydra' in sys.modules)"
-    root = Path(__file__).parents[2]
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split()[-1] == "False"
 
 
 def test_a_seed_is_set_before_the_networks_are_made() -> None:

@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass
 from itertools import pairwise, product
 from typing import Any
 
-from hydra import compose, initialize
+from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -112,7 +112,8 @@ def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
             alternatives.append([text])
     for texts in product(*alternatives):
         try:
-            with initialize(version_base="1.3", config_path=None):
+            # Of a module, as Hydra would read the source of every caller to find out where it is.
+            with initialize_config_module("navigation.settings", version_base="1.3"):
                 settings = as_settings(compose("train", list(texts)))
         except (HydraException, OmegaConfBaseException) as error:
             raise ValueError(_one_line(error)) from error

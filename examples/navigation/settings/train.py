@@ -11,6 +11,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -311,8 +312,9 @@ GROUPS: dict[str, dict[str, Any]] = {
 }
 
 
+@cache
 def register() -> None:
-    """Make the settings known to Hydra."""
+    """Make the settings known to Hydra; a second call changes nothing."""
     OmegaConf.register_new_resolver("curriculum_name", _resolve_name, replace=True)
     store = ConfigStore.instance()
     store.store(name="train", node=TrainSettings)

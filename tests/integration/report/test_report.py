@@ -73,6 +73,7 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
             assert picture.width == width
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_random_worlds_have_tables_of_their_own_without_the_paper(study: Path) -> None:
     rows = pd.read_csv(study / "episodes.csv")
     rooms = rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))
@@ -100,6 +101,7 @@ def test_the_arms_of_a_study_have_rows_of_their_own(study: Path) -> None:
     assert "| ddpg | per | None | 9,000; 9,000 | 0.472 |" in text
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_other_physics_have_tables_of_their_own(study: Path) -> None:
     rows = pd.read_csv(study / "episodes.csv")
     both = [rows.assign(physics=physics) for physics in ("wheels", "kinematic")]
@@ -110,6 +112,7 @@ def test_other_physics_have_tables_of_their_own(study: Path) -> None:
     assert text.count(LINE) == 2
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_the_worlds_of_a_generator_and_those_of_barn_are_a_row_each_with_the_worst_run(
     study: Path,
 ) -> None:
@@ -126,6 +129,7 @@ def test_the_worlds_of_a_generator_and_those_of_barn_are_a_row_each_with_the_wor
     assert "| all | 87.5% (1: 75.0%) | 0.0% (0: 0.0%) |" in text
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(study: Path) -> None:
     steps = [1000, 2000, 3000]
     of_runs = {"mpfa_per": ([0.9, 0.2, 0.96], [0.1, 0.9, 0.94]), "per": ([0.9, 1, 1], [0, 0, 0.8])}
@@ -147,6 +151,7 @@ def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(study: Path) ->
     assert "| ddpg | per | 90% | 2,000 |  | 0 of 2 |" in (study / "tables.md").read_text("utf-8")
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_two_studies_together_have_the_runs_of_both(
     study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -171,6 +176,7 @@ def test_a_folder_without_rows_is_refused(
     assert "no episodes.csv with rows" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_runs_on_other_pairs_are_not_compared(
     study: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
