@@ -20,15 +20,15 @@ def name_of(path):
 
 
 @cache
-def tree_of(path):
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path):
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
 @cache
 def imports(path):
     """Top-level names of all modules that a file imports, wherever in it."""
     found = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -39,7 +39,7 @@ def imports(path):
 
 def calls(path):
     """Names of all functions that a file calls directly."""
-    calls = [node.func for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
+    calls = [node.func for node in nodes_of(path) if isinstance(node, ast.Call)]
     return {func.id for func in calls if isinstance(func, ast.Name)}
 
 
@@ -89,11 +89,7 @@ def test_the_training_application_s_folders_import_those_that_come_before_them()
     }
     for path in folder.rglob("*.py"):
         place = "" if path.parent == folder else path.parent.name
-        modules = {
-            node.module or ""
-            for node in ast.walk(tree_of(path))
-            if isinstance(node, ast.ImportFrom)
-        }
+        modules = {node.module or "" for node in nodes_of(path) if isinstance(node, ast.ImportFrom)}
         found = {name.split(".")[1] for name in modules if name.startswith("navigation.")}
         assert found & set(allowed) <= allowed[place] | {place}, name_of(path)
 
@@ -122,7 +118,7 @@ def test_no_package_file_asserts_what_a_user_gives():
     assert not [
         f"{name_of(path)}:{node.lineno}"
         for path in REPLAY + TASKS
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Assert)
     ]
 

@@ -369,11 +369,13 @@ def sample_task_on_grid(
             break
         goal_cell = goals[rng.integers(len(goals))]
         goal = within_cell(grid, rng, x[goal_cell], y[goal_cell], goal_room)
-        field = DistanceField(grid, goal)
-        way = field.values[columns, rows]
         direct = np.hypot(x - goal[0], y - goal[1])
         # Start and goal leave the middle of their cells: by this much they may come nearer.
         fits = may_start & (direct >= min_goal_distance + grid.resolution)
+        if not fits.any():  # The ways to this goal, which take the time, need not be known.
+            continue
+        field = DistanceField(grid, goal)
+        way = field.values[columns, rows]
         fits &= np.isfinite(way) & (way <= max_goal_distance - grid.resolution)
         around = fits & (way > 1.08 * direct + 0.3)
         wanted = detour and bool(around.any())

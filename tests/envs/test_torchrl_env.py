@@ -34,10 +34,12 @@ def test_the_specs_hold(num_envs: int | None, physics: str) -> None:
     env.close()
 
 
-def test_parallel_environments_have_the_same_face() -> None:
-    env = make_navigation_env("A", num_envs=2, parallel=True, physics="kinematic", seed=0)
+# Each process imports PyTorch and TorchRL.
+@pytest.mark.parametrize("num_envs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_parallel_environments_have_the_same_face(num_envs: int) -> None:
+    env = make_navigation_env("A", num_envs=num_envs, parallel=True, physics="kinematic", seed=0)
     try:
-        assert env.rollout(3)["next", "info", "distance"].shape == (2, 3, 1)
+        assert env.rollout(3)["next", "info", "distance"].shape == (num_envs, 3, 1)
     finally:
         env.close()
 

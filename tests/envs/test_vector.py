@@ -96,7 +96,7 @@ def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments:
     theirs = SyncVectorEnv(singles, autoreset_mode=mode, observation_mode="different")
     seeds, rng, episodes = [3, 4, 5, 6], np.random.default_rng(0), 0
     assert_alike(ours.reset(seed=seeds), theirs.reset(seed=seeds), 1e-9)
-    for _ in range(150):
+    for _ in range(100):
         actions = drive(rng, 4)
         seen = ours.step(actions)
         assert_alike(seen, theirs.step(actions), 1e-9)
