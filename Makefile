@@ -33,6 +33,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest
+DOCTESTS := --doctest-modules torchrl_mpfa envs
+# Together with the tests, as each process of pytest needs seconds to import PyTorch.
+ALSO := $(if $(filter check,$(MAKECMDGOALS)),$(DOCTESTS) tests)
 
 # This project needs Python 3.10, and PyBullet has wheels up to 3.11; on later versions everything
 # but the simulated wheels works. Interpreters are run to find their version rather than trusted by
@@ -68,9 +71,9 @@ paper: $(STAMP) ## Make the paper's figures and tables from runs/paper, and name
 	$(BIN)/python examples/report.py runs/paper --paper $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects
-	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ARGS)
+	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ALSO) $(ARGS)
 
-check: lint types doctest test ## Check format, lint, types, doctests and tests
+check: lint types test ## Check format, lint, types, doctests and tests
 
 lint: $(STAMP)
 	$(BIN)/python -m ruff format --check .
@@ -80,7 +83,7 @@ types: $(STAMP)
 	$(BIN)/python -m mypy
 
 doctest: $(STAMP)
-	$(PYTEST) --doctest-modules torchrl_mpfa envs
+	$(PYTEST) $(DOCTESTS)
 
 format: $(STAMP) ## Format the code and fix what ruff can fix
 	$(BIN)/python -m ruff format .

@@ -1,35 +1,42 @@
 """What holds for all tests: no log lines of TorchRL, one thread, a fixed global seed."""
 
 import gc
-import logging
 import os
+from collections.abc import Generator
+
+import pytest
 
 # Also for the processes that tests start: two of them and two of pytest's on two cores.
 os.environ["OMP_NUM_THREADS"] = "1"
-
-import pytest
-import torch
-from torchrl import torchrl_logger
-
 # TorchRL tells of every storage that it allocates.
-torchrl_logger.setLevel(logging.WARNING)
+os.environ["RL_LOGGING_LEVEL"] = "WARNING"
 
 
-def pytest_collection_finish() -> None:
-    """Leave what was imported out of later garbage collections, each of which takes 0.3 s of it."""
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Leave what is imported out of garbage collections, each of which would take 0.3 s of it."""
+    gc.disable()
+    found = yield
     gc.collect()
     gc.freeze()
+    gc.enable()
+    return found
 
 
+# PyTorch takes seconds to import, and of the processes of pytest-xdist the first runs no test.
 @pytest.fixture(autouse=True)
 def one_thread():
     """TorchRL's parallel environments leave more, and tiny operations then wait for each other."""
+    import torch
+
     torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)
 def fixed_seed():
     """Networks start from torch's global generator; every test starts it at the same place."""
+    import torch
+
     # torch.manual_seed would also keep a traceback for each accelerator that is not there.
     torch.default_generator.manual_seed(0)
     if torch.cuda.is_available():

@@ -106,8 +106,9 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
         (["test", "WORKERS=0", "SLOW=1"], ["python -m pytest -n 0", "-m 'slow or not slow'"]),
         (
             ["check"],
-            ["ruff format --check .", "ruff check .", "mypy", "--doctest-modules"],
+            ["ruff format --check .", "ruff check .", "mypy", "--doctest-modules torchrl_mpfa"],
         ),
+        (["doctest"], ["python -m pytest --doctest-modules torchrl_mpfa envs"]),
         (["bench", "ARGS=--quick"], ["python -m benchmarks --quick"]),
         (["wheel-test"], ["python .ci/wheel_test.py"]),
     ],
@@ -123,9 +124,14 @@ def test_each_target_runs_its_commands_and_installs_nothing_twice(
     assert places == sorted(places)
 
 
-def test_the_tests_run_once_when_checks_and_tests_are_asked_for(installed: Path) -> None:
-    lines = make(installed, "-n", "check", "test").stdout.splitlines()
-    assert sum("-m pytest -n " in line for line in lines) == 1
+@pytest.mark.parametrize("goals", [["check"], ["check", "test"], ["test", "check"]], ids=" ".join)
+def test_tests_and_doctests_run_once_when_checks_are_asked_for(
+    installed: Path, goals: list[str]
+) -> None:
+    lines = make(installed, "-n", *goals).stdout.splitlines()
+    (tests,) = [line for line in lines if "-m pytest" in line]
+    both = "-n 2 --dist worksteal --doctest-modules torchrl_mpfa envs tests"
+    assert tests.split(" -m pytest ")[1].split() == both.split()
 
 
 @pytest.mark.parametrize("program", [SHIM_THAT_FAILS, TOO_OLD])
