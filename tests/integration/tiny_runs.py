@@ -41,16 +41,17 @@ def tiny(
         method=replace(GROUPS["method"][method]),
         learner=GROUPS["learner"][learner](),
         curriculum=CurriculumSettings("tiny", list(episodes or STAGES)),
-        environment=EnvironmentSettings(physics="kinematic", max_steps=25),
+        environment=EnvironmentSettings(physics="kinematic", max_steps=14),
         checkpoint_every=10_000,
         seed=3,
         robots=robots,
         updates=updates,
     )
-    settings.method.capacity, settings.method.batch_size = 100, 16
+    settings.method.capacity, settings.method.batch_size = 30, 8
+    settings.method.update_block = min(settings.method.update_block, 10)
     settings.learner.width = 16
-    settings.exploration.random_steps = 20
-    settings.exploration.annealing_steps = 60
+    settings.exploration.random_steps = 10
+    settings.exploration.annealing_steps = 30
     settings.tracking.mode = "off"
     return settings
 

@@ -21,8 +21,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 MAKE = {"ddpg": make_ddpg_loss, "td3": make_td3_loss}
 LEARNERS = {"ddpg": DDPGLearner, "td3": TD3Learner}
-# Python stands in for the C++ compiler: what is traced is the same.
-TRACED = {"backend": "eager"}
 # The function itself, where tracing takes most of the time.
 UNTRACED = {"disable": True}
 
@@ -201,12 +199,24 @@ def test_a_program_takes_the_same_forty_steps(name, options):
 
 
 @pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
-def test_a_traced_program_does_so_too(name):
-    learners = make_pair(name, TRACED, loss={"target_average": 2} if name == "ddpg" else {})
-    for seed in range(4):
+def test_a_traced_program_does_so_too_and_is_made_once_whatever_the_rates(name):
+    made = []
+
+    def backend(module, inputs):
+        """Python stands in for the C++ compiler: what is traced is the same."""
+        made.append(module)
+        return module.forward
+
+    options = {"target_average": 2} if name == "ddpg" else {}
+    learners = make_pair(name, {"backend": backend}, loss=options)
+    for seed in range(12):
+        for learner in learners:
+            learner.anneal(1.0 - seed / 12)
         update_both(learners, seed)
         update_both(learners, seed + 50, trains="critic", loss_function="pal", new_step=False)
     assert_alike(*learners)
+    # One for both networks and one for the critic; TD3 delays its actor.
+    assert len(made) == {"ddpg": 2, "td3": 3}[name]
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -217,21 +227,6 @@ def test_draws_for_one_of_both_move_that_one_alone(name):
         update_both(learners, seed + 50, trains="critic", loss_function="smooth_l1", new_step=False)
         update_both(learners, seed + 90, trains="actor", new_step=False)
     assert_alike(*learners)
-
-
-@pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
-def test_rates_that_fall_at_each_update_make_no_program_anew(name):
-    made = []
-
-    def backend(module, inputs):
-        made.append(module)
-        return module.forward
-
-    learner = make_pair(name, {"backend": backend})[1]
-    for seed in range(12):
-        learner.anneal(1.0 - seed / 12)
-        learner.update(make_batch(seed=seed))
-    assert len(made) == {"ddpg": 1, "td3": 2}[name]
 
 
 @pytest.mark.parametrize("name", LEARNERS)

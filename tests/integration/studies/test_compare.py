@@ -22,6 +22,7 @@ from navigation.settings.command_line import composed
 from navigation.studies import execution
 from navigation.studies.arms import parse_arm, with_defaults
 from navigation.studies.processes import Lost
+from navigation.training import running
 from navigation.training.running import Refused, resume, start
 from tests.integration.tiny_runs import OVERRIDES
 
@@ -65,6 +66,8 @@ class InThisProcess:
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(compare, "Child", InThisProcess)
     monkeypatch.setattr(compare, "_PAUSE", 0.0)
+    # A picture of a run takes longer than the two episodes of one.
+    monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
     yield
     torch.set_flush_denormal(False)
 

@@ -24,6 +24,7 @@ from navigation.studies.protocol import (
     tables,
 )
 from navigation.studies.remaining import counts, hours_left
+from navigation.training import running
 from navigation.worlds import parse_worlds
 from tests.integration.studies.test_compare import InThisProcess
 from tests.integration.tiny_runs import OVERRIDES
@@ -201,7 +202,7 @@ def test_every_arm_of_every_table_can_be_trained() -> None:
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Two tables that share an arm, of runs that take no second."""
     settings = (*OVERRIDES, "curriculum.stages=[{world: A, episodes: 2}]")
-    settings += ("evaluation.every=5", "evaluation.episodes=1", "evaluation.world=A")
+    settings += ("evaluation.every=10", "evaluation.episodes=1", "evaluation.world=A")
 
     def two(root: Path, *, most: int | None = None) -> dict[str, Table]:
         worlds = compare.Evaluation(("B",), 2)
@@ -215,6 +216,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(study, "tables", two)
     monkeypatch.setattr(compare, "Child", InThisProcess)
     monkeypatch.setattr(compare, "_PAUSE", 0.0)
+    monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
     return tmp_path
 
 

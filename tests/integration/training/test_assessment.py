@@ -30,7 +30,7 @@ def assessed(
     stages: list[Stage] | None = None,
     learner: str = "ddpg",
 ) -> TrainSettings:
-    stages = stages or [Stage("A", actions=600 if robots > 1 else 300)]
+    stages = stages or [Stage("A", actions=360 if robots > 1 else 200)]
     settings = tiny(episodes=stages, learner=learner, robots=robots, updates=1)
     settings.environment.max_steps, settings.environment.clearance = 12, 0.4
     settings.exploration.random_steps = 60
@@ -198,14 +198,14 @@ def taken(run: TrainingRun) -> int:
     return 0 if run.assessment.over else int(run.assessment.state_dict()["taken"])
 
 
-@pytest.mark.parametrize("stages", [None, [Stage("A", actions=300), Stage("B", actions=300)]])
+@pytest.mark.parametrize("stages", [None, [Stage("A", actions=180), Stage("B", actions=180)]])
 def test_a_run_that_is_stopped_in_an_assessment_goes_on_alike(
     tmp_path: Path, stages: list[Stage] | None
 ) -> None:
     settings = assessed(stages=stages)
     whole = train(tmp_path / "whole", settings)
     part = TrainingRun(settings, tmp_path)
-    part.train(lambda: part.actions >= 400 and taken(part) > 0 and part.stop.ask())
+    part.train(lambda: part.actions >= 240 and taken(part) > 0 and part.stop.ask())
     part.close()
     state = read_checkpoint(tmp_path)
     assert not state["assessment"]["over"]
@@ -223,21 +223,21 @@ def test_a_run_that_is_stopped_in_an_assessment_goes_on_alike(
 
 
 def test_another_world_has_a_best_of_its_own(tmp_path: Path) -> None:
-    settings = assessed(stages=[Stage("A", actions=450), Stage("B", actions=450)])
+    settings = assessed(stages=[Stage("A", actions=270), Stage("B", actions=270)])
     run = train(tmp_path, settings)
-    first = next(each for each in run.assessments if each.total_steps > 450)
+    first = next(each for each in run.assessments if each.total_steps > 270)
     assert first.best == -math.inf
     assert first.kept
     assert first.episodes == 5
     # Episodes that another world cut short are not waited for.
-    assert first.total_steps < 450 + 3 * 12 * 3
+    assert first.total_steps < 270 + 3 * 12 * 3
 
 
 def test_what_is_kept_is_what_is_evaluated_and_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = assessed()
-    settings.evaluation.every, settings.evaluation.episodes = 300, 2
+    settings.evaluation.every, settings.evaluation.episodes = 180, 2
     found, seen = loop.evaluate_policy, []
 
     def evaluated(settings: TrainSettings, policy: torch.nn.Module, **named: Any) -> Any:

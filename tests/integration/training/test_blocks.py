@@ -16,7 +16,7 @@ from tests.integration.training.test_training import assert_same_run, stop_after
 
 def blocky(block: int, method: str = "rud") -> TrainSettings:
     settings = tiny(method, [Stage("A", actions=120)], robots=3, updates=2)
-    settings.method.update_block = block
+    settings.method.batch_size, settings.method.update_block = 16, block
     return settings
 
 

@@ -190,7 +190,7 @@ def test_one_wandb_run_stays_one_through_resuming(
         return init(**{**arguments, "mode": "disabled"})
 
     monkeypatch.setattr(tracking.wandb, "init", remember)
-    begin(tmp_path, "tracking=offline", episodes=1)
+    begin(tmp_path, "tracking=offline", "tracking.pictures_every=null", episodes=1)
     go_on(tmp_path, STAGES.format(2))
     go_on(tmp_path, STAGES.format(3))
     assert len({each["id"] for each in started}) == 1

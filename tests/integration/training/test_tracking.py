@@ -141,6 +141,7 @@ def board_rows(folder: Path) -> dict[str, list[tuple[int, float]]]:
 def in_both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A run that was killed and went on, and the same one without that."""
     settings = tiny(episodes=[Stage("A", 4)])
+    settings.environment.max_steps = 25
     settings.tracking = TrackingSettings(csv=True, tensorboard=True, log_every=5)
     folder = tmp_path_factory.mktemp("logs")
     (folder / "killed").mkdir()
@@ -169,7 +170,8 @@ def test_tensorboard_shows_the_same_rows_as_the_csv_files(in_both: tuple[Path, P
 
 def test_wandb_has_no_row_of_a_run_that_was_killed_twice(tmp_path: Path, kept: Kept) -> None:
     settings = tiny(episodes=[Stage("A", 4)])
-    settings.tracking = replace(OFFLINE, log_every=5)
+    settings.environment.max_steps = 25
+    settings.tracking = replace(OFFLINE, log_every=5, pictures_every=None)
     (tmp_path / "killed").mkdir()
     run = killed_and_resumed(tmp_path / "killed", settings, saved=20, killed=32)
     killed, kept.rows = kept.rows, {}
@@ -235,6 +237,7 @@ def test_pictures_are_shown_at_the_end_or_more_often_or_never(
         return 0.0
 
     settings = tiny(episodes=[Stage("A", 2)])
+    settings.environment.max_steps = 25
     settings.tracking = replace(OFFLINE, pictures_every=every)
     monkeypatch.setattr("navigation.training.loop.show_policy", show)
     whole(tmp_path / "run", settings)
@@ -276,7 +279,7 @@ def of_curiosity(settings: TrainSettings) -> None:
 
 
 def of_evaluations(settings: TrainSettings) -> None:
-    settings.evaluation = replace(settings.evaluation, every=30, world="A", episodes=1)
+    settings.evaluation = replace(settings.evaluation, every=10, world="A", episodes=1)
     settings.tracking.pictures_every = 0
 
 

@@ -27,7 +27,7 @@ def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
     tmp_path: Path, method: str
 ) -> None:
     settings = tiny(method)
-    settings.tracking.log_every = 7
+    settings.environment.max_steps, settings.tracking.log_every = 18, 7
     run = TrainingRun(settings, tmp_path)
     learned: dict[int, int] = {}
     rewards: list[float] = []
@@ -92,19 +92,19 @@ def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
 
 def test_the_error_is_the_mean_of_the_sizes_in_units_of_the_reward(tmp_path: Path) -> None:
     run = TrainingRun(tiny(), tmp_path)
-    run.train(lambda: len(run.buffer) >= 40 and run.stop.ask())
+    run.train(lambda: len(run.buffer) >= 25 and run.stop.ask())
     log = UpdateLog(100, reward_scale=0.1)
     log.learns(torch.arange(4))
     squared = torch.tensor([0.04, 0.0, 0.01, 0.01])
     log.learned({"td_error": squared})
-    log.add(40, episode=1, buffer=run.buffer)
+    log.add(25, episode=1, buffer=run.buffer)
     run.close()
     assert log.rows[0]["td_error"] == pytest.approx((2 + 0 + 1 + 1) / 4)
 
 
 def test_a_run_that_was_killed_and_goes_on_has_every_row_once(tmp_path: Path) -> None:
     settings = tiny()
-    settings.tracking.log_every = 3
+    settings.environment.max_steps, settings.tracking.log_every = 25, 3
     settings.checkpoint_every = 20
     train(tmp_path / "whole", settings)
     part = TrainingRun(settings, tmp_path)
@@ -122,7 +122,7 @@ def test_a_run_that_was_killed_and_goes_on_has_every_row_once(tmp_path: Path) ->
 
 def test_a_run_goes_on_whose_checkpoint_is_older_than_the_rows(tmp_path: Path) -> None:
     settings = tiny()
-    settings.tracking.log_every = 5
+    settings.environment.max_steps, settings.tracking.log_every = 25, 5
     part = TrainingRun(settings, tmp_path)
     part.train(lambda: part.actions >= 40 and part.stop.ask())
     part.close()
