@@ -50,7 +50,7 @@ from torchrl_mpfa.signals import (
 from torchrl_mpfa.storages import SignalMemmapStorage, SignalTable, SignalTensorStorage
 from torchrl_mpfa.updates import run_updates
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "ACTION_GRADIENT",
