@@ -13,6 +13,7 @@ from mpfa_envs.render import (
     render_samples,
     render_traces,
     render_values,
+    samples,
     viridis,
 )
 from mpfa_envs.render.colors import LINES
@@ -116,6 +117,36 @@ def test_samples_are_bright_where_transitions_priorities_and_samples_are_many() 
     assert sums[1][1] > sums[1][0]
     assert sums[2][1] > sums[2][0]
     assert pixel(panels[0], 0.3, 3.3) == (250, 249, 246)
+
+
+def test_a_cell_of_fewer_than_three_transitions_stays_empty() -> None:
+    counts = {(-3.5, 3.5): 9, (0.5, 3.5): 3, (3.5, 3.5): 2}
+    places = np.repeat(np.array(list(counts)), list(counts.values()), axis=0)
+    ones = np.ones(len(places))
+    pictures = render_samples("A", places, ones, ones, spacing=1.0, size=480)
+    floor = (250, 249, 246)
+    shown = [pixel(pictures[:, :480], x, y) != floor for x, y in counts]
+    assert shown == [True, True, False]
+    # A cell ends where the next one begins.
+    assert [pixel(pictures[:, :480], x, 3.5) == floor for x in (-0.2, 0.2, 0.8, 1.2)] == [
+        *(True, False, False, True)
+    ]
+
+
+def test_how_often_is_told_in_units_of_uniform_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends, real = {}, samples.Scale
+
+    def scale(name: str, low: float, high: float) -> samples.Scale:
+        ends[name] = low, high
+        return real(name, low, high)
+
+    monkeypatch.setattr(samples, "Scale", scale)
+    places = halves()
+    counts = np.where(places[:, 0] > 0, 3, 1)
+    render_samples("A", places, counts, counts, spacing=1.0)
+    mean = sum(counts.tolist()) / len(counts)
+    assert ends["times as often as uniformly"] == pytest.approx((1 / mean, 3 / mean))
+    assert ends["mean priority"] == (1.0, 3.0)
 
 
 def test_samples_may_be_numbers_of_transitions() -> None:

@@ -93,6 +93,15 @@ def test_the_window_knows_the_keys_that_are_held() -> None:
     window.close()
 
 
+def test_a_picture_of_another_size_has_a_window_of_its_size() -> None:
+    window, rng = Window("test", fps=1000), np.random.default_rng(0)
+    for height, width in ((40, 60), (50, 30)):
+        picture = rng.integers(0, 256, (height, width, 3), np.uint8)
+        assert window.show(picture)
+        np.testing.assert_array_equal(on_screen(), picture)
+    window.close()
+
+
 @pytest.mark.parametrize("how", ["quit", "escape"])
 def test_a_window_that_the_user_closes_shows_nothing_more(how: str) -> None:
     window = Window("test", fps=1000)

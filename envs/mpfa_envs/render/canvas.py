@@ -212,7 +212,10 @@ class Layer:
         self._canvas.draw = ImageDraw.Draw(self._canvas.image)
 
     def __exit__(self, *error: object) -> None:
-        self._below.alpha_composite(self._canvas.image)
+        # A layer is empty but for a small part, which takes less time.
+        box = self._canvas.image.getbbox()
+        if box is not None:
+            self._below.alpha_composite(self._canvas.image, box[:2], box)
         self._canvas.image = self._below
         self._canvas.draw = ImageDraw.Draw(self._below)
 
