@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import ast
 import json
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +28,7 @@ from control.tasks import TASKS, make_env, task_of
 from control.training import METHODS, Regime, Settings, greedy_returns, iterations, train
 from navigation.report import study_pages
 from navigation.report.study_rows import Rows, read_kept, scores_of
-from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.methods import Replay, loss_options, make_replay
 
 PENDULUM = TASKS["Pendulum-v1"]
 TINY = Regime(actions=96, first_actions=16, batch_size=16, width=8, every=48, episodes=1, updates=1)
@@ -95,26 +98,79 @@ def test_the_same_seed_gives_the_same_run_and_another_one_another() -> None:
     assert first["return"].tolist() == again["return"].tolist() != other["return"].tolist()
 
 
-def rows_of(method: str, actions: int = 48) -> tuple[TensorDict, int]:
-    """What a run of so many actions has stored, and the updates that it made."""
+def rows_of(method: str, actions: int = 48, *, used: int = 0) -> tuple[TensorDict, int]:
+    """What a run of so many actions has stored, and the updates that it made.
+
+    So many random numbers more were used before it.
+    """
     settings = Settings("Pendulum-v1", method, 3, replace(TINY, actions=actions))
     torch.manual_seed(3)
     env = TransformedEnv(GymWrapper(make_env(PENDULUM)), InitTracker())
     env.set_seed(3)
     learner = training.make_learner(settings, env)
     replay = make_replay(method, capacity=1000, batch_size=16)
+    torch.rand(used)
     for _ in iterations(settings.regime, env, learner, replay, seed=3):
         pass
     return replay.buffer[:], learner.updates
 
 
 def test_all_methods_begin_with_the_same_networks_starts_and_noise() -> None:
-    (ours, updates), (theirs, _) = rows_of("mpfa_per"), rows_of("uniform")
+    (ours, updates), (theirs, _) = rows_of("mpfa_per"), rows_of("uniform", used=7)
     first = TINY.first_actions
     for key in ("observation", "action", ("next", "reward")):
         torch.testing.assert_close(ours[key][:first], theirs[key][:first])
     # From the sixteenth action on one for each four.
     assert updates == (48 - 16) // 4 + 1
+
+
+def test_the_replay_is_made_for_the_task_and_its_exponent_reaches_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[tuple[dict[str, Any], Replay]] = []
+    real = training.make_replay
+
+    def make(method: str, **named: Any) -> Replay:
+        made.append((named, real(method, **named)))
+        return made[0][1]
+
+    monkeypatch.setattr(training, "make_replay", make)
+    train(Settings("Pendulum-v1", "mpfa_per", 3, replace(TINY, actions=48)))
+    ((named, replay),) = made
+    assert (named["positive_above"], named["capacity"]) == ("mean", 48)
+    assert named["generator"].initial_seed() == 3
+    assert replay.method.beta < replay.method.beta_end
+    assert replay.buffer.sampler.beta == pytest.approx(replay.method.beta_end)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_loss_writes_the_signals_of_the_method(method: str) -> None:
+    learner = training.make_learner(
+        Settings("Pendulum-v1", method, 3, TINY), GymWrapper(make_env(PENDULUM))
+    )
+    assert list(learner.loss.signals) == loss_options(method)["signals"]
+
+
+def test_the_time_of_evaluations_is_none_of_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+
+    def evaluated(*_: Any) -> np.ndarray:
+        nonlocal now
+        now += 100.0
+        return np.zeros(1)
+
+    def blocks(*parts: Any, **named: Any) -> Iterator[int]:
+        nonlocal now
+        for actions in iterations(*parts, **named):
+            now += 1.0
+            yield actions
+
+    monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=lambda: now))
+    monkeypatch.setattr(training, "greedy_returns", evaluated)
+    monkeypatch.setattr(training, "iterations", blocks)
+    found = train(Settings("Pendulum-v1", "uniform", 3, TINY))
+    # Four actions in each block.
+    assert found["trained_for"].tolist() == [12.0, 24.0]
 
 
 def test_noise_goes_on_from_one_block_of_actions_to_the_next() -> None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -25,6 +26,7 @@ from navigation.settings.train import (
 from navigation.training import tracking
 from navigation.training.checkpoints import read_checkpoint
 from navigation.training.loop import TrainingRun
+from navigation.training.showing import show_policy
 from navigation.training.tracking import Tracker
 from tests.integration.tiny_runs import tiny
 
@@ -66,7 +68,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> Kept:
 
 def episode(number: int, *, actions: int) -> EpisodeRecord:
     ended = {"success": True, "collision": False, "timeout": False}
-    lengths = {"path_length": 1.0, "shortest_path": 1.0}
+    lengths = {"path_length": 1.5, "shortest_path": 1.0}
     return EpisodeRecord(number, "A", 10, actions, 5.0, 0.5, 1.0, **ended, **lengths)
 
 
@@ -76,9 +78,21 @@ def test_episodes_that_end_at_one_action_are_all_in_the_log(tmp_path: Path, kept
         tracker.log_episode(episode(number, actions=actions))
     tracker.log_evaluation(EvaluationRecord(176, 4, "validation", 0.5, 0.5, 0.0, 0.4, 1.0, 2.0))
     rows = list(kept.rows.values())
-    assert [row["train/episode"] for row in rows if "train/episode" in row] == [0, 1, 2, 3]
+    ended = [row for row in rows if "train/episode" in row]
+    assert [row["train/episode"] for row in ended] == [0, 1, 2, 3]
+    assert [row["train/path_length"] for row in ended] == [1.5] * 4
+    # A second after the run began.
+    assert [row["time/steps_per_second"] for row in ended] == [160.0, 160.0, 160.0, 176.0]
     # All are plotted over the actions of the run.
     assert [row[kept.axes["*"]] for row in rows] == [160, 160, 160, 176, 176]
+
+
+def test_a_run_keeps_its_id_and_one_of_a_sweep_has_the_sweep_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_RUN_ID", "1a2b3c4d")
+    ids = [Tracker(TrainSettings(), tmp_path, run_id=given).run_id for given in ("own", None)]
+    assert ids == ["own", "1a2b3c4d"]
 
 
 class Killed(BaseException):
@@ -106,11 +120,12 @@ def killed_and_resumed(
     return again
 
 
-def whole(folder: Path, settings: TrainSettings) -> None:
+def whole(folder: Path, settings: TrainSettings) -> TrainingRun:
     folder.mkdir()
     run = TrainingRun(settings, folder)
     run.train()
     run.close()
+    return run
 
 
 def csv_rows(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -181,6 +196,8 @@ def test_wandb_has_no_row_of_a_run_that_was_killed_twice(tmp_path: Path, kept: K
     # Steps of wandb count on where they were, in the place of beginning again.
     assert list(killed) == list(range(len(killed)))
     assert kept.finished == 3
+    # No pictures were asked for, and the policy goes with them.
+    assert not kept.artifacts
     assert run.tracker.upload is not None and run.tracker.upload.endswith(run.tracker.run_id)
 
 
@@ -207,15 +224,26 @@ def test_a_run_that_is_begun_anew_begins_new_logs(tmp_path: Path) -> None:
 
 
 def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
-    tmp_path: Path, kept: Kept
+    tmp_path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    took: list[float] = []
+
+    def show(*parts: Any, **named: Any) -> float:
+        took.append(show_policy(*parts, **named))
+        return 1000.0
+
+    monkeypatch.setattr("navigation.training.loop.show_policy", show)
     settings = tiny(episodes=[Stage("A", 1)])
     settings.tracking = replace(OFFLINE)
     settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
-    whole(tmp_path / "run +1", settings)
+    run = whole(tmp_path / "run +1", settings)
     (row,) = [row for row in kept.rows.values() if "policy/paths" in row]
     kinds = {name: type(row[f"policy/{name}"]).__name__ for name in ("paths", "values")}
     assert kinds == {"paths": "Image", "values": "Image"}
+    paths, values = (np.asarray(row[f"policy/{name}"].image) for name in ("paths", "values"))
+    assert paths.shape == values.shape and not np.array_equal(paths, values)
+    # The clock of the run stands still meanwhile.
+    assert took[0] > 0.01 and run.robots.elapsed() < -900.0
     assert type(row["policy/episode"]).__name__ == "Video"
     table = row["policy/episodes"]
     assert len(table.data) == 2 and "spl" in table.columns
@@ -224,6 +252,19 @@ def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
     assert artifact.metadata["method"] == "mpfa_per"
     assert artifact.metadata["episodes"] == 1
     assert list(artifact.manifest.entries) == [files.POLICY]
+
+
+@pytest.mark.parametrize(
+    ("places", "shows"),
+    [({}, False), ({"csv": True}, False), ({"csv": True, "tensorboard": True}, True)],
+    ids=["nowhere", "csv", "csv and tensorboard"],
+)
+def test_pictures_are_made_where_a_log_can_show_them(
+    places: dict[str, bool], shows: bool, tmp_path: Path
+) -> None:
+    tracker = Tracker(TrainSettings(tracking=TrackingSettings(**places)), tmp_path, run_id=None)
+    assert tracker.shows == shows
+    tracker.close()
 
 
 @pytest.mark.parametrize("every", [None, 0, 20])
