@@ -446,4 +446,6 @@ class VectorNavigationEnv(
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the physics server; keyword arguments are not used."""
-        self._batch.drives.close()
+        # gymnasium 1.2 also closes what was never built, as its arguments were refused.
+        if hasattr(self, "_batch"):
+            self._batch.drives.close()
