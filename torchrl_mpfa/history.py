@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.samplers import TreeSampler
 
 _LOW, _HIGH = 1e-6, 1e6
 """Ends of the bins; what lies beyond counts to the outermost ones."""
@@ -60,15 +58,7 @@ class ReplayHistory:
             step: The time, such as the number of actions so far.
             buffer: The buffer.
         """
-        sampler = buffer.sampler
-        if not isinstance(sampler, TreeSampler) or not len(buffer):
-            return
-        size = len(buffer)
-        priorities = sampler.priorities()[:size]
-        leaf = priorities**sampler.alpha
-        weight = importance_weights(leaf, beta=sampler.beta, lowest=float(leaf.min()))
-        found = {**_signals(buffer, size), "priority": priorities, "weight": weight}
-        for name, values in found.items():
+        for name, values in buffer.distributions().items():
             self._count(name, step, values)
 
     def _count(self, name: str, step: int, values: Tensor) -> None:
@@ -111,11 +101,3 @@ class ReplayHistory:
                 )
         self._steps = {name: list(state["steps"]) for name, state in state_dict.items()}
         self._counts = {name: list(state["counts"].numpy()) for name, state in state_dict.items()}
-
-
-def _signals(buffer: SignalReplayBuffer, size: int) -> dict[str, Tensor]:
-    """Each signal of all transitions as it was last written, by name; NaN where it never was."""
-    table = getattr(buffer.storage, "signal_table", None)
-    if table is None:
-        return {}
-    return {name: table.rows[:size, column] for name, column in table.column.items()}

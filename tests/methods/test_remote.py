@@ -12,8 +12,10 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 
 from tests.methods.replays import make_transitions
+from torchrl_mpfa import ReplayHistory
 from torchrl_mpfa.methods import METHODS, MethodReplayBuffer, can_be_remote, make_ray_replay
 from torchrl_mpfa.methods import make_replay as make_local_replay
+from torchrl_mpfa.methods.remote import RaySignalReplayBuffer
 
 CAPACITY = 64
 
@@ -46,6 +48,20 @@ def test_a_buffer_made_of_settings_is_the_one_of_the_method() -> None:
     assert local.stats() == made.stats()
     assert made.sampler.beta == 0.7
     assert made.rewards().shape == (CAPACITY,)
+
+
+def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
+    here = MethodReplayBuffer(method("mpfa_per"), seed=3)
+    here.extend(make_transitions(40))
+    # Stands in for the process: nothing else of the buffer is in this one.
+    elsewhere = object.__new__(RaySignalReplayBuffer)
+    elsewhere._client = here
+    histories = ReplayHistory(), ReplayHistory()
+    for history, buffer in zip(histories, (here, elsewhere), strict=True):
+        history.add(0, buffer)
+    known, found = (history.state_dict() for history in histories)
+    assert sorted(found) == ["priority", "reward", "weight"]
+    assert_same(found, known)
 
 
 def test_methods_that_look_into_their_buffer_stay_with_it() -> None:
@@ -102,6 +118,7 @@ def test_draws_of_a_remote_buffer_are_those_of_eq_8_and_late_signals_are_left_ou
         local.load_state_dict(buffer.state_dict())
         assert (local.sample() == buffer.sample()).all()
         assert torch.equal(local.rewards(), buffer.rewards())
+        assert_same(buffer.distributions(), local.distributions())
     finally:
         buffer.shutdown()
 

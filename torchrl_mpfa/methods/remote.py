@@ -86,6 +86,11 @@ class RaySignalReplayBuffer(RayReplayBuffer):
         found: torch.Tensor = self._client.rewards()
         return found
 
+    def distributions(self) -> dict[str, torch.Tensor]:
+        """See :meth:`SignalReplayBuffer.distributions`."""
+        found: dict[str, torch.Tensor] = self._client.distributions()
+        return found
+
     def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
         """See :meth:`SignalReplayBuffer.update_tensordict_priority`."""
         self._client.update_tensordict_priority(data, batches=batches)
