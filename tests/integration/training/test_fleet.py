@@ -26,6 +26,8 @@ TRAIN = Path(__file__).parents[3] / "examples" / "train.py"
 def on_ray(actions: int) -> TrainSettings:
     settings = tiny(episodes=[Stage("A", actions=actions)], robots=8, updates=2)
     settings.ray = RaySettings(workers=2, steps=8)
+    settings.method.capacity, settings.method.batch_size = 100, 16
+    settings.environment.max_steps = 25
     return settings
 
 
