@@ -18,11 +18,12 @@ from mpfa_envs.checks import check_count
 from mpfa_envs.episodes import EpisodeSource, WorldChoice
 from mpfa_envs.kernels.step import outcomes
 from mpfa_envs.noise import RobotNoise
-from mpfa_envs.observation import INFO_TYPES, Memory
+from mpfa_envs.observation import Memory
 from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
 from mpfa_envs.robot import RobotModel
-from mpfa_envs.robot_batch import FLAGS, NUMBERS, RobotBatch
+from mpfa_envs.robot_batch import RobotBatch
 from mpfa_envs.tasks import Task
+from mpfa_envs.vector_infos import final_infos, gather_infos
 from mpfa_envs.vector_options import (
     read_mask,
     read_reset_mask,
@@ -36,8 +37,6 @@ from mpfa_envs.worlds import World
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_MASKS = tuple(f"_{name}" for name in INFO_TYPES)
-_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 _EMPTY = World(name="empty")
 
 
@@ -365,7 +364,7 @@ class VectorNavigationEnv(
         infos: dict[str, Any] = {}
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos = self._final(ended)
+            infos = final_infos(self._batch.observations, self._infos(ended), ended)
             for index in np.flatnonzero(ended).tolist():
                 self._begin(index, None)
             self._batch.sense(ended, self._rngs)
@@ -378,22 +377,8 @@ class VectorNavigationEnv(
         self._batch.begin(index, self._source.draw(index, rng, given), rng)
 
     def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """An array for each key of the info, and a mask of the chosen robots, or of all."""
-        mask = np.ones(self.num_envs, dtype=np.bool_) if chosen is None else chosen
-        flags, numbers = self.info_tables
-        return dict(zip(_KEYS, (*flags, *numbers, *(mask,) * len(_MASKS)), strict=True))
-
-    def _final(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
-        """What the last step of episodes has shown, before new ones begin."""
-        seen = np.full(self.num_envs, None, dtype=object)
-        for index in np.flatnonzero(ended).tolist():
-            seen[index] = self._batch.observations[index].copy()
-        return {
-            "final_obs": seen,
-            "_final_obs": ended,
-            "final_info": self._infos(ended),
-            "_final_info": ended,
-        }
+        """The infos of the chosen robots, or of all."""
+        return gather_infos(*self.info_tables, chosen)
 
     def state_dict(self) -> dict[str, Any]:
         """Give all that the environment needs to go on elsewhere in the middle of episodes.

@@ -360,3 +360,8 @@ def test_pictures_show_each_world() -> None:
     env.reset(seed=0)
     assert [picture.shape for picture in env.render()] == [(480, 480, 3)] * 2
     assert make(2).render() is None
+
+
+def test_what_was_never_built_can_be_closed() -> None:
+    # gymnasium 1.2 closes an environment whose arguments were refused, when it is collected.
+    VectorNavigationEnv.__new__(VectorNavigationEnv).close_extras()
