@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         GENERATORS,
         generate_world,
         generator_tasks,
+        register_generator,
         split_worlds,
         world_seed,
     )
@@ -116,6 +117,7 @@ __all__ = [
     "make_planner",
     "navigation_reward",
     "observation_slices",
+    "register_generator",
     "render_trajectories",
     "run_tasks",
     "sample_task",
@@ -190,6 +192,7 @@ _MODULES = {
     "make_planner": "planners",
     "navigation_reward": "reward",
     "observation_slices": "observation",
+    "register_generator": "generators",
     "render_trajectories": "render",
     "run_tasks": "evaluation",
     "sample_task": "tasks",

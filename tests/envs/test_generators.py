@@ -6,6 +6,7 @@ import random
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
@@ -16,11 +17,17 @@ from benchmarks.worlds import errors_of_fields, measure
 from mpfa_envs import (
     GENERATORS,
     Box,
+    Cylinder,
     FreeGrid,
+    NavigationEnv,
     PathPlanner,
+    VectorNavigationEnv,
     World,
+    evaluate,
     generate_world,
     generator_tasks,
+    generators,
+    register_generator,
     sample_task_on_grid,
     split_worlds,
     world_seed,
@@ -343,3 +350,62 @@ def test_fields_are_within_a_few_percent_of_the_exact_planner(name: str, most: f
     assert len(errors) > 40
     # Where the planner slips through a gap that holds no center of a cell, a field goes around it.
     assert np.mean(errors <= most) > 0.95 and np.mean(errors) < most / 2
+
+
+@pytest.fixture(autouse=True)
+def forgets_generators() -> Iterator[None]:
+    """Leave the other tests the built-in generators alone."""
+    before = dict(generators._registered)
+    yield
+    generators._registered.clear()
+    generators._registered.update(before)
+
+
+def pillars(source: random.Random, difficulty: float) -> World:
+    """A room with one pillar, the wider the more difficult."""
+    pillar = Cylinder(source.uniform(-4, 4), source.uniform(-4, 4), 0.1 + difficulty)
+    return World(name="pillars", cylinders=(pillar,))
+
+
+def test_a_generator_of_ones_own_stands_wherever_a_built_in_one_does() -> None:
+    register_generator("pillars", pillars)
+    worlds = split_worlds("pillars", "validation", 2)
+    assert [world.name for world in worlds] == ["pillars-validation-0", "pillars-validation-1"]
+    assert worlds[0].cylinders != worlds[1].cylinders
+    assert generate_world("pillars", 3, difficulty=1.0).cylinders[0].radius == 1.1
+    env = NavigationEnv(world="pillars-7", physics="kinematic")
+    assert env.world == generate_world("pillars", 7)
+    robots = VectorNavigationEnv(3, world="pillars", physics="kinematic")
+    robots.reset(seed=0)
+    first = [world.name for world in robots.worlds]
+    robots.reset()
+    names = {*first, *(world.name for world in robots.worlds)}
+    assert len(names) == 6
+    assert all(name.startswith("pillars-") for name in names)
+    ahead = evaluate(lambda _: np.ones(2), "pillars:test", episodes=2, physics="kinematic")
+    assert [result.world for result in ahead] == ["pillars-test-0", "pillars-test-0"]
+
+
+def test_a_generator_of_ones_own_may_be_defined_again() -> None:
+    register_generator("pillars", lambda source, difficulty: World(name="empty"))
+    assert not generate_world("pillars", 0).cylinders
+    register_generator("pillars", pillars)
+    assert generate_world("pillars", 0).cylinders
+
+
+@pytest.mark.parametrize("name", ["rooms", "crowd", "validation", "barn"])
+def test_built_in_generators_and_worlds_cannot_be_replaced(name: str) -> None:
+    with pytest.raises(ValueError, match=f"name must not be that of a built-in .*, got '{name}'"):
+        register_generator(name, pillars)
+
+
+@pytest.mark.parametrize("name", ["", "Pillars", "two words", "pillars-7", "pillars2"])
+def test_names_that_worlds_could_not_have_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"name must be lower-case letters a to z, got {name!r}"):
+        register_generator(name, pillars)
+
+
+def test_a_generator_that_gives_no_world_is_named() -> None:
+    register_generator("nothing", lambda source, difficulty: None)  # type: ignore[arg-type, return-value]
+    with pytest.raises(TypeError, match="generator 'nothing' must give a World, got NoneType"):
+        generate_world("nothing", 0)

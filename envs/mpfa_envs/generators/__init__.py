@@ -15,6 +15,7 @@ from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.distance import FreeGrid, has_task, sample_task_on_grid
 from mpfa_envs.generators.bars import bars
@@ -33,19 +34,19 @@ Generator: TypeAlias = Callable[[random.Random, float], World]
 Split = Literal["train", "validation", "test"]
 """What a seed is for."""
 
-GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(
-    {
-        "rooms": rooms,
-        "clutter": clutter,
-        "bars": bars,
-        "fields": fields,
-        "halls": halls,
-        "mazes": mazes,
-        "mixed": mixed,
-        "crowd": crowd,
-    }
-)
-"""The generators by name."""
+_BUILT_IN: Final[Mapping[str, Generator]] = {
+    "rooms": rooms,
+    "clutter": clutter,
+    "bars": bars,
+    "fields": fields,
+    "halls": halls,
+    "mazes": mazes,
+    "mixed": mixed,
+    "crowd": crowd,
+}
+_registered = dict(_BUILT_IN)
+GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(_registered)
+"""The generators by name; :func:`register_generator` adds one."""
 ROBOT_DISTANCE: Final = 0.25
 """In every world there is a task whose way keeps this: a TurtleBot2 with 0.07 m to spare [m]."""
 _SPLIT_SIZE: Final = 10**9
@@ -54,6 +55,38 @@ _HALFWAY: Final = ("rooms", "crowd")
 """Generators whose worlds have a difficulty of 0.5 unless told otherwise."""
 _TASK_STREAM: Final = 7312590
 _NAME = re.compile(r"([a-z]+)(?:-(validation|test))?-([0-9]{1,9})(?:@(1|0?\.[0-9]+|0))?")
+
+
+def register_generator(name: str, generator: Generator) -> None:
+    """Add a generator of your own, for this process.
+
+    Its name then stands wherever that of a built-in one does: ``world="pillars"`` is a new world in
+    each episode, ``"pillars-7"`` world 7, ``"pillars:test"`` the tasks of its test worlds.
+
+    Args:
+        name: Lower-case letters. A generator of your own that has this name is replaced.
+        generator: From a source of randomness and a difficulty in [0, 1] to a world. It must draw
+            all its random numbers from that source.
+
+    Raises:
+        ValueError: If the name has other characters, or is taken by a built-in generator or world.
+
+    Examples:
+        >>> from mpfa_envs import Cylinder, NavigationEnv, World, register_generator
+        >>> def pillars(source, difficulty):
+        ...     places = [(source.uniform(-4, 4), source.uniform(-4, 4)) for _ in range(6)]
+        ...     radius = 0.1 + 0.4 * difficulty
+        ...     return World(name="pillars", cylinders=tuple(Cylinder(*p, radius) for p in places))
+        >>> register_generator("pillars", pillars)
+        >>> env = NavigationEnv(world="pillars-7", physics="kinematic")
+        >>> len(env.world.cylinders)
+        6
+    """
+    if re.fullmatch("[a-z]+", name) is None:
+        raise ValueError(f"name must be lower-case letters a to z, got {name!r}")
+    if name in _BUILT_IN or name in WORLDS or name == "barn":
+        raise ValueError(f"name must not be that of a built-in generator or world, got {name!r}")
+    _registered[name] = generator
 
 
 def world_seed(split: Split, index: int) -> int:
@@ -97,6 +130,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         :func:`~mpfa_envs.builtin_worlds.resolve_world` understands.
 
     Raises:
+        TypeError: If a generator of your own gives something else.
         ValueError: If there is no such generator, an argument is out of its range, or none of 100
             attempts has a task.
 
@@ -116,6 +150,8 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         # Rooms are as they were before there were others, so that their seeds mean the same.
         own = 0.5 if name in _HALFWAY else rng.random()
         world = generator(rng, own if difficulty is None else difficulty)
+        if not isinstance(world, World):
+            raise TypeError(f"generator {name!r} must give a World, got {type(world).__name__}")
         if _can_be_driven(world):
             return world.renamed(_world_name(name, int(seed), difficulty))
     raise ValueError(
