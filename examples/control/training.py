@@ -200,14 +200,12 @@ def iterations(
         frames_per_batch=regime.actions_at_once,
         total_frames=regime.actions,
     )
-    beta, beta_end = replay.method.beta, replay.method.beta_end
     actions = 0
     for steps in collector:
         replay.buffer.extend(steps.select(*_KEPT))
         noise.step(len(steps))
         actions += len(steps)
-        done = actions / regime.actions
-        replay.buffer.anneal(beta + (beta_end - beta) * done, done)
+        replay.anneal(actions / regime.actions)
         if actions >= regime.first_actions:
             run_updates(replay.buffer, learner, replay.select, updates=regime.updates)
         yield actions

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from tests.methods.replays import make_transitions, seeded
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, loss_options, make_replay
+from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
 
 
 def more(name):
@@ -132,3 +133,29 @@ def test_a_batch_holds_what_was_written():
     replay.buffer.extend(TensorDict({"next": {"reward": torch.ones(10, 1)}}, [10]))
     (draw,) = replay.select(replay.buffer)
     assert draw.batch["next", "reward"].shape == (4, 1)
+
+
+def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
+    replay = make_replay("hvper", capacity=100, batch_size=4)
+    sampler, betas, weights = replay.buffer.sampler, [], []
+    names = [RELATIVE_VALUE.name, RELATIVE_ERROR.name]
+    for fraction in (0.0, 0.5, 1.0):
+        replay.anneal(fraction)
+        betas.append(sampler.beta)
+        weights.append(sampler.fusion.weights(names, None, None).tolist())
+    method = replay.method
+    assert betas == [method.beta, (method.beta + method.beta_end) / 2, method.beta_end]
+    assert weights == [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]
+
+
+def test_annealing_by_a_fraction_that_is_none_changes_nothing():
+    replay = make_replay("per", capacity=100)
+    for fraction in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match=r"fraction must be in \[0, 1\], got"):
+            replay.anneal(fraction)
+    assert replay.buffer.sampler.beta == replay.method.beta
+
+
+@pytest.mark.parametrize("name", ["uniform", "pal", "cer"])
+def test_annealing_without_priorities_does_nothing(name):
+    make_replay(name, capacity=100).anneal(1.0)

@@ -98,6 +98,26 @@ class Replay:
     method: Method
     entries: tuple[str, ...] = ()
 
+    def anneal(self, fraction: float) -> None:
+        """Move what changes over a training: beta of Eq. (10), linearly, and a fusion's weights.
+
+        Args:
+            fraction: How much of the training is done.
+
+        Raises:
+            ValueError: If ``fraction`` is not in [0, 1].
+
+        Examples:
+            >>> replay = make_replay("per", capacity=1_000)
+            >>> replay.anneal(0.5)
+            >>> replay.buffer.sampler.beta
+            0.7
+        """
+        if not 0.0 <= fraction <= 1.0:
+            raise ValueError(f"fraction must be in [0, 1], got {fraction}")
+        start, end = self.method.beta, self.method.beta_end
+        self.buffer.anneal(start + (end - start) * fraction, fraction)
+
 
 def make_replay(
     method: str | Method = "mpfa_per",

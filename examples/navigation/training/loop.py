@@ -113,7 +113,8 @@ class TrainingRun:
             policy=self.learner.policy,
             sigma=lambda: self.explorer.sigma,
         )
-        self.buffer, self.select, self.entries = replay.buffer, replay.select, replay.entries
+        self._replay, self.buffer = replay, replay.buffer
+        self.select, self.entries = replay.select, replay.entries
         self.log.forget(method.capacity)
         wanted = settings.assessment
         self.assessment = Assessment(wanted) if wanted.episodes else None
@@ -317,8 +318,7 @@ class TrainingRun:
     def _anneal(self) -> None:
         """Move what changes with the run: beta of Eq. (10), fusion and learning rates."""
         settings, done = self.settings, self.schedule.fraction
-        start, end = settings.method.beta, settings.method.beta_end
-        self.buffer.anneal(start + (end - start) * done, done)
+        self._replay.anneal(done)
         lowest, power = settings.learner.lr_end_factor, settings.learner.lr_power
         if power is None:
             few = self.schedule.unit == "episode" and self.schedule.total < _MANY_EPISODES
