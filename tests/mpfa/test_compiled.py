@@ -331,6 +331,28 @@ def test_a_compiled_learner_goes_on_from_a_state_that_is_loaded(name):
     assert all(logs[0][key].equal(logs[1][key]) for key in logs[0])
 
 
+@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("before", [False, UNTRACED], ids=["eager", "compiled"])
+def test_rates_that_are_annealed_after_a_state_is_loaded_are_those_of_the_next_step(name, before):
+    learners = [
+        LEARNERS[name](make_loss(name), actor_lr=1e-3, critic_lr=1e-2, compile=compile)
+        for compile in (before, False, UNTRACED)
+    ]
+    first, plain, compiled = learners
+    first.anneal(0.3)
+    for seed in range(2):
+        first.update(make_batch(seed=seed))
+    for learner in (plain, compiled):
+        learner.load_state_dict(first.state_dict())
+    update_both([plain, compiled], 2)
+    assert_alike(plain, compiled)
+    for learner in (plain, compiled):
+        learner.anneal(0.0)
+    weights = [weight.detach().clone() for weight in compiled.loss.parameters()]
+    update_both([plain, compiled], 3)
+    assert all(map(torch.equal, weights, compiled.loss.parameters()))
+
+
 def test_what_cannot_be_one_program_is_refused_by_name():
     actor, critic = make_networks()
     wrapped = TensorDictModule(actor.module, actor.in_keys, actor.out_keys)

@@ -48,11 +48,6 @@ class FlatParameters:
         self._targets = None if targets is None else [targets[name] for name in learned]
         self._unit = [name for name, value in learned.items() if any(value is u for u in unit)]
         self._optimizer = optimizer
-        self._group: Mapping[str, Any] = next(
-            group
-            for group in optimizer.param_groups
-            if any(each is self._parameters[0] for each in group["params"])
-        )
         self.weights = self.targets = self.mean = self.square = torch.empty(0)
         self.hold()
 
@@ -91,6 +86,15 @@ class FlatParameters:
             return vector
         tensors = self.views(vector)
         return self.joined({**tensors, **{name: unit_rows(tensors[name]) for name in self._unit}})
+
+    @property
+    def _group(self) -> Mapping[str, Any]:
+        """Settings of the optimizer for these parameters; loading a state replaces them."""
+        return next(
+            group
+            for group in self._optimizer.param_groups
+            if any(each is self._parameters[0] for each in group["params"])
+        )
 
     def next_step(self) -> Step:
         """Numbers of the step that comes next."""
