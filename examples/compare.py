@@ -1,4 +1,4 @@
-"""Train several methods with several seeds, evaluate the last policy of each, keep every episode.
+"""Train several methods with several seeds, evaluate each run's policy, keep every episode.
 
     python examples/compare.py                             three methods, three seeds, two at a time
     python examples/compare.py --learners ddpg td3         two learners

@@ -265,7 +265,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         self._unreturned, self._handed_out = 0, None
 
     def anneal(self, beta: float, fraction: float) -> None:
-        """Set beta, and a fusion's weights if they change; no effect on sampling without priorities.
+        """Set beta, and the weights of a fusion that changes; no effect without priorities.
 
         Args:
             beta: Exponent of the importance weights, Eq. (10).

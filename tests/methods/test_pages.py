@@ -15,6 +15,8 @@ PAGES = Path(__file__).resolve().parents[2] / "docs/methods"
 @pytest.mark.parametrize("page", ["README.md", "mpfa_per.md"])
 def test_the_examples_of_a_page_run_in_their_order(page, monkeypatch):
     monkeypatch.setattr("builtins.print", lambda *words: None)
+    # What a page adds to the catalogue is gone afterwards.
+    monkeypatch.setattr("torchrl_mpfa.methods.METHODS", dict(METHODS))
     names = {"METHODS": dict(METHODS), "Method": Method, "make_replay": make_replay}
     blocks = re.findall(
         r"```python\n(.*?)```", (PAGES / page).read_text(encoding="utf-8"), re.DOTALL

@@ -145,7 +145,7 @@ def comparison_table(rows: pd.DataFrame) -> str:
         )
     if not lines:
         return ""
-    head = ["", "success, p", "SPL, p", "least p there can be"]
+    head = ["", "success, p", "SPL, p", "smallest attainable p"]
     return table([*head, "SPL of a pair: probability of improvement, over runs"], lines)
 
 
