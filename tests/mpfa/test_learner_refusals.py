@@ -11,12 +11,15 @@ from tests.mpfa.losses import BOUNDS, make_batch, make_networks
 from tests.mpfa.transitions import same
 from torchrl_mpfa import (
     DDPGLearner,
+    DQNLearner,
     Draw,
     SACLearner,
+    SignalDQNLoss,
     TD3Learner,
     make_ddpg_loss,
     make_sac_loss,
     make_td3_loss,
+    make_value_network,
 )
 
 TRACED = {"compile": {"backend": "eager"}}
@@ -227,3 +230,15 @@ def test_the_defaults_are_those_of_table_1_and_a_light_decay(name):
     groups = make_learner(name).optimizer.param_groups
     assert [group["lr"] for group in groups[:2]] == [1e-4, 1e-4]
     assert [group["weight_decay"] for group in groups[:2]] == [0.0, 1e-4]
+
+
+@pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
+def test_a_copy_which_would_not_learn_is_refused(name, options):
+    learner = make_learner(name, **options)
+    with pytest.raises(TypeError, match=f"a {type(learner).__name__} cannot be copied: make"):
+        deepcopy(learner)
+
+
+def test_a_copy_of_a_learner_of_discrete_actions_is_refused():
+    with pytest.raises(TypeError, match="a DQNLearner cannot be copied: make another one"):
+        deepcopy(DQNLearner(SignalDQNLoss(make_value_network(6, 4, width=8))))

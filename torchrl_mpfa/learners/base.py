@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NoReturn, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_range
-from torchrl_mpfa.learners.states import check_state, refuse_unfinished
+from torchrl_mpfa.learners.states import check_state, refuse_copy, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.networks.unit import project_rows
@@ -221,6 +221,10 @@ class ActorCriticLearner:
             raise ValueError(f"factor must be in [0, 1], got {factor}")
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * factor
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        """Refuse, see :func:`refuse_copy`."""
+        refuse_copy(self)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, target networks, optimizer and count; tensors and plain values only."""

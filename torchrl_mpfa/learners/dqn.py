@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +11,12 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.learners.base import OptimizerName, check_rate, make_optimizer
-from torchrl_mpfa.learners.states import check_state, check_updates, refuse_unfinished
+from torchrl_mpfa.learners.states import (
+    check_state,
+    check_updates,
+    refuse_copy,
+    refuse_unfinished,
+)
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.refusals import check_gamma
@@ -124,6 +129,10 @@ class DQNLearner:
         self.targets.step()
         self.updates += 1
         return {key: value.detach() for key, value in log.items()}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        """Refuse, see :func:`refuse_copy`."""
+        refuse_copy(self)
 
     def end_episode(self) -> None:
         """Nothing changes."""

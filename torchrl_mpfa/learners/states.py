@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDictBase
@@ -56,6 +56,20 @@ def _first_not_finite(batch: TensorDictBase) -> str | None:
             number = value[row].reshape(-1)[rows[row]][0].item()
             return f"{number} in {key!r}, row {row}"
     return None
+
+
+def refuse_copy(learner: object) -> NoReturn:
+    """Refuse to copy a learner: the optimizer of a copy would move none of the copy's parameters.
+
+    TorchRL's losses hold parameters in ways that a deep copy takes apart.
+
+    Raises:
+        TypeError: Always.
+    """
+    raise TypeError(
+        f"a {type(learner).__name__} cannot be copied: make another one, and have it load the "
+        "state_dict() of this one"
+    )
 
 
 def check_state(given: Any, own: Mapping[str, Any], optimizer: torch.optim.Optimizer) -> None:
