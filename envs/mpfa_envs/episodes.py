@@ -13,7 +13,7 @@ import numpy as np
 from mpfa_envs.builtin_worlds import WORLDS, resolve_world
 from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.path import shortest_length
-from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs.plain_worlds import fingerprint, world_from_plain, world_to_plain
 from mpfa_envs.tasks import Task, check_task, sample_task
 from mpfa_envs.worlds import World
 
@@ -170,6 +170,21 @@ class EpisodeSource:
     def fixed(self, robot: int) -> World | None:
         """The world that a robot always drives in; None with a generator."""
         return None if self._generator else self._worlds[robot]
+
+    def describe(self) -> dict[str, Any]:
+        """What decides which episodes come, as plain values by name."""
+        world: str | list[str] | None = self._generator
+        if world is None:
+            names = {id(each): fingerprint(each) for each in self._worlds if each is not None}
+            world = [names[id(each)] for each in self._worlds]
+            world = world[0] if len(names) == 1 else world
+        return {
+            "world": world,
+            "max_goal_distance": self._max_goal_distance,
+            "difficulty": self._difficulty,
+            "episodes_per_world": self._episodes_per_world,
+            "split": self._split,
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Where each robot is among the worlds of a generator."""

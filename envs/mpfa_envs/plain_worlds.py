@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from typing import Any
 
 from mpfa_envs.occupancy import OccupancyGrid
@@ -88,6 +90,26 @@ def world_from_plain(values: dict[str, Any]) -> World:
         )
     except (KeyError, TypeError, IndexError) as error:
         raise ValueError(f"worlds must hold the fields of a World, got {values!r}") from error
+
+
+def fingerprint(world: World) -> str:
+    """Tell a world from others, those of its name included.
+
+    Args:
+        world: The world.
+
+    Returns:
+        Its name, and eight digits that are the same for equal worlds in every process.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.plain_worlds import fingerprint
+        >>> fingerprint(WORLDS["A"])
+        'A (8db8ff63)'
+    """
+    # 1 and 1.0 are the same number, but not the same text.
+    values = json.loads(json.dumps(world_to_plain(world), default=float), parse_int=float)
+    return f"{world.name} ({hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]})"
 
 
 def _edges(box: Box) -> list[float]:

@@ -5,7 +5,9 @@ The equation is from https://doi.org/10.3389/fnbot.2023.1281166.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Final, NamedTuple
 
 PROGRESS_SCALE: Final = 5.0
@@ -92,3 +94,28 @@ def navigation_reward(
         return RewardTerms(collision=collision_reward)
     # Eq. (25), last case, with its sign corrected.
     return RewardTerms(progress=progress_scale * (outcome.previous_distance - outcome.distance))
+
+
+def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
+    """Read what Eq. (25) pays.
+
+    Args:
+        reward: A reward function.
+
+    Returns:
+        Rewards for the goal, for a collision and per meter of approach; None if the function is
+        neither :func:`~mpfa_envs.navigation_reward` nor a ``functools.partial`` of it by keywords.
+    """
+    function = reward.func if isinstance(reward, partial) else reward
+    if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
+        return None
+    given = inspect.signature(navigation_reward).bind_partial(
+        **(reward.keywords if isinstance(reward, partial) else {})
+    )
+    given.apply_defaults()
+    scales = given.arguments
+    return (
+        float(scales["goal_reward"]),
+        float(scales["collision_reward"]),
+        float(scales["progress_scale"]),
+    )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +27,7 @@ from mpfa_envs.kernels.step import (
 from mpfa_envs.map_memory import MapMemory
 from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
-from mpfa_envs.reward import RewardFunction, StepOutcome, navigation_reward
+from mpfa_envs.reward import StepOutcome, payments_of
 from mpfa_envs.tasks import read_task
 from mpfa_envs.vector_drives import make_drives
 from mpfa_envs.vector_state import read_array
@@ -361,28 +359,3 @@ class RobotBatch:
             longer = np.zeros((len(self.trails), 2 * steps + 1, 2))
             longer[:, : self.trails.shape[1]] = self.trails
             self.trails = longer
-
-
-def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
-    """Read what Eq. (25) pays.
-
-    Args:
-        reward: A reward function.
-
-    Returns:
-        Rewards for the goal, for a collision and per meter of approach; None if the function is
-        neither :func:`~mpfa_envs.navigation_reward` nor a ``functools.partial`` of it by keywords.
-    """
-    function = reward.func if isinstance(reward, partial) else reward
-    if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
-        return None
-    given = inspect.signature(navigation_reward).bind_partial(
-        **(reward.keywords if isinstance(reward, partial) else {})
-    )
-    given.apply_defaults()
-    scales = given.arguments
-    return (
-        float(scales["goal_reward"]),
-        float(scales["collision_reward"]),
-        float(scales["progress_scale"]),
-    )

@@ -388,7 +388,7 @@ class VectorNavigationEnv(
             on wheels also what was driven in each episode.
         """
         return {
-            "arguments": describe(self, self.lidar, self.num_envs),
+            "arguments": describe(self, self._source),
             "rngs": [rng.bit_generator.state for rng in self._rngs],
             "begun": self._begun,
             "source": self._source.state_dict(),
@@ -405,10 +405,10 @@ class VectorNavigationEnv(
             state: What :meth:`state_dict` gave.
 
         Raises:
-            ValueError: If it is of an environment with other arguments, or no state; nothing has
-                changed then.
+            ValueError: If it is of an environment with other arguments, the first of which is
+                named, or no state; nothing has changed then.
         """
-        state = check_alike(state, describe(self, self.lidar, self.num_envs))
+        state = check_alike(state, describe(self, self._source))
         rngs = read_generators(state.get("rngs"), self.num_envs)
         self._batch.load_state_dict(state["batch"])
         self._source.load_state_dict(state["source"])

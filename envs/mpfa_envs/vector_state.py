@@ -3,49 +3,71 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from mpfa_envs.noise import RobotNoise
+from mpfa_envs.reward import payments_of
+from mpfa_envs.robot import RobotModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.arguments import TaskArguments
-    from mpfa_envs.lidar import Lidar
+    from mpfa_envs.episodes import EpisodeSource
+    from mpfa_envs.reward import RewardFunction
+    from mpfa_envs.vector import VectorNavigationEnv
+
+_OF_THE_ROBOT: Final = tuple(field.name for field in fields(RobotModel) if field.name != "name")
+_OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
 
 
-def describe(rules: TaskArguments, lidar: Lidar, robots: int) -> dict[str, Any]:
+def describe(env: VectorNavigationEnv, source: EpisodeSource) -> dict[str, Any]:
     """Name the arguments that an environment must share with the one that it goes on for.
 
     Args:
-        rules: The arguments of the task.
-        lidar: What the robots see by.
-        robots: Their number.
+        env: The environment.
+        source: Where its episodes come from.
 
     Returns:
-        Plain values by name.
+        Plain values by name: whatever decides what happens next.
     """
+    lidar = env.lidar
     return {
-        "num_envs": robots,
-        "robot": rules.robot.name,
-        "physics": rules.physics,
-        "max_steps": rules.max_steps,
-        "time_step": rules.time_step,
-        "action_repeat": rules.action_repeat,
-        "goal_radius": rules.goal_radius,
-        "collision_distance": rules.collision_distance,
-        "closeness_distance": rules.closeness_distance,
-        "progress": rules.progress,
-        "memory": rules.memory,
-        "history": rules.history,
+        "num_envs": env.num_envs,
+        "robot": env.robot.name,
+        **{f"robot.{name}": float(getattr(env.robot, name)) for name in _OF_THE_ROBOT},
+        "physics": env.physics,
+        "max_steps": env.max_steps,
+        "time_step": env.time_step,
+        "action_repeat": env.action_repeat,
+        "goal_radius": env.goal_radius,
+        "collision_distance": env.collision_distance,
+        "closeness_distance": env.closeness_distance,
+        "progress": env.progress,
+        **_describe_reward(env.reward),
+        "memory": env.memory,
+        "history": env.history,
         # None without, as states had it before there was any.
-        "noise": None if rules.noise == RobotNoise() else asdict(rules.noise),
+        "noise": None if env.noise == RobotNoise() else asdict(env.noise),
         "rays": lidar.angles.size,
         "sectors": lidar.sectors,
+        **{f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR},
+        "min_goal_distance": env.min_goal_distance,
+        "detour_chance": env.detour_chance,
+        **source.describe(),
+        "autoreset_mode": env.autoreset_mode.value,
     }
+
+
+def _describe_reward(reward: RewardFunction) -> dict[str, Any]:
+    """What can be compared of a reward: what Eq. (25) pays, and of another one that it is that."""
+    payments = payments_of(reward)
+    if payments is None:
+        return {"reward": "a function of your own"}
+    names = ("goal_reward", "collision_reward", "progress_scale")
+    return {"reward": "navigation_reward", **dict(zip(names, payments, strict=True))}
 
 
 def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -68,10 +90,11 @@ def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]
         raise ValueError(f"state must be what state_dict() gave, with {parts}, got another value")
     found = state["arguments"]
     for name, value in expected.items():
-        if found.get(name) != value:
+        # States did not always describe all of them.
+        if name in found and found[name] != value:
             raise ValueError(
                 f"state must be of an environment with {name} = {value!r}, got one with "
-                f"{found.get(name)!r}"
+                f"{found[name]!r}"
             )
     return state
 

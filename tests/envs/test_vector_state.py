@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from mpfa_envs import VectorNavigationEnv
-from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs import (
+    ROBOTS,
+    WORLDS,
+    Box,
+    RewardTerms,
+    VectorNavigationEnv,
+    World,
+    navigation_reward,
+)
+from mpfa_envs.plain_worlds import fingerprint, world_from_plain, world_to_plain
 from tests.envs.shapes import random_shapes
 
 
@@ -153,3 +163,64 @@ def test_what_is_no_state_of_this_environment_is_refused(
     with pytest.raises(ValueError, match=message):
         env.load_state_dict(state)
     assert drive(env, 5, 40) == drive(twin, 5, 40)
+
+
+BURGER = ROBOTS["burger"]
+OTHERS: list[tuple[dict[str, Any], str]] = [
+    ({"world": "mixed"}, r"world = 'A \(.{8}\)', got one with 'mixed'"),
+    ({"world": ["A", "B"]}, r"world = 'A \(.{8}\)', got one with \['A .*', 'B .*'\]"),
+    ({"world": World(name="A", boxes=(Box(1.0, 1.0, 2.0, 2.0),))}, "world = .*, got .*'A "),
+    ({"robot": replace(BURGER, mass=2.0)}, "robot.mass = 1.0, got one with 2.0"),
+    ({"progress_scale": 99.0}, "progress_scale = 5.0, got one with 99.0"),
+    ({"reward": partial(navigation_reward, goal_reward=3.0)}, "goal_reward = 10.0, got .* 3.0"),
+    ({"reward": lambda outcome: RewardTerms()}, "reward = 'navigation_reward', got .* of your own"),
+    ({"lidar": {"max_range": 2.0}}, "lidar.max_range = 10.0, got one with 2.0"),
+    ({"lidar": {"reduction": "median"}}, "lidar.reduction = 'min', got one with 'median'"),
+    ({"lidar": {"field_of_view": 90.0}}, "lidar.field_of_view = 180.0, got one with 90.0"),
+    ({"lidar": {"noise": 0.1}}, "lidar.noise = 0.0, got one with 0.1"),
+    ({"lidar": {"dropout": 0.1}}, "lidar.dropout = 0.0, got one with 0.1"),
+    ({"min_goal_distance": 3.0}, "min_goal_distance = 2.0, got one with 3.0"),
+    ({"max_goal_distance": 5.0}, "max_goal_distance = inf, got one with 5.0"),
+    ({"detour_chance": 0.0}, "detour_chance = 0.8, got one with 0.0"),
+    ({"episodes_per_world": 2}, "episodes_per_world = 1, got one with 2"),
+    ({"split": "validation"}, "split = 'train', got one with 'validation'"),
+    ({"autoreset_mode": AutoresetMode.SAME_STEP}, "autoreset_mode = 'NextStep', got .*'SameStep'"),
+]
+
+
+def burgers(**arguments: object) -> VectorNavigationEnv:
+    standard = {"world": "A", "robot": "burger", "physics": "kinematic"}
+    return VectorNavigationEnv(2, **standard | arguments)
+
+
+@pytest.mark.parametrize(("arguments", "message"), OTHERS, ids=[message for _, message in OTHERS])
+def test_a_state_of_an_environment_with_another_argument_is_refused(
+    arguments: dict[str, Any], message: str
+) -> None:
+    state = burgers(**arguments).state_dict()
+    with pytest.raises(ValueError, match=f"state must be of an environment with {message}"):
+        burgers().load_state_dict(state)
+
+
+def test_a_state_of_worlds_of_another_difficulty_is_refused() -> None:
+    state = burgers(world="bars", difficulty=0.3).state_dict()
+    with pytest.raises(ValueError, match=r"difficulty = None, got one with 0\.3"):
+        burgers(world="bars").load_state_dict(state)
+
+
+def test_a_state_that_describes_fewer_arguments_is_loaded() -> None:
+    env, other = burgers(), burgers()
+    env.reset(seed=0)
+    state = env.state_dict()
+    for name in ("world", "reward", "progress_scale", "robot.mass", "lidar.noise", "split"):
+        del state["arguments"][name]
+    other.load_state_dict(state)
+    assert drive(other, 0, 20) == drive(env, 0, 20)
+
+
+def test_equal_worlds_have_one_fingerprint_and_others_of_their_name_do_not() -> None:
+    whole = World(name="hall", size=(8, 6), boxes=(Box(1, 1, 2, 2),))
+    same = World(name="hall", size=(8.0, 6.0), boxes=(Box(1.0, 1.0, 2.0, 2.0),))
+    assert fingerprint(whole) == fingerprint(same)
+    assert fingerprint(replace(whole, boxes=())) != fingerprint(whole)
+    assert len({fingerprint(world) for world in WORLDS.values()}) == len(WORLDS)
