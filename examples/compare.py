@@ -51,10 +51,18 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--methods", nargs="+", default=["mpfa_per", "per", "uniform"])
-    parser.add_argument("--learners", nargs="+", default=["ddpg"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--folder", type=Path, default=Path("runs/compare"))
+    for name, default, kind, text in (
+        ("methods", ["mpfa_per", "per", "uniform"], str, "as in train.py method=NAME"),
+        ("learners", ["ddpg"], str, "as in train.py learner=NAME"),
+        ("seeds", [0, 1, 2], int, "one run of each method with each of them"),
+    ):
+        shown = " ".join(map(str, default))
+        parser.add_argument(
+            f"--{name}", nargs="+", type=kind, default=default, help=f"{text} (default: {shown})"
+        )
+    parser.add_argument(
+        "--folder", type=Path, default=Path("runs/compare"), help="(default: runs/compare)"
+    )
     parser.add_argument(
         "--jobs", type=int, help=f"runs at a time (default: {_JOBS}; with --ray as many as fit)"
     )
