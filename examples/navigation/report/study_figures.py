@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ def plot_study(table: Table, rows: Rows, folder: Path) -> list[Path]:
     scores = scores_of(rows, table)
     if not scores:
         return []
+    panels = {title: arms for title, arms in table.panels.items() if set(arms) & set(scores)}
+    table = replace(table, panels=panels)
     paths = [folder / f"{table.name}_{name}.png" for name in ("curves", "profiles", "arms")]
     plot_curves(table, rows, paths[0])
     plot_profiles(table, scores, paths[1])

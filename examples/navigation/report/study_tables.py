@@ -78,7 +78,12 @@ def p_of(sides: Sides, measure: str) -> float:
 
 
 def comparison_lines(
-    scores: Scores, pairs: Sequence[Pair], measure: str, worlds: Mapping[str, pd.DataFrame]
+    scores: Scores,
+    pairs: Sequence[Pair],
+    measure: str,
+    worlds: Mapping[str, pd.DataFrame],
+    *,
+    absent: bool = True,
 ) -> str:
     """A table of comparisons that are corrected for each other.
 
@@ -87,6 +92,7 @@ def comparison_lines(
         pairs: Arms to compare; those that lack runs have empty cells, and count in the correction.
         measure: Of :data:`MEASURES`.
         worlds: Success in each world, by arm; it makes the interval for other runs and worlds.
+        absent: Whether pairs that lack runs have lines.
 
     Returns:
         A table in Markdown; empty without a pair that has runs.
@@ -101,7 +107,7 @@ def comparison_lines(
     rng = np.random.default_rng(0)
     lines = []
     short = short_names([label for pair in pairs for label in pair])
-    for pair in pairs:
+    for pair in pairs if absent else known:
         names = " − ".join(short[label] for label in pair)
         if pair not in known:
             lines.append([names, "0", *[""] * _width(measure)])
@@ -200,7 +206,8 @@ def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
         parts += ["## Success of the last policy by kind of world", kinds]
     for which, pairs in (("Planned", table.planned), ("Other", table.explored)):
         for measure in order:
-            lines = comparison_lines(scores, pairs, measure, worlds)
+            planned = which == "Planned"
+            lines = comparison_lines(scores, pairs, measure, worlds, absent=planned)
             title = "primary measure, " if measure == table.primary else ""
             title += MEASURES[measure].format(**words)
             parts += [f"## {which} comparisons: {title}", lines] * bool(lines)

@@ -17,7 +17,7 @@ import study
 from navigation import files
 from navigation.records import write_table
 from navigation.report import study_pages
-from navigation.report.study_figures import mean_curve, plot_curves, plot_volumes
+from navigation.report.study_figures import mean_curve, plot_curves, plot_study, plot_volumes
 from navigation.report.study_rows import (
     Rows,
     keep,
@@ -194,6 +194,8 @@ def test_a_comparison_without_runs_counts_in_the_correction() -> None:
     assert "| 0.062 | 0.125 |" in lines[2]
     assert lines[3].split("|")[1:4] == [" a − c ", " 0 ", "  "]
     assert {line.count("|") for line in lines} == {lines[0].count("|")}
+    fewer = comparison_lines(scores, [("a", "b"), ("a", "c")], "area", {}, absent=False)
+    assert fewer.splitlines() == lines[:3]
     # Arms of other seeds are compared by the means of their runs.
     (line,) = comparison_lines(scores, [("a", "d")], "area", {}).splitlines()[2:]
     assert "| 5, 1 | +2.000 | one run |" in line
@@ -257,6 +259,17 @@ def test_a_curve_is_where_its_values_are(tmp_path: Path) -> None:
     per, uniform = (colored(tmp_path / "c.png", color) for color in (BLUE, ORANGE))
     upper = slice(0, 330)
     assert heights(per[upper], quarter=1) > heights(uniform[upper], quarter=1) + 0.3
+
+
+def test_a_panel_without_runs_is_left_out(runs: Path, tmp_path: Path) -> None:
+    table = small_table(runs)
+    rows, sizes = read_runs(table, runs), []
+    for name, panels in (("one", {}), ("two", {"others": ("s/td3/lap", "s/td3/pal")})):
+        (tmp_path / name).mkdir()
+        whole = replace(table, panels={**table.panels, **panels})
+        with Image.open(plot_study(whole, rows, tmp_path / name)[0]) as picture:
+            sizes.append(picture.size)
+    assert sizes[0] == sizes[1]
 
 
 def test_where_a_method_is_better_than_uniform_replay_the_map_is_blue(tmp_path: Path) -> None:
