@@ -85,7 +85,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--worlds",
         nargs="+",
         default=["test"],
-        help="names, world files, spans (rooms:100-109), splits (bars:test), barn, or all (default: test)",
+        help="names, world files, spans (rooms:100-109), splits (bars:test), barn, or all "
+        "(default: test)",
     )
     parser.add_argument(
         "--episodes", type=int, help="for each (default: 200 in a world, 400 for a generator)"

@@ -154,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
         "--worlds",
         nargs="+",
         default=["rooms:test"],
-        help="as of evaluate.py (default: rooms:test)",
+        help="as in evaluate.py (default: rooms:test)",
     )
     parser.add_argument("--races", type=int, default=10, help="at most (default: 10)")
     parser.add_argument("--seed", type=int, default=0, help="seed of starts and goals (default: 0)")

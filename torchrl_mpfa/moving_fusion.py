@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Annealed(Protocol):
-    """What changes as the training goes on."""
+    """A part with a schedule over the training."""
 
     def anneal(self, fraction: float) -> None:
         """Say how much of the training is done, from 0 to 1."""
@@ -26,7 +26,7 @@ class Annealed(Protocol):
 
 @dataclass
 class ScheduledFusion:
-    """Weights that move in a line from one set to another as the training goes on.
+    """Weights that are interpolated linearly from one set to another over the training.
 
     Args:
         start: Weight of each signal at the start, by name; a signal without one is not counted.

@@ -1,4 +1,4 @@
-"""The learner's side of one iteration: several updates for what several robots brought.
+"""The learner's side of one iteration: several updates for the transitions of several robots.
 
 The batches of all updates are sampled in one call and their priorities written in one, which costs
 a fraction of as many calls; the price is that no batch knows of the updates just before it.
@@ -39,7 +39,7 @@ def run_updates(
     are written after each draw.
 
     Args:
-        buffer: Where batches of ``B`` are sampled, as its constructor was told.
+        buffer: Where batches of ``B`` are sampled, its own batch size.
         learner: What is trained.
         select: From the buffer to the draws of an update.
         updates: Number of updates ``U``.

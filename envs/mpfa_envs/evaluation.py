@@ -116,7 +116,7 @@ def evaluate(
     progress: bool = False,
     **env_arguments: Any,
 ) -> list[EpisodeResult]:
-    """Drive a policy through fixed tasks; contact is the only collision.
+    """Run a policy on fixed tasks; contact is the only collision.
 
     Args:
         policy: A :class:`~mpfa_envs.Policy`, any function from observation to action, or a

@@ -1,4 +1,4 @@
-"""What robots remember: a map of what their lidar met, and the way to the goal that it leaves."""
+"""What robots remember: a map of what their lidar hit, and the way to the goal that it leaves."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Sketch(NamedTuple):
 class MapMemory:
     """A map for each of many robots, empty when an episode begins.
 
-    The map has square cells. A cell from which a point that the lidar met is nearer than the
+    The map has square cells. A cell from which a point that the lidar hit is nearer than the
     robot's rim can be is blocked; what was not seen is held to be free. The way is the cheapest one
     to the goal over the map, where cells near an obstacle cost three times as much as free ones and
     blocked cells thirty times, found anew whenever something seen makes it costlier. Its direction

@@ -93,7 +93,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
     ``reward_goal``, ``reward_collision``, ``reward_progress``, ``reward_other``; and of the
     walkers, so far: ``walker_distance`` [m], the least distance between the robot's rim and theirs,
     ``intrusion_time`` [s], for which it was below 0.5 m, and ``time_to_collision`` [s], the least
-    time after which robot and walker would have touched had both gone on as they went; without
+    time after which robot and walker would have touched had both kept their velocities; without
     walkers, or far from all of them, they are 10 m, zero and 10 s.
 
     Args:
@@ -118,7 +118,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         reward: Computes the reward in place of Eq. (25), and without progress_scale;
             ``functools.partial(navigation_reward, goal_reward=20.0)``, say.
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``.
-        memory: ``"map"``: the robot keeps a map of what its lidar met in this episode and senses
+        memory: ``"map"``: the robot keeps a map of what its lidar hit in this episode and senses
             the way to the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it
             senses what is before it and nothing else.
         history: How many earlier scans it senses beside the last one, sector by sector: those of
@@ -128,7 +128,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         closeness_distance: A range of this or less has closeness one [m]. None: the default of
             collision_distance, whatever that is.
         min_goal_distance: Least distance between a sampled start and goal [m].
-        detour_chance: Chance that a sampled task must have an obstacle in its way; 0: as it comes.
+        detour_chance: Chance that a sampled task must have an obstacle in its way; 0: no condition.
         render_mode: ``"rgb_array"`` to get pictures from :meth:`render`; ``"human"`` for a live
             window in real time, which needs pygame.
 

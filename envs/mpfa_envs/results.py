@@ -48,7 +48,7 @@ class EpisodeResult:
     intrusion_time: float | None = None
     """Time in the personal space of a walker, within 0.5 m of its rim [s]."""
     time_to_collision: float | None = None
-    """Least time after which robot and walker would have touched had both gone on as they went, at
+    """Least time after which robot and walker would have touched had both kept their velocities, at
     most 10 s [s]."""
 
     @property

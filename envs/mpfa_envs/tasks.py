@@ -75,7 +75,7 @@ def sample_task(
         collision_distance: Distance of the center from an obstacle that is a collision [m].
         min_goal_distance: Least distance between start and goal [m].
         detour_chance: Chance that the straight line between them must come too near to an obstacle,
-            in a world that has any; 0: as it comes.
+            in a world that has any; 0: no condition.
 
     Returns:
         The task; its heading is uniform.

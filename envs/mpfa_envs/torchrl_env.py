@@ -242,7 +242,7 @@ def make_navigation_env(
         num_envs: Number of robots; None: one, without a batch dimension.
         parallel: Run each robot in a process of its own, all in the same worlds.
         device: Where the tensors live.
-        seed: Seed of the environments; None leaves them to chance.
+        seed: Seed of the environments; None: random.
         **kwargs: Further arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Returns:

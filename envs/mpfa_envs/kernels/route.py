@@ -1,4 +1,4 @@
-"""Maps that robots make of what their lidar met, and the ways to the goal that these leave open."""
+"""Maps that robots make of what their lidar hit, and the ways to the goal that these leave open."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _cell(place: float, count: int) -> int:
 
 @njit
 def _enter(levels: NDArray[np.uint8], u: float, v: float, blocked: float, near: float) -> bool:
-    """Enter a point that the lidar met; tell whether the map has changed."""
+    """Enter a point that the lidar hit; tell whether the map has changed."""
     nx, ny = levels.shape
     changed = False
     for i in range(max(math.ceil(u - near), 0), min(math.floor(u + near), nx - 1) + 1):

@@ -197,7 +197,7 @@ class DynamicWindow:
     def _rim_clearances(
         self, row: NDArray[np.float64], arcs: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Distance of the rim from the nearest point that the lidar met [m], ``[K, T]``."""
+        """Distance of the rim from the nearest point that the lidar hit [m], ``[K, T]``."""
         closeness = row[self._parts["lidar"]]
         ranges = self.closeness_distance / np.maximum(closeness, 1e-9)
         met = ranges < 0.999 * self.max_range

@@ -165,8 +165,8 @@ def power_lines(rows: pd.DataFrame) -> str:
         )
         lines.append(
             f"Success of {learner} varies from run to run by {100 * deviation:.2f} points "
-            f"(standard deviation, {freedom} degrees of freedom).\nRuns of each method until a "
-            f"t-test finds a difference with 80 % power: {needed}."
+            f"(standard deviation, {freedom} degrees of freedom).\nRuns per method for a "
+            f"t-test to find a difference with 80 % power: {needed}."
         )
     return "\n\n".join(lines)
 
