@@ -44,6 +44,28 @@ def test_an_outlier_changes_nothing_but_its_own_rank():
     assert torch.equal(*(buffer.sample()["index"] for buffer in buffers))
 
 
+def test_equal_priorities_have_one_share_that_of_their_mean_rank():
+    sampler = make_sampler(1000)
+    sampler.mark_update(torch.arange(1000))
+    assert len(torch.as_tensor(sampler._sum_tree[torch.arange(1000)]).unique()) == 1
+    buffer = make_buffer(make_sampler(6, rank_refresh=0), 6, 4)
+    set_signals(buffer, td_error=torch.tensor([2.0, 5.0, 1.0, 2.0, 9.0, 2.0]))
+    leaves = torch.as_tensor(buffer.sampler._sum_tree[torch.arange(6)])
+    ranks = torch.tensor([4.0, 2.0, 6.0, 4.0, 1.0, 4.0], dtype=torch.double)
+    torch.testing.assert_close(leaves, ranks.pow(-ALPHA))
+
+
+def test_a_priority_that_stays_keeps_its_share_between_two_sortings():
+    buffer = make_buffer(make_sampler(6, rank_refresh=0), 6, 4)
+    errors = torch.tensor([2.0, 5.0, 1.0, 2.0, 9.0, 2.0])
+    set_signals(buffer, td_error=errors)
+    sampler = buffer.sampler
+    before = torch.as_tensor(sampler._sum_tree[torch.arange(6)]).clone()
+    sampler.rank_refresh = 100.0
+    set_signals(buffer, td_error=errors)
+    assert torch.equal(torch.as_tensor(sampler._sum_tree[torch.arange(6)]), before)
+
+
 def test_between_two_sortings_a_priority_gets_the_rank_that_it_would_have_had():
     sampler = make_sampler(10, rank_refresh=100.0)
     buffer = make_buffer(sampler, 10, 4)
@@ -66,7 +88,9 @@ def test_all_are_sorted_when_enough_priorities_are_new():
     ranks = [torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values]
     for slot in range(6):
         sampler.update_signals(
-            torch.tensor([slot]), {"td_error": torch.tensor([0.1])}, storage=buffer._storage
+            torch.tensor([slot]),
+            {"td_error": torch.tensor([0.1 - 0.01 * slot])},
+            storage=buffer._storage,
         )
         ranks.append(torch.as_tensor(sampler._sum_tree[torch.arange(10)]).sort().values)
     whole = torch.arange(10.0, 0.0, -1.0).double().pow(-ALPHA)

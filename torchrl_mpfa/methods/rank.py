@@ -36,9 +36,9 @@ class RankSampler(SignalSampler):
     r"""Sampling by :math:`P(i) \propto (1 / \mathrm{rank}(i))^\alpha`, insensitive to outliers.
 
     Ranks are by the fused and adjusted priority; with the TD error alone this is the rank-based
-    variant of PER. All transitions are sorted from time to time; in between, the new priority of
-    a transition gets the rank that it would have had in the last order, as the original, too,
-    sorts but now and then.
+    variant of PER. Equal priorities, as fresh transitions have, count by the mean of their ranks.
+    All transitions are sorted from time to time; in between, the new priority of a transition gets
+    the rank that it would have had in the last order, as the original, too, sorts but now and then.
 
     Args:
         *args: As :class:`~torchrl_mpfa.SignalSampler`.
@@ -68,8 +68,11 @@ class RankSampler(SignalSampler):
         self._written = 0
 
     def _leaf(self, priority: Tensor) -> Tensor:
-        rank = torch.searchsorted(self._order, -priority) + 1
-        return rank_share(rank.to(torch.double), alpha=self._alpha)
+        negated = -priority
+        above = torch.searchsorted(self._order, negated)
+        # Equal ones share the mean of their places; one that has no equal stands after those above.
+        until = torch.searchsorted(self._order, negated, right=True).maximum(above + 1)
+        return rank_share((above + until + 1).double() / 2, alpha=self._alpha)
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         super()._write(slots, priority, learned=learned)
@@ -80,9 +83,11 @@ class RankSampler(SignalSampler):
     def _sort(self) -> None:
         """Give every written slot its true rank."""
         slots = self._priorities.isfinite().nonzero().squeeze(1)
-        self._order, places = self._priorities[slots].neg().sort(stable=True)
-        ranks = torch.arange(1, len(slots) + 1, dtype=torch.double)
-        self._write_leaves(slots[places], rank_share(ranks, alpha=self._alpha))
+        self._order, places = self._priorities[slots].neg().sort()
+        _, equal = self._order.unique_consecutive(return_counts=True)
+        ranks = equal.cumsum(0) - (equal.double() - 1) / 2
+        shares = rank_share(ranks, alpha=self._alpha).repeat_interleave(equal)
+        self._write_leaves(slots, torch.empty_like(shares).index_copy_(0, places, shares))
         self._written = 0
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
