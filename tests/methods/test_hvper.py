@@ -96,6 +96,41 @@ def test_a_negative_value_is_no_error_as_only_its_place_is_kept():
     buffer.update_tensordict_priority(batch)
 
 
+def relative_errors(batches, errors, *, stale=()):
+    """The relative TD errors that an update of these batches leaves in the table."""
+    signals = [RELATIVE_VALUE, RELATIVE_ERROR]
+    count = len(errors)
+    sampler = SignalSampler(count, 0.6, 0.4, EPS, signals=signals, fusion=value_schedule())
+    storage = make_buffer(sampler, count, 8, signals=signals).storage
+    table = storage.signal_table
+    slots = torch.arange(count)
+    written_at = table.written_at(slots)
+    written_at[list(stale)] -= 1
+    sampler.update_signals(
+        slots,
+        {RELATIVE_VALUE.name: errors, RELATIVE_ERROR.name: errors},
+        storage=storage,
+        written_at=written_at,
+        batches=batches,
+    )
+    return table.rows[:, table.column[RELATIVE_ERROR.name]]
+
+
+def test_of_several_batches_in_one_update_each_is_relative_to_itself():
+    errors = torch.rand(16, generator=seeded(5)) + 0.1
+    errors[8:] *= 100
+    found = relative_errors(2, errors)
+    assert found[:8].tolist() == pytest.approx((errors[:8] / errors[:8].max()).tolist())
+    assert found[8:].tolist() == pytest.approx((errors[8:] / errors[8:].max()).tolist())
+
+
+def test_what_was_overwritten_meanwhile_is_none_of_its_batch():
+    errors = torch.tensor([1.0, 100.0, 2.0, 4.0])
+    assert relative_errors(1, errors, stale=[1])[[0, 2, 3]].tolist() == [0.25, 0.5, 1.0]
+    errors = torch.tensor([1.0, 2.0, 100.0, torch.nan])
+    assert relative_errors(2, errors, stale=[2, 3])[:2].tolist() == [0.5, 1.0]
+
+
 def test_what_is_out_of_range_is_refused():
     with pytest.raises(ValueError, match="penalty must be finite and not negative, got -1"):
         ReplayPenalty(penalty=-1)

@@ -14,39 +14,47 @@ Learned = Mapping[str, Callable[[Tensor], Tensor] | None]
 """Signals that the loss learns, each with what makes a priority of it, if anything does."""
 
 
-def with_signals(
-    table: SignalTable, slots: Tensor, signals: Mapping[str, Tensor], learned: Learned
-) -> Tensor:
-    """Rows of the table with the learned signals of a batch in them; the table stays as it is.
+def write_signals(
+    rows: Tensor,
+    table: SignalTable,
+    signals: Mapping[str, Tensor],
+    learned: Learned,
+    *,
+    live: Tensor | None,
+    sizes: Sequence[int],
+) -> None:
+    """Write the learned signals of batches in copies of their rows; the table stays as it is.
 
     Args:
-        table: The table.
-        slots: Slots of the batch, shape ``[B]``.
+        rows: Rows of the transitions that are still in the buffer, shape ``[M, C]``.
+        table: The table that they are of.
         signals: Signals by name, each of shape ``[B]`` or ``[B, 1]``.
-        learned: Those that must be there.
-
-    Returns:
-        The rows, one for each slot.
+        learned: Those that must be there. What makes a priority of one sees the rows of one batch.
+        live: Which transitions are still in the buffer, shape ``[B]``; None: all.
+        sizes: How many of each batch are.
 
     Raises:
         KeyError: If a signal is missing.
         ValueError: If one has not one number per transition.
     """
-    rows = table.rows.index_select(0, slots)
+    count = len(rows) if live is None else len(live)
     for name, priority_of in learned.items():
         if name not in signals:
             raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
         value = signals[name].detach()
-        if value.numel() != slots.numel():
+        if value.numel() != count:
             raise ValueError(
                 f"signal {name!r} must have one number per transition, got shape "
-                f"{[*value.shape]} for {slots.numel()} slots"
+                f"{[*value.shape]} for {count} slots"
             )
-        value = value.reshape(-1)
-        if priority_of is not None:
-            value = priority_of(value)
-        rows.select(1, table.column[name]).copy_(value)
-    return rows
+        value = value.reshape(-1) if live is None else value.reshape(-1)[live]
+        column = rows.select(1, table.column[name])
+        if priority_of is None:
+            column.copy_(value)
+            continue
+        for one, into in zip(value.split(sizes), column.split(sizes), strict=True):
+            if len(one):
+                into.copy_(priority_of(one))
 
 
 def check_signals(chosen: Tensor, names: Sequence[str], learned: Learned) -> None:

@@ -18,7 +18,7 @@ from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import one_sided
 from torchrl_mpfa.samplers.binding import signal_table_of
-from torchrl_mpfa.samplers.rows import check_signals, with_signals
+from torchrl_mpfa.samplers.rows import check_signals, write_signals
 from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.samplers.states import entry
 from torchrl_mpfa.samplers.statistics import batch_statistics
@@ -259,19 +259,19 @@ class SignalSampler(TreeSampler):
         sizes = [len(slots) // batches] * batches
         if len(check_index(slots, table.size)) < len(slots):
             raise IndexError(f"index must be in [0, {table.size}), the filled slots, got -1")
-        rows = with_signals(table, slots, signals, self._learned)
-        stale = 0
+        rows, live, stale = table.rows.index_select(0, slots), None, 0
         if written_at is not None:
             if written_at.numel() != slots.numel():
                 raise ValueError(
                     "written_at must have one number per transition, got shape "
                     f"{[*written_at.shape]} for {slots.numel()} slots"
                 )
-            live = rows.select(1, table.time_column) == written_at.reshape(-1)
-            if not live.all():
-                stale = int((~live).sum())
-                sizes = live.reshape(batches, -1).sum(1).tolist()
-                rows, slots = rows[live], slots[live]
+            same = rows.select(1, table.time_column) == written_at.reshape(-1)
+            if not same.all():
+                live, stale = same, int((~same).sum())
+                sizes = same.reshape(batches, -1).sum(1).tolist()
+                rows, slots = rows[same], slots[same]
+        write_signals(rows, table, signals, self._learned, live=live, sizes=sizes)
         check_signals(rows[:, self._columns], self._names, self._learned)
         if slots.numel() == 0:
             return stale
