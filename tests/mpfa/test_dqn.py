@@ -199,6 +199,16 @@ def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
+def test_ends_that_are_bytes_count_as_booleans(kind):
+    batch, numbers = transitions(), transitions()
+    for key in ("done", "terminated"):
+        numbers["next", key] = numbers["next", key].to(torch.uint8)
+    for each in (batch, numbers):
+        learners()[kind].update(each)
+    assert torch.equal(batch["signals", "td_error"], numbers["signals", "td_error"])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
 def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
     learner = learners()[kind]
     learner.update(transitions(seed=5))  # Values that are not zero.

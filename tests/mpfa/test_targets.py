@@ -134,6 +134,19 @@ def test_other_value_estimators_are_honored_as_by_torchrl(name, estimator, optio
     assert not torch.allclose(targets_of(ours, batch.clone()), expected)
 
 
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32], ids=str)
+@pytest.mark.parametrize("estimator", [ValueEstimators.TD0, ValueEstimators.TD1], ids=str)
+@pytest.mark.parametrize("name", KINDS)
+def test_ends_that_are_numbers_count_as_booleans(name, estimator, dtype):
+    _, loss = make_pair(name, estimator)
+    batch = make_batch(12).reshape(2, 6)
+    numbers = batch.clone()
+    for key in ("done", "terminated"):
+        numbers["next", key] = numbers["next", key].to(dtype)
+    torch.testing.assert_close(targets_of(loss, numbers), targets_of(loss, batch))
+    assert numbers["next", "terminated"].dtype is dtype
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_an_estimator_may_be_given_as_it_is(name):
     _, by_name = make_pair(name, ValueEstimators.TDLambda, lmbda=0.7)

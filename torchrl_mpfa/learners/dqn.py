@@ -19,6 +19,7 @@ from torchrl_mpfa.learners.states import (
 )
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
+from torchrl_mpfa.losses.functional import bootstrap_target
 from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
@@ -250,10 +251,14 @@ class QLearner:
         cell_of, table = self.policy.module.cell_of, self.table
         entry = cell_of(batch["observation"]) * table.shape[1] + batch["action"].argmax(-1)
         ahead = table[cell_of(batch["next", "observation"])].amax(-1)
-        goes_on = ~batch["next", "terminated"].squeeze(-1)
         steps = batch.get("steps_to_next_obs", None)
-        discount = self.gamma ** (1 if steps is None else steps.reshape(-1))
-        target = batch["next", "reward"].squeeze(-1) + discount * ahead * goes_on
+        target = bootstrap_target(
+            batch["next", "reward"].squeeze(-1),
+            ahead,
+            batch["next", "terminated"].squeeze(-1),
+            gamma=self.gamma,
+            steps=None if steps is None else steps.reshape(-1),
+        )
         td_error = target - table.view(-1)[entry]
         squared, value = td_error.square(), table.view(-1)[entry]
         log = {"loss_value": squared.mean(), "td_error": squared, "pred_value": value}

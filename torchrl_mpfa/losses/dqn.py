@@ -14,6 +14,7 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 
 from torchrl_mpfa.losses.functional import distance
 from torchrl_mpfa.losses.refusals import check_gamma
+from torchrl_mpfa.losses.targets import as_torchrl_needs
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
@@ -95,13 +96,13 @@ class SignalDQNLoss(DQNLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        scaled = batch.select(*self.in_keys)
+        scaled = as_torchrl_needs(
+            batch.select(*self.in_keys), self.tensor_keys, reward_scale=self.reward_scale
+        )
         # Transitions of several steps say of how many: the bootstrap is discounted by all of them.
         steps = self.value_estimator.tensor_keys.steps_to_next_obs
         if (count := batch.get(steps, None)) is not None:
             scaled[steps] = count
-        reward = ("next", self.tensor_keys.reward)
-        scaled[reward] = scaled[reward] * self.reward_scale
         each: Tensor = super().forward(scaled)["loss"]
         if self._bends:
             bend = batch.get("bend", None)

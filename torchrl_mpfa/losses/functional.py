@@ -33,7 +33,8 @@ def bootstrap_target(
     Args:
         reward: :math:`r_i`, discounted and summed over the steps, shape ``[B]``.
         next_value: Q of the target networks at the next state, shape ``[B]``.
-        terminated: Whether the episode ended there; a time limit is no end, shape ``[B]``.
+        terminated: Whether the episode ended there, as booleans or numbers; a time limit is no
+            end, shape ``[B]``.
         gamma: Discount.
         steps: Steps :math:`n_i` to the next state, shape ``[B]``; None: one.
 
@@ -49,7 +50,8 @@ def bootstrap_target(
         [1.125, 1.0]
     """
     discount = gamma if steps is None else gamma**steps
-    return reward + discount * next_value * ~terminated
+    # Of integers ~ would turn over the bits.
+    return reward + discount * next_value * ~terminated.bool()
 
 
 def smoothing_noise(action: Tensor, *, deviation: float, limit: float) -> Tensor:

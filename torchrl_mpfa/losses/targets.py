@@ -13,6 +13,26 @@ from torchrl_mpfa.losses.functional import bootstrap_target
 _ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
+def as_torchrl_needs(batch: TensorDictBase, keys: Any, *, reward_scale: float) -> TensorDictBase:
+    """A shallow copy of a batch with scaled rewards, and ends as booleans whatever they were.
+
+    Args:
+        batch: Transitions.
+        keys: Names of ``reward``, ``done`` and ``terminated`` within ``"next"``.
+        reward_scale: Factor of the rewards.
+
+    Returns:
+        The copy.
+    """
+    found = batch.copy()
+    after = found.get("next")
+    after.set(keys.reward, after.get(keys.reward) * reward_scale)
+    for key in (keys.done, keys.terminated):
+        if (end := after.get(key, None)) is not None:
+            after.set(key, end.bool())
+    return found
+
+
 class EstimatedTargets:
     """How a loss makes targets of the values of the next states."""
 
@@ -25,12 +45,12 @@ class EstimatedTargets:
     def _target(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
         """Targets by the loss's value estimator, shape ``[B]``."""
         after, keys, estimator = tensordict.get("next"), self.tensor_keys, self.value_estimator
-        reward = after.get(keys.reward) * self.reward_scale
         if not self.bootstraps_once:
-            scaled = tensordict.copy().set(("next", keys.reward), reward)
+            scaled = as_torchrl_needs(tensordict, keys, reward_scale=self.reward_scale)
             longer: Tensor = estimator.value_estimate(scaled, next_value=next_value.unsqueeze(-1))
             return longer.squeeze(-1)
         steps = tensordict.get(estimator.tensor_keys.steps_to_next_obs, None)
+        reward = after.get(keys.reward) * self.reward_scale
         return bootstrap_target(
             reward.reshape(next_value.shape),
             next_value,
