@@ -11,7 +11,7 @@ import report
 pytestmark = pytest.mark.usefixtures("tables_alone")
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {
-    "results": "results.md",
+    "results": "paper_task.md",
     "results/first": "first_study.md",
 }
 
@@ -40,7 +40,7 @@ def test_the_tables_of_the_further_runs_are_made_of_their_rows(runs: str, tmp_pa
     found = [line for line in text.splitlines() if line.startswith("| ddpg | mpfa_per |")]
     # How it ended, how fast it learned, and when it first had each of two rates of success.
     assert len(found) == 4
-    assert missing("\n".join(found), "results.md") == []
+    assert missing("\n".join(found), "paper_task.md") == []
 
 
 def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_pat
     assert "| ddpg/mpfa_per | 9 | success |" in test
     # Outcomes of single runs are in the tables of their folders.
     intervals = test[test.index("|  | runs |") :]
-    assert missing(intervals, "results.md") == []
+    assert missing(intervals, "paper_task.md") == []
 
 
 @pytest.mark.parametrize("study", PAGES)
