@@ -44,7 +44,8 @@ class NavigationTorchEnv(EnvBase):
                                            :data:`~mpfa_envs.INFO_TYPES`, bool or float32
     ============================ ========= =============================================
 
-    All shapes follow the batch size: ``[]`` for one robot, else ``[num_envs]``.
+    All shapes follow the batch size: ``[]`` for one robot, else ``[num_envs]``. ``reset(seed=3)``
+    seeds the robots that it starts, as ``set_seed(3)`` seeds all.
 
     Args:
         num_envs: Number of robots in this process; None: one, without a batch dimension, which has
@@ -153,16 +154,21 @@ class NavigationTorchEnv(EnvBase):
         self._tasks: list[Task | None] = [None] * self.env.num_envs
 
     def _set_seed(self, seed: int | None) -> None:
-        # One robot without a batch dimension has the seed itself, as a NavigationEnv.
         if seed is not None:
-            self.env.set_seed(seed if self.batch_size else [seed])
+            self.env.set_seed(self._seed_of_robots(seed))
+
+    def _seed_of_robots(self, seed: int) -> int | list[int]:
+        """One robot without a batch dimension has the seed itself, as a NavigationEnv."""
+        return seed if self.batch_size else [seed]
 
     def _mask(self, tensordict: TensorDictBase | None, key: str) -> NDArray[np.bool_] | None:
         """Which robots an entry of the input names; None: all."""
         mask = None if tensordict is None else tensordict.get(key, None)
         return None if mask is None else mask.reshape(-1).cpu().numpy()
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None
+    ) -> TensorDictBase:
         mask = self._mask(tensordict, "_reset")
         chosen = np.ones(self.env.num_envs, dtype=np.bool_) if mask is None else mask
         if chosen.any():
@@ -171,7 +177,9 @@ class NavigationTorchEnv(EnvBase):
                 for ones in (self._worlds, self._tasks)
             )
             options = {"reset_mask": chosen, "worlds": worlds, "tasks": tasks}
-            observations, _ = self.env.reset(options=options)
+            observations, _ = self.env.reset(
+                seed=None if seed is None else self._seed_of_robots(seed), options=options
+            )
             for index in np.flatnonzero(chosen).tolist():
                 self._worlds[index] = self._tasks[index] = None
         else:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from mpfa_envs import (
@@ -55,6 +57,44 @@ def test_a_seed_gives_the_same_episodes_again(num_envs: int | None) -> None:
     assert (rollouts[0] == rollouts[1]).all()
     if num_envs:
         assert not torch.equal(rollouts[0]["observation"][0], rollouts[0]["observation"][1])
+
+
+def as_serial() -> SerialEnv:
+    return SerialEnv(1, lambda: NavigationTorchEnv(num_envs=2, world="bars", physics="kinematic"))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: make_navigation_env("bars", physics="kinematic"),
+        lambda: make_navigation_env("bars", num_envs=2, physics="kinematic"),
+        lambda: TransformedEnv(make_navigation_env("bars", physics="kinematic"), StepCounter()),
+        as_serial,
+    ],
+    ids=["one", "two", "transformed", "serial"],
+)
+def test_a_reset_with_a_seed_begins_as_after_it_was_set(make: Callable[[], EnvBase]) -> None:
+    env, other = make(), make()
+    first, again = env.reset(seed=3), env.reset(seed=3)
+    assert torch.equal(first["observation"], again["observation"])
+    assert not torch.equal(env.reset()["observation"], first["observation"])
+    if not isinstance(env, SerialEnv):  # It counts on from worker to worker.
+        other.set_seed(3)
+        assert torch.equal(other.reset()["observation"], first["observation"])
+    with pytest.raises(TypeError, match="unexpected keyword argument 'foo'"):
+        env.reset(foo=1)
+    with pytest.raises(ValueError, match="seed must be an integer of at least 0, got -1"):
+        env.reset(seed=-1)
+    env.close()
+
+
+def test_a_seed_is_for_the_robots_that_a_reset_names() -> None:
+    env = make_navigation_env("bars", num_envs=2, physics="kinematic", seed=0)
+    env.reset()
+    mask = TensorDict({"_reset": torch.tensor([[False], [True]])}, [2])
+    before, first = env.env.poses, env.reset(mask.clone(), seed=3)["observation"]
+    assert torch.equal(env.reset(mask.clone(), seed=3)["observation"], first)
+    assert (env.env.poses == before).all(axis=1).tolist() == [True, False]
 
 
 def test_a_time_limit_is_truncated_and_a_collision_terminated() -> None:
