@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from mpfa_envs.vector import VectorNavigationEnv
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
     from torchrl.data import TensorSpec
@@ -160,6 +161,31 @@ class NavigationTorchEnv(EnvBase):
     def _seed_of_robots(self, seed: int) -> int | list[int]:
         """One robot without a batch dimension has the seed itself, as a NavigationEnv."""
         return seed if self.batch_size else [seed]
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Load a state as TorchRL has it: nothing of the robots, and empty in this class.
+
+        TorchRL's creators and collectors hand such states on without the observations that belong
+        to them. Where the robots are is in the state of :attr:`env`.
+
+        Args:
+            state_dict: What ``state_dict()`` gave.
+            strict: Whether it must have all keys and no other, and to warn that the robots do not
+                move.
+            assign: As in :meth:`torch.nn.Module.load_state_dict`.
+
+        Returns:
+            Which keys do not match.
+        """
+        if strict:
+            warnings.warn(
+                "a state_dict of TorchRL holds nothing of the robots, which stay where they are: "
+                "save env.env.state_dict(), and load it with env.env.load_state_dict(state)",
+                stacklevel=2,
+            )
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def _mask(self, tensordict: TensorDictBase | None, key: str) -> NDArray[np.bool_] | None:
         """Which robots an entry of the input names; None: all."""

@@ -1,13 +1,23 @@
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    EnvCreator,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from mpfa_envs import (
@@ -148,6 +158,30 @@ def test_the_usual_transforms_and_the_collector_work() -> None:
     batches = [batch.numel() for batch in collector]
     collector.shutdown()
     assert batches == [32, 32]
+
+
+def test_who_loads_a_state_of_torchrl_is_told_where_that_of_the_robots_is() -> None:
+    env = NavigationTorchEnv(num_envs=2, world="bars", physics="kinematic")
+    twin = NavigationTorchEnv(num_envs=2, world="bars", physics="kinematic")
+    other = TransformedEnv(twin, StepCounter())
+    state = env.reset(seed=0)
+    with pytest.warns(UserWarning, match=r"save env\.env\.state_dict\(\), and load it with env\."):
+        env.load_state_dict(env.state_dict())
+    other.reset()
+    other.base_env.env.load_state_dict(env.env.state_dict())
+    for _ in range(5):
+        actions = state.select("observation").set("action", torch.full((2, 2), 0.7))
+        state, again = env.step(actions.clone())["next"], other.base_env.step(actions)["next"]
+        assert (state == again).all()
+
+
+# A creator gives each environment the state of a first one; with its robots, all would be alike.
+def test_environments_of_a_creator_are_left_to_chance_without_a_word() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        create = EnvCreator(partial(NavigationTorchEnv, world="A", physics="kinematic"))
+        first, second = create(), create()
+    assert not torch.equal(first.reset()["observation"], second.reset()["observation"])
 
 
 def test_what_was_collected_does_not_change_with_the_next_step() -> None:
