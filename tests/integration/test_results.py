@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import report
+from navigation.report import study_pages
 
 pytestmark = pytest.mark.usefixtures("tables_alone")
 DOCS = Path(__file__).parents[2] / "docs"
@@ -50,6 +51,31 @@ def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_pat
     # Outcomes of single runs are in the tables of their folders.
     intervals = test[test.index("|  | runs |") :]
     assert missing(intervals, "paper_task.md") == []
+
+
+def test_the_pages_of_the_study_are_made_of_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = sorted((DOCS / "results/study").glob("*.md"))
+    figures = {page.stem: sorted(page.parent.glob(f"{page.stem}_*.png")) for page in pages}
+    monkeypatch.setattr(study_pages, "plot_study", lambda table, *_: figures[table.name])
+    report.main([str(DOCS / "results/study"), "--study", "--output", str(tmp_path)])
+    assert [page.name for page in pages] == sorted(path.name for path in tmp_path.glob("*.md"))
+    assert pages
+    for page in pages:
+        made = (tmp_path / page.name).read_text("utf-8")
+        # The order of the figures is theirs who drew them.
+        assert sorted(made.splitlines()) == sorted(page.read_text("utf-8").splitlines())
+
+
+def test_the_numbers_of_the_study_in_the_results_are_those_of_its_pages() -> None:
+    text = (DOCS / "results.md").read_text("utf-8")
+    section = text.split("## When do priorities help?")[1].split("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ")]
+    pages = (DOCS / "results/study").glob("*.md")
+    known = {line for page in pages for line in page.read_text("utf-8").splitlines()}
+    assert len(rows) > 5
+    assert [line for line in rows if line not in known] == []
 
 
 @pytest.mark.parametrize("study", PAGES)

@@ -12,6 +12,13 @@ from navigation.report.study_tables import study_tables
 from navigation.studies.protocol import ROOT, Table, tables
 from torchrl_mpfa.saving import write_text_atomically
 
+_TITLES = {
+    "curves": "Mean of the runs and its 95 % interval, over actions",
+    "profiles": "Share of the runs above each value of the primary measure",
+    "arms": "The primary measure of each run, with mean and 95 % interval of each arm",
+    "volumes": "Area by replay volume and method",
+}
+
 
 def write_study(folder: Path, output: Path) -> list[Path]:
     """Write a page and the figures of each table that has rows, and name the runs it lacks.
@@ -40,6 +47,8 @@ def write_study(folder: Path, output: Path) -> list[Path]:
 
 def _write(table: Table, rows: Rows, output: Path, *, absent: str) -> list[Path]:
     output.mkdir(parents=True, exist_ok=True)
-    page = output / f"{table.name}.md"
-    write_text_atomically(study_tables(table, rows, absent=absent) + "\n", page)
-    return [page, *plot_study(table, rows, output)]
+    page, figures = output / f"{table.name}.md", plot_study(table, rows, output)
+    shown = "\n\n".join(f"![{_TITLES[path.stem[2:]]}]({path.name})" for path in figures)
+    text = study_tables(table, rows, absent=absent)
+    write_text_atomically(f"{text}\n\n## Figures\n\n{shown}\n", page)
+    return [page, *figures]

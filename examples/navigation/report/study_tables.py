@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 import numpy as np
 import pandas as pd
@@ -44,6 +45,8 @@ MEASURES = {
 }
 """What they are called, with what is over actions in a table, and how much of it is the goal."""
 Scores = Mapping[str, pd.DataFrame]
+_WIDTH = 100
+"""Characters of a line of prose."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,8 @@ def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
     order = sorted(MEASURES, key=lambda name: name != table.primary)
     arms = arm_lines(scores, labels, table.primary, worlds)
     words = {"height": table.height, "goal": f"{GOAL:.0%}", "note": table.note}
-    parts = [f"# {table.name}: {table.question}", NOTES.format(**words), "## Arms", arms]
+    notes = map(_filled, NOTES.format(**words).split("\n\n"))
+    parts = [f"# {table.name}: {table.question}", *notes, "## Arms", arms]
     if kinds := kind_lines(rows, labels):
         parts += ["## Success of the last policy by kind of world", kinds]
     for which, pairs in (("Planned", table.planned), ("Other", table.explored)):
@@ -212,8 +216,13 @@ def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
             title += MEASURES[measure].format(**words)
             parts += [f"## {which} comparisons: {title}", lines] * bool(lines)
     if absent:
-        parts += ["## Missing", absent]
+        parts += ["## Missing", *map(_filled, absent.split("\n\n"))]
     return "\n\n".join(part for part in parts if part)
+
+
+def _filled(paragraph: str) -> str:
+    """A paragraph in lines that fit a page; commands stay as they are."""
+    return paragraph if paragraph.startswith(" ") else fill(paragraph, _WIDTH)
 
 
 def _cells(
