@@ -132,6 +132,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         with self._replay_lock, self._write_lock:
             index = self._write(data)
         if priority is not None and update_priority is not False:
+            # In the order of the slots, which is that of the data as they were written.
+            priority = self._transpose(priority) if self.dim_extend > 0 else priority
             self.update_priority(index, priority.reshape(-1, *priority.shape[data.ndim :]))
         return index
 

@@ -84,6 +84,17 @@ def test_priorities_by_hand_take_places_too():
         assert found.tolist() == pytest.approx([7.05**0.6, 9.05**0.6])
 
 
+@pytest.mark.parametrize("shape", [(ENVS, STEPS), (ENVS, STEPS, 1)])
+def test_a_priority_that_comes_with_a_transition_lands_on_its_slot(shape):
+    buffer = make_deep_buffer()
+    data = make_trajectories()
+    data["td_error"] = (data["observation"] + 1.0).reshape(shape)
+    buffer.extend(data)
+    expected = buffer.storage[:]["observation"].flatten() + 1.0
+    found = buffer.sampler.priorities()[: ENVS * STEPS] - 0.05
+    torch.testing.assert_close(found, expected.double())
+
+
 def test_rows_that_were_overwritten_are_known_in_two_dimensions():
     buffer = make_deep_buffer()
     buffer.extend(make_trajectories(steps=8))
