@@ -155,11 +155,24 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         return index
 
     def add(self, data: TensorDictBase) -> Any:
-        """Write one transition, and return its slot."""
+        """Write one transition, and return its slot.
+
+        In a storage of several dimensions, one of each environment, batch size ``[E]``, and return
+        their places, ``[E, 2]``.
+
+        Raises:
+            KeyError: See :meth:`extend`.
+            ValueError: See :meth:`extend`; or if ``data`` has no dimension of environments.
+        """
         if not self._checks:
             return super().add(data)
         # TorchRL's add would ask the new transition for learned signals, which it cannot have.
-        index = self.extend(data.unsqueeze(0))
+        if data.ndim < self.dim_extend:
+            raise ValueError(
+                f"data must be one step of each environment, batch size [E], got {[*data.shape]}"
+            )
+        # Where there are several environments, time comes after them.
+        index = self.extend(data.unsqueeze(self.dim_extend))
         return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
 
     def empty(self, empty_write_count: bool = True) -> None:

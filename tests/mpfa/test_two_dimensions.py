@@ -84,6 +84,23 @@ def test_priorities_by_hand_take_places_too():
         assert found.tolist() == pytest.approx([7.05**0.6, 9.05**0.6])
 
 
+def test_adding_a_step_of_every_environment_equals_extending_by_it():
+    one, many = make_deep_buffer(), make_deep_buffer()
+    data = make_trajectories()
+    many.extend(data)
+    places = [one.add(data[:, step]) for step in range(STEPS)]
+    assert torch.cat(places).equal(many.extend(data) - torch.tensor([STEPS, 0]))
+    assert one.storage.shape == (STEPS, ENVS)
+    assert one.storage[:]["observation"].equal(many.storage[:STEPS]["observation"])
+
+
+def test_adding_a_step_of_no_environment_is_refused():
+    buffer = make_deep_buffer()
+    with pytest.raises(ValueError, match=r"one step of each environment, .* got \[\]"):
+        buffer.add(make_trajectories()[0, 0])
+    assert len(buffer) == 0
+
+
 @pytest.mark.parametrize("shape", [(ENVS, STEPS), (ENVS, STEPS, 1)])
 def test_a_priority_that_comes_with_a_transition_lands_on_its_slot(shape):
     buffer = make_deep_buffer()
