@@ -13,6 +13,7 @@ from tests.mpfa.transitions import (
     make_transitions,
     same,
     seeded,
+    snapshot,
     train_rounds,
     write_signals,
 )
@@ -67,6 +68,23 @@ def test_a_batch_from_before_the_buffer_was_emptied_is_stale():
     buffer.extend(make_transitions(8))
     buffer.update_tensordict_priority(batch)
     assert buffer.stale_updates == 4
+
+
+@pytest.mark.parametrize("filled", [0, 3])
+def test_a_batch_of_slots_that_are_no_longer_filled_is_stale(filled):
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample())
+    batch["index"], batch["written_at"] = torch.tensor([1, 4, 6, 7]), torch.tensor([1.0, 4, 6, 7])
+    buffer.empty()
+    if filled:
+        buffer.extend(make_transitions(filled))
+    before = snapshot(buffer)
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 4
+    assert same(before, snapshot(buffer))
+    with pytest.raises(IndexError, match=rf"index must be in \[0, {filled}\), got 7"):
+        buffer.update_tensordict_priority(batch.exclude("written_at"))
 
 
 def test_a_row_that_was_written_in_place_is_stale():

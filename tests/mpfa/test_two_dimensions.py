@@ -121,6 +121,18 @@ def test_rows_that_were_overwritten_are_known_in_two_dimensions():
     assert buffer.stale_updates == int((batch["index"][:, 0] < 2).sum()) > 0
 
 
+@pytest.mark.parametrize("steps", [0, 1])
+def test_a_batch_from_before_the_buffer_was_emptied_is_stale_in_two_dimensions(steps):
+    buffer = make_deep_buffer()
+    buffer.extend(make_trajectories(steps=8))
+    batch = write_signals(buffer.sample())
+    buffer.empty()
+    if steps:
+        buffer.extend(make_trajectories(steps=steps))
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 8
+
+
 def test_training_goes_on_bit_for_bit_in_two_dimensions(tmp_path):
     first, second, third = make_deep_buffer(), make_deep_buffer(seed=3), make_deep_buffer(seed=4)
     first.extend(make_trajectories(steps=6))

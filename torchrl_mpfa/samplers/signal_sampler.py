@@ -244,7 +244,7 @@ class SignalSampler(TreeSampler):
 
         Raises:
             KeyError: If a signal that the sampler fuses is missing.
-            IndexError: If a slot is outside the filled part of the buffer.
+            IndexError: If a slot was never filled or, without ``written_at``, is not filled now.
             ValueError: If a signal or ``written_at`` has the wrong shape, a signal is negative or
                 not finite, or the slots are not so many equal batches.
             TypeError: If the storage keeps no signals, or the index holds anything but integers.
@@ -257,8 +257,10 @@ class SignalSampler(TreeSampler):
         if len(slots) % batches:
             raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
         sizes = [len(slots) // batches] * batches
-        if len(check_index(slots, table.size)) < len(slots):
-            raise IndexError(f"index must be in [0, {table.size}), the filled slots, got -1")
+        # A batch from before the buffer was emptied is stale, as its times of writing tell.
+        filled = table.size if written_at is None else table.known
+        if len(check_index(slots, filled)) < len(slots):
+            raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
         rows, live, stale = table.rows.index_select(0, slots), None, 0
         if written_at is not None:
             if written_at.numel() != slots.numel():

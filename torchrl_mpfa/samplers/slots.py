@@ -40,7 +40,8 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
     slots = slots.long()
     if slots.ndim <= 1:
         return slots.reshape(-1)
-    shape = getattr(storage, "shape", None)
+    # Not the filled part of it: a batch may be from before the storage was emptied.
+    shape = getattr(storage, "_total_shape", None)
     if shape is None or len(shape) < 2 or len(shape) != slots.shape[-1]:
         raise RuntimeError(
             f"index must have one dimension, or one place for each dimension of a storage, got "

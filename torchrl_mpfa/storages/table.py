@@ -66,18 +66,24 @@ class SignalTable:
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
         self._one = torch.ones((), dtype=torch.double)
-        self.writes = 0
+        self.writes = self.size = self.cleared = 0
         self.clear()
 
     def clear(self) -> None:
         """Forget every slot; the count of writes goes on, so that old batches stay old."""
         self.rows.copy_(self._blank)
+        self.cleared = max(self.cleared, self.size)
         self.size = 0
 
     def grow(self, capacity: int) -> None:
         """Add slots at the end; only for a table in memory."""
         more = self._blank.expand(capacity - self.capacity, -1)
         self.rows, self.capacity = torch.cat([self.rows, more]), capacity
+
+    @property
+    def known(self) -> int:
+        """Slots, counted from the front, that are filled or were before the table was cleared."""
+        return max(self.size, self.cleared)
 
     @property
     def rewards(self) -> Tensor:
