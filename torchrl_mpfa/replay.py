@@ -183,7 +183,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         """
         with self._futures_lock:
             self._clear_prefetch_queue_locked()
-            super().empty(empty_write_count)
+            with self._replay_lock, self._write_lock:
+                super().empty(empty_write_count)
 
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
         data, info = super()._sample(batch_size)

@@ -1,5 +1,7 @@
 """SignalReplayBuffer: from batch to sampler, beside TorchRL's other parts."""
 
+from concurrent.futures import ThreadPoolExecutor, wait
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -229,6 +231,25 @@ def test_emptying_forgets_what_was_prefetched():
     buffer.empty()
     buffer.extend(make_transitions(50, first=1000))
     assert min(float(buffer.sample()["observation"].min()) for _ in range(4)) >= 1000
+
+
+def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):
+    # The writer would be at the third slot of a storage that holds none.
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(8))
+    other, written, emptied = ThreadPoolExecutor(1), [], buffer.sampler._empty
+
+    def empty():
+        written.append(other.submit(buffer.extend, make_transitions(2, first=8)))
+        wait(written, timeout=0.1)
+        emptied()
+
+    monkeypatch.setattr(buffer.sampler, "_empty", empty)
+    buffer.empty()
+    assert written[0].result().tolist() == [0, 1]
+    assert len(buffer) == 2
+    assert buffer[:]["observation"].flatten().tolist() == [8, 9]
+    assert buffer.extend(make_transitions(1)).tolist() == [2]
 
 
 def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():
