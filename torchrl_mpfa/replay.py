@@ -75,8 +75,9 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         self._handed_out: TensorDictBase | None = None
         super().__init__(generator=generator or seeded_generator(), **kwargs)
 
-    def _init(self) -> None:
-        super()._init()
+    def _initialize_prioritized_sampler(self) -> None:
+        # As long as TorchRL can still undo what it has made: it may have put that off to this use.
+        super()._initialize_prioritized_sampler()
         if self._fuses:
             self._sampler.bind(self._storage)
             self._storage.needs_signals = True
@@ -91,11 +92,12 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
 
     @property
     def _fuses(self) -> bool:
-        return isinstance(self._sampler, SignalSampler)
+        # Not the attribute: the property has the parts made, where that was put off to their use.
+        return isinstance(self.sampler, SignalSampler)
 
     @property
     def _checks(self) -> bool:
-        return isinstance(self._storage, SignalStorageMixin) and not self._is_consuming()
+        return isinstance(self.storage, SignalStorageMixin) and not self._is_consuming()
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Write transitions, and return their slots.
@@ -293,7 +295,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
 
     def rewards(self) -> Tensor:
         """Rewards of all transitions, shape ``[N]``."""
-        found: Tensor = self._storage.signal_table.rewards
+        found: Tensor = self.storage.signal_table.rewards
         return found
 
     def distributions(self) -> dict[str, Tensor]:
@@ -318,7 +320,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
     def stats(self) -> dict[str, Any]:
         """TorchRL's counters, and the sampler's statistics of signals and batch."""
         found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
-        if self._fuses:
+        if self.initialized and self._fuses:
             found.update(self._sampler.stats(self._storage))
         return found
 
@@ -335,7 +337,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         for key in ("_storage", "_sampler", "_writer", "_transforms", "_batch_size", "_rng"):
             if key not in state_dict:
                 raise KeyError(f"{key!r} is missing in the saved buffer")
-        check_sampler_state(self._sampler, state_dict["_sampler"])
+        check_sampler_state(self.sampler, state_dict["_sampler"])
         self._storage.check_state(state_dict["_storage"])
         size = self._storage._max_size_along_dim0 if self._storage.ndim == 1 else None
         check_writer_state(state_dict["_writer"], None if size is None else size())
@@ -375,7 +377,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
                 anything does not fit this buffer; nothing is changed.
         """
         folder = open_dump(path)
-        for part, name in ((self._sampler, "sampler"), (self._storage, "storage")):
+        for part, name in ((self.sampler, "sampler"), (self.storage, "storage")):
             if hasattr(part, "check_dump"):
                 part.check_dump(folder / name)
         super().loads(folder)
