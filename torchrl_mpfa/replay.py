@@ -24,6 +24,8 @@ from torchrl_mpfa.replay_state import (
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.storages.base import SignalStorageMixin
+from torchrl_mpfa.storages.schema import as_path
+from torchrl_mpfa.storages.table import SignalTable
 
 _MISSING = (
     "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "
@@ -48,7 +50,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
 
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none.
-        ValueError: If capacity or signals of sampler and storage differ.
+        ValueError: If capacity or signals of sampler and storage differ, or ``priority_key`` is
+            where a sampler that fuses signals reads one.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -73,13 +76,15 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         self.stale_updates = 0
         self._unreturned = 0
         self._handed_out: TensorDictBase | None = None
+        # TorchRL sets it once the parts are made, which have to agree with it.
+        self.priority_key = kwargs.get("priority_key", "td_error")
         super().__init__(generator=generator or seeded_generator(), **kwargs)
 
     def _initialize_prioritized_sampler(self) -> None:
         # As long as TorchRL can still undo what it has made: it may have put that off to this use.
         super()._initialize_prioritized_sampler()
         if self._fuses:
-            self._sampler.bind(self._storage)
+            self._check_priority_key(self._sampler.bind(self._storage))
             self._storage.needs_signals = True
         if self._checks:
             self._storage.strict = True
@@ -88,6 +93,14 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
                 f"prefetch must be 0 with a prioritized sampler, got {self._prefetch_cap}: batches "
                 "that are sampled ahead know nothing of the update before them, and one seed would "
                 "not always give the same batches"
+            )
+
+    def _check_priority_key(self, table: SignalTable) -> None:
+        read = (table.reward_key, *(signal.key for signal in table.written))
+        if as_path(self.priority_key) in map(as_path, read):
+            raise ValueError(
+                f"priority_key must not be where a reward or a signal is read, got "
+                f"{self.priority_key!r}: first priorities are not stored with the transitions"
             )
 
     @property
@@ -124,12 +137,16 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
             return torch.zeros(shape, dtype=torch.long)
         priority = data.get(self.priority_key, None)
         # The writer adds the slots to it, and the caller's is left as it is.
-        data = data.exclude(self.priority_key) if priority is not None else data.copy()
+        taken = priority is not None and self._fuses
+        data = data.exclude(self.priority_key) if taken else data.copy()
         if type(data) is not TensorDict:
             data = data.contiguous()
         if self._storage.ndim == 1 and data.ndim > 1:
             data = data.reshape(-1)
-        if priority is not None:
+        # Where nothing is sampled by it, a reward may be negative.
+        weighs = isinstance(self._sampler, PrioritizedSampler)
+        reward_key = self._storage.signal_table.reward_key
+        if priority is not None and (weighs or self.priority_key != reward_key):
             check_finite(f"{self.priority_key!r} of the transitions", priority)
         with self._replay_lock, self._write_lock:
             index = self._write(data)

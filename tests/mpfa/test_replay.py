@@ -24,6 +24,7 @@ from torchrl_mpfa import (
     MPFASampler,
     Signal,
     SignalReplayBuffer,
+    SignalSampler,
     SignalTensorStorage,
     TreeSampler,
 )
@@ -323,6 +324,41 @@ def test_transitions_that_bring_a_priority_of_their_own_start_with_it():
     buffer.extend(data)
     expected = [(p + 0.05) ** 0.6 for p in range(4)]
     assert leaves(buffer).tolist() == pytest.approx(expected)
+
+
+@pytest.mark.filterwarnings("ignore:Calling update_priority:UserWarning")
+@pytest.mark.parametrize(
+    ("make_sampler", "key"),
+    [
+        (RandomSampler, ("next", "reward")),
+        (RandomSampler, "td_error"),
+        (lambda: PrioritizedSampler(16, 1.0, 0.4, 0.0), "td_error"),
+        (lambda: TreeSampler(16, 1.0, 0.4, 0.0), "td_error"),
+    ],
+)
+def test_a_priority_is_stored_with_the_transition_where_no_signals_are_fused(make_sampler, key):
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(16), sampler=make_sampler(), batch_size=4, priority_key=key
+    )
+    data = make_transitions(6).set("td_error", torch.arange(6.0) + 1)
+    for row in range(2):
+        buffer.extend(data[3 * row : 3 * row + 3])
+    batch = buffer.sample()
+    assert batch[key].equal(data[key][batch["index"]])
+    if hasattr(buffer.sampler, "_sum_tree"):
+        assert leaves(buffer).tolist() == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("key", [("next", "reward"), "novelty", ("novelty",)])
+def test_a_priority_key_that_would_take_a_signal_away_is_refused(key):
+    signals = ["td_error", Signal("novelty", key="novelty", known_at="write")]
+    with pytest.raises(ValueError, match=r"priority_key must not be where a reward .*, got "):
+        SignalReplayBuffer(
+            storage=SignalTensorStorage(16, signals=signals),
+            sampler=SignalSampler(16, 0.6, 0.4, signals=signals),
+            batch_size=4,
+            priority_key=key,
+        )
 
 
 def test_the_paper_signal_of_the_reward_is_its_absolute_value():
