@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import ReplayBuffer, TensorDictReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
@@ -51,7 +51,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none.
         ValueError: If capacity or signals of sampler and storage differ, or ``priority_key`` is
-            where a sampler that fuses signals reads one.
+            where a sampler that fuses signals reads one, or ``sample_unit`` makes sequences for it.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -85,6 +85,11 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         super()._initialize_prioritized_sampler()
         if self._fuses:
             self._check_priority_key(self._sampler.bind(self._storage))
+            if not isinstance(self._sample_unit, Transition | None):
+                raise ValueError(
+                    "sample_unit must be None with a sampler that fuses signals, got "
+                    f"{type(self._sample_unit).__name__}: signals belong to single transitions"
+                )
             self._storage.needs_signals = True
         if self._checks:
             self._storage.strict = True

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage
+from torchrl.data import LazyTensorStorage, Sequence, Transition
 
 from tests.mpfa.transitions import (
     make_buffer,
@@ -143,6 +143,13 @@ def test_transitions_with_a_reward_that_is_not_finite_are_refused(buffer, wrong)
 def test_capacities_of_sampler_and_storage_must_agree():
     with pytest.raises(ValueError, match=r"max_capacity of the sampler is 8, max_size .* 16"):
         SignalReplayBuffer(storage=SignalTensorStorage(16), sampler=MPFASampler(8), batch_size=4)
+
+
+def test_sequences_are_refused_where_signals_are_fused():
+    parts = {"storage": SignalTensorStorage(8), "sampler": MPFASampler(8), "batch_size": 4}
+    with pytest.raises(ValueError, match=r"sample_unit must be None .*, got Sequence: signals"):
+        SignalReplayBuffer(**parts, sample_unit=Sequence(3))
+    assert SignalReplayBuffer(**parts, sample_unit=Transition()).batch_size == 4
 
 
 def test_a_storage_without_signals_is_refused():
