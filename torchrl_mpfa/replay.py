@@ -50,7 +50,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
 
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none.
-        ValueError: If capacity or signals of sampler and storage differ, or ``priority_key`` is
+        ValueError: If ``batch_size`` is not a positive integer, capacity or signals of sampler and
+            storage differ, or ``priority_key`` is
             where a sampler that fuses signals reads one, or ``sample_unit`` makes sequences for it.
 
     Examples:
@@ -76,6 +77,8 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         self.stale_updates = 0
         self._unreturned = 0
         self._handed_out: TensorDictBase | None = None
+        if (batch_size := kwargs.get("batch_size")) is not None:
+            check_counts(batch_size=batch_size)
         # TorchRL sets it once the parts are made, which have to agree with it.
         self.priority_key = kwargs.get("priority_key", "td_error")
         super().__init__(generator=generator or seeded_generator(), **kwargs)

@@ -152,6 +152,12 @@ def test_sequences_are_refused_where_signals_are_fused():
     assert SignalReplayBuffer(**parts, sample_unit=Transition()).batch_size == 4
 
 
+@pytest.mark.parametrize("wrong", [-1, 0, "a", 2.5, True])
+def test_a_batch_size_that_is_no_count_is_refused_before_anything_is_made(wrong):
+    with pytest.raises(ValueError, match=f"batch_size must be a positive integer, got {wrong!r}"):
+        SignalReplayBuffer(storage=SignalTensorStorage(8), batch_size=wrong)
+
+
 def test_a_storage_without_signals_is_refused():
     with pytest.raises(TypeError, match=r"storage must keep signals .*got LazyTensorStorage"):
         SignalReplayBuffer(storage=LazyTensorStorage(8), sampler=MPFASampler(8), batch_size=4)
