@@ -50,6 +50,12 @@ def test_a_buffer_made_of_settings_is_the_one_of_the_method() -> None:
     assert made.rewards().shape == (CAPACITY,)
 
 
+def test_a_seed_of_a_buffer_is_its_own_affair() -> None:
+    before = torch.get_rng_state()
+    MethodReplayBuffer(method("mpfa_per"), seed=3)
+    assert torch.get_rng_state().equal(before)
+
+
 def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
     here = MethodReplayBuffer(method("mpfa_per"), seed=3)
     here.extend(make_transitions(40))

@@ -27,7 +27,7 @@ class MethodReplayBuffer(SignalReplayBuffer):
 
     Args:
         method: The settings.
-        seed: Of all randomness, that of the transforms too.
+        seed: Of its randomness.
         **kwargs: Passed to :class:`~torchrl_mpfa.SignalReplayBuffer`.
 
     Examples:
@@ -37,11 +37,18 @@ class MethodReplayBuffer(SignalReplayBuffer):
     """
 
     def __init__(self, method: Method, *, seed: int = 0, **kwargs: Any) -> None:
-        torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         super().__init__(**buffer_parts(method), generator=generator, **kwargs)
         # Batches of several updates are sampled in one call, of which TorchRL would warn.
         self._warned_batch_size_conflict = True
+
+
+class _AloneInProcess(MethodReplayBuffer):
+    """The buffer where nothing else is random: its seed is that of the transforms too."""
+
+    def __init__(self, method: Method, *, seed: int = 0, **kwargs: Any) -> None:
+        torch.manual_seed(seed)
+        super().__init__(method, seed=seed, **kwargs)
 
 
 class RaySignalReplayBuffer(RayReplayBuffer):
@@ -65,7 +72,7 @@ class RaySignalReplayBuffer(RayReplayBuffer):
         super().__init__(
             method,
             seed=seed,
-            replay_buffer_cls=MethodReplayBuffer,
+            replay_buffer_cls=_AloneInProcess,
             remote_config={"num_cpus": 0} if remote_config is None else remote_config,
         )
         self._rows = method.batch_size * method.candidates
