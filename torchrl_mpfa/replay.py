@@ -50,9 +50,9 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
 
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none.
-        ValueError: If ``batch_size`` is not a positive integer, capacity or signals of sampler and
-            storage differ, or ``priority_key`` is
-            where a sampler that fuses signals reads one, or ``sample_unit`` makes sequences for it.
+        ValueError: If ``batch_size`` is not a positive integer, or capacity or signals of sampler
+            and storage differ; or, where signals are fused, if ``priority_key`` is where one is
+            read, or ``sample_unit`` makes sequences.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -193,11 +193,11 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         """
         if not self._checks:
             return super().add(data)
-        # TorchRL's add would ask the new transition for learned signals, which it cannot have.
         if data.ndim < self.dim_extend:
             raise ValueError(
                 f"data must be one step of each environment, batch size [E], got {[*data.shape]}"
             )
+        # TorchRL's add would ask the new transition for learned signals, which it cannot have.
         # Where there are several environments, time comes after them.
         index = self.extend(data.unsqueeze(self.dim_extend))
         return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
@@ -365,7 +365,9 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         check_sampler_state(self.sampler, state_dict["_sampler"])
         self._storage.check_state(state_dict["_storage"])
         size = self._storage._max_size_along_dim0 if self._storage.ndim == 1 else None
-        check_writer_state(state_dict["_writer"], None if size is None else size())
+        # A writer of data that no one may write has no cursor, nor has its state.
+        if hasattr(self._writer, "_cursor"):
+            check_writer_state(state_dict["_writer"], None if size is None else size())
         check_batch_size(state_dict["_batch_size"])
         check_generator_state(state_dict["_rng"])
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def check_writer_state(state: Any, slots: int | None) -> None:
-    """Refuse the state of a writer that points outside the storage.
+    """Refuse the state of a writer in a ring that points outside the storage.
 
     Args:
         state: The state.

@@ -5,6 +5,7 @@ from copy import deepcopy
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import ImmutableDatasetWriter
 
 from tests.mpfa.transitions import make_buffer, make_transitions, same, snapshot, train_rounds
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, SignalTensorStorage, TreeSampler
@@ -102,6 +103,19 @@ def test_a_state_that_does_not_fit_is_refused_and_the_next_batches_are_the_same(
         buffer.load_state_dict(state)
     assert same(before, snapshot(buffer))
     assert train_rounds(buffer, 3).equal(train_rounds(twin, 3))
+
+
+def test_data_that_no_one_may_write_are_restored_without_a_cursor():
+    buffers = []
+    for seed in (0, 5):
+        storage = SignalTensorStorage(8)
+        storage.set(torch.arange(8), make_transitions(8, seed=seed))
+        buffers.append(make_buffer(8, seed=seed, storage=storage))
+        buffers[-1].set_writer(ImmutableDatasetWriter())
+        train_rounds(buffers[-1], 2)
+    first, second = buffers
+    second.load_state_dict(snapshot(first))
+    assert train_rounds(first, 2).equal(train_rounds(second, 2))
 
 
 @pytest.mark.parametrize("column", range(6))
