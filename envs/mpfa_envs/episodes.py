@@ -15,6 +15,7 @@ from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.path import shortest_length
 from mpfa_envs.plain_worlds import fingerprint, world_from_plain, world_to_plain
 from mpfa_envs.tasks import Task, check_task, sample_task
+from mpfa_envs.vector_state import read_list
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
@@ -41,6 +42,17 @@ class Episode(NamedTuple):
     """The shortest path to the goal's center [m]."""
     field: DistanceField | LocalField | None
     """Lengths of the ways to the goal, if the progress is along the shortest path."""
+
+
+class Whereabouts(NamedTuple):
+    """How far the robots are among the worlds of a generator."""
+
+    refused: int
+    """Worlds that had no task."""
+    left: list[int]
+    """Episodes that each robot still has in its world."""
+    worlds: list[World | None]
+    """That world, where there are any left."""
 
 
 def _grid_of(world: World, distance: float) -> FreeGrid:
@@ -195,14 +207,30 @@ class EpisodeSource:
             "worlds": [world_to_plain(world) if left and world else None for world, left in kept],
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave."""
-        self.refused = int(state["refused"])
-        self._left = [int(left) for left in state["left"]]
+    def read(self, state: Mapping[str, Any]) -> Whereabouts:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Args:
+            state: What it gave.
+
+        Returns:
+            Where it says that the robots are.
+
+        Raises:
+            ValueError: If something is missing, or not there for each robot.
+        """
+        counts, values = (read_list(state, name, len(self._left)) for name in ("left", "worlds"))
+        left = [check_count("left", count, least=0) for count in counts]
+        worlds = [None if each is None else world_from_plain(each) for each in values]
+        if any(count and world is None for count, world in zip(left, worlds, strict=True)):
+            raise ValueError("worlds of the state must hold a world wherever left is not 0")
+        return Whereabouts(check_count("refused", state.get("refused"), least=0), left, worlds)
+
+    def load(self, found: Whereabouts) -> None:
+        """Go on from what :meth:`read` gave."""
+        self.refused, self._left = found.refused, found.left
         if self._generator:
-            self._worlds = [
-                None if values is None else world_from_plain(values) for values in state["worlds"]
-            ]
+            self._worlds = found.worlds
 
     def check(self, world: World, task: Task | None) -> Task | None:
         """Refuse a world that is too large, or a task that cannot be driven."""

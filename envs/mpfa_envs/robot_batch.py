@@ -30,7 +30,7 @@ from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
 from mpfa_envs.reward import StepOutcome, payments_of
 from mpfa_envs.tasks import read_task
 from mpfa_envs.vector_drives import make_drives
-from mpfa_envs.vector_state import read_array
+from mpfa_envs.vector_state import read_array, read_list
 from mpfa_envs.walker_batch import WalkerBatch
 from mpfa_envs.walkers import no_encounters
 from mpfa_envs.world_batch import WorldBatch
@@ -230,13 +230,16 @@ class RobotBatch:
         """
         arrays = self._arrays()
         values = {name: read_array(state, name, like) for name, like in arrays.items()}
-        for name in ("worlds", "tasks"):
-            if len(state.get(name, ())) != len(self.tasks):
-                raise ValueError(f"{name} of the state must have {len(self.tasks)} entries")
-        worlds = [world_from_plain(plain) for plain in state["worlds"]]
-        tasks = [None if task is None else read_task(task) for task in state["tasks"]]
+        plain, given = (read_list(state, name, len(self.tasks)) for name in ("worlds", "tasks"))
+        worlds = [world_from_plain(each) for each in plain]
+        tasks = [None if task is None else read_task(task) for task in given]
         walkers = self.walkers.read(state.get("walkers", {}), worlds)
-        last = int(values["steps"].max())
+        drives = self.drives.read(state.get("drives", {}))
+        # The compiled loops write a trail at the number of its steps.
+        steps, most = values["steps"], self._rules.max_steps
+        if steps.min() < 0 or steps.max() > most:
+            raise ValueError(f"steps of the state must be in [0, {most}], got {steps.tolist()}")
+        last = int(steps.max())
         trails = read_array(state, "trails", np.zeros((len(tasks), last + 1, 2)))
         if self.memory is not None:
             self.memory.load_state_dict(state.get("memory", {}))
@@ -256,7 +259,7 @@ class RobotBatch:
                 distance = self._rules.collision_distance
                 self._fields[index] = distance_field(world, distance, task.goal)
         self.walkers.load(walkers)
-        self.drives.load_state_dict(state["drives"], starts, self.episodes.motions.copy())
+        self.drives.load(drives, starts, self.episodes.motions.copy())
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays that a robot's episode is in, by name."""

@@ -409,10 +409,11 @@ class VectorNavigationEnv(
                 named, or no state; nothing has changed then.
         """
         state = check_alike(state, describe(self, self._source))
-        rngs = read_generators(state.get("rngs"), self.num_envs)
+        rngs = read_generators(state.get("rngs"), self.num_envs, begun=state["begun"])
+        worlds = self._source.read(state["source"])
         self._batch.load_state_dict(state["batch"])
-        self._source.load_state_dict(state["source"])
-        self._rngs, self._begun = rngs, bool(state["begun"])
+        self._source.load(worlds)
+        self._rngs, self._begun = rngs, state["begun"]
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Render each robot's room from above.

@@ -8,6 +8,7 @@ import numpy as np
 
 from mpfa_envs.drives import read_motion, substeps
 from mpfa_envs.kernels.motion import drive_arcs
+from mpfa_envs.vector_state import read_array
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,9 +40,17 @@ class Drives(Protocol):
         """What brings the robots where they are in their episodes."""
         ...
 
-    def load_state_dict(
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Raises:
+            ValueError: If something is missing or of another shape.
+        """
+        ...
+
+    def load(
         self,
-        state: Mapping[str, Any],
+        arrays: Mapping[str, NDArray[Any]],
         starts: NDArray[np.float64],
         motions: NDArray[np.float64],
     ) -> None:
@@ -88,9 +97,13 @@ class KinematicDrives:
         """Nothing is held."""
         return {}
 
-    def load_state_dict(
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Nothing is held."""
+        return {}
+
+    def load(
         self,
-        state: Mapping[str, Any],
+        arrays: Mapping[str, NDArray[Any]],
         starts: NDArray[np.float64],
         motions: NDArray[np.float64],
     ) -> None:
@@ -183,21 +196,38 @@ class WheelDrives:
         counts = self._counts.copy()
         return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
 
-    def load_state_dict(
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Args:
+            state: What it gave.
+
+        Returns:
+            Its arrays.
+
+        Raises:
+            ValueError: If something is missing or of another shape.
+        """
+        counts = read_array(state, "counts", self._counts)
+        if counts.min() < 0:
+            raise ValueError(f"counts of the state must not be negative, got {counts.tolist()}")
+        speeds = read_array(state, "speeds", np.zeros((len(counts), counts.max(), 2)))
+        return {"counts": counts, "speeds": speeds}
+
+    def load(
         self,
-        state: Mapping[str, Any],
+        arrays: Mapping[str, NDArray[Any]],
         starts: NDArray[np.float64],
         motions: NDArray[np.float64],
     ) -> None:
         """Drive the episodes again from their starts.
 
         Args:
-            state: What :meth:`state_dict` gave.
+            arrays: What :meth:`read` gave.
             starts: Poses at the start (x, y, heading) [m, m, rad], ``[N, 3]``.
             motions: Poses and speeds, ``[N, 5]``, changed on the way.
         """
-        counts = np.array(state["counts"], dtype=np.int64)
-        speeds = np.array(state["speeds"], dtype=np.float64)
+        counts, speeds = arrays["counts"], arrays["speeds"]
         last = int(counts.max())
         # All end at once; who has driven for a shorter time is placed later.
         for step in range(last + 1):

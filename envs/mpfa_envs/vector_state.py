@@ -83,11 +83,13 @@ def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]
     Raises:
         ValueError: If it is no state, or an argument differs.
     """
-    parts = ("arguments", "source", "batch")
+    parts = {"arguments": Mapping, "source": Mapping, "batch": Mapping, "begun": bool}
     if not isinstance(state, Mapping) or not all(
-        isinstance(state.get(part), Mapping) for part in parts
+        isinstance(state.get(part), kind) for part, kind in parts.items()
     ):
-        raise ValueError(f"state must be what state_dict() gave, with {parts}, got another value")
+        raise ValueError(
+            f"state must be what state_dict() gave, with {tuple(parts)}, got another value"
+        )
     found = state["arguments"]
     for name, value in expected.items():
         # States did not always describe all of them.
@@ -119,12 +121,34 @@ def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArr
     return values
 
 
-def read_generators(states: object, robots: int) -> list[np.random.Generator]:
+def read_list(state: Mapping[str, Any], name: str, robots: int) -> Sequence[Any]:
+    """Read what a state has of each robot.
+
+    Args:
+        state: Where it is.
+        name: Its name.
+        robots: Number of robots.
+
+    Returns:
+        It.
+
+    Raises:
+        ValueError: If it is missing, or not there for each robot.
+    """
+    values = state.get(name)
+    if not isinstance(values, list | tuple) or len(values) != robots:
+        found = len(values) if isinstance(values, list | tuple) else repr(values)
+        raise ValueError(f"{name} of the state must have {robots} entries, got {found}")
+    return values
+
+
+def read_generators(states: object, robots: int, *, begun: bool) -> list[np.random.Generator]:
     """Make each robot's source of randomness anew.
 
     Args:
         states: The states of their bit generators.
-        robots: Number of robots; there may be none before the first reset.
+        robots: Number of robots.
+        begun: Whether there was a reset; before, there may be none.
 
     Returns:
         The sources.
@@ -132,7 +156,8 @@ def read_generators(states: object, robots: int) -> list[np.random.Generator]:
     Raises:
         ValueError: If there are not as many as robots, or a state is none.
     """
-    if not isinstance(states, Sequence) or len(states) not in (0, robots):
+    counts = (robots,) if begun else (0, robots)
+    if not isinstance(states, Sequence) or len(states) not in counts:
         raise ValueError(f"rngs of the state must have {robots} entries, got {states!r}")
     generators = [np.random.default_rng(0) for _ in states]
     for generator, state in zip(generators, states, strict=True):

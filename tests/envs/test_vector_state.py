@@ -148,6 +148,16 @@ def with_value(value: object, *keys: str) -> Callable[[dict[str, Any]], None]:
         (with_value([{}, {}], "batch", "worlds"), "worlds must hold the fields of a World"),
         (with_value("map", "arguments", "memory"), "memory = 'none', got one with 'map'"),
         (with_value([3, 4], "batch", "tasks"), "task must be a start and a goal, got 3"),
+        (with_value(3, "batch", "tasks"), "tasks of the state must have 2 entries, got 3"),
+        (with_value([], "rngs"), "rngs of the state must have 2 entries"),
+        (with_value(np.array([0, 10**9]), "batch", "steps"), r"steps .* in \[0, 500\], got"),
+        (without("begun"), "state must be what state_dict.* gave"),
+        (without("source", "refused"), "refused must be an integer of at least 0, got None"),
+        (without("source", "left"), "left of the state must have 2 entries, got None"),
+        (with_value([1], "source", "left"), "left of the state must have 2 entries, got 1"),
+        (with_value([-1, 0], "source", "left"), "left must be an integer of at least 0, got -1"),
+        (with_value([None], "source", "worlds"), "worlds of the state must have 2 entries"),
+        (with_value([2, 0], "source", "left"), "worlds .* hold a world wherever left is not 0"),
     ],
 )
 def test_what_is_no_state_of_this_environment_is_refused(
@@ -160,9 +170,26 @@ def test_what_is_no_state_of_this_environment_is_refused(
     twin.load_state_dict(env.state_dict())
     state = env.state_dict()
     spoil(state)
+    assert drive(env, 5, 8) == drive(twin, 5, 8)
     with pytest.raises(ValueError, match=message):
         env.load_state_dict(state)
-    assert drive(env, 5, 40) == drive(twin, 5, 40)
+    assert drive(env, 8, 40) == drive(twin, 8, 40)
+
+
+def test_wheels_stay_where_they_are_without_what_they_have_driven() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    env = VectorNavigationEnv(2, world="B", physics="wheels")
+    env.reset(seed=0)
+    drive(env, 0, 3)
+    for spoil in (without("batch", "drives"), with_value(np.zeros(2), "batch", "drives", "speeds")):
+        state = env.state_dict()
+        spoil(state)
+        drive(env, 3, 4)
+        poses = env.poses
+        with pytest.raises(ValueError, match=r"(counts|speeds) of the state must have shape"):
+            env.load_state_dict(state)
+        np.testing.assert_array_equal(env.poses, poses)
+    env.close()
 
 
 BURGER = ROBOTS["burger"]
