@@ -11,7 +11,8 @@ from torchrl.data.replay_buffers.scheduler import LinearScheduler
 
 from tests import oracles
 from tests.mpfa.transitions import make_transitions, same, seeded
-from torchrl_mpfa import TreeSampler
+from torchrl_mpfa import MixtureSampler, TreeSampler
+from torchrl_mpfa.methods import LA3PSampler, RankSampler
 
 
 def filled(sampler, count, capacity):
@@ -273,3 +274,32 @@ def test_alpha_may_leave_zero_exactly():
     sampler.alpha = 0.5
     torch.testing.assert_close(leaves(sampler, 8), priority.double().sqrt())
     assert leaves(sampler, 10)[8:].tolist() == [0.0, 0.0]
+
+
+def states_of(sampler):
+    return {key: value for key, value in sampler.state_dict().items() if key != "_highest_slot"}
+
+
+@pytest.mark.parametrize("kind", [TreeSampler, RankSampler, LA3PSampler, MixtureSampler])
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("alpha", math.nan, ValueError),
+        ("alpha", -1.0, ValueError),
+        ("alpha", 300.0, ValueError),
+        ("alpha", "x", TypeError),
+        ("beta", math.nan, ValueError),
+        ("beta", -1.0, ValueError),
+        ("beta", math.inf, ValueError),
+        ("beta", None, TypeError),
+    ],
+)
+def test_an_exponent_that_cannot_be_is_refused_and_changes_nothing(kind, name, value, error):
+    sampler = kind(64, 0.6, 0.4, 0.01)
+    sampler.update_priority(torch.arange(64), torch.logspace(-2, 5, 64))
+    before = states_of(sampler)
+    with pytest.raises(error, match=f"{name} must"):
+        setattr(sampler, name, value)
+    assert same(states_of(sampler), before)
+    setattr(sampler, name, 0.9)
+    assert getattr(sampler, name) == 0.9

@@ -119,6 +119,11 @@ class MixtureSampler(SignalSampler):
             probability += leaf * (share / total)
         return index, importance_weights(probability, beta=self._beta, lowest=lowest)
 
+    def _check_alpha(self, value: float) -> None:
+        super()._check_alpha(value)
+        for part in self._parts.values():
+            part._check_alpha(value)
+
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
         super()._retransform_priority_trees(old_alpha, new_alpha)
         for part in self._parts.values():

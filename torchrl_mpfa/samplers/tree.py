@@ -100,6 +100,56 @@ class TreeSampler(SavedTrees):
         self._highest_slot: int | None = None
 
     @property
+    def alpha(self) -> float:
+        r"""Priority exponent :math:`\alpha` of Eq. (8).
+
+        Setting it follows in all leaves.
+
+        Raises:
+            TypeError: If it is set to what is no number.
+            ValueError: If it is set to what is negative or not finite, or to what leaves priorities
+                of zero or without a finite sum; nothing is changed then.
+        """
+        alpha: float = self._alpha
+        return alpha
+
+    @alpha.setter
+    def alpha(self, value: float) -> None:
+        check_range("alpha", value, low=0)
+        self._check_alpha(value)
+        before, self._alpha = self._alpha, value
+        if value != before:
+            self._retransform_priority_trees(before, value)
+
+    def _check_alpha(self, value: float) -> None:
+        """Refuse an exponent by which priorities vanish or overflow."""
+        written = self._priorities[self._priorities > 0]
+        before, self._alpha = self._alpha, value
+        leaf = self._leaf(written)
+        self._alpha = before
+        if not (leaf.sum() < math.inf and leaf.reciprocal().sum() < math.inf):
+            raise ValueError(
+                f"alpha must leave the priorities, from {written.min():g} to {written.max():g}, "
+                f"positive and of a finite sum, got {value}"
+            )
+
+    @property
+    def beta(self) -> float:
+        r"""Importance exponent :math:`\beta` of Eq. (10).
+
+        Raises:
+            TypeError: If it is set to what is no number.
+            ValueError: If it is set to what is negative or not finite; nothing is changed then.
+        """
+        beta: float = self._beta
+        return beta
+
+    @beta.setter
+    def beta(self, value: float) -> None:
+        check_range("beta", value, low=0)
+        self._beta = value
+
+    @property
     def _max_priority(self) -> tuple[float | None, int | None]:
         """Highest priority without eps, and the slot that has or had it: TorchRL's bookkeeping."""
         highest = self._highest_priority()
