@@ -333,6 +333,38 @@ def test_batches_of_another_device_come_back_to_that_of_their_rows(updates):
     assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
 
 
+class Elsewhere(torch.Tensor):
+    """Stands for a tensor on a GPU: cannot be computed with beside one of the CPU."""
+
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        here = [each for each in args if type(each) is torch.Tensor and each.ndim]
+        # Copying goes across devices, and a mask of the CPU may select.
+        if here and func.__name__ not in ("copy_", "__getitem__"):
+            raise RuntimeError("expected all tensors to be on the same device")
+        with torch._C.DisableTorchFunctionSubclass():
+            found = func(*args, **(kwargs or {}))
+        if func.__name__ == "to" or not isinstance(found, torch.Tensor):
+            return found.as_subclass(torch.Tensor) if isinstance(found, torch.Tensor) else found
+        return found.as_subclass(cls)
+
+
+def test_batches_on_another_device_than_the_signals_update_them():
+    ours, theirs = make_buffer(300), make_buffer(300)
+    for buffer, kind in ((ours, Elsewhere), (theirs, torch.Tensor)):
+        batch = buffer.sample()
+        buffer.extend(make_rows(100))  # Some of the rows are overwritten before they come back.
+        value = batch["action"].square().sum(-1).as_subclass(kind)
+        stale = buffer.sampler.update_signals(
+            batch["index"],
+            {"td_error": value, "action_gradient": value},
+            storage=buffer.storage,
+            written_at=batch["written_at"].as_subclass(kind),
+        )
+        assert 0 < stale < BATCH
+    assert_same(ours.sampler.state_dict(), theirs.sampler.state_dict())
+
+
 @pytest.mark.parametrize("sampler", [RandomSampler(), PrioritizedSampler(300, 0.6, 0.4)])
 def test_buffers_of_torchrl_are_served_as_they_are(sampler):
     def make():

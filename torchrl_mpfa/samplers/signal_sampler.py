@@ -268,7 +268,8 @@ class SignalSampler(TreeSampler):
                     "written_at must have one number per transition, got shape "
                     f"{[*written_at.shape]} for {slots.numel()} slots"
                 )
-            same = rows.select(1, table.time_column) == written_at.reshape(-1)
+            written_at = written_at.reshape(-1).to(rows.device)
+            same = rows.select(1, table.time_column) == written_at
             if not same.all():
                 live, stale = same, int((~same).sum())
                 sizes = same.reshape(batches, -1).sum(1).tolist()
