@@ -46,6 +46,26 @@ def test_equal_deviations_have_a_finite_divergence():
     assert gaussian_divergence(torch.full((8, 2), 0.5), variance=0.04).isfinite()
 
 
+class Elsewhere:
+    """A policy on a device that not every machine has; only what is there already does it read."""
+
+    in_keys = ("observation",)
+
+    def parameters(self):
+        return iter([torch.empty(1, device="meta")])
+
+    def __call__(self, read):
+        assert read.device == torch.device("meta")
+        return TensorDict({"action": torch.zeros(len(read), 2)}, [len(read)])
+
+
+def test_the_policy_may_be_on_another_device_than_the_batch():
+    action = torch.tensor([0.0, 0.5]).repeat_interleave(4).unsqueeze(1).expand(8, 2)
+    batch = TensorDict({"observation": torch.rand(8, 3), "action": action}, [8])
+    chosen = LowestDivergence(Elsewhere(), batches=2, sigma=0.2)(batch)
+    assert torch.equal(chosen["action"], torch.zeros(4, 2))
+
+
 def mixed_batches(sigma, *, spread, generator, count=256):
     """Three batches, each half the policy's and half uniformly random, and their shares of it.
 

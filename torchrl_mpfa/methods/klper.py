@@ -19,9 +19,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.methods.acting import actions_of
 
 _LEAST_VARIANCE = 1e-3
 
@@ -77,7 +77,8 @@ class LowestDivergence:
         batch = select(buffer.sample(3 * 256))
 
     Args:
-        policy: The current policy; reads what its ``in_keys`` name, writes the action.
+        policy: The current policy, on any device; reads what its ``in_keys`` name, writes the
+            action.
         batches: Number of batches ``K`` to choose from.
         sigma: Standard deviation of the exploration noise in units of the action, or a function
             that tells that of the episode that acts.
@@ -127,8 +128,7 @@ class LowestDivergence:
         count = len(tensordict)
         if count % self.batches:
             raise ValueError(f"{count} transitions cannot make {self.batches} equal batches")
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            chosen = self.policy(tensordict.select(*self.policy.in_keys)).get(self.action_key)
+        chosen = actions_of(self.policy, tensordict, action_key=self.action_key)
         deviation = tensordict.get(self.action_key) - chosen
         sigma = self.sigma() if callable(self.sigma) else self.sigma
         divergence = gaussian_divergence(

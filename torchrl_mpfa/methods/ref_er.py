@@ -24,7 +24,6 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mpfa.losses.trust import (
     BEHAVIOR_MEAN,
@@ -32,6 +31,7 @@ from torchrl_mpfa.losses.trust import (
     BEHAVIOR_WEIGHT,
     POLICY_WEIGHT,
 )
+from torchrl_mpfa.methods.acting import actions_of
 from torchrl_mpfa.samplers.states import check_count, check_number, refuse
 from torchrl_mpfa.selection import Draw
 
@@ -193,10 +193,7 @@ class RememberForget:
         if not isinstance(sampler, RememberingSampler):
             raise TypeError(f"buffer must have a RememberingSampler, got {type(sampler).__name__}")
         batch = buffer.sample()
-        read = batch.select(*self.policy.in_keys)
-        parameter = next(self.policy.parameters())
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            now = self.policy(read.to(parameter.device))["action"].to(batch["action"].device)
+        now = actions_of(self.policy, batch)
         sigma = batch[BEHAVIOR_SIGMA].clamp_min(LEAST_SIGMA)
         ratio = importance_ratio(batch["action"], now, batch[BEHAVIOR_MEAN], sigma)
         limit = self.limit(sampler.batches)
