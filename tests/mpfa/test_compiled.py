@@ -52,6 +52,19 @@ def by_losses(name, loss, batch, trains="both", **kwargs):
     return {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}, log
 
 
+@pytest.mark.parametrize("critics", [1, 3])
+def test_any_number_of_critics_has_the_gradients_of_the_losses(critics):
+    expected, batch = make_batch(), make_batch()
+    loss, whole = (make_loss("td3", num_qvalue_nets=critics) for _ in range(2))
+    torch.manual_seed(5)
+    gradients, _ = by_losses("td3", loss, expected)
+    torch.manual_seed(5)
+    differentiate_at_once(whole, batch)
+    for key, value in whole.named_parameters():
+        torch.testing.assert_close(value.grad, gradients[key], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(batch["signals"].to_dict(), expected["signals"].to_dict())
+
+
 @pytest.mark.parametrize("name", MAKE)
 @pytest.mark.parametrize("weighted", [True, False], ids=["weights", "no weights"])
 @pytest.mark.parametrize(

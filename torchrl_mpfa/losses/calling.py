@@ -126,7 +126,7 @@ class Parts:
     critic: DirectModule
     """Any of the critics, for its structure."""
     critic_parameters: dict[str, Tensor]
-    """Parameters of all critics; of several they are stacked, ``[C, ...]``."""
+    """Parameters of all critics, ``[C, ...]`` where they are stacked."""
     target_actor: DirectModule
     """Policy that holds the target parameters."""
     target_critics: Sequence[DirectModule]
@@ -134,6 +134,8 @@ class Parts:
     target_parameters: tuple[dict[str, Tensor], dict[str, Tensor]]
     """Parameters of target actor and target critics, by the same names; those of an actor that has
     no target of its own are the current ones."""
+    stacked: bool
+    """Whether parameters of critics are stacked, be it of one."""
     action_bounds: tuple[Any, Any] | None = None
     """Least and greatest action of a smoothed target; None: targets are not smoothed."""
     target_noise: Callable[[Tensor], Tensor] | None = None
@@ -141,9 +143,9 @@ class Parts:
 
     def split(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:
         """Parameters of each critic."""
-        count = len(self.target_critics)
-        if count == 1:
+        if not self.stacked:
             return [parameters]
+        count = len(self.target_critics)
         return [{name: value[i] for name, value in parameters.items()} for i in range(count)]
 
     def of_targets(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:

@@ -200,6 +200,7 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
                 bare(self.target_actor_network_params),
                 bare(self.target_value_network_params),
             ),
+            stacked=False,
             action_bounds=(self.min_action, self.max_action) if smooths else None,
             target_noise=self.target_noise if smooths else None,
         )

@@ -121,6 +121,7 @@ class SignalTD3Loss(TwinCritics, TargetSmoothing, TD3Loss):
                 bare(self.target_actor_network_params),
                 bare(self.target_qvalue_network_params),
             ),
+            stacked=True,
             action_bounds=(self.min_action, self.max_action),
             target_noise=self.target_noise,
         )
