@@ -102,6 +102,23 @@ def test_the_models_go_on_from_a_state_that_is_loaded():
 
 
 @pytest.mark.parametrize(
+    "key", ["observation", "action", ("next", "observation"), ("next", "reward")], ids=str
+)
+def test_a_batch_with_a_number_that_is_none_is_refused_before_anything_changes(key):
+    curiosity, batch = Curiosity(6, 2), make_batch()
+    curiosity(make_batch(seed=1))
+    before = copy.deepcopy(curiosity.checkpoint())
+    batch[key][5, 0] = torch.nan
+    spoiled = batch.clone()
+    with pytest.raises(ValueError, match=r"batch must be finite, got nan in .*, row 5"):
+        curiosity(batch)
+    assert set(batch.keys(True)) == set(spoiled.keys(True))
+    after = curiosity.checkpoint()
+    assert all(torch.equal(after["models"][k], before["models"][k]) for k in before["models"])
+    assert str(after["optimizer"]) == str(before["optimizer"])
+
+
+@pytest.mark.parametrize(
     ("name", "value"),
     [("features", 0), ("width", 0), ("scale", -1.0), ("lr", 0.0), ("forward_share", 2.0)],
 )

@@ -18,6 +18,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.learners.states import refuse_unfinished
 
 
 def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
@@ -130,28 +131,39 @@ class Curiosity(nn.Module):
 
         Returns:
             Detached values for the log.
+
+        Raises:
+            KeyError: If the batch lacks an entry.
+            ValueError: If a number of it is not finite; nothing is changed then.
         """
-        observation, action = batch.get("observation"), batch.get("action")
-        following = batch.get("next")
-        after, reward = following.get("observation"), following.get(self.reward_key)
+        observation, action = batch["observation"], batch["action"]
+        following = batch["next"]
+        after, reward = following["observation"], following[self.reward_key]
         bonus = self.bonus(observation, action, after).reshape(reward.shape).to(reward.dtype)
+        losses = self._losses(observation, action, after)
+        refuse_unfinished({"loss_reward": reward + bonus, **losses}, batch)
+        self._learn(losses)
         following.set("extrinsic_reward", reward)
         following.set("intrinsic_reward", bonus)
         following.set(self.reward_key, reward + bonus)
-        return {**self._learn(observation, action, after), "intrinsic_reward": bonus}
+        log = {f"{name}_loss": losses[f"loss_{name}"].detach() for name in ("inverse", "forward")}
+        return {**log, "intrinsic_reward": bonus}
 
-    def _learn(self, observation: Tensor, action: Tensor, after: Tensor) -> dict[str, Tensor]:
-        """One step of both models; the features learn from the inverse one and follow."""
+    def _losses(self, observation: Tensor, action: Tensor, after: Tensor) -> dict[str, Tensor]:
+        """The losses of both models; the features learn from the inverse one and follow."""
         before, then = self.encoder(observation), self.encoder(after)
         told = self.inverse_model(torch.cat((before, then), -1))
         inverse_loss = (told - action).square().sum(-1).mean()
         foreseen = self.forward_model(torch.cat((before, action), -1))
         forward_loss = intrinsic_reward(foreseen, then, scale=1.0).mean()
+        return {"loss_inverse": inverse_loss, "loss_forward": forward_loss}
+
+    def _learn(self, losses: dict[str, Tensor]) -> None:
+        """One step of both models."""
         self.optimizer.zero_grad(set_to_none=True)
         share = self.forward_share
-        ((1.0 - share) * inverse_loss + share * forward_loss).backward()
+        ((1.0 - share) * losses["loss_inverse"] + share * losses["loss_forward"]).backward()
         self.optimizer.step()
-        return {"inverse_loss": inverse_loss.detach(), "forward_loss": forward_loss.detach()}
 
     def checkpoint(self) -> dict[str, Any]:
         """Models and optimizer; tensors and plain values only."""
