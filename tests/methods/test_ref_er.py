@@ -255,6 +255,13 @@ def test_the_weight_is_saved(way, tmp_path):
     assert second.sampler.policy_weight == 0.25
 
 
+def test_a_buffer_that_is_emptied_begins_with_the_whole_weight():
+    buffer = make_buffer(RememberingSampler(), 9, 2)
+    buffer.sampler.policy_weight, buffer.sampler.batches = 0.25, 7
+    buffer.empty()
+    assert (buffer.sampler.policy_weight, buffer.sampler.batches) == (1.0, 7)
+
+
 def test_what_is_missing_or_out_of_range_is_named():
     with pytest.raises(ValueError, match="method 'ref_er' needs policy"):
         make_replay("ref_er")

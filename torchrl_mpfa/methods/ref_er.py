@@ -97,6 +97,11 @@ class RememberingSampler(RandomSampler):
         self.policy_weight = 1.0
         self.batches = 0
 
+    def _empty(self) -> None:
+        super()._empty()
+        # No transition is far in an empty buffer. The batches go on: they are the training's.
+        self.policy_weight = 1.0
+
     def state_dict(self) -> dict[str, Any]:
         """The weight of the policy's gradient, and the batches so far."""
         return {"_policy_weight": self.policy_weight, "_batches": self.batches}
