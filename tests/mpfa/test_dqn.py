@@ -209,6 +209,15 @@ def test_ends_that_are_bytes_count_as_booleans(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
+def test_actions_may_be_booleans(kind):
+    batch, booleans = transitions(), transitions()
+    booleans["action"] = booleans["action"].bool()
+    for each in (batch, booleans):
+        learners()[kind].update(each)
+    assert torch.equal(batch["signals", "td_error"], booleans["signals", "td_error"])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
 def test_transitions_of_several_steps_are_discounted_by_all_of_them(kind):
     learner = learners()[kind]
     learner.update(transitions(seed=5))  # Values that are not zero.

@@ -249,7 +249,9 @@ class QLearner:
         """
         batch = _whole_batch(draw, type(self).__name__)
         cell_of, table = self.policy.module.cell_of, self.table
-        entry = cell_of(batch["observation"]) * table.shape[1] + batch["action"].argmax(-1)
+        # Booleans have no argmax.
+        action = batch["action"].float().argmax(-1)
+        entry = cell_of(batch["observation"]) * table.shape[1] + action
         ahead = table[cell_of(batch["next", "observation"])].amax(-1)
         steps = batch.get("steps_to_next_obs", None)
         target = bootstrap_target(
