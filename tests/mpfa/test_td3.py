@@ -7,6 +7,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import TD3Loss, ValueEstimators
 
+from tests.mpfa import sac_networks
 from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks, parameter_gradients
 from torchrl_mpfa import SignalTD3Loss, TD3Learner, make_ddpg_loss, make_td3_loss
 
@@ -182,10 +183,12 @@ def test_an_action_spec_takes_the_place_of_bounds():
     assert loss.max_action.tolist() == [0.5, 0.5]
 
 
-@pytest.mark.parametrize("key", ["observation", "action"])
+@pytest.mark.parametrize(
+    "key", ["observation", "action", "next", ("next", "reward"), ("next", "terminated")], ids=str
+)
 def test_a_missing_input_is_named(key):
     batch = make_batch().exclude(key)
-    with pytest.raises(KeyError, match=key):
-        make_loss()(batch)
-    with pytest.raises(KeyError, match=key):
-        make_ddpg_loss(*make_networks())(batch)
+    word = key if isinstance(key, str) else key[-1]
+    for loss in (make_loss(), make_ddpg_loss(*make_networks()), sac_networks.make_loss()):
+        with pytest.raises(KeyError, match=word):
+            loss(batch)

@@ -268,7 +268,7 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             value = value.detach()
 
         with torch.no_grad():
-            next_value = self._next_value(tensordict.get("next"))
+            next_value = self._next_value(tensordict["next"])
             target = self._target(tensordict, next_value)
         td_error = (target - value).detach()
         self._write_signals(tensordict, td_error, value)

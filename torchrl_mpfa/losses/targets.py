@@ -25,8 +25,8 @@ def as_torchrl_needs(batch: TensorDictBase, keys: Any, *, reward_scale: float) -
         The copy.
     """
     found = batch.copy()
-    after = found.get("next")
-    after.set(keys.reward, after.get(keys.reward) * reward_scale)
+    after = found["next"]
+    after.set(keys.reward, after[keys.reward] * reward_scale)
     for key in (keys.done, keys.terminated):
         if (end := after.get(key, None)) is not None:
             after.set(key, end.bool())
@@ -44,17 +44,17 @@ class EstimatedTargets:
 
     def _target(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
         """Targets by the loss's value estimator, shape ``[B]``."""
-        after, keys, estimator = tensordict.get("next"), self.tensor_keys, self.value_estimator
+        after, keys, estimator = tensordict["next"], self.tensor_keys, self.value_estimator
         if not self.bootstraps_once:
             scaled = as_torchrl_needs(tensordict, keys, reward_scale=self.reward_scale)
             longer: Tensor = estimator.value_estimate(scaled, next_value=next_value.unsqueeze(-1))
             return longer.squeeze(-1)
         steps = tensordict.get(estimator.tensor_keys.steps_to_next_obs, None)
-        reward = after.get(keys.reward) * self.reward_scale
+        reward = after[keys.reward] * self.reward_scale
         return bootstrap_target(
             reward.reshape(next_value.shape),
             next_value,
-            after.get(keys.terminated).reshape(next_value.shape),
+            after[keys.terminated].reshape(next_value.shape),
             gamma=estimator.gamma,
             steps=None if steps is None else steps.reshape(next_value.shape),
         )
