@@ -14,7 +14,6 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
 from torchrl_mpfa.dumps import new_dump, open_dump
-from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.replay_state import (
     check_batch_size,
     check_generator_state,
@@ -327,17 +326,14 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
         """Numbers of all transitions by name, each of shape ``[N]``.
 
         Each signal as it was last written (NaN where it never was), ``"priority"``, and
-        ``"weight"``, the importance weight of Eq. (10) that the transition would have in a batch;
-        nothing without priorities.
+        ``"weight"``, the importance weight of Eq. (10) that the transition would have in a batch
+        (NaN where it cannot be sampled); nothing without priorities.
         """
         sampler, size = self.sampler, len(self)
         if not isinstance(sampler, TreeSampler) or not size:
             return {}
-        priorities = sampler.priorities()[:size]
-        leaf = priorities**sampler.alpha
-        weight = importance_weights(leaf, beta=sampler.beta, lowest=float(leaf.min()))
+        found = {"priority": sampler.priorities()[:size], "weight": sampler.batch_weights(size)}
         table = getattr(self.storage, "signal_table", None)
-        found = {"priority": priorities, "weight": weight}
         if table is not None:
             found |= {name: table.rows[:size, column] for name, column in table.column.items()}
         return found

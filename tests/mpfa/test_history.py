@@ -6,7 +6,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import RandomSampler
 
-from torchrl_mpfa import MPFASampler, ReplayHistory, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import (
+    MixtureSampler,
+    MPFASampler,
+    ReplayHistory,
+    SignalReplayBuffer,
+    SignalSampler,
+    SignalTensorStorage,
+)
+from torchrl_mpfa.methods import CappedSampler, LA3PSampler, RankSampler
 
 
 def filled(sampler, rows=200):
@@ -23,6 +31,29 @@ def learn(buffer):
         {"td_error": 10.0 * torch.rand(count), "action_gradient": torch.rand(count)}, [count]
     )
     buffer.update_tensordict_priority(batch)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (SignalSampler, {}),
+        (RankSampler, {}),
+        (MixtureSampler, {"signals": ["reward", "td_error"]}),
+        (LA3PSampler, {}),
+        (CappedSampler, {"replay_cap": 2}),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_the_weights_of_all_transitions_are_those_that_batches_have(kind, options):
+    buffer = filled(kind(200, 0.6, 0.4, 0.01, **options))
+    learn(buffer)
+    weights = buffer.distributions()["weight"]
+    index, found = buffer.sampler.sample(buffer.storage, 40)
+    torch.testing.assert_close(weights[index].float(), found["priority_weight"])
+    spent = getattr(buffer.sampler, "_spent", torch.zeros(200, dtype=torch.bool))
+    assert torch.equal(weights.isnan(), spent)
+    assert spent.any() == (kind is CappedSampler)
+    assert kind is LA3PSampler or weights[~spent].unique().numel() > 10
 
 
 def test_histograms_count_what_the_buffer_holds():

@@ -105,6 +105,10 @@ class LA3PSampler(SignalSampler):
             index = self._proportional(tree, size, count)
         return index, torch.ones(count)
 
+    def batch_weights(self, size: int) -> Tensor:
+        """All 1, see :meth:`TreeSampler.batch_weights`."""
+        return torch.ones(size, dtype=torch.double)
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
 

@@ -99,11 +99,7 @@ class MixtureSampler(SignalSampler):
         chosen = torch.multinomial(shares, batch_size, replacement=True, generator=self._rng)
         index = torch.empty(batch_size, dtype=torch.long)
         trees = [self._parts[name] for name in self._names]
-        totals = [part._sum_tree.query(0, size) for part in trees]
-        lowest = sum(
-            share * part._min_tree.query(0, size) / total
-            for share, part, total in zip(shares.tolist(), trees, totals, strict=True)
-        )
+        totals, lowest = self._sums(shares, size)
         if not (min(totals) > 0 and lowest > 0):
             raise RuntimeError(
                 f"every priority must be positive to sample, got sums of {totals} by signal: raise "
@@ -113,11 +109,33 @@ class MixtureSampler(SignalSampler):
             rows = (chosen == number).nonzero().squeeze(1)
             if len(rows):
                 index[rows] = self._proportional(part._sum_tree, size, len(rows))
-        probability = torch.zeros(batch_size, dtype=torch.double)
-        for share, part, total in zip(shares.tolist(), trees, totals, strict=True):
-            leaf = torch.as_tensor(part._sum_tree[index]).reshape(-1)
-            probability += leaf * (share / total)
+        probability = self._probability(index, shares, totals)
         return index, importance_weights(probability, beta=self._beta, lowest=lowest)
+
+    def batch_weights(self, size: int) -> Tensor:
+        """See :meth:`TreeSampler.batch_weights`."""
+        shares = self.shares
+        totals, lowest = self._sums(shares, size)
+        probability = self._probability(torch.arange(size), shares, totals)
+        return importance_weights(probability, beta=self._beta, lowest=lowest)
+
+    def _sums(self, shares: Tensor, size: int) -> tuple[list[float], float]:
+        """Sum of each signal's leaves, and a bound of the lowest probability."""
+        trees = [self._parts[name] for name in self._names]
+        totals = [part._sum_tree.query(0, size) for part in trees]
+        lowest = sum(
+            share * part._min_tree.query(0, size) / total
+            for share, part, total in zip(shares.tolist(), trees, totals, strict=True)
+        )
+        return totals, lowest
+
+    def _probability(self, index: Tensor, shares: Tensor, totals: list[float]) -> Tensor:
+        """Probability of slots, shape ``[B]``."""
+        probability = torch.zeros(len(index), dtype=torch.double)
+        for share, name, total in zip(shares.tolist(), self._names, totals, strict=True):
+            leaf = torch.as_tensor(self._parts[name]._sum_tree[index]).reshape(-1)
+            probability += leaf * (share / total)
+        return probability
 
     def _check_alpha(self, value: float) -> None:
         super()._check_alpha(value)

@@ -246,6 +246,25 @@ class TreeSampler(SavedTrees):
         leaf = torch.as_tensor(self._sum_tree[index]).reshape(-1)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
 
+    def batch_weights(self, size: int) -> Tensor:
+        """Weight of Eq. (10) that each of the first slots would have in a batch.
+
+        Args:
+            size: Number of slots ``N``, all of them filled.
+
+        Returns:
+            Weights, in double precision, shape ``[N]``; NaN where a slot cannot be sampled.
+
+        Examples:
+            >>> sampler = TreeSampler(2, 1.0, 1.0, eps=0.0)
+            >>> sampler.update_priority([0, 1], torch.tensor([1.0, 2.0]))
+            >>> sampler.batch_weights(2).tolist()
+            [1.0, 0.5]
+        """
+        leaf = torch.as_tensor(self._sum_tree[torch.arange(size)]).reshape(-1)
+        weight = importance_weights(leaf, beta=self._beta, lowest=self._min_tree.query(0, size))
+        return torch.where(leaf > 0, weight, torch.nan)
+
     def _uniform(self, size: int, batch_size: int) -> Tensor:
         """Slots sampled uniformly, shape ``[B]``."""
         if self.stratified:
