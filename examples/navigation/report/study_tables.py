@@ -28,16 +28,16 @@ from navigation.studies.protocol import Pair, Table, short_names
 from navigation.worlds import family
 
 NOTES = """\
-The unit is the run. Area: mean height of the curve of {height}, from zero on.
-Actions to {goal}: those until the first evaluation with so much, median of the runs. {note}
-Differences are between runs of the same seeds, where both arms have the same ones.
+The unit is the run. Area: mean height of the curve of {height}, starting at zero actions.
+Actions to {goal}: those until the first evaluation that reaches it, median of the runs. {note}
+Where two arms have the same seeds, differences are between runs with the same seed.
 
-Intervals: bootstrap over seeds, or over seeds and worlds, of a single world its pairs of start and
-goal. *p*: of all ways to choose the signs of the differences, or without common seeds to deal the
-runs to both sides; of actions with their ranks. Corrected by Holm's method, runs that are missing
-having p = 1. *Found with 80 %*: the true difference that so many runs would have found, at a level
-of 0.05 over the number of comparisons. *Better run*: chance that a run of the first arm is better
-than one of the second."""
+Intervals: bootstrap over seeds, or over seeds and worlds (of a single world: its pairs of start and
+goal). *p*: permutation test of the signs of the differences; where the seeds differ, of the runs
+themselves; for actions to the goal, of ranks. Corrected by Holm's method; comparisons without runs
+count with p = 1. *Found with 80 %*: the true difference that this number of runs would have found
+with a probability of 80 %, at a level of 0.05 divided by the number of comparisons. *Better run*:
+probability that a run of the first arm is better than one of the second."""
 MEASURES = {
     "area": "area under the curve of {height}",
     "success": "success of the last policy",
