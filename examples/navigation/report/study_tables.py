@@ -28,7 +28,7 @@ from navigation.studies.protocol import Pair, Table, short_names
 from navigation.worlds import family
 
 NOTES = """\
-The unit is the run. Area: mean height of the curve of {height}, starting at zero actions.
+The unit is the run. Area: mean height of the curve of {height}, from zero on.
 Actions to {goal}: those until the first evaluation that reaches it, median of the runs. {note}
 Where two arms have the same seeds, differences are between runs with the same seed.
 
