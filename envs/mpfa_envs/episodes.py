@@ -140,10 +140,13 @@ class EpisodeSource:
         # A task of each world, or the lack of one, shows before anything runs.
         rng = np.random.default_rng(0)
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
-        self.diagonal = max(self._draw(probe, rng).world.diagonal for probe in probes)
+        self.diagonal = GENERATED_DIAGONAL
         """Longest distance in the rooms [m]."""
+        diagonals = [self._draw(probe, rng).world.diagonal for probe in probes]
         if self._generator:
-            self.diagonal, self.refused = GENERATED_DIAGONAL, 0
+            self.refused = 0
+        else:
+            self.diagonal = max(diagonals)
 
     def draw(
         self,
@@ -286,7 +289,9 @@ class EpisodeSource:
         from mpfa_envs.generators import generate_world, world_seed
 
         seed = world_seed(self._split, int(rng.integers(10**9)))
-        return generate_world(str(self._generator), seed, difficulty=self._difficulty)
+        world = generate_world(str(self._generator), seed, difficulty=self._difficulty)
+        self.check(world, None)
+        return world
 
     def _draw_in(self, world: World, rng: np.random.Generator) -> Episode:
         """Draw an episode in a fixed world, as :class:`~mpfa_envs.NavigationEnv` does."""

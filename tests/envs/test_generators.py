@@ -405,6 +405,17 @@ def test_names_that_worlds_could_not_have_are_refused(name: str) -> None:
         register_generator(name, pillars)
 
 
+def test_what_cannot_be_called_is_no_generator() -> None:
+    with pytest.raises(ValueError, match="generator must be callable, got None"):
+        register_generator("pillars", None)  # type: ignore[arg-type]
+
+
+def test_rooms_beyond_the_bounds_of_the_observations_are_refused() -> None:
+    register_generator("long", lambda source, difficulty: World(name="long", size=(60.0, 3.0)))
+    with pytest.raises(ValueError, match=r"world 'long-.*' must be at most 50 m .* got 60\.07 m"):
+        VectorNavigationEnv(1, world="long", physics="kinematic")
+
+
 def test_a_generator_that_gives_no_world_is_named() -> None:
     register_generator("nothing", lambda source, difficulty: None)  # type: ignore[arg-type, return-value]
     with pytest.raises(TypeError, match="generator 'nothing' must give a World, got NoneType"):

@@ -65,11 +65,12 @@ def register_generator(name: str, generator: Generator) -> None:
 
     Args:
         name: Lower-case letters. A generator of your own that has this name is replaced.
-        generator: From a source of randomness and a difficulty in [0, 1] to a world. It must draw
-            all its random numbers from that source.
+        generator: From a source of randomness and a difficulty in [0, 1] to a world, at most 50 m
+            from corner to corner. It must draw all its random numbers from that source.
 
     Raises:
-        ValueError: If the name has other characters, or is taken by a built-in generator or world.
+        ValueError: If the name has other characters, or is taken by a built-in generator or world,
+            or the generator cannot be called.
 
     Examples:
         >>> from mpfa_envs import Cylinder, NavigationEnv, World, register_generator
@@ -82,8 +83,10 @@ def register_generator(name: str, generator: Generator) -> None:
         >>> len(env.world.cylinders)
         6
     """
-    if re.fullmatch("[a-z]+", name) is None:
+    if not isinstance(name, str) or re.fullmatch("[a-z]+", name) is None:
         raise ValueError(f"name must be lower-case letters a to z, got {name!r}")
+    if not callable(generator):
+        raise ValueError(f"generator must be callable, got {generator!r}")
     if name in _BUILT_IN or name in WORLDS or name == "barn":
         raise ValueError(f"name must not be that of a built-in generator or world, got {name!r}")
     _registered[name] = generator
