@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from difflib import get_close_matches
+from operator import index
 from typing import Any
 
 
@@ -71,10 +72,14 @@ def check_count(name: str, value: Any, *, least: int = 1) -> int:
         ...
         ValueError: seed must be an integer of at least 0, got -1
     """
-    if isinstance(value, bool) or not hasattr(value, "__index__") or value.__index__() < least:
+    try:
+        number = None if isinstance(value, bool) else index(value)
+    except TypeError:
+        number = None
+    if number is None or number < least:
         what = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} must be {what}, got {value!r}")
-    return int(value)
+    return number
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

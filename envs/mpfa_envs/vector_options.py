@@ -53,6 +53,8 @@ def read_reset_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[n
     Raises:
         ValueError: If there is a key that no option has, or the mask is none or empty.
     """
+    if not isinstance(options, Mapping | None):
+        raise ValueError(f"options must be a dictionary or None, got {options!r}")
     for key in options or ():
         if key not in _KEYS:
             raise ValueError(f"options must have keys among {list(_KEYS)}, got {key!r}")

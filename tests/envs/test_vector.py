@@ -229,6 +229,7 @@ def test_options_fix_the_next_episode_and_no_later_one() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["reset_mask"], r"options must be a dictionary or None, got \['reset_mask'\]"),
         ({"task": []}, "options must have keys among .*got 'task'"),
         ({"tasks": [None]}, "tasks must have 2 entries, got 1"),
         ({"tasks": "ab"}, "tasks must be a sequence .*got 'ab'"),
@@ -312,6 +313,7 @@ def test_a_mask_of_other_robots_moves_nothing(only: object) -> None:
         (-1, "seed must be an integer of at least 0, got -1"),
         ([1], "seed must have 2 entries, got 1"),
         ([1, -1], "seed must be an integer of at least 0, got -1"),
+        (np.array([1, 2]), r"seed must be an integer of at least 0, got array\(\[1, 2\]\)"),
     ],
 )
 def test_a_bad_seed_is_refused(seed: object, message: str) -> None:
