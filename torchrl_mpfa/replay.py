@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ReplayBuffer, TensorDictReplayBuffer, Transition
+from torchrl.data import ReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
@@ -20,6 +20,7 @@ from torchrl_mpfa.replay_state import (
     check_sampler_state,
     check_writer_state,
 )
+from torchrl_mpfa.replay_writes import FollowedReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.storages.base import SignalStorageMixin
@@ -35,12 +36,15 @@ _UNRETURNED = 100
 """Batches in a row with signals that were not handed back, after which sampling is refused."""
 
 
-class SignalReplayBuffer(TensorDictReplayBuffer):
+class SignalReplayBuffer(FollowedReplayBuffer):
     """:class:`~torchrl.data.TensorDictReplayBuffer` for samplers that fuse several signals.
 
     TorchRL's buffer reduces whatever a batch brings to one number per transition. This one reads
     each signal that the sampler fuses, drops the rows whose slot was overwritten since they were
     sampled, and hands the rest on. With any other sampler it is TorchRL's buffer.
+
+    A reward that is written in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``,
+    ``buffer["next", "reward"] = ...``) counts in the next update of its transition's priority.
 
     Args:
         generator: Source of all randomness of the buffer; by default a new one, seeded by
@@ -103,8 +107,7 @@ class SignalReplayBuffer(TensorDictReplayBuffer):
             )
 
     def _check_priority_key(self, table: SignalTable) -> None:
-        read = (table.reward_key, *(signal.key for signal in table.written))
-        if as_path(self.priority_key) in map(as_path, read):
+        if as_path(self.priority_key) in map(as_path, table.read_keys):
             raise ValueError(
                 f"priority_key must not be where a reward or a signal is read, got "
                 f"{self.priority_key!r}: first priorities are not stored with the transitions"

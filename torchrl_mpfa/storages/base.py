@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from torchrl_mpfa.storages.states import (
     check_data_state,
     check_length,
     read_metadata,
+    rows_of_data,
     signals_of_data,
 )
 from torchrl_mpfa.storages.table import SignalTable
@@ -96,6 +98,28 @@ class SignalStorageMixin:
         table, slots = self.signal_table, self._slots(cursor)
         table.write(slots, table.blank(len(slots)) if admitted.rows is None else admitted.rows)
         table.size = len(self)  # type: ignore[arg-type]
+
+    @contextmanager
+    def rewriting(self) -> Iterator[None]:
+        """Read rewards and signals anew, of which entries are written in place inside of it.
+
+        Raises:
+            ValueError: If a reward or a signal is not finite then, or a signal negative; those
+                entries are as they were.
+        """
+        stored = self._storage if self.initialized else None  # type: ignore[attr-defined]
+        entries = []
+        if isinstance(stored, TensorDictBase):
+            found = (stored.get(key, None) for key in self.signal_table.read_keys)
+            entries = [(entry, entry.clone()) for entry in found if entry is not None]
+        try:
+            yield
+            rows = rows_of_data(self.signal_table, stored, len(self))  # type: ignore[arg-type]
+        except BaseException:
+            for entry, before in entries:
+                entry.copy_(before)
+            raise
+        self.signal_table.rewrite(rows)
 
     def _check(self, data: Any) -> _Admitted:
         if not is_tensor_collection(data):

@@ -119,14 +119,33 @@ def signals_of_data(table: SignalTable, data: Any, length: int) -> dict[str, Any
     Raises:
         ValueError: If a reward or a signal is not one finite number per transition.
     """
-    leaves, entries = _leaves(data), {}
-    for key in (table.reward_key, *(signal.key for signal in table.written)):
-        if (leaf := leaves.get(".".join(as_path(key)))) is not None:
-            entries[key] = leaf.reshape(table.capacity, -1)[:length]
-    rows = table.read(entries, length) if length else table.blank(0)
+    rows = rows_of_data(table, data, length)
     writes = table.writes + length
     rows[:, table.time_column] = torch.arange(table.writes, writes)
     return {**table.state_dict(), "size": length, "writes": writes, "rows": rows}
+
+
+def rows_of_data(table: SignalTable, data: Any, length: int) -> Tensor:
+    """Rows of a table as they would be read from stored data at their write.
+
+    Args:
+        table: The table; it is not changed.
+        data: As in :func:`signals_of_data`.
+        length: Number of filled slots.
+
+    Returns:
+        The rows of the filled slots.
+
+    Raises:
+        ValueError: If a reward or a signal is not one finite number per transition.
+    """
+    leaves = _leaves(data)
+    entries = {
+        key: leaves[name].reshape(table.capacity, -1)[:length]
+        for key in table.read_keys
+        if (name := ".".join(as_path(key))) in leaves
+    }
+    return table.read(entries, length) if length else table.blank(0)
 
 
 def _all_finite(value: Tensor) -> bool:

@@ -53,6 +53,7 @@ class SignalTable:
         self.learned = [s for s in made if s.known_at == "update"]
         self.written = [s for s in made if s.known_at == "write"]
         self.reward_key = reward_key
+        self.read_keys = [reward_key, *(s.key for s in self.written)]
         self.names = [s.name for s in (*self.learned, *self.written)]
         self.column = {name: place for place, name in enumerate(self.names)}
         self.reward_column = len(self.names)
@@ -142,6 +143,17 @@ class SignalTable:
             rows[:, self.time_column] = torch.arange(self.writes, self.writes + count)
         self.rows[index] = rows
         self.writes += count
+
+    def rewrite(self, rows: Tensor) -> None:
+        """Take from rows that were read what is known at the write, for all filled slots.
+
+        What the learner gave stays until its next update; a row that changes counts as a write.
+        """
+        known = [*(self.column[s.name] for s in self.written), self.reward_column]
+        before, after = self.rows[: self.size, known], rows[:, known]
+        same = (before == after) | (before.isnan() & after.isnan())
+        self.rows[: self.size, known] = after
+        self.writes += int((~same.all(1)).sum())
 
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
