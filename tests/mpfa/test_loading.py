@@ -118,6 +118,46 @@ def test_data_that_no_one_may_write_are_restored_without_a_cursor():
     assert train_rounds(first, 2).equal(train_rounds(second, 2))
 
 
+@pytest.mark.parametrize("way", ["extend", "write in place", "load another"])
+def test_a_state_whose_data_were_overwritten_since_is_refused(pair, way):
+    other, buffer = pair
+    buffer.extend(make_transitions(2))
+    state, copy = buffer.state_dict(), snapshot(buffer)
+    if way == "extend":
+        buffer.extend(make_transitions(8, rewards=[50.0] * 8))
+    elif way == "write in place":
+        buffer.set_(("next", "reward"), torch.full((8, 1), 50.0))
+    else:
+        buffer.load_state_dict(other)
+        written = copy["_storage"]["_signals"]["writes"]
+        while buffer.storage.signal_table.writes < written:
+            buffer.extend(make_transitions(1))
+    before = snapshot(buffer)
+    for reader in (buffer, make_buffer(8)):
+        with pytest.raises(ValueError, match="was written to since this state of it was made"):
+            reader.load_state_dict(state)
+    assert same(before, snapshot(buffer))
+    buffer.load_state_dict(copy)
+    assert same(copy, snapshot(buffer))
+
+
+def test_a_state_may_be_loaded_again_and_elsewhere_as_long_as_nothing_is_written(pair):
+    _, buffer = pair
+    state, other = buffer.state_dict(), make_buffer(8)
+    train_rounds(buffer, 2)
+    for _ in range(2):
+        buffer.load_state_dict(state)
+        other.load_state_dict(state)
+        assert train_rounds(buffer, 2).equal(train_rounds(other, 2))
+
+
+def test_a_state_that_was_saved_without_a_clock_is_restored(pair):
+    state, buffer = pair
+    del state["_storage"]["_signals_clock"]
+    buffer.load_state_dict(state)
+    assert len(buffer) == 8
+
+
 @pytest.mark.parametrize("column", range(6))
 @pytest.mark.parametrize("wrong", [torch.inf, -1.0])
 def test_signals_that_cannot_be_are_refused(pair, column, wrong):

@@ -27,6 +27,8 @@ from torchrl_mpfa.storages.table import SignalTable
 
 _FORMAT = 1
 _FILE = "signals.pt"
+_CLOCK = "_signals_clock"
+"""Entry of a state: the count of writes as it is now, not as it was."""
 
 
 @dataclass(frozen=True)
@@ -221,17 +223,23 @@ class SignalStorageMixin:
         self.signal_table.clear()
 
     def state_dict(self) -> dict[str, Any]:
-        """The data, and the signals under ``"_signals"``."""
+        """The data, and the signals under ``"_signals"``.
+
+        As in TorchRL the data are not copied: save or copy the state before more is written, after
+        which it is refused.
+        """
         state: dict[str, Any] = super().state_dict()  # type: ignore[misc]
-        return {**state, "_signals": self.signal_table.state_dict(), "_signals_format": _FORMAT}
+        table = self.signal_table
+        own = {"_signals": table.state_dict(), "_signals_format": _FORMAT, _CLOCK: table.clock}
+        return {**state, **own}
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
         """Refuse a state that does not fit, before anything changes.
 
         Raises:
             KeyError: If the state lacks an entry, or a reward or signal that the sampler needs.
-            ValueError: If format, capacity, signals, or the form of the data differ, or the data
-                are not finite.
+            ValueError: If format, capacity, signals, or the form of the data differ, the data are
+                not finite, or they were overwritten since the state was made.
         """
         self._checked_signals(state_dict)
 
@@ -258,6 +266,12 @@ class SignalStorageMixin:
             raise KeyError("the saved storage has no signals: '_signals' is missing")
         _check_format(state.get("_signals_format"))
         self.signal_table.check_state(state["_signals"])
+        # What was saved before there were clocks has none.
+        if state.get(_CLOCK) not in (None, [state["_signals"]["writes"]]):
+            raise ValueError(
+                "the storage was written to since this state of it was made, whose data are the "
+                "storage's own: save or copy a state before more is written"
+            )
 
     def _check_data(self, data: Any, length: int) -> None:
         check_data_state(
@@ -281,6 +295,8 @@ class SignalStorageMixin:
             ValueError: See :meth:`check_state`.
         """
         signals = self._checked_signals(state_dict)
+        if state_dict.get(_CLOCK) is not self.signal_table.clock:
+            self.signal_table.stop_clock()
         super().load_state_dict(state_dict)  # type: ignore[misc]
         self._schema = None
         self.signal_table.load_state_dict(signals)
@@ -314,6 +330,7 @@ class SignalStorageMixin:
                 could execute something.
         """
         state = self.check_dump(path)
+        self.signal_table.stop_clock()
         super().loads(path)  # type: ignore[misc]
         self._schema = None
         self.signal_table.load_state_dict(state["_signals"])

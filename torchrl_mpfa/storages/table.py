@@ -67,8 +67,23 @@ class SignalTable:
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
         self._one = torch.ones((), dtype=torch.double)
-        self.writes = self.size = self.cleared = 0
+        self.clock = [0]
+        self.size = self.cleared = 0
         self.clear()
+
+    @property
+    def writes(self) -> int:
+        """Count of all writes; ``clock`` holds it for whoever has to see it go on."""
+        return self.clock[0]
+
+    @writes.setter
+    def writes(self, count: int) -> None:
+        self.clock[0] = count
+
+    def stop_clock(self) -> None:
+        """Tell those who hold the clock that the data are no longer those of its writes."""
+        count, self.clock[0] = self.writes, -1
+        self.clock = [count]
 
     def clear(self) -> None:
         """Forget every slot; the count of writes goes on, so that old batches stay old."""
