@@ -23,6 +23,7 @@ from torchrl_mpfa import (
     REWARD,
     MPFASampler,
     Signal,
+    SignalMemmapStorage,
     SignalReplayBuffer,
     SignalSampler,
     SignalTensorStorage,
@@ -270,6 +271,21 @@ def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():
     buffer.update_tensordict_priority(write_signals(batch))
     written = data["next", "reward"].squeeze(1)
     torch.testing.assert_close(buffer.storage.signal_table.rewards.float(), written)
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
+def test_to_read_a_full_buffer_through_a_transform_leaves_the_storage_as_it_is(kind):
+    buffer = make_buffer(8, storage=kind(8))
+    buffer.append_transform(RewardScaling(loc=0.0, scale=10.0, in_keys=[("next", "reward")]))
+    data = make_transitions(8)
+    buffer.extend(data)
+    for _ in range(2):
+        torch.testing.assert_close(buffer[:]["next", "reward"], data["next", "reward"] * 10)
+    assert buffer.storage[:]["next", "reward"].equal(data["next", "reward"])
+    buffer.extend(make_transitions(1, rewards=[7.0]))
+    assert buffer.storage[:]["next", "reward"][0] == 7.0
+    buffer.storage[:]["observation"].fill_(3.0)
+    assert (buffer.storage[:]["observation"] == 3.0).all()
 
 
 def test_inverse_transforms_act_before_the_reward_is_read():

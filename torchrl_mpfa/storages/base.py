@@ -76,6 +76,13 @@ class SignalStorageMixin:
         """
         self._admitted = self._check(data)
 
+    def get(self, index: Any) -> Any:
+        """Read transitions; all slots come as a tensordict that shares their tensors."""
+        found = super().get(index)  # type: ignore[misc]
+        # A full storage gives itself in TorchRL, where a buffer's transform then writes in it.
+        own = found is self._storage and isinstance(found, TensorDictBase)  # type: ignore[attr-defined]
+        return found.copy() if own else found
+
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
         """Write transitions and reset the signals of their slots.
 
