@@ -1,6 +1,6 @@
 """make_replay: every method from its name, and a sentence for every mistake."""
 
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 
 import pytest
 import torch
@@ -9,7 +9,11 @@ from tensordict import TensorDict
 from tests.methods.replays import make_transitions, seeded
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, loss_options, make_replay
+from torchrl_mpfa.methods.assembly import unused_settings
 from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
+from torchrl_mpfa.methods.ranges import RANGES, check_ranges
+
+NAN = float("nan")
 
 
 def more(name):
@@ -56,6 +60,20 @@ def test_a_setting_reaches_its_part():
     assert asdict(METHODS["mpfa_per"]) == asdict(Method())
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_every_number_and_switch_of_a_method_is_within_its_range(name):
+    check_ranges(METHODS[name])
+    assert not list(unused_settings(METHODS[name]))
+    for field in fields(Method):
+        if isinstance(getattr(METHODS[name], field.name), int | float):
+            assert field.name in {*RANGES, "positive_above"}
+
+
+def test_a_method_of_ones_own_may_carry_what_it_does_not_use():
+    mine = replace(METHODS["mpfa_plus"], name="mine")
+    assert make_replay(mine, capacity=10, boost_factor=2.0).method.boost_bound == "none"
+
+
 def test_a_method_of_ones_own_is_made_alike():
     mine = Method("mine", ["td_error", "novelty"], fusion="scaled", boost=False, decay=False)
     assert make_replay(mine, capacity=10).signals == ("novelty", "td_error")
@@ -94,7 +112,24 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"decay_position": "row"}, "unknown decay_position 'row'"),
         ({"capacity": 0}, "capacity must be a positive integer, got 0"),
         ({"batch_size": 2.5}, "batch_size must be a positive integer, got 2.5"),
-        ({"alpha": -1.0}, "alpha must be finite and at least 0, got -1"),
+        ({"alpha": -1.0}, "alpha must be finite and not negative, got -1.0"),
+        ({"method": "lap", "priority_floor": -1}, "priority_floor must be finite and not negative"),
+        ({"method": "lap", "priority_floor": NAN}, "priority_floor must be finite .* got nan"),
+        ({"method": "hvper", "replay_penalty": -1}, "replay_penalty must be finite and not neg"),
+        ({"method": "reaper", "reliability": -1}, "reliability must be finite and not negative"),
+        ({"boost": "x"}, "boost must be true or false, got 'x'"),
+        ({"beta_end": NAN}, r"beta_end must be in \[0, 1\], got nan"),
+        ({"curiosity_scale": -1}, "curiosity_scale must be positive and finite, got -1"),
+        ({"boost_target": -1}, r"boost_target must be in \[0, 1\), got -1"),
+        ({"method": "geometric", "recency": 1}, r"recency must be in \[0, 1\), got 1"),
+        ({"method": "ref_er", "far_cutoff": 0}, "far_cutoff must be positive and finite, got 0"),
+        (
+            {"method": "per", "boost_factor": 10.0},
+            "boost_factor must be 3.0 with boost=False, which cannot use it, got 10.0",
+        ),
+        ({"method": "mpfa_plus", "boost_bound": "cap"}, "boost_bound must be 'none' with boost="),
+        ({"method": "ddpg", "boost": True}, "boost must be False with selection='uniform'"),
+        ({"method": "per", "decay_position": "rank"}, "decay_position must be 'batch' with decay"),
         (
             {"method": "uniform", "combination": "product"},
             "combination must be 'sum' with selection='uniform', which cannot .* got 'product'",

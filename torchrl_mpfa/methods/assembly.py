@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import RandomSampler, Storage
 
 from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
-from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.losses.trust import BEHAVIOR
 from torchrl_mpfa.methods.catalogue import METHODS, Method
@@ -28,6 +27,7 @@ from torchrl_mpfa.methods.klper import LowestDivergence
 from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
 from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
+from torchrl_mpfa.methods.ranges import check_ranges
 from torchrl_mpfa.methods.rank import RankSampler
 from torchrl_mpfa.methods.reaper import EPISODE, Reliability
 from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler
@@ -66,6 +66,13 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "split": LA3PSampler,
 }
 _SELECTIONS: dict[str, Selection] = {"split": split_draws, "halves": uniform_halves}
+_OF_PRIORITIES = (
+    "combination",
+    "floor_quantile",
+    "priority_floor",
+    "reliability",
+    "replay_penalty",
+)
 WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
     "fusion": set(_FUSIONS),
@@ -228,27 +235,28 @@ def loss_options(method: str | Method) -> dict[str, Any]:
     }
 
 
-def unused_settings(method: Method) -> Iterator[tuple[str, str]]:
+def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
     """What is set and has no effect.
 
+    A method of one's own may have parameters of a boost or a decay that it does not make; one out
+    of the catalogue may have those that it has there.
+
     Yields:
-        Name of a setting that must have its default, and of the setting that is why.
+        Name of a setting, what it must be, and name of the setting that is why.
     """
-    default = Method()
-    uniform = method.selection in _UNIFORM
-    for name in (
-        "combination",
-        "floor_quantile",
-        "priority_floor",
-        "reliability",
-        "replay_penalty",
+    uniform, default = method.selection in _UNIFORM, Method()
+    named = METHODS.get(method.name, method)
+    for base, cause, wrong, names in (
+        (default, "selection", uniform, _OF_PRIORITIES),
+        (default, "priority_floor", method.priority_floor == 0, ("floor_quantile",)),
+        (named, "selection", uniform, ("boost", "decay")),
+        (named, "boost", not method.boost, ("boost_factor", "boost_target", "boost_bound")),
+        (named, "decay", not method.decay, ("decay_sharpness", "decay_position")),
+        (named, "curiosity", not method.curiosity, ("curiosity_scale",)),
     ):
-        if getattr(method, name) == getattr(default, name):
-            continue
-        if uniform:
-            yield name, "selection"
-        elif name == "floor_quantile" and method.priority_floor == 0:
-            yield name, "priority_floor"
+        for name in names if wrong else ():
+            if getattr(method, name) != getattr(base, name):
+                yield name, getattr(base, name), cause
 
 
 def entries_of(method: Method) -> tuple[str, ...]:
@@ -373,12 +381,11 @@ def _settled(method: str | Method, settings: dict[str, Any]) -> Method:
         raise ValueError(
             f"combination 'mixture' needs selection='prioritized', got {made.selection!r}"
         )
-    for name, cause in unused_settings(made):
+    check_level(made.positive_above)
+    check_ranges(made)
+    for name, only, cause in unused_settings(made):
         raise ValueError(
-            f"{name} must be {getattr(Method(), name)!r} with {cause}={getattr(made, cause)!r}, "
+            f"{name} must be {only!r} with {cause}={getattr(made, cause)!r}, "
             f"which cannot use it, got {getattr(made, name)!r}"
         )
-    check_level(made.positive_above)
-    counts = ("capacity", "batch_size", "candidates", "target_average", "update_block")
-    check_counts(**{name: getattr(made, name) for name in counts})
     return made

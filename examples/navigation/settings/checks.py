@@ -20,8 +20,7 @@ from navigation.settings.train import TrainSettings
 from navigation.worlds import is_of_a_test
 from torchrl_mpfa.methods import Method, can_be_remote
 from torchrl_mpfa.methods.assembly import WORDS, unused_settings
-
-Rule = tuple[Callable[[Any], bool], str]
+from torchrl_mpfa.methods.ranges import NOT_NEGATIVE, POSITIVE, RANGES, SHARE, Rule
 
 
 def at_least(least: float) -> Rule:
@@ -38,9 +37,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-POSITIVE: Rule = (lambda value: 0.0 < value < math.inf, "positive and finite")
-NOT_NEGATIVE: Rule = (lambda value: 0.0 <= value < math.inf, "finite and not negative")
-SHARE: Rule = (lambda value: 0.0 <= value <= 1.0, "in [0, 1]")
 OPEN_SHARE: Rule = (lambda value: 0.0 < value <= 1.0, "in (0, 1]")
 LEVEL: Rule = (
     lambda value: value == "mean" or (_is_number(value) and math.isfinite(value)),
@@ -74,28 +70,8 @@ RULES: dict[str, Rule] = {
     "updates": at_least(1),
     "method.name": NAME,
     **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
+    **{f"method.{name}": rule for name, rule in RANGES.items()},
     "method.positive_above": LEVEL,
-    "method.capacity": at_least(1),
-    "method.batch_size": at_least(1),
-    "method.candidates": at_least(1),
-    "method.replay_cap": at_least(1),
-    "method.recency": (lambda value: 0.0 <= value < 1.0, "in [0, 1)"),
-    "method.target_average": at_least(1),
-    "method.alpha": NOT_NEGATIVE,
-    "method.beta": SHARE,
-    "method.beta_end": SHARE,
-    "method.eps": NOT_NEGATIVE,
-    "method.priority_floor": NOT_NEGATIVE,
-    "method.floor_quantile": SHARE,
-    "method.far_share": SHARE,
-    "method.far_cutoff": POSITIVE,
-    "method.reliability": NOT_NEGATIVE,
-    "method.update_block": at_least(1),
-    "method.replay_penalty": NOT_NEGATIVE,
-    "method.boost_factor": POSITIVE,
-    "method.boost_target": (lambda value: 0.0 <= value < 1.0, "in [0, 1)"),
-    "method.decay_sharpness": NOT_NEGATIVE,
-    "method.curiosity_scale": POSITIVE,
     "learner.name": NAME,
     "learner.algorithm": choice("ddpg", "td3", "sac", "dqn", "q_learning"),
     "learner.actor_lr": POSITIVE,
@@ -232,9 +208,9 @@ def check_settings(settings: TrainSettings) -> None:
 
 def _check_method(method: Method) -> None:
     """Refuse what does not go together, or has no effect."""
-    for name, cause in unused_settings(method):
+    for name, only, cause in unused_settings(method):
         raise ValueError(
-            f"method.{name} must be {getattr(Method(), name)} with method.{cause}="
+            f"method.{name} must be {only} with method.{cause}="
             f"{getattr(method, cause)}, which cannot use it, got {getattr(method, name)}"
         )
     for name in method.signals:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 import compare
 import study
@@ -18,6 +19,7 @@ from navigation.studies.arms import with_defaults
 from navigation.studies.jobs import Evaluation, Study
 from navigation.studies.protocol import (
     FIRST_SEED,
+    PARTS,
     VOLUMES,
     Table,
     label_of,
@@ -28,6 +30,9 @@ from navigation.training import running
 from navigation.worlds import parse_worlds
 from tests.integration.studies.test_compare import InThisProcess
 from tests.integration.tiny_runs import OVERRIDES
+from torchrl_mpfa.methods import METHODS
+from torchrl_mpfa.methods.assembly import unused_settings
+from torchrl_mpfa.methods.ranges import check_ranges
 
 ROOT = Path("runs/study")
 
@@ -94,6 +99,20 @@ def test_the_order_of_the_paper_is_compared_neighbor_by_neighbor() -> None:
         *("mpfa_per-klper", "klper-ddpg_radam", "ddpg_radam-mw", "mw-hvper"),
         "hvper-averaged_ddpg",
     ]
+
+
+def test_the_method_of_every_arm_is_accepted() -> None:
+    found = set()
+    for each in every_study():
+        for job in each.jobs:
+            words = [w for w in job.overrides(each.settings) if w.startswith("method")]
+            found.add(tuple(words))
+    for words in found:
+        given = OmegaConf.to_object(OmegaConf.from_dotlist(list(words[1:]))) if words[1:] else {}
+        method = replace(METHODS[words[0].removeprefix("method=")], **given.get("method", {}))
+        check_ranges(method)
+        assert not list(unused_settings(method)), words
+    assert len(found) > len(PARTS)
 
 
 def test_no_two_studies_want_other_settings_of_one_run() -> None:
