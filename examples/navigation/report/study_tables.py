@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
@@ -221,8 +222,16 @@ def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
 
 
 def _filled(paragraph: str) -> str:
-    """A paragraph in lines that fit a page; commands stay as they are."""
-    return paragraph if paragraph.startswith(" ") else fill(paragraph, _WIDTH)
+    """A paragraph, or a command, in lines that fit a page."""
+    if not paragraph.startswith(" "):
+        return fill(paragraph, _WIDTH)
+    lines = ["   "]
+    for word in shlex.split(paragraph):
+        if len(lines[-1]) + len(shlex.quote(word)) > _WIDTH:
+            lines[-1] += " \\"
+            lines.append("       ")
+        lines[-1] += f" {shlex.quote(word)}"
+    return "\n".join(lines)
 
 
 def _cells(
