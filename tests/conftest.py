@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from collections.abc import Generator
 
 import pytest
@@ -41,3 +42,12 @@ def fixed_seed():
     torch.default_generator.manual_seed(0)
     if torch.cuda.is_available():
         torch.cuda.manual_seed_all(0)
+
+
+@pytest.fixture(autouse=True)
+def built_in_generators():
+    """A generator that a test registers, or a page that it runs, is gone afterwards."""
+    yield
+    module = sys.modules.get("mpfa_envs.generators")
+    for name in set(module.GENERATORS) - set(module._BUILT_IN) if module else ():
+        module._registered.pop(name, None)

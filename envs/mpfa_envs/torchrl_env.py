@@ -62,7 +62,7 @@ class NavigationTorchEnv(EnvBase):
     Examples:
         >>> from mpfa_envs import NavigationTorchEnv
         >>> env = NavigationTorchEnv(num_envs=2, world="B", physics="kinematic")
-        >>> env.rollout(5)["next", "info", "distance"].shape
+        >>> env.rollout(5, break_when_any_done=False)["next", "info", "distance"].shape
         torch.Size([2, 5, 1])
         >>> env.close()
 

@@ -6,7 +6,6 @@ import random
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
@@ -26,7 +25,6 @@ from mpfa_envs import (
     evaluate,
     generate_world,
     generator_tasks,
-    generators,
     register_generator,
     sample_task_on_grid,
     split_worlds,
@@ -350,15 +348,6 @@ def test_fields_are_within_a_few_percent_of_the_exact_planner(name: str, most: f
     assert len(errors) > 40
     # Where the planner slips through a gap that holds no center of a cell, a field goes around it.
     assert np.mean(errors <= most) > 0.95 and np.mean(errors) < most / 2
-
-
-@pytest.fixture(autouse=True)
-def forgets_generators() -> Iterator[None]:
-    """Leave the other tests the built-in generators alone."""
-    before = dict(generators._registered)
-    yield
-    generators._registered.clear()
-    generators._registered.update(before)
 
 
 def pillars(source: random.Random, difficulty: float) -> World:

@@ -112,6 +112,9 @@ def test_the_ids_are_the_tasks_that_the_regimes_learn(
     assert made.tasks == trained.tasks
     assert made.worlds == trained.worlds
     mine, theirs = (env.state_dict()["arguments"] for env in (made, trained))
+    # When robots begin anew is decided by whoever steps them.
+    for arguments in (mine, theirs):
+        del arguments["autoreset_mode"]
     assert mine == pytest.approx(theirs)
     assert made.reward.keywords == trained.reward.keywords
     for name in ("detour_chance", "min_goal_distance"):

@@ -23,7 +23,7 @@ from navigation.training.loop import TrainingRun
 from navigation.training.running import prepare_process
 from tests.integration.tiny_runs import rows, tiny, train
 from torchrl_mpfa import SignalSampler, save_atomically
-from torchrl_mpfa.methods import ALIASES
+from torchrl_mpfa.methods import ALIASES, Method
 
 
 def test_training_treats_denormal_numbers_as_zero() -> None:
@@ -176,9 +176,10 @@ def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
     settings.method.curiosity_scale = 1e6
     # Nothing is learned in the first episodes, so that both runs drive the same way.
     settings.method.batch_size = settings.method.capacity = 1000
-    without = replace(settings, method=replace(settings.method, curiosity=False))
-    curious, plain = train(tmp_path / "curious", settings), train(tmp_path / "plain", without)
-    assert [r.reward for r in curious.records] == [r.reward for r in plain.records]
+    plain = replace(settings.method, curiosity=False, curiosity_scale=Method().curiosity_scale)
+    without = replace(settings, method=plain)
+    curious, bare = train(tmp_path / "curious", settings), train(tmp_path / "plain", without)
+    assert [r.reward for r in curious.records] == [r.reward for r in bare.records]
     learned = tiny("ddpg_radam")
     learned.method.curiosity_scale = 1e6
     run = train(tmp_path / "learned", learned)
