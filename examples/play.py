@@ -64,8 +64,9 @@ class Racer:
     """
 
     def __init__(self, episode: WorldTask, **env_arguments: Any) -> None:
-        limit = {} if episode.max_steps is None else {"max_steps": episode.max_steps}
-        self.env = NavigationEnv(**{**env_arguments, **limit, "world": episode.world})
+        self.env = NavigationEnv(
+            **{**env_arguments, **episode.limit(env_arguments), "world": episode.world}
+        )
         self.observation, self.info = self.env.reset(seed=0, options=episode.task._asdict())
         self.running = True
 

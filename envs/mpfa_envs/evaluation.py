@@ -6,7 +6,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -84,7 +84,12 @@ class Blind:
     ) -> NDArray[np.float32]:
         """One action for each observation."""
         if self.alone:
-            return np.asarray(self.policy(observations[0]), dtype=np.float32)[None]
+            action = np.asarray(self.policy(observations[0]), dtype=np.float32)
+            if action.shape != (2,):
+                raise ValueError(
+                    f"policy must give an action of shape (2,) for one observation, got {action!r}"
+                )
+            return action[None]
         actions = np.asarray(self.policy(observations), dtype=np.float32)
         if actions.shape != (len(observations), 2):
             raise ValueError(
@@ -113,7 +118,7 @@ def evaluate(
     seed: int = 0,
     physics: Physics | None = None,
     envs_at_once: int | None = None,
-    progress: bool = False,
+    progress_bar: bool = False,
     **env_arguments: Any,
 ) -> list[EpisodeResult]:
     """Run a policy on fixed tasks; contact is the only collision.
@@ -127,12 +132,14 @@ def evaluate(
         seed: Seed of the tasks in a world.
         physics: ``"wheels"`` or ``"kinematic"``; None: that of the policy.
         envs_at_once: As in :func:`run_tasks`.
-        progress: Whether to show a bar.
+        progress_bar: Whether to show one.
         **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv` in place of
-            ``policy.env_arguments``.
+            ``policy.env_arguments``; ``max_steps`` counts where a task has no time limit of its
+            own, as those of generators and of the benchmark have.
 
     Returns:
-        One result an episode, world by world.
+        One result an episode, world by world. Those of a world are the same whichever others are
+        evaluated with it.
 
     Raises:
         ValueError: If an argument is out of its range; nothing has moved then.
@@ -156,7 +163,9 @@ def evaluate(
         for each in several
         for task in world_tasks(each, episodes=episodes, seed=seed, robot=robot)
     ]
-    return run_tasks(policy, tasks, envs_at_once=envs_at_once, progress=progress, **arguments)
+    return run_tasks(
+        policy, tasks, envs_at_once=envs_at_once, progress_bar=progress_bar, **arguments
+    )
 
 
 def run_tasks(
@@ -164,7 +173,7 @@ def run_tasks(
     tasks: Sequence[WorldTask],
     *,
     envs_at_once: int | None = None,
-    progress: bool = False,
+    progress_bar: bool = False,
     on_end: Callable[[VectorNavigationEnv, int, int], object] | None = None,
     **env_arguments: Any,
 ) -> list[EpisodeResult]:
@@ -178,18 +187,24 @@ def run_tasks(
             :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
             wheels; None: 64 for one, a :class:`Driver` or a
             :class:`~mpfa_envs.DynamicWindow`, else one at a time.
-        progress: Whether to show a bar.
+        progress_bar: Whether to show one.
         on_end: Called at the end of every episode with the environment, the number of the robot,
             whose ``env.trail(robot)`` is the way that it took, and that of the task.
-        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`; ``max_steps``
+            counts where a task has no time limit of its own.
 
     Returns:
         One result a task, in the order of the tasks.
 
     Raises:
-        ValueError: If an argument is out of its range, or the policy gives no action for each
-            observation.
+        ValueError: If an argument is out of its range, or the robot cannot drive a task, and
+            nothing has moved then; or if the policy gives no action for each observation.
     """
+    for name in ("world", "num_envs", "autoreset_mode"):
+        if name in env_arguments:
+            raise ValueError(
+                f"{name} must be left to the tasks, which decide it, got {env_arguments[name]!r}"
+            )
     if envs_at_once is None:
         takes_many = isinstance(policy, (Policy, DynamicWindow, Driver))
         envs_at_once = ENVS_AT_ONCE if takes_many else 1
@@ -198,18 +213,33 @@ def run_tasks(
     results: dict[int, EpisodeResult] = {}
     arguments = {"collision_distance": "contact", **env_arguments}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
-    with _progress_bar(len(tasks) if progress else None) as advance:
-        for max_steps, numbers in _by_time_limit(tasks).items():
-            limit = {} if max_steps is None else {"max_steps": max_steps}
+    with ExitStack() as opened, _progress_bar(len(tasks) if progress_bar else None) as advance:
+        fleets = []
+        for numbers in _by_time_limit(tasks).values():
             robots = min(envs_at_once, len(numbers))
             arguments["world"] = _room_for([tasks[number].world for number in numbers])
-            with closing(VectorNavigationEnv(robots, **{**arguments, **limit})) as env:
-                for ended in _drive(env, driver, tasks, deque(numbers)):
-                    results[ended.number] = _result(tasks, ended)
-                    advance()
-                    if on_end:
-                        on_end(env, ended.robot, ended.number)
+            limit = tasks[numbers[0]].limit(arguments)
+            env = VectorNavigationEnv(robots, **{**arguments, **limit})
+            fleets.append((opened.enter_context(closing(env)), numbers))
+        for env, numbers in fleets:
+            _check(env, tasks, numbers)
+        for env, numbers in fleets:
+            for ended in _drive(env, driver, tasks, deque(numbers)):
+                results[ended.number] = _result(tasks, ended)
+                advance()
+                if on_end:
+                    on_end(env, ended.robot, ended.number)
     return [results[number] for number in range(len(tasks))]
+
+
+def _check(env: VectorNavigationEnv, tasks: Sequence[WorldTask], numbers: Sequence[int]) -> None:
+    """Refuse tasks that the robot cannot drive."""
+    for number in numbers:
+        world, task, *_ = tasks[number]
+        try:
+            env.check_task(0, *task, world)
+        except ValueError as error:
+            raise ValueError(f"task {number}, in world {world.name!r}: {error}") from error
 
 
 def _by_time_limit(tasks: Sequence[WorldTask]) -> dict[int | None, list[int]]:
@@ -282,8 +312,8 @@ def _begin(
         int(number) if begins else None for number, begins in zip(at_work, begun, strict=True)
     ]
     observations, _ = env.reset(
-        # The seed is that of a noisy lidar: each episode has its own, whichever robot drives it.
-        seed=chosen,
+        # The seed is that of walkers and noise: each task has its own, whichever robot drives it.
+        seed=[None if number is None else _seed(tasks, number) for number in chosen],
         options={
             "reset_mask": begun,
             "worlds": [None if number is None else tasks[number].world for number in chosen],
@@ -291,6 +321,12 @@ def _begin(
         },
     )
     return observations
+
+
+def _seed(tasks: Sequence[WorldTask], number: int) -> int:
+    """The seed of a task's walkers and noise."""
+    seed = tasks[number].seed
+    return number if seed is None else seed
 
 
 def _result(tasks: Sequence[WorldTask], ended: _Ended) -> EpisodeResult:

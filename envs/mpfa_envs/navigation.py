@@ -107,7 +107,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         time_step: Duration of a time step [s].
         action_repeat: Time steps for which an action is held. Their rewards add up, and the episode
             may end after any of them. The default is half as many decisions as time steps.
-        goal_radius: Distance of the robot's center from the goal that reaches it [m].
+        goal_radius: Distance of the robot's center from the goal that reaches it, walls or not [m].
         collision_distance: Distance of the robot's center from an obstacle or wall that is a
             collision [m]. None: the robot's radius and 0.07 m, 0.25 m for the TurtleBot2.
             ``"contact"``: the robot's radius.

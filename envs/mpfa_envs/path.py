@@ -333,14 +333,20 @@ def shortest_length(world: World, radius: float, start: Point, goal: Point) -> f
         >>> round(shortest_length(barn_world(9), 0.18, start[:2], goal), 1)
         10.4
     """
-    if is_small(world):
-        return planner_for(world, radius).length(start, goal)
-    return _length_on_grid(world, radius, start, goal)
+    measure = _length_of_planner if is_small(world) else _length_on_grid
+    return measure(world, radius, start, goal)
 
 
-@lru_cache(maxsize=256)
+# Lengths are kept, as a reset asks twice for them, and an evaluation before its first episode.
+@lru_cache(maxsize=512)
+def _length_of_planner(world: World, radius: float, start: Point, goal: Point) -> float:
+    """Measure the shortest path exactly [m]."""
+    return planner_for(world, radius).length(start, goal)
+
+
+@lru_cache(maxsize=512)
 def _length_on_grid(world: World, radius: float, start: Point, goal: Point) -> float:
-    """Measure the shortest path on a grid [m]; kept, as a reset asks twice."""
+    """Measure the shortest path on a grid [m]."""
     for point in (start, goal):
         if world.clearance(*point) < radius - _TOUCH:
             return math.inf

@@ -90,7 +90,8 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
     """Rates and means with 95 % intervals; time and path count successes only.
 
     Rates have Wilson's interval, which stays right near 0 and 1, means that of the percentile
-    bootstrap; NaN where there are no two values to tell a spread from.
+    bootstrap; NaN where there are no two values to tell a spread from. Episodes count as
+    independent: for worlds other than these, intervals are too narrow where a world has several.
 
     Args:
         results: The episodes.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final, NamedTuple, cast, get_args
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast, get_args
 
 from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
 from mpfa_envs.builtin_worlds import resolve_world
@@ -17,10 +18,12 @@ if TYPE_CHECKING:
 
 TASKS_PER_WORLD: Final = 4
 """In each world of a generator."""
+_STANDARD_TIME_STEP: Final = 0.1
+"""What time limits are counted in [s]."""
 GENERATED_MAX_STEPS: Final = 1500
-"""Time limit in the worlds of a generator, of which some have ways of 40 m, in time steps."""
+"""Time limit in the worlds of a generator, of which some have ways of 40 m."""
 BARN_MAX_STEPS: Final = 1000
-"""The benchmark's 100 s, in time steps of 0.1 s."""
+"""The benchmark's 100 s."""
 _IN_A_WORLD: Final = 200
 _OF_A_GENERATOR: Final = 400
 
@@ -31,7 +34,25 @@ class WorldTask(NamedTuple):
     world: World
     task: Task
     max_steps: int | None = None
-    """Time limit in time steps; None: that of the environment."""
+    """Time limit in steps of 0.1 s, whatever the environment's; None: that of the environment."""
+    seed: int | None = None
+    """Of walkers and noise; None: the number of the task among those that are driven."""
+
+    def limit(self, env_arguments: Mapping[str, Any]) -> dict[str, int]:
+        """The time limit as an argument of an environment; nothing where that has its own.
+
+        Args:
+            env_arguments: The environment's other arguments, ``time_step`` [s] perhaps among them.
+
+        Examples:
+            >>> from mpfa_envs import world_tasks
+            >>> world_tasks("bars:test", episodes=1)[0].limit({"time_step": 0.05})  # 150 s
+            {'max_steps': 3000}
+        """
+        if self.max_steps is None:
+            return {}
+        time_step = env_arguments.get("time_step", _STANDARD_TIME_STEP)
+        return {"max_steps": round(self.max_steps * _STANDARD_TIME_STEP / time_step)}
 
 
 def world_tasks(
@@ -70,7 +91,8 @@ def world_tasks(
     if name == "barn":
         # The robot starts at one pose in all of them: more episodes would be the same ones again.
         worlds = map(barn_world, range(len(BARN_WORLDS)))
-        return [WorldTask(world, barn_task(), BARN_MAX_STEPS) for world in worlds][:episodes]
+        tasks = [WorldTask(world, barn_task(), BARN_MAX_STEPS) for world in worlds][:episodes]
+        return _numbered(tasks)
     if isinstance(name, str) and name.partition(":")[0] in GENERATORS:
         generator, _, split = name.partition(":")
         if split not in get_args(Split)[1:]:
@@ -85,7 +107,13 @@ def world_tasks(
             worlds=-(-count // TASKS_PER_WORLD),
             tasks=TASKS_PER_WORLD,
         )
-        return [WorldTask(*each, GENERATED_MAX_STEPS) for each in made[:count]]
+        return _numbered([WorldTask(*each, GENERATED_MAX_STEPS) for each in made[:count]])
     world = resolve_world(name)
     count = _IN_A_WORLD if episodes is None else episodes
-    return [WorldTask(world, task) for task in evaluation_pairs(world, count, seed, robot=robot)]
+    pairs = evaluation_pairs(world, count, seed, robot=robot)
+    return _numbered([WorldTask(world, task) for task in pairs])
+
+
+def _numbered(tasks: Sequence[WorldTask]) -> list[WorldTask]:
+    """Seed each task by its number in its set, whichever tasks are driven along with it."""
+    return [each._replace(seed=number) for number, each in enumerate(tasks)]

@@ -66,7 +66,7 @@ class VectorNavigationEnv(
         max_steps: Time limit of an episode in time steps.
         time_step: Duration of a time step [s].
         action_repeat: Time steps for which an action is held.
-        goal_radius: Distance of the robot's center from the goal that reaches it [m].
+        goal_radius: Distance of the robot's center from the goal that reaches it, walls or not [m].
         collision_distance: Distance of the center from an obstacle that is a collision [m].
         progress_scale: ε_p of Eq. (25) [1/m].
         progress: What an approach is measured by.

@@ -94,7 +94,7 @@ def drive(
     def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
         trails[number] = env.trail(robot)
 
-    results = run_tasks(policy, tasks, progress=progress, on_end=keep, **arguments)
+    results = run_tasks(policy, tasks, progress_bar=progress, on_end=keep, **arguments)
     return Drives(tasks, results, trails)
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.layers import Linear, Tanh
 from mpfa_envs.results import bootstrap, wilson
+from mpfa_envs.robot import resolve_robot
 
 POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.npz"))
 
@@ -206,6 +208,23 @@ def test_tasks_of_generators_have_150_seconds_and_those_of_barn_100() -> None:
     assert found[0].timeout and found[0].time_s == pytest.approx(150.0)
 
 
+def test_a_time_limit_is_in_seconds_whatever_the_time_step() -> None:
+    for time_step in (0.05, 0.2):
+        given = {"physics": "kinematic", "time_step": time_step, "action_repeat": 1}
+        (found,) = evaluate(circle, "barn", episodes=1, **given)
+        assert found.timeout and found.time_s == pytest.approx(100.0)
+
+
+def test_a_task_has_the_same_walkers_and_noise_beside_whatever_tasks_it_is_driven() -> None:
+    given: dict[str, Any] = {"physics": "kinematic", "lidar": {"noise": 0.05}, "max_steps": 100}
+    crowd = world_tasks("crowd:test", episodes=6)
+    alone = run_tasks(steer, crowd, **given)
+    after = run_tasks(steer, [*world_tasks("A", episodes=2), *crowd], **given)
+    assert after[2:] == alone
+    some = run_tasks(steer, crowd[3:], **given)
+    assert [found.path_length for found in some] == [found.path_length for found in alone[3:]]
+
+
 @pytest.mark.parametrize("name", ["bars", "bars:train", "bras:test"])
 def test_what_stands_for_no_tasks_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=f"world must be .*got '{name}'"):
@@ -233,6 +252,37 @@ def test_a_policy_of_one_observation_is_told_what_to_do() -> None:
 
     with pytest.raises(ValueError, match=r"shape \(2, 2\) for observations of shape \(2, 24\)"):
         evaluate(single, "A", episodes=2, physics="kinematic", envs_at_once=2)
+
+
+@pytest.mark.parametrize("action", [np.ones(1), np.ones((1, 2)), np.float64(1.0)])
+def test_a_single_action_is_two_numbers(action: NDArray[np.float64]) -> None:
+    with pytest.raises(ValueError, match=r"policy must give an action of shape \(2,\) .*got array"):
+        evaluate(lambda _: action, "A", episodes=1, physics="kinematic")
+
+
+def test_a_task_that_the_robot_cannot_drive_is_named_before_any_is_driven() -> None:
+    wide = replace(resolve_robot("turtlebot2"), name="wide", radius=0.45)
+    tasks, driven = world_tasks("bars:test", episodes=40), 0
+
+    def count(observation: NDArray[np.float32]) -> NDArray[np.float64]:
+        nonlocal driven
+        driven += 1
+        return np.ones(2)
+
+    with pytest.raises(ValueError, match=r"task \d+, in world 'bars-test-\d+': (goal|start) must"):
+        run_tasks(count, tasks, robot=wide, physics="kinematic")
+    assert driven == 0
+
+
+def test_what_the_tasks_decide_is_refused_as_an_argument() -> None:
+    for name, value in (("world", "B"), ("num_envs", 3), ("autoreset_mode", "next_step")):
+        with pytest.raises(ValueError, match=f"{name} must be left to the tasks"):
+            run_tasks(steer, world_tasks("A", episodes=1), **{name: value})
+
+
+def test_a_policy_that_names_its_reward_is_driven_with_it() -> None:
+    policy = steering_policy(progress="shortest_path", physics="kinematic", max_steps=20)
+    assert len(evaluate(policy, "A", episodes=2)) == 2
 
 
 def test_no_tasks_have_no_results() -> None:

@@ -136,8 +136,7 @@ def drive_episode(
     from mpfa_envs.vector import VectorNavigationEnv
 
     arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
-    if episode.max_steps is not None:
-        arguments["max_steps"] = episode.max_steps
+    arguments |= episode.limit({**arguments, **env_arguments})
     arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
     driver = as_driver(policy)
