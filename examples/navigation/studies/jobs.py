@@ -116,8 +116,9 @@ class Job:
         return _read_json(self.path / files.STATUS)
 
     def is_trained(self) -> bool:
-        """Whether it came to its end."""
-        return bool(self.status().get("finished"))
+        """Whether it came to its end, and left behind what a run has there."""
+        there = all((self.path / name).exists() for name in (files.POLICY, files.EPISODES))
+        return there and bool(self.status().get("finished"))
 
     def is_evaluated(self, wanted: Evaluation) -> bool:
         """Whether the policy that it has now was evaluated as it is asked for."""

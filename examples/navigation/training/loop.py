@@ -32,7 +32,7 @@ from navigation.stopping import Stop
 from navigation.training.assembly import make_curiosity, make_learner, method_of
 from navigation.training.assessment import Assessment
 from navigation.training.checkpoints import FORMAT, random_state, set_random_state
-from navigation.training.driving import Robots
+from navigation.training.driving import make_robots
 from navigation.training.evaluations import evaluate_policy, exported_policy
 from navigation.training.exploration import make_explorer
 from navigation.training.schedule import Schedule
@@ -172,8 +172,10 @@ class TrainingRun:
                 if self._is_sound():
                     self.save()
                 raise
-            bar.set_postfix_str(self._tell())
+            bar.set_postfix_str(self._summary())
         self.save()
+        # Whoever reads that a run is finished may remove its checkpoint.
+        self._tell(saved=True)
         if self.schedule.finished and self.actions > begun:
             self._show()
         return self.schedule.finished
@@ -334,7 +336,7 @@ class TrainingRun:
         success = sum(record.success for record in recent) / len(recent)
         return f"{recent[-1].world}: success {success:.0%} of last {len(recent)}, {speed}"
 
-    def _tell(self) -> str:
+    def _tell(self, *, saved: bool = False) -> str:
         """Say how far the run is, to whoever reads its folder, and in a few words."""
         self._told, summary = time.monotonic(), self._summary()
         status = {
@@ -345,7 +347,7 @@ class TrainingRun:
             "steps": self.actions,
             "summary": summary,
             "given_up": self.robots.given_up,
-            "finished": self.schedule.finished,
+            "finished": self.schedule.finished and saved,
         }
         write_text_atomically(json.dumps(status), self.folder / files.STATUS)
         return summary
@@ -439,12 +441,3 @@ class TrainingRun:
         """Release the simulation and finish the log."""
         self.robots.close()
         self.tracker.close()
-
-
-def make_robots(settings: TrainSettings) -> Robots:
-    """The robots of a run, in this process or on a Ray cluster."""
-    if not settings.ray.workers:
-        return Robots(settings)
-    from navigation.training.fleet import Fleet
-
-    return Fleet(settings)

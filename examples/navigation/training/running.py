@@ -101,6 +101,8 @@ def resume(folder: Path, overrides: list[Override]) -> int:
             check_lawful(as_settings(state["settings"]), settings, folder)
             prepare_process(settings)
             training = TrainingRun(settings, folder, state)
+            # A run that was finished is not, once it is asked for more.
+            (folder / files.STATUS).unlink(missing_ok=True)
             write_settings(settings, folder / files.SETTINGS)
         return _train(training)
 

@@ -87,6 +87,7 @@ def test_a_run_that_is_not_at_its_end_is_missing_and_in_no_table(tmp_path: Path)
     (job.path / "evaluation-test").mkdir(parents=True)
     for name in ("updates.csv", "episodes.csv", "evaluation-test/episodes.csv"):
         write_table(pd.DataFrame({"total_steps": [1]}), job.path / name)
+    (job.path / "policy.npz").write_bytes(b"policy")
     for finished in (False, True):
         (job.path / "status.json").write_text(json.dumps({"finished": finished}))
         assert (job.name in missing(first)) != finished

@@ -57,6 +57,7 @@ def write_run(job: Job, heights: Sequence[float], outcomes: Sequence[Sequence[bo
     folder.mkdir(parents=True)
     (job.path / files.STATUS).write_text(json.dumps({"finished": True}))
     (job.path / files.POLICY).write_bytes(b"policy")
+    (job.path / files.EPISODES).write_text("success,world\n")
     curve = {"total_steps": 1000 * np.arange(1, len(heights) + 1), "success": heights}
     write_table(pd.DataFrame(curve), job.path / files.EVALUATIONS)
     rows = [

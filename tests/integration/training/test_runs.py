@@ -23,7 +23,8 @@ from navigation.records import read_table
 from navigation.settings.command_line import composed, parse_overrides
 from navigation.settings.resuming import changed
 from navigation.settings.train import register
-from navigation.training import tracking
+from navigation.studies.jobs import Job
+from navigation.training import loop, tracking
 from navigation.training.checkpoints import read_checkpoint
 from navigation.training.loop import TrainingRun
 from navigation.training.running import Refused, resume, start
@@ -68,6 +69,44 @@ def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
         *(files.CHECKPOINT, files.POLICY, files.SETTINGS, files.EPISODES, files.CURVE),
         *(files.STATUS, files.UPDATES, ".lock"),
     }
+
+
+@pytest.mark.parametrize("lost", ["save_atomically", "write_table"])
+def test_a_run_is_not_finished_before_all_of_it_is_saved(
+    lost: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    job = Job("ddpg", "per", 0, tmp_path)
+    assert begin(job.path, episodes=1) == 0
+    assert job.is_trained()
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, lost, full)
+        patch.setattr(loop, "_TELL_EVERY", 0.0)
+        with pytest.raises(OSError, match="no space"):
+            go_on(job.path, STAGES.format(2))
+    status = job.status()
+    assert (status["done"], status["total"], status["finished"]) == (2, 2, False)
+    assert not job.is_trained()
+    assert go_on(job.path, STAGES.format(2)) == 0
+    assert job.is_trained()
+    (job.path / files.POLICY).unlink()
+    assert not job.is_trained()
+
+
+def test_a_finished_run_that_shall_go_on_is_not_finished_before_it_has_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(_: TrainingRun) -> bool:
+        raise SystemExit(137)
+
+    job = Job("ddpg", "per", 0, tmp_path)
+    assert begin(job.path, episodes=1) == 0
+    monkeypatch.setattr(TrainingRun, "train", killed)
+    with pytest.raises(SystemExit):
+        go_on(job.path, STAGES.format(2))
+    assert not job.is_trained()
 
 
 def test_a_second_run_in_the_same_folder_is_refused_while_the_first_is_at_work(
