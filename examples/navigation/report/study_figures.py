@@ -160,20 +160,24 @@ def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
     widths = [len(each) for each in volumes.values()]
     figure, axes = new_figure(1, 2, panel=(5, 4), width_ratios=widths)
     for axis, (reward, of) in zip(axes, volumes.items(), strict=True):
-        areas = np.full((len(OF_VOLUMES), len(of)), np.nan)
-        for row, method in enumerate(OF_VOLUMES):
-            for column, volume in enumerate(of):
-                suffix = "" if volume == 32 else f"/v{volume}"
+        gaps = np.full((len(OF_VOLUMES), len(of)), np.nan)
+        for column, volume in enumerate(of):
+            suffix = "" if volume == 32 else f"/v{volume}"
+            uniform = scores.get(f"{reward}/td3/uniform{suffix}")
+            for row, method in enumerate(OF_VOLUMES):
                 runs = scores.get(f"{reward}/td3/{method}{suffix}")
-                areas[row, column] = np.nan if runs is None else runs["area"].mean()
-        gaps = areas - areas[OF_VOLUMES.index("uniform")]
+                if runs is None or not len(runs):
+                    continue
+                areas, text = runs["area"], f"{runs['area'].mean():.2f}"
+                # Of the same seeds, as in the tables; one run has no color.
+                shared = (areas - uniform["area"]).dropna() if uniform is not None else areas[:0]
+                if len(shared) > 1:
+                    gaps[row, column] = gap = shared.mean()
+                    text += f", {gap:+.2f}" if row else ""
+                color = "white" if abs(np.nan_to_num(gaps[row, column])) > 0.14 else "black"
+                text += f"\n{len(runs)} runs" if len(runs) > 1 else "\n1 run"
+                axis.text(column, row, text, ha="center", va="center", color=color)
         image = axis.imshow(gaps, cmap="RdBu", vmin=-0.2, vmax=0.2, aspect="auto")
-        for (row, column), area in np.ndenumerate(areas):
-            gap = gaps[row, column]
-            text = "" if np.isnan(area) else f"{area:.2f}"
-            text += "" if np.isnan(gap) or row == 0 else f"\n{gap:+.2f}"
-            color = "white" if abs(np.nan_to_num(gap)) > 0.14 else "black"
-            axis.text(column, row, text, ha="center", va="center", color=color)
         axis.set_xticks(range(len(of)), [str(volume) for volume in of])
         axis.set_yticks(range(len(OF_VOLUMES)), OF_VOLUMES)
         axis.set(xlabel="replay volume", title=f"{reward} reward")

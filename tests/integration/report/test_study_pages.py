@@ -275,10 +275,11 @@ def test_a_panel_without_runs_is_left_out(runs: Path, tmp_path: Path) -> None:
 
 def test_where_a_method_is_better_than_uniform_replay_the_map_is_blue(tmp_path: Path) -> None:
     scores = {
-        f"sparse/td3/{method}": pd.DataFrame({"area": [0.5 + 0.2 * (method == "per")]})
+        f"sparse/td3/{method}": pd.DataFrame({"area": [0.5 + 0.2 * (method == "per")] * 2})
         for method in OF_VOLUMES
     }
-    scores["sparse/td3/lap"] = pd.DataFrame({"area": [0.3]})
+    scores["sparse/td3/lap"] = pd.DataFrame({"area": [0.3, 0.3]})
+    scores["sparse/td3/geometric"] = pd.DataFrame({"area": [0.0]})  # One run shows nothing.
     plot_volumes(scores, tmp_path / "v.png")
     # The ends of the color map, in the one column that has runs.
     for color, row in (((5, 48, 97), 1), ((103, 0, 31), 4)):
