@@ -6,9 +6,15 @@ Both are of a two-sided t-test, to which the permutation test of means comes ver
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 
 import numpy as np
 from scipy import optimize, stats
+
+MOST = 10_000
+"""Runs that anyone is told to make."""
+_EFFECTS = 1e-3, 1e3
+"""The least and the greatest effect that is looked for, in standard deviations."""
 
 
 def runs_needed(deviation: float, difference: float, *, power: float = 0.8) -> int:
@@ -20,17 +26,17 @@ def runs_needed(deviation: float, difference: float, *, power: float = 0.8) -> i
         power: Chance to find it at the level of 5 %.
 
     Returns:
-        The number of runs of each.
+        The number of runs of each; one more than :data:`MOST` if these are too few.
 
     Examples:
         >>> runs_needed(1.95, 2.0), runs_needed(1.95, 5.0)
         (16, 4)
     """
-    for runs in range(2, 10_000):
-        shift = difference / deviation * math.sqrt(runs / 2)
-        if _chance(2 * runs - 2, shift, 0.05) >= power:
-            return runs
-    raise ValueError(f"difference must not vanish beside deviation, got {difference}, {deviation}")
+
+    def found(runs: int) -> float:
+        return _chance(2 * runs - 2, difference / deviation * math.sqrt(runs / 2), 0.05)
+
+    return bisect_left(range(MOST + 1), power, lo=2, key=found)
 
 
 def difference_found(
@@ -46,7 +52,8 @@ def difference_found(
         power: Chance to find it.
 
     Returns:
-        The difference, in units of the deviation's; NaN for one run of each.
+        The difference, in units of the deviation's; NaN for one run of each, and where not even a
+        thousand deviations would be found.
 
     Examples:
         >>> round(difference_found(1.0, 20, 20), 3)
@@ -70,7 +77,8 @@ def paired_difference_found(
         power: Chance to find it.
 
     Returns:
-        The difference, in units of the deviation's; NaN for one seed.
+        The difference, in units of the deviation's; NaN for one seed, and where not even a thousand
+        deviations would be found.
 
     Examples:
         >>> round(paired_difference_found(1.0, 20), 3)
@@ -82,8 +90,14 @@ def paired_difference_found(
 
 
 def _effect(freedom: int, shift: float, level: float, power: float) -> float:
-    """Effect in standard deviations that is found with some chance."""
-    return float(optimize.brentq(lambda d: _chance(freedom, d * shift, level) - power, 1e-3, 1e3))
+    """Effect in standard deviations that is found with some chance; NaN beyond a thousand."""
+
+    def missing(effect: float) -> float:
+        return _chance(freedom, effect * shift, level) - power
+
+    if not missing(_EFFECTS[0]) < 0.0 < missing(_EFFECTS[1]):
+        return math.nan
+    return float(optimize.brentq(missing, *_EFFECTS))
 
 
 def _chance(freedom: int, shift: float, level: float) -> float:

@@ -257,7 +257,7 @@ def _cells(
         squares = sum(float(((each - each.mean()) ** 2).sum()) for each in (ours, theirs))
         deviation = math.sqrt(squares / freedom)
         least = difference_found(deviation, len(ours), len(theirs), level=level)
-    cells = [f"{gap.value:+.3f}", _ends(gap, "+.3f"), f"{least:.3f}"]
+    cells = [f"{gap.value:+.3f}", _ends(gap, "+.3f"), "" if math.isnan(least) else f"{least:.3f}"]
     if measure == "success":
         a, b = (worlds[label] for label in pair)
         both = ""

@@ -20,7 +20,7 @@ from navigation.report.intervals import (
     t_interval,
 )
 from navigation.report.permutation import least_p, permutation_p
-from navigation.report.power import runs_needed
+from navigation.report.power import MOST, runs_needed
 from navigation.studies.paper import NAMES, TABLE_2, TESTS
 
 _OF_THE_PAPER = ("mpfa_per", "per")
@@ -160,7 +160,7 @@ def power_lines(rows: pd.DataFrame) -> str:
             continue
         deviation = math.sqrt(squares / freedom)
         needed = ", ".join(
-            f"{runs_needed(deviation, difference)} for {100 * difference:g} points"
+            f"{_count(runs_needed(deviation, difference))} for {100 * difference:g} points"
             for difference in _DIFFERENCES
         )
         lines.append(
@@ -252,6 +252,10 @@ def _ends(interval: Interval) -> str:
     if math.isnan(interval.low):
         return "one run"
     return f"[{interval.low:.3f}, {interval.high:.3f}]"
+
+
+def _count(runs: int) -> str:
+    return f"{runs}" if runs <= MOST else f"more than {MOST:,}"
 
 
 def _difference(ours: Array, theirs: Array) -> str:

@@ -74,6 +74,18 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.usefixtures("tables_alone")
+def test_runs_that_differ_much_have_their_tables(study: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    good = rows["seed"] == 1
+    rows = rows.assign(success=good, collision=~good)
+    write_table(rows, study / "episodes.csv")
+    assert report.main([str(study)]) == 0
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    assert "from run to run by 70.71 points" in text
+    assert "80 % power: more than 10,000 for 2 points, 3141 for 5 points." in text
+
+
+@pytest.mark.usefixtures("tables_alone")
 def test_random_worlds_have_tables_of_their_own_without_the_paper(study: Path) -> None:
     rows = pd.read_csv(study / "episodes.csv")
     rooms = rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))

@@ -19,7 +19,12 @@ from navigation.report.intervals import (
     widened_ends,
 )
 from navigation.report.permutation import deal_p, flip_p, holm, permutation_p, rank_flip_p, rank_p
-from navigation.report.power import difference_found, paired_difference_found, runs_needed
+from navigation.report.power import (
+    MOST,
+    difference_found,
+    paired_difference_found,
+    runs_needed,
+)
 
 
 def plain_p(ours: Array, theirs: Array) -> float:
@@ -254,3 +259,18 @@ def test_the_runs_that_a_difference_needs_find_it_and_one_less_does_not() -> Non
     assert difference_found(1.95, runs, runs) <= 2.0 < difference_found(1.95, runs - 1, runs - 1)
     assert np.isnan(difference_found(1.0, 1, 1))
     assert difference_found(1.0, 2, 1, level=0.05 / 40) > 100
+
+
+@pytest.mark.parametrize("deviation", [0.4, 0.5, 0.505, 0.51, 0.7, 1e9])
+def test_runs_that_vary_much_need_more_than_anyone_makes(deviation: float) -> None:
+    # For many runs the statistic is normal: 2.8 = 1.96 + 0.84 of its standard deviations.
+    normal = 2 * (2.801585 * deviation / 0.02) ** 2
+    runs = runs_needed(deviation, 0.02)
+    assert runs == pytest.approx(min(normal, MOST + 1), abs=2)
+    assert (runs > MOST) == (normal > MOST)
+
+
+def test_what_a_few_runs_cannot_find_is_no_number() -> None:
+    assert np.isnan(difference_found(1.0, 1, 2, level=0.05 / 52))
+    assert np.isnan(paired_difference_found(1.0, 2, level=0.05 / 100))
+    assert 500 < difference_found(1.0, 1, 2, level=0.05 / 31) < 1000

@@ -203,6 +203,19 @@ def test_a_comparison_without_runs_counts_in_the_correction() -> None:
     assert comparison_lines(scores, [("x", "c")], "area", {}) == ""
 
 
+def test_too_few_runs_to_find_any_difference_leave_a_cell_empty() -> None:
+    index = pd.Index([0, 1], name="seed")
+    scores = {
+        "a": pd.DataFrame({"area": [0.9]}, index[:1]),
+        "b": pd.DataFrame({"area": [0.4, 0.6]}, index),
+        "c": pd.DataFrame({"area": [0.4]}, index[:1]),
+    }
+    pairs = [("a", "b"), ("a", "c"), *(("a", f"x{n}") for n in range(50))]
+    two, one = comparison_lines(scores, pairs, "area", {}, absent=False).splitlines()[2:]
+    assert two.startswith("| a − b | 1, 2 | +0.400 | one run |  | ")
+    assert one.startswith("| a − c | 1 | +0.500 | one run |  | ")
+
+
 def test_runs_that_are_missing_are_named_with_their_command(runs: Path, tmp_path: Path) -> None:
     table = small_table(runs)
     assert missing(table, read_runs(table, runs), runs) == ""
