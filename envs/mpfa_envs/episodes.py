@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -16,12 +17,14 @@ from mpfa_envs.path import shortest_length
 from mpfa_envs.plain_worlds import fingerprint, world_from_plain, world_to_plain
 from mpfa_envs.tasks import Task, check_task, sample_task
 from mpfa_envs.vector_state import read_list
+from mpfa_envs.walker_starts import start_walkers
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
     from mpfa_envs.arguments import TaskArguments
     from mpfa_envs.distance import DistanceField, FreeGrid
     from mpfa_envs.local_field import LocalField
+    from mpfa_envs.walker_starts import WalkerStarts
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """What stands for one world."""
@@ -42,6 +45,8 @@ class Episode(NamedTuple):
     """The shortest path to the goal's center [m]."""
     field: DistanceField | LocalField | None
     """Lengths of the ways to the goal, if the progress is along the shortest path."""
+    walkers: WalkerStarts
+    """Where the walkers start."""
 
 
 class Whereabouts(NamedTuple):
@@ -87,6 +92,50 @@ def distance_field(
 
         return LocalField(_kept_grid_of(world, distance), goal)
     return DistanceField(_kept_grid_of(world, distance), goal)
+
+
+@contextmanager
+def keeping(rngs: Iterable[np.random.Generator]) -> Iterator[None]:
+    """Let sources of randomness be as they were if what they are needed for is refused."""
+    before = [(rng, rng.bit_generator.state) for rng in rngs]
+    try:
+        yield
+    except BaseException:
+        for rng, state in before:
+            rng.bit_generator.state = state
+        raise
+
+
+def draw_episode(
+    rules: TaskArguments, world: World, rng: np.random.Generator, task: Task | None = None
+) -> Episode:
+    """Draw an episode in a fixed world.
+
+    Args:
+        rules: The arguments of the task.
+        world: The room.
+        rng: Source of randomness.
+        task: Start and goal; None: any.
+
+    Returns:
+        The episode.
+
+    Raises:
+        ValueError: If the world has no task, or a walker fits nowhere.
+    """
+    distance = rules.collision_distance
+    if task is None:
+        task = sample_task(
+            world,
+            rng,
+            collision_distance=distance,
+            min_goal_distance=rules.min_goal_distance,
+            detour_chance=rules.detour_chance,
+        )
+    length = shortest_length(world, rules.robot.radius, task.start[:2], task.goal)
+    along = rules.progress == "shortest_path"
+    field = distance_field(world, distance, task.goal) if along else None
+    return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
 
 
 class EpisodeSource:
@@ -150,26 +199,45 @@ class EpisodeSource:
 
     def draw(
         self,
-        robot: int,
-        rng: np.random.Generator,
-        given: tuple[World, Task | None] | None = None,
-    ) -> Episode:
-        """Draw the next episode of a robot.
+        robots: Sequence[int],
+        rngs: Sequence[np.random.Generator],
+        given: Sequence[tuple[World, Task | None] | None] | None = None,
+        renewed: Iterable[int] = (),
+    ) -> list[Episode]:
+        """Draw the next episodes of some robots, or none if one of them has none.
 
         Args:
-            robot: Its number.
-            rng: Its source of randomness.
-            given: A world for this episode alone, and a task or None for any of that world.
+            robots: Their numbers.
+            rngs: The sources of randomness of all robots.
+            given: For each robot, a world for this episode alone, with a task or None for any of
+                that world; or None.
+            renewed: Robots whose episode is in a new world, as after a seed.
 
         Returns:
-            The episode.
+            The episodes.
 
         Raises:
-            ValueError: If no world with a task is found.
+            ValueError: If no world with a task is found; nothing is drawn then.
         """
+        before = Whereabouts(self.refused, list(self._left), list(self._worlds))
+        try:
+            with keeping(rngs[robot] for robot in robots):
+                for robot in renewed:
+                    self.forget(robot)
+                return [
+                    self._draw_next(each, rngs[each], None if given is None else given[each])
+                    for each in robots
+                ]
+        except BaseException:
+            self.load(before)
+            raise
+
+    def _draw_next(
+        self, robot: int, rng: np.random.Generator, given: tuple[World, Task | None] | None
+    ) -> Episode:
+        """Draw the next episode of a robot."""
         if given is not None:
-            world, task = given
-            return self._draw_in(world, rng) if task is None else self.of_task(world, task)
+            return self._draw_in(given[0], rng, given[1])
         kept = self._worlds[robot] if self._generator is None or self._left[robot] else None
         episode = self._draw(kept, rng)
         if self._generator:
@@ -259,15 +327,6 @@ class EpisodeSource:
             radius=rules.robot.radius,
         )
 
-    def of_task(self, world: World, task: Task) -> Episode:
-        """Make an episode of a task that is given."""
-        rules = self._rules
-        field = None
-        if rules.progress == "shortest_path":
-            field = distance_field(world, rules.collision_distance, task.goal)
-        length = shortest_length(world, rules.robot.radius, task.start[:2], task.goal)
-        return Episode(world, task, length, field)
-
     def _draw(self, world: World | None, rng: np.random.Generator) -> Episode:
         """Draw an episode in a world, in a new one where it is None or has no task."""
         if self._generator is None and world is not None:
@@ -293,19 +352,11 @@ class EpisodeSource:
         self.check(world, None)
         return world
 
-    def _draw_in(self, world: World, rng: np.random.Generator) -> Episode:
+    def _draw_in(self, world: World, rng: np.random.Generator, task: Task | None = None) -> Episode:
         """Draw an episode in a fixed world, as :class:`~mpfa_envs.NavigationEnv` does."""
-        if math.isfinite(self._max_goal_distance):
+        if task is None and math.isfinite(self._max_goal_distance):
             return self._draw_on_grid(world, rng)
-        rules = self._rules
-        task = sample_task(
-            world,
-            rng,
-            collision_distance=rules.collision_distance,
-            min_goal_distance=rules.min_goal_distance,
-            detour_chance=rules.detour_chance,
-        )
-        return self.of_task(world, task)
+        return draw_episode(self._rules, world, rng, task)
 
     def _draw_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
         """Draw an episode over the cells of a grid, in milliseconds however full the world is."""
@@ -320,7 +371,8 @@ class EpisodeSource:
             detour_chance=rules.detour_chance,
         )
         length = field.at(*task.start[:2])
-        return Episode(world, task, length, field if rules.progress == "shortest_path" else None)
+        kept = field if rules.progress == "shortest_path" else None
+        return Episode(world, task, length, kept, start_walkers(world, task.start[:2], rng))
 
 
 def resolve_generator(world: object) -> str | None:

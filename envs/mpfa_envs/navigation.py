@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
 
 from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
 from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
-from mpfa_envs.episodes import distance_field
+from mpfa_envs.episodes import draw_episode, keeping
 from mpfa_envs.live_view import RenderMode
 from mpfa_envs.noise import RobotNoise
 from mpfa_envs.observation import INFO_TYPES, Memory
-from mpfa_envs.path import shortest_length
 from mpfa_envs.reward import (
     PROGRESS_SCALE,
     RewardFunction,
@@ -28,7 +28,7 @@ from mpfa_envs.reward import (
 )
 from mpfa_envs.robot import RobotModel
 from mpfa_envs.senses import Senses
-from mpfa_envs.tasks import Task, check_task, sample_task
+from mpfa_envs.tasks import Task, check_task
 from mpfa_envs.walkers import no_encounters
 
 if TYPE_CHECKING:
@@ -251,28 +251,20 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         if seed is not None:
             check_count("seed", seed, least=0)
         task = self.check_task(options) if options else None
-        super().reset(seed=seed)
-        if task is None:
-            task = sample_task(
-                self.world,
-                self.np_random,
-                collision_distance=self.collision_distance,
-                min_goal_distance=self.min_goal_distance,
-                detour_chance=self.detour_chance,
-            )
+        source = (self.np_random, self.np_random_seed) if seed is None else seeding.np_random(seed)
+        with keeping(source[:1]):
+            _, task, length, self._field, walkers = draw_episode(self, self.world, source[0], task)
+        self._np_random, self._np_random_seed = source
         self._task = task
         self._goal = task.goal
-        length = shortest_length(self.world, self.robot.radius, task.start[:2], task.goal)
         self._shortest_path = max(length - self.goal_radius, 0.0)
         self._steps = 0
         self._path_length = 0.0
         self._motion = self._drive.place(*task.start)
         self._distance = math.dist(task.start[:2], task.goal)
-        if self.progress == "shortest_path":
-            self._field = distance_field(self.world, self.collision_distance, task.goal)
         self._way = self._way_from(*task.start[:2])
         if self._walkers is not None:
-            self._walkers.begin(0, task.start[:2], self.np_random)
+            self._walkers.begin(0, walkers)
         self._encounters = np.array(no_encounters())[:, None]
         self._min_clearance = self._to_obstacle(*task.start[:2]) - self.robot.radius
         self._trail = [task.start[:2]]

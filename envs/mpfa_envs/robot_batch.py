@@ -115,7 +115,7 @@ class RobotBatch:
         Args:
             index: Number of the robot.
             episode: What it is to drive.
-            rng: Its source of randomness, of which the walkers take their starts.
+            rng: Its source of randomness, of which its odometry takes its errors.
         """
         task, episodes = episode.task, self.episodes
         if self.worlds[index] is not episode.world:
@@ -127,7 +127,7 @@ class RobotBatch:
         if self._fields is not None and episode.field is not None:
             self._fields[index] = episode.field
             way = episode.field.at(x, y)
-        self.walkers.begin(index, (x, y), rng)
+        self.walkers.begin(index, episode.walkers)
         clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
         clearance -= self._rules.robot.radius
         self.drives.place(index, x, y, heading)

@@ -108,10 +108,10 @@ class RoomsEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float3
         given = self._read(options or {})
         if seed is not None:
             check_count("seed", seed, least=0)
-        super().reset(seed=seed)
         observations, infos = self.robots.reset(
             seed=None if seed is None else [seed], options=given
         )
+        super().reset(seed=seed)
         self._running = True
         if self.render_mode == "human":
             self.render()

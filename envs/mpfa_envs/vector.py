@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.episodes import EpisodeSource, WorldChoice
+from mpfa_envs.episodes import Episode, EpisodeSource, WorldChoice
 from mpfa_envs.kernels.step import outcomes
 from mpfa_envs.noise import RobotNoise
 from mpfa_envs.observation import Memory
@@ -272,18 +272,18 @@ class VectorNavigationEnv(
         Raises:
             ValueError: If a seed is negative, or there are not as many as robots.
         """
-        self._take_generators(read_seed(seed, self.num_envs), range(self.num_envs))
-
-    def _take_generators(
-        self, rngs: Sequence[np.random.Generator | None], robots: Iterable[int]
-    ) -> None:
-        """Let some robots draw from new sources of randomness, where they are given."""
-        if not self._rngs:
-            self._rngs = spawn_generators(np.random.SeedSequence(), self.num_envs)
-        for index in robots:
-            if (rng := rngs[index]) is not None:
-                self._rngs[index] = rng
+        seeded = read_seed(seed, self.num_envs)
+        self._rngs = self._generators(seeded)
+        for index, rng in enumerate(seeded):
+            if rng is not None:
                 self._source.forget(index)
+
+    def _generators(
+        self, seeded: Sequence[np.random.Generator | None]
+    ) -> list[np.random.Generator]:
+        """The robots' sources of randomness, new ones where they are given."""
+        kept = self._rngs or spawn_generators(np.random.SeedSequence(), self.num_envs)
+        return [new or old for new, old in zip(seeded, kept, strict=True)]
 
     def reset(
         self,
@@ -313,9 +313,12 @@ class VectorNavigationEnv(
         if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
         robots = np.flatnonzero(chosen).tolist()
-        self._take_generators(seeded, robots)
-        for index in robots:
-            self._begin(index, given[index])
+        seeded = [rng if wanted else None for rng, wanted in zip(seeded, chosen, strict=True)]
+        rngs = self._generators(seeded)
+        renewed = [index for index in robots if seeded[index] is not None]
+        episodes = self._source.draw(robots, rngs, given, renewed)
+        self._rngs = rngs
+        self._begin(robots, episodes)
         self._begun = True
         self._batch.sense(chosen, self._rngs)
         return self._batch.observations.copy(), self._infos(chosen)
@@ -356,8 +359,7 @@ class VectorNavigationEnv(
                 "reset(options={'reset_mask': ...}) before step()"
             )
         moving = chosen & self._batch.running
-        for index in np.flatnonzero(waiting).tolist():
-            self._begin(index, None)
+        self._begin_next(waiting)
         self._batch.advance(speeds, moving, self._rngs)
         self._batch.sense(chosen, self._rngs)
         rewards, terminated, truncated = outcomes(self._batch.episodes, moving)
@@ -365,16 +367,20 @@ class VectorNavigationEnv(
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             infos = final_infos(self._batch.observations, self._infos(ended), ended)
-            for index in np.flatnonzero(ended).tolist():
-                self._begin(index, None)
+            self._begin_next(ended)
             self._batch.sense(ended, self._rngs)
         infos = self._infos(None) | infos
         return self.observations, rewards, terminated, truncated, infos
 
-    def _begin(self, index: int, given: tuple[World, Task | None] | None) -> None:
-        """Start the next episode of a robot, the given one or one that is drawn."""
-        rng = self._rngs[index]
-        self._batch.begin(index, self._source.draw(index, rng, given), rng)
+    def _begin_next(self, waiting: NDArray[np.bool_]) -> None:
+        """Start the next episodes of the robots that wait for them."""
+        if robots := np.flatnonzero(waiting).tolist():
+            self._begin(robots, self._source.draw(robots, self._rngs))
+
+    def _begin(self, robots: Sequence[int], episodes: Sequence[Episode]) -> None:
+        """Start the next episodes of some robots."""
+        for index, episode in zip(robots, episodes, strict=True):
+            self._batch.begin(index, episode, self._rngs[index])
 
     def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
         """The infos of the chosen robots, or of all."""

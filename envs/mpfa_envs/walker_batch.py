@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -26,20 +25,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.lidar import Lidar
-    from mpfa_envs.shapes import Point
-    from mpfa_envs.walkers import Walker
+    from mpfa_envs.walker_starts import WalkerStarts
     from mpfa_envs.world_batch import WorldBatch
     from mpfa_envs.worlds import World
 
-_START: Final = 1.0
-"""How far from the robot's center a walker's rim is at the start, if there is such a place [m]."""
-_SLACK: Final = 0.02
-"""How much farther from an obstacle than its radius a walker starts [m]."""
-_SAMPLES: Final = 256
-"""Places that are sampled at once."""
-_FEW: Final = 16
-"""Those of them that are looked at first."""
-_ROUNDS: Final = 20
 _MARGIN: Final = 0.05
 """A ray that ends this near to a walker, and three deviations of its noise, met it [m]."""
 _CHANGING: Final = ("states", "targets")
@@ -58,10 +47,11 @@ class WalkerBatch:
         >>> import numpy as np
         >>> from mpfa_envs import Walker, World
         >>> from mpfa_envs.walker_batch import WalkerBatch
+        >>> from mpfa_envs.walker_starts import start_walkers
         >>> from mpfa_envs.world_batch import WorldBatch
         >>> worlds = WorldBatch([World(name="one", walkers=(Walker(),))])
         >>> batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
-        >>> batch.begin(0, (0.0, 0.0), np.random.default_rng(0))
+        >>> batch.begin(0, start_walkers(worlds[0], (0.0, 0.0), np.random.default_rng(0)))
         >>> before = batch.of(0)
         >>> batch.move(np.array([True]), np.zeros((1, 5)))
         >>> float(np.hypot(*(batch.of(0) - before)[0, :2]).round(6))  # 0.3 m/s for 0.1 s
@@ -84,23 +74,18 @@ class WalkerBatch:
         self._rooms: dict[int, OrcaRoom] = {}
         """The worlds of the robots around whom somebody avoids others."""
 
-    def begin(self, index: int, start: Point, rng: np.random.Generator) -> None:
+    def begin(self, index: int, starts: WalkerStarts) -> None:
         """Put the walkers of a robot's world where they start.
 
         Args:
             index: Number of the robot.
-            start: Where it starts (x, y) [m].
-            rng: Its source of randomness; a world without walkers takes nothing of it.
-
-        Raises:
-            ValueError: If a walker fits nowhere.
+            starts: What :func:`~mpfa_envs.walker_starts.start_walkers` gave for that world.
         """
-        world = self._worlds[index]
-        self._set(index, world)
-        if not world.walkers:
-            return
-        states, targets = start_walkers(world, start, rng)
+        self._set(index, self._worlds[index])
+        states, targets = starts
         count = len(states)
+        if not count:
+            return
         self._arrays.states[index, :count], self._arrays.targets[index, :count] = states, targets
         self._place(index)
 
@@ -268,85 +253,3 @@ class WalkerBatch:
             wider[name] = np.zeros(new, dtype=old.dtype)
             wider[name][tuple(map(slice, old.shape))] = old
         self._arrays = WalkerArrays(**wider)
-
-
-def start_walkers(
-    world: World, start: Point, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Sample where the walkers of a world start.
-
-    They keep 1 m from the robot and do not overlap, where there is room for that.
-
-    Args:
-        world: The world.
-        start: Where the robot starts (x, y) [m].
-        rng: Source of randomness.
-
-    Returns:
-        (x, y) and the speeds in both directions [m, m/s], ``[K, 4]``; which waypoint comes next,
-        ``[K]``.
-
-    Raises:
-        ValueError: If a walker fits nowhere.
-    """
-    states = np.zeros((len(world.walkers), 4))
-    targets = np.zeros(len(world.walkers), dtype=np.int64)
-    taken = [(*start, _START)]
-    for number, walker in enumerate(world.walkers):
-        sample = _sample_room if walker.behavior == "straight" else _sample_round
-        for _ in range(_ROUNDS):
-            places, nexts, headings = sample(world, walker, rng)
-            chosen = _choose(world, walker, places, taken)
-            if chosen is not None:
-                break
-        else:
-            raise ValueError(f"world {world.name!r} has no place for {walker}")
-        x, y = places[chosen].tolist()
-        heading = float(headings[chosen])
-        states[number] = x, y, walker.speed * math.cos(heading), walker.speed * math.sin(heading)
-        targets[number] = nexts[chosen]
-        taken.append((x, y, walker.radius))
-    return states, targets
-
-
-def _choose(
-    world: World,
-    walker: Walker,
-    places: NDArray[np.float64],
-    taken: list[tuple[float, float, float]],
-) -> int | None:
-    """Number of the first free place that is far enough from what is taken, or of the farthest."""
-    # One of the first will nearly always do, and to look at all takes ten times as long.
-    for few in (places[:_FEW], places):
-        gaps = np.min([np.hypot(few[:, 0] - x, few[:, 1] - y) - reach for x, y, reach in taken], 0)
-        free = np.ones(len(few), dtype=np.bool_)
-        if walker.behavior == "straight":  # A round is free, which the world has checked.
-            free = world.clearances(few) >= walker.radius + _SLACK
-        enough = free & (gaps >= walker.radius)
-        if enough.any():
-            return int(np.argmax(enough))
-    return int(np.argmax(np.where(free, gaps, -np.inf))) if free.any() else None
-
-
-def _sample_room(
-    world: World, walker: Walker, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Places anywhere in the room with a direction each: (x, y), 0 and heading."""
-    half = np.array(world.size) / 2 - walker.radius
-    places = rng.uniform(-half, half, (_SAMPLES, 2))
-    headings = rng.uniform(-math.pi, math.pi, _SAMPLES)
-    return places, np.zeros(_SAMPLES, dtype=np.int64), headings
-
-
-def _sample_round(
-    world: World, walker: Walker, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Places anywhere on a walker's round: (x, y), the next waypoint and the heading to it."""
-    points = np.array(walker.waypoints)
-    ways = np.roll(points, -1, axis=0) - points
-    ends = np.cumsum(np.hypot(*ways.T))
-    along = rng.uniform(0.0, ends[-1], _SAMPLES)
-    legs = np.minimum(np.searchsorted(ends, along, side="right"), len(points) - 1)
-    shares = 1.0 - (ends[legs] - along) / np.hypot(*ways[legs].T)
-    places = points[legs] + shares[:, None] * ways[legs]
-    return places, (legs + 1) % len(points), np.arctan2(ways[legs, 1], ways[legs, 0])

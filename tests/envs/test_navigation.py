@@ -407,3 +407,22 @@ def test_a_bad_seed_is_refused_and_the_episode_goes_on(seed: object) -> None:
     with pytest.raises(ValueError, match=f"seed must be an integer of at least 0, got {seed!r}"):
         env.reset(seed=seed)  # type: ignore[arg-type]
     assert env.step([1.0, 1.0])[4]["x"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("seed", [None, 1])
+def test_an_episode_goes_on_where_the_next_one_has_no_place_for_a_walker(
+    seed: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env, twin = (NavigationEnv(world="A", physics="kinematic") for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=0)
+
+    def refuse(world: World, start: object, rng: object) -> None:
+        raise ValueError(f"world {world.name!r} has no place")
+
+    with monkeypatch.context() as patch, pytest.raises(ValueError, match="'A' has no place"):
+        patch.setattr("mpfa_envs.episodes.start_walkers", refuse)
+        env.reset(seed=seed)
+    assert (env.task, env.np_random_seed) == (twin.task, 0)
+    np.testing.assert_array_equal(env.step([1.0, 0.5])[0], twin.step([1.0, 0.5])[0])
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])

@@ -10,6 +10,7 @@ import pytest
 from mpfa_envs import Box, Cylinder, Polygon, Walker, World
 from mpfa_envs.orca import OrcaRoom, _outlines
 from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.walker_starts import start_walkers
 from mpfa_envs.world_batch import WorldBatch
 
 pytest.importorskip("pyrvo", reason="an extra")
@@ -84,7 +85,7 @@ def test_a_velocity_that_leads_into_a_wall_is_not_driven_and_one_that_leads_off_
     monkeypatch.setattr(OrcaRoom, "choose", choose)
     worlds = WorldBatch([World(name="free", walkers=(AVOIDER,))])
     batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
-    batch.begin(0, (0.0, 0.0), np.random.default_rng(0))
+    batch.begin(0, start_walkers(worlds[0], (0.0, 0.0), np.random.default_rng(0)))
     targets = np.ones((1, 1), dtype=np.int64)
     # The wall is at 5 m, and the walker's radius 0.25 m.
     for x, speed, moves in ((4.7, 1.0, False), (4.6, 1.0, True), (4.9, -1.0, True)):

@@ -16,6 +16,7 @@ from mpfa_envs import (
     NavigationEnv,
     RoomsEnv,
     VectorNavigationEnv,
+    World,
     generate_world,
     generator_tasks,
 )
@@ -104,6 +105,7 @@ def test_an_episode_can_be_fixed(env: RoomsEnv) -> None:
         ({"world": "A", "goal": (4.0, 4.0)}, "start and goal, or neither"),
         ({"start": (0.0, 0.0, 0.0), "goal": (4.0, 4.0)}, "world must be given"),
         ({"world": "A", "start": (99.0, 0.0, 0.0), "goal": (4.0, 4.0)}, "99"),
+        ({"world": World(name="tiny", size=(0.8, 0.8))}, "world 'tiny' has no"),
     ],
 )
 def test_options_that_are_no_episode_are_refused_and_the_last_one_goes_on(
@@ -112,9 +114,13 @@ def test_options_that_are_no_episode_are_refused_and_the_last_one_goes_on(
     env.reset(seed=0)
     before = env.world, env.task
     with pytest.raises(ValueError, match=message):
-        env.reset(options=options)
+        env.reset(seed=1, options=options)
     assert (env.world, env.task) == before
+    assert env.np_random_seed == 0
     env.step(ACTIONS[0])
+    following, _ = env.reset()
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.reset()[0], following)
 
 
 def test_it_is_rendered_on_demand() -> None:

@@ -31,6 +31,7 @@ from mpfa_envs import (
 from tests.envs.shapes import random_shapes
 
 NAMES = ["A", "B", "D", "test"]
+TINY = World(name="tiny", size=(0.8, 0.8))
 MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
 
 
@@ -239,6 +240,7 @@ def test_options_fix_the_next_episode_and_no_later_one() -> None:
         ({"reset_mask": np.zeros(2, dtype=np.bool_)}, "reset_mask must name at least one robot"),
         ({"reset_mask": [True, False]}, "reset_mask must be a NumPy array of 2 bool"),
         ({"worlds": [World(name="hall", size=(90.0, 9.0)), None]}, "robot 0: world 'hall' .* 14"),
+        ({"worlds": [None, TINY]}, "world 'tiny' has no free start"),
     ],
 )
 def test_bad_options_are_refused_and_the_episodes_go_on(options: dict, message: str) -> None:
@@ -253,6 +255,20 @@ def test_bad_options_are_refused_and_the_episodes_go_on(options: dict, message: 
     twin.reset(seed=0)
     np.testing.assert_array_equal(twin.step(np.ones((2, 2)))[0], before)
     np.testing.assert_array_equal(twin.step(np.ones((2, 2)))[0], env.step(np.ones((2, 2)))[0])
+    np.testing.assert_array_equal(twin.reset()[0], env.reset()[0])
+
+
+def test_a_refused_reset_takes_no_randomness_and_no_world_of_a_generator() -> None:
+    arguments = {"world": "rooms", "physics": "kinematic", "max_goal_distance": 20.0}
+    env, twin = (VectorNavigationEnv(3, episodes_per_world=2, **arguments) for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=0)
+    for seed in (None, 5):
+        with pytest.raises(ValueError, match="world 'tiny' has no"):
+            env.reset(seed=seed, options={"worlds": [None, None, TINY]})
+    for _ in range(3):
+        np.testing.assert_array_equal(twin.reset()[0], env.reset()[0])
+        assert twin.worlds == env.worlds
 
 
 @pytest.mark.parametrize(

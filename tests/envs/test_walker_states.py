@@ -7,6 +7,7 @@ import pytest
 
 from mpfa_envs import Lidar, Walker, World
 from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.walker_starts import start_walkers
 from mpfa_envs.world_batch import WorldBatch
 
 HALL = World(name="hall", size=(40.0, 40.0), walkers=(Walker(speed=1.0),))
@@ -20,7 +21,7 @@ def batch_with(state: list[float]) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("way", ["load", "begin"])
 def test_the_room_that_a_walker_had_does_not_lead_it_through_a_wall_elsewhere(way: str) -> None:
     batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
-    batch.begin(0, (15.0, 15.0), np.random.default_rng(0))
+    batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
     middle = batch.read(batch_with([0.0, 0.0, 1.0, 0.0]), [HALL])
     batch.load(middle)
     everyone, nobody = np.ones(1, dtype=np.bool_), np.zeros((1, 5))
@@ -30,7 +31,7 @@ def test_the_room_that_a_walker_had_does_not_lead_it_through_a_wall_elsewhere(wa
         batch.load(batch.read(batch_with([19.5, 0.0, 1.0, 0.0]), [HALL]))
     else:
         batch._worlds[0] = World(name="cell", size=(2.0, 2.0), walkers=HALL.walkers)
-        batch.begin(0, (0.5, 0.5), np.random.default_rng(0))
+        batch.begin(0, start_walkers(batch._worlds[0], (0.5, 0.5), np.random.default_rng(0)))
     world = batch._worlds[0]
     for _ in range(30):
         batch.move(everyone, nobody)
@@ -58,7 +59,7 @@ def test_a_map_is_shown_no_walker_by_a_noisy_lidar_either() -> None:
 
 def test_a_state_that_is_nowhere_is_refused_before_anything_changes() -> None:
     batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
-    batch.begin(0, (15.0, 15.0), np.random.default_rng(0))
+    batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
     before = batch.of(0)
     with pytest.raises(ValueError, match="states of the state must be finite"):
         batch.load(batch.read(batch_with([np.nan, 0.0, 1.0, 0.0]), [HALL]))

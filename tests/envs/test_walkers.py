@@ -28,6 +28,7 @@ from mpfa_envs.kernels.walkers import time_to_collision
 from mpfa_envs.render.colors import WALKER
 from mpfa_envs.robot import ROBOTS
 from mpfa_envs.walker_batch import WalkerBatch
+from mpfa_envs.walker_starts import start_walkers
 from mpfa_envs.world_batch import WorldBatch
 
 ROUND = ((-3.0, 0.5), (3.0, 0.5), (3.0, -3.0))
@@ -46,7 +47,7 @@ STANDING = replace(BUSY, walkers=())
 
 def batch_of(world: World, seed: int = 0, time_step: float = 0.1) -> WalkerBatch:
     batch = WalkerBatch(WorldBatch([world]), radius=0.18, time_step=time_step)
-    batch.begin(0, (4.0, 4.0), np.random.default_rng(seed))
+    batch.begin(0, start_walkers(world, (4.0, 4.0), np.random.default_rng(seed)))
     return batch
 
 
@@ -124,7 +125,7 @@ def test_walkers_start_apart_from_the_robot_and_elsewhere_in_each_episode() -> N
     batch = WalkerBatch(WorldBatch([BUSY]), radius=0.18, time_step=0.1)
     rng, places = np.random.default_rng(0), []
     for _ in range(50):
-        batch.begin(0, (0.0, -1.0), rng)
+        batch.begin(0, start_walkers(BUSY, (0.0, -1.0), rng))
         states = batch.of(0)
         assert (np.hypot(states[:, 0], states[:, 1] + 1.0) - states[:, 4]).min() >= 1.0
         assert (BUSY.clearances(states[:, :2]) - states[:, 4]).min() > -1e-9
@@ -210,10 +211,9 @@ def test_who_avoids_others_runs_into_nobody_who_does_and_gets_around() -> None:
 def test_who_avoids_others_goes_around_a_robot_that_stands_in_the_way() -> None:
     pytest.importorskip("pyrvo", reason="an extra")
     there_and_back = Walker(behavior="orca", waypoints=((-3.0, 0.01), (3.0, 0.01)))
-    batch = WalkerBatch(
-        WorldBatch([World(name="lane", walkers=(there_and_back,))]), radius=0.18, time_step=0.1
-    )
-    batch.begin(0, (0.0, 0.0), np.random.default_rng(0))
+    lane = World(name="lane", walkers=(there_and_back,))
+    batch = WalkerBatch(WorldBatch([lane]), radius=0.18, time_step=0.1)
+    batch.begin(0, start_walkers(lane, (0.0, 0.0), np.random.default_rng(0)))
     gaps, places = [], []
     for _ in range(600):
         batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
@@ -280,7 +280,7 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
         memory = MapMemory(1, ROBOTS["turtlebot2"], lidar)
         memory.begin(0, world)
         batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
-        batch.begin(0, (0.0, -1.0), np.random.default_rng(0))
+        batch.begin(0, start_walkers(world, (0.0, -1.0), np.random.default_rng(0)))
         rng, hits = np.random.default_rng(1), 0
         for heading in np.linspace(-3.0, 3.0, 60):
             batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
