@@ -9,7 +9,7 @@
 
 Prints one row per world or generator, and the total. Writes to --output; by default to
 ``evaluation-WORLDS`` in the folder of the run, or, for other files and planners, to
-runs/evaluation-NAME:
+runs/evaluation-NAME; another seed and noise are part of that name:
 summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (one row
 per episode), settings.json (the arguments, and a policy's card), trajectories.png (paths in up to
 nine worlds, at most twenty in each), episode.gif (the longest one from above, with the speeds of
@@ -155,8 +155,16 @@ def name_of(options: argparse.Namespace) -> str:
 
 
 def output_folder(options: argparse.Namespace) -> Path:
-    """Where results go unless the command line says: each choice of worlds has its own folder."""
+    """Where results go unless the command line says.
+
+    Each choice of worlds, seed and noise has its own folder; that of the first seed without noise
+    may hold rows of a study.
+    """
     name = f"evaluation-{worlds_label(options.worlds)}"
+    if options.seed:
+        name += f"-seed{options.seed}"
+    noise = {} if options.noise is None else asdict(options.noise)
+    name += "".join(f"-{what}{value:g}" for what, value in noise.items() if value)
     policy = options.path
     if policy is None:
         return Path("runs") / f"evaluation-{name_of(options)}" / name

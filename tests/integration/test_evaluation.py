@@ -13,9 +13,11 @@ import evaluate
 from mpfa_envs import GENERATORS, EpisodeResult, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
 from mpfa_envs.render import film_episode
+from navigation import files
 from navigation.evaluating import summary_row
 from navigation.records import read_table
 from navigation.settings.train import GROUPS, TrainSettings
+from navigation.studies.jobs import Evaluation, Job
 from navigation.training.assembly import make_learner
 from navigation.training.evaluations import exported_policy
 from navigation.worlds import parse_worlds, worlds_label
@@ -75,7 +77,7 @@ def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     # The tasks of this seed are short, and a picture takes longer than a step.
     worlds = ["--worlds", "A", "B", "--episodes", "2", "--seed", "145"]
     summary = evaluate.main(["--policy", *words, *worlds])
-    folder = Path("runs") / f"evaluation-{name}" / "evaluation-A+B"
+    folder = Path("runs") / f"evaluation-{name}" / "evaluation-A+B-seed145"
     assert list(summary["world"]) == ["A", "B", "total"]
     assert list(summary["success"]) == [1.0, 1.0, 1.0]
     found = json.loads((folder / "evaluation.json").read_text())
@@ -122,6 +124,33 @@ def test_several_worlds_have_a_row_each_and_a_total(
     assert (run / "evaluation-A" / "episodes.csv").read_bytes() == before
     assert len(read_table(run / "evaluation-A+rooms-5-6" / "episodes.csv")) == 6
     assert "rooms-6" in capsys.readouterr().out
+
+
+def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Path) -> None:
+    asked = Evaluation(("A",), 1)
+    job = Job("ddpg", "per", 0, run.parent)
+    run.rename(job.path)
+    (job.path / files.EPISODES).write_text("success,world\n")
+    (job.path / files.STATUS).write_text('{"finished": true}')
+    how = [str(job.path), "--worlds", "A", "--episodes", "1", "--no-pictures"]
+    study = ["--output", str(job.path / asked.folder)]
+    others = (["--seed", "3"], ["--noise", "slip=0.1,latency=1"])
+    evaluate.main(how)
+    assert job.is_evaluated(asked)
+    for other in others:
+        evaluate.main([*how, *other])
+        assert job.is_evaluated(asked)
+    names = {path.name for path in job.path.glob("evaluation-*")}
+    assert names == {"evaluation-A", "evaluation-A-seed3", "evaluation-A-slip0.1-latency1"}
+    for other in others:
+        evaluate.main([*how, *other, *study])
+        assert not job.is_evaluated(asked)
+    # Written before there were seeds and noise.
+    evaluate.main(how)
+    file = job.path / asked.folder / files.SETTINGS
+    found = json.loads(file.read_text())
+    file.write_text(json.dumps({name: found[name] for name in found if name != "seed"}))
+    assert job.is_evaluated(asked)
 
 
 def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> None:

@@ -22,6 +22,10 @@ from navigation.worlds import worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
 SCRIPTS = Path(__file__).resolve().parents[2]
+_OF_THE_RESULT = ("evaluation.every", "ray.workers", "ray.steps", "ray.sync")
+"""Settings that a run may change on its way, although it becomes another one by them."""
+_FREE = {*LAWFUL, *OF_THE_CALL, "device"} - {*_OF_THE_RESULT}
+"""Settings that may be others than those that a study asks for."""
 
 
 def run_name(learner: str, method: str, arm: str, seed: int) -> str:
@@ -129,6 +133,9 @@ class Job:
             and found.get("episodes") == wanted.episodes
             and found.get("words") == list(wanted.words)
             and found.get("physics") == wanted.physics
+            # A study drives the pairs of the first seed, and robots without errors.
+            and found.get("seed", 0) == 0
+            and found.get("noise") is None
             and policy.exists()
             and found.get("sha256") == files.digest(policy)
         )
@@ -139,11 +146,10 @@ class Job:
         if not found:
             return []
         had, wanted = (dict(settings_by_name(each)) for each in (as_settings(found), asked))
-        free = {*LAWFUL, *OF_THE_CALL, "device"}
         return [
             f"{name}={had[name]}, asked for is {value}"
             for name, value in wanted.items()
-            if name not in free and had[name] != value
+            if name not in _FREE and had[name] != value
         ]
 
 

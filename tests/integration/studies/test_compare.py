@@ -19,8 +19,10 @@ import evaluate
 from navigation import files
 from navigation.records import read_table
 from navigation.settings.command_line import composed
+from navigation.settings.train import register
 from navigation.studies import execution
 from navigation.studies.arms import parse_arm, with_defaults
+from navigation.studies.jobs import Job, other_than_asked
 from navigation.studies.processes import Lost
 from navigation.training import running
 from navigation.training.running import Refused, resume, start
@@ -112,6 +114,30 @@ def test_a_study_keeps_every_episode_and_refuses_other_settings(
     assert compare.main(more) == 0
     assert len(read_table(tmp_path / files.EPISODES)) == 9
     assert checkpoint.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("setting", "matters"),
+    [
+        ("evaluation.every=400", True),
+        ("ray.workers=2", True),
+        ("ray.steps=8", True),
+        ("ray.sync=true", True),
+        ("threads=2", False),
+        ("checkpoint_every=50", False),
+        ("tracking.project=other", False),
+    ],
+)
+def test_what_makes_another_run_of_it_is_not_what_a_study_asked_for(
+    setting: str, matters: bool, tmp_path: Path
+) -> None:
+    register()
+    job = Job("ddpg", "per", 0, tmp_path)
+    job.path.mkdir()
+    many = [*OVERRIDES, "robots=4", EPISODES.format(1)]
+    running.write_settings(job.asked(many), job.path / files.SETTINGS)
+    assert not other_than_asked([job], many)
+    assert (job in other_than_asked([job], [*many, setting])) == matters
 
 
 @pytest.mark.usefixtures("in_this_process")
