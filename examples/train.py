@@ -4,7 +4,7 @@
     python examples/train.py method=per seed=3            another method, another seed
     python examples/train.py regime=paper                 Table 1, one robot, worlds A, B, C, D
     python examples/train.py regime=paper curriculum=A    only world A
-    python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep
+    python examples/train.py -m seed=0,1,2 method=mpfa_per,per    a sweep, in hydra.sweep.dir
     python examples/train.py ray.workers=8 robots=128 updates=32    robots on a Ray cluster
     python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    resume a run that was stopped
 
@@ -28,6 +28,7 @@ from navigation.settings.train import as_settings, register
 from navigation.training.running import Refused, resume, start
 
 REFUSED = 2
+_SWEEP = ("-m", "--multirun")
 
 
 def run(config: DictConfig) -> None:
@@ -55,6 +56,12 @@ def main() -> None:
         folders = [o.value() for o in overrides if o.key_or_group == "resume"]
         if folders and folders[-1] is not None:
             raise SystemExit(resume(Path(str(folders[-1])), overrides))
+        named = any(override.key_or_group == "run_dir" for override in overrides)
+        if named and any(option in arguments for option in _SWEEP):
+            raise ValueError(
+                "run_dir is for one run: those of a sweep have their settings as names, in the "
+                "folder hydra.sweep.dir=FOLDER"
+            )
         for settings in composed(arguments):
             check_folder(Path(settings.run_dir))
     except (ValueError, Refused) as error:

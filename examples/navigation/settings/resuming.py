@@ -76,6 +76,22 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
     return as_settings(config)
 
 
+def check_single(overrides: list[Override]) -> None:
+    """Refuse settings of several runs, as a sweep has them.
+
+    Args:
+        overrides: The command line.
+
+    Raises:
+        ValueError: With the first one.
+    """
+    for override in overrides:
+        if override.is_sweep_override():
+            key, _, values = (override.input_line or "").partition("=")
+            several = f": several are {key}=[{values}]" if key == SEVERAL else ""
+            raise ValueError(f"resume: a run takes one value, got {key}={values}{several}")
+
+
 def choices_of(override: Override) -> list[str]:
     """What a command line chooses of a group: one word or several in brackets."""
     value = override.value()

@@ -208,7 +208,7 @@ class TrainSettings:
             "run": {"dir": "${run_dir}"},
             "sweep": {
                 "dir": "runs/sweep-${now:%Y-%m-%d_%H-%M-%S}",
-                "subdir": "${hydra.job.override_dirname}",
+                "subdir": "${one_folder:${hydra.job.override_dirname}}",
             },
             # The run writes its settings itself, once it knows that the folder is its own.
             "output_subdir": None,
@@ -313,9 +313,15 @@ GROUPS: dict[str, dict[str, Any]] = {
 
 
 @cache
+def _one_folder(settings: str) -> str:
+    """Name of the folder of a run, in which a value may be a path."""
+    return settings.replace("/", "_")
+
+
 def register() -> None:
     """Make the settings known to Hydra; a second call changes nothing."""
     OmegaConf.register_new_resolver("curriculum_name", _resolve_name, replace=True)
+    OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
     store = ConfigStore.instance()
     store.store(name="train", node=TrainSettings)
     for group, choices in GROUPS.items():

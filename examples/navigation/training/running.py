@@ -19,7 +19,7 @@ from navigation import files
 from navigation.figures import plot_learning_curve
 from navigation.records import EpisodeRecord, as_table
 from navigation.settings.checks import check_settings
-from navigation.settings.resuming import changed, check_lawful
+from navigation.settings.resuming import changed, check_lawful, check_single
 from navigation.settings.train import TrainSettings, as_settings
 from navigation.training.assembly import method_of
 from navigation.training.checkpoints import read_checkpoint
@@ -89,6 +89,7 @@ def resume(folder: Path, overrides: list[Override]) -> int:
     """
     with ExitStack() as held:
         with refusing():
+            check_single(overrides)
             if not folder.is_dir():
                 raise FileNotFoundError(f"resume: there is no folder {folder}")
             for name in (each.key_or_group for each in overrides):

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 
 import train
 from navigation import files
@@ -197,6 +198,11 @@ def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: s
         (STAGES.format(1), r"curriculum.stages may have more .* has \[A: 2\], got \[A: 1\]"),
         ("run_dir=elsewhere", "resume: run_dir is of no use, a run goes on in its folder"),
         ("overwrite=true", "resume: overwrite is of no use"),
+        ("tracking=csv,wandb", r"takes one value, got tracking=.*: several are tracking=\[csv,wan"),
+        (
+            "evaluation.every=100,200",
+            "resume: a run takes one value, got evaluation.every=100,200$",
+        ),
         ("learner.gamma=2", r"learner.gamma must be in \[0, 1\], got 2"),
         ("learner.width=abc", "learner.width"),
     ],
@@ -254,6 +260,23 @@ def test_a_wrong_setting_is_one_line_and_exit_status_2(
     assert exit_status(monkeypatch, f"run_dir={tmp_path / 'run'}", "learner.gamma=2") == 2
     assert capsys.readouterr().err == "train.py: learner.gamma must be in [0, 1], got 2.0\n"
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["-m", "--multirun"])
+def test_a_sweep_has_no_run_dir(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert exit_status(monkeypatch, option, "seed=0,1", "run_dir=mine") == 2
+    assert "the folder hydra.sweep.dir=FOLDER" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_of_a_sweep_has_one_folder_though_a_value_is_a_path() -> None:
+    with initialize_config_module("navigation.settings", version_base="1.3"):
+        words = ["seed=1", "tracking.group=a/b"]
+        config = compose("train", words, return_hydra_config=True)
+    assert config.hydra.sweep.subdir == "seed=1,tracking.group=a_b"
 
 
 def appears(file: Path, seconds: float = 120) -> bool:
