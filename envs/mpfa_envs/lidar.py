@@ -256,13 +256,17 @@ class Lidar:
     def disturb(self, ranges: NDArray[np.float64], rng: np.random.Generator) -> None:
         """Add the noise to a scan, and let rays drop out.
 
+        A ray that meets nothing has no range to be wrong about: it stays at the maximum.
+
         Args:
             ranges: Range of each ray, changed in place [m], shape ``[rays]``.
             rng: Source of the noise.
         """
         if self.noise > 0.0:
+            missed = ranges >= self.max_range
             ranges += self.noise * rng.standard_normal(ranges.size)
             np.clip(ranges, 0.0, self.max_range, out=ranges)
+            ranges[missed] = self.max_range
         if self.dropout > 0.0:
             ranges[rng.random(ranges.size) < self.dropout] = self.max_range
 

@@ -102,6 +102,18 @@ def test_the_lidar_agrees_with_the_ray_test_of_the_engine() -> None:
         simulation.close()
 
 
+def test_a_ray_that_meets_nothing_has_no_noise() -> None:
+    lidar = Lidar(World(name="wide", size=(30.0, 30.0)), noise=0.05)
+    rng = np.random.default_rng(0)
+    assert (lidar.scan(0.0, 0.0, 0.3, rng=rng) == lidar.max_range).all()
+    exact = lidar.cast(14.0, 0.0, 0.3)
+    noisy, met = exact.copy(), exact < lidar.max_range
+    lidar.disturb(noisy, rng)
+    assert 0 < met.sum() < met.size
+    assert (noisy[~met] == lidar.max_range).all()
+    assert (noisy[met] != exact[met]).all()
+
+
 def test_noise_needs_a_generator_and_is_its_only_randomness() -> None:
     lidar = Lidar(WORLDS["A"], noise=0.1)
     with pytest.raises(ValueError, match=r"rng must be a Generator when noise is 0.1, got None"):
