@@ -7,7 +7,7 @@ import platform
 import tempfile
 import weakref
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -92,6 +92,14 @@ class Simulation:
             # Robots that do not touch are solved apart, so that none depends on what others do.
             minimumSolverIslandSize=1,
             physicsClientId=self._client,
+        )
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be copied or pickled: a copy would have the same server and robots."""
+        raise TypeError(
+            "physics='wheels' cannot be copied or pickled, as its robots are in a physics server: "
+            "make another environment with the same arguments and, of a VectorNavigationEnv, load "
+            "its state_dict() there with load_state_dict(); physics='kinematic' can be copied"
         )
 
     @property

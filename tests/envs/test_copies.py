@@ -1,0 +1,41 @@
+"""Copies of an environment: of their own, or refused."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mpfa_envs import NavigationEnv, RoomsEnv, VectorNavigationEnv
+
+WAYS = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
+MAKERS = [NavigationEnv, RoomsEnv, lambda **arguments: VectorNavigationEnv(2, **arguments)]
+
+
+@pytest.mark.parametrize("way", WAYS, ids=["copy", "pickle"])
+@pytest.mark.parametrize("make", MAKERS, ids=["one", "rooms", "many"])
+def test_a_copy_without_wheels_drives_the_same_episode_on_its_own(
+    make: Callable, way: Callable
+) -> None:
+    env = make(world="A", physics="kinematic")
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 0.5)
+    env.step(action)
+    other = way(env)
+    theirs = [other.step(action)[0] for _ in range(3)]
+    for expected in theirs:
+        np.testing.assert_array_equal(env.step(action)[0], expected)
+    np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
+
+
+@pytest.mark.parametrize("way", WAYS, ids=["copy", "pickle"])
+def test_a_copy_on_wheels_is_refused_as_it_would_move_the_same_robot(way: Callable) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    for make in MAKERS:
+        env = make(world="A", physics="wheels")
+        with pytest.raises(TypeError, match=r"'wheels' cannot be copied .* state_dict\(\)"):
+            way(env)
+        env.close()
