@@ -67,6 +67,7 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
         split of a generator that its world is of, BARN, or the world; studies that are older than
         ``physics`` have an empty one.
     """
+    names = [folder.name for folder in folders]
     tables = []
     for folder in folders:
         found = read_table(folder / files.EPISODES)
@@ -80,11 +81,12 @@ def read_studies(folders: Sequence[Path]) -> pd.DataFrame:
             )
         for column in ("arm", "physics"):
             found[column] = found[column].fillna("") if column in found else ""
-        names = found[["learner", "method", "arm", "seed"]]
-        found["path"] = [str(folder / run_name(*each)) for each in names.itertuples(index=False)]
-        found["arm"] = names[["learner", "method", "arm"]].agg("/".join, axis=1).str.rstrip("/")
+        words = found[["learner", "method", "arm", "seed"]]
+        found["path"] = [str(folder / run_name(*each)) for each in words.itertuples(index=False)]
+        found["arm"] = words[["learner", "method", "arm"]].agg("/".join, axis=1).str.rstrip("/")
         seed = found["seed"].astype(str)
-        found["run"] = seed if len(folders) == 1 else folder.name + "/" + seed
+        name = str(folder) if names.count(folder.name) > 1 else folder.name
+        found["run"] = seed if len(folders) == 1 else f"{name}/" + seed
         found["family"] = found["world"].map(family)
         tables.append(found)
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
@@ -113,8 +115,8 @@ def write_paper(wanted: Sequence[Study], output: Path) -> int:
     trained, updates, tested = (
         read_runs(wanted, find)
         for find in (
-            lambda path: path / files.EPISODES,
-            lambda path: path / files.UPDATES,
+            lambda job: job.path / files.EPISODES,
+            lambda job: job.path / files.UPDATES,
             evaluation_of,
         )
     )
@@ -178,6 +180,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("paper", "study"):
         if getattr(options, name) and len(options.folders) > 1:
             parser.error(f"--{name} takes one folder, got {len(options.folders)}")
+    there = [folder.resolve() for folder in options.folders]
+    for folder, path in zip(options.folders, there, strict=True):
+        if there.count(path) > 1:
+            parser.error(f"{folder} is named twice: its runs count once")
     try:
         files.check_folder(output)
         return report(options, output)

@@ -24,6 +24,7 @@ from navigation.report.intervals import (
 from navigation.report.permutation import deal_p, flip_p, holm, rank_flip_p, rank_p
 from navigation.report.power import difference_found, paired_difference_found
 from navigation.report.study_rows import GOAL, Rows, kinds_of, scores_of, worlds_of
+from navigation.report.tables import median_of
 from navigation.report.tables import table as markdown
 from navigation.studies.protocol import Pair, Table, short_names
 from navigation.worlds import family
@@ -154,7 +155,7 @@ def arm_lines(
         never = int(np.isinf(runs["actions"]).sum())
         cells = [short[label], str(len(runs))]
         cells += [f"{of_area.value:.3f} {_ends(of_area)}", f"{middle.value:.3f} {_ends(middle)}"]
-        cells += [_median(runs["actions"]), f"{never} of {len(runs)}"]
+        cells += [median_of(runs["actions"]), f"{never} of {len(runs)}"]
         if len(success):
             rate = mean_interval(success, rng=rng)
             both = mean_over_worlds(*_matrix(worlds[label]), rng=rng)
@@ -246,7 +247,7 @@ def _cells(
     """Difference, intervals, and what could have been found; of actions the medians."""
     ours, theirs = sides.ours, sides.theirs
     if measure == "actions":
-        return [_median(ours), _median(theirs)]
+        return [median_of(ours), median_of(theirs)]
     if sides.paired:
         gap = mean_interval(ours - theirs, rng=rng)
         deviation = float((ours - theirs).std(ddof=1)) if len(ours) > 1 else math.nan
@@ -287,11 +288,6 @@ def _matrix(success: pd.DataFrame) -> tuple[Array, list[str]]:
 def _mean(values: pd.Series) -> float:
     found = float(values.mean())
     return -math.inf if math.isnan(found) else found
-
-
-def _median(values: Array | pd.Series) -> str:
-    middle = float(np.quantile(np.asarray(values, dtype=float), 0.5, method="inverted_cdf"))
-    return "never" if math.isinf(middle) else f"{middle:,.0f}"
 
 
 def _ends(interval: Interval, form: str = ".3f") -> str:

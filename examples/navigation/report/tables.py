@@ -196,7 +196,7 @@ def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
             steps = [_first(found, rate, "total_steps") for found in runs.values()]
             seconds = [_first(found, rate, "trained_for") for found in runs.values()]
             never = sum(math.isinf(each) for each in steps)
-            medians = [_median(each) for each in (steps, seconds)]
+            medians = [median_of(each) for each in (steps, seconds)]
             lines.append([*_cells(arm, width), f"{rate:.0%}", *medians, f"{never} of {len(runs)}"])
     head = [*_ARM[:width], "success", "actions, median of the runs", "seconds of training, median"]
     return table([*head, "never"], lines)
@@ -208,21 +208,31 @@ def area_under(steps: pd.Series, values: pd.Series) -> float:
     return float(np.trapezoid(y, x) / x[-1])
 
 
+def median_of(values: Iterable[float]) -> str:
+    """The median of what runs took, of an even number the lower of the two in the middle.
+
+    Args:
+        values: Of each run; infinite where it never came so far.
+
+    Returns:
+        The median: "never" if more than half of the runs never came so far, empty for NaN.
+
+    Examples:
+        >>> median_of([4000.0, 2000.0, math.inf, math.inf]), median_of([2000.0, math.inf, math.inf])
+        ('4,000', 'never')
+    """
+    middle = float(np.quantile(np.array(list(values)), 0.5, method="inverted_cdf"))
+    if math.isnan(middle):
+        return ""
+    return "never" if math.isinf(middle) else f"{middle:,.0f}"
+
+
 def _first(found: pd.DataFrame, rate: float, column: str) -> float:
     """Value of a column where a rate of success is first reached; infinite if it never is."""
     reached = found[found["success"] >= rate]
     if not len(reached):
         return math.inf
     return float(reached[column].iloc[0]) if column in found else math.nan
-
-
-def _median(values: Sequence[float]) -> str:
-    """The median of runs, of which more than half may not have come so far."""
-    if any(math.isnan(value) for value in values):
-        return ""
-    ordered = sorted(values)
-    middle = (ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]) / 2
-    return f"{middle:,.0f}" if math.isfinite(middle) else "never"
 
 
 def _worst(rows: pd.DataFrame) -> str:

@@ -12,7 +12,7 @@ from navigation import files
 from navigation.figures import Runs
 from navigation.records import read_table
 from navigation.studies.arms import Arm
-from navigation.studies.jobs import Job, Study
+from navigation.studies.jobs import TESTED, Job, Study
 
 RUNS = 10
 """Experiments that each curve of the paper is the mean of."""
@@ -132,12 +132,12 @@ def missing_lines(wanted: Sequence[Study]) -> str:
     return "\n".join(lines).rstrip()
 
 
-def read_runs(wanted: Sequence[Study], find: Callable[[Path], Path | None]) -> Runs:
+def read_runs(wanted: Sequence[Study], find: Callable[[Job], Path | None]) -> Runs:
     """A table of each run that is at its end and has it, by method or arm.
 
     Args:
         wanted: The studies.
-        find: From the folder of a run to the file, if there is one.
+        find: From a run to the file, if there is one.
 
     Returns:
         The tables; methods without any are left out.
@@ -146,18 +146,18 @@ def read_runs(wanted: Sequence[Study], find: Callable[[Path], Path | None]) -> R
     for study in wanted:
         for name, jobs in study.runs().items():
             for job in jobs:
-                file = find(job.path) if job.is_trained() else None
+                file = find(job) if job.is_trained() else None
                 rows = pd.DataFrame() if file is None else read_table(file)
                 if len(rows):
                     found.setdefault(name, {})[job.name] = rows
     return found
 
 
-def evaluation_of(path: Path) -> Path | None:
-    """The rows of a run in the unseen world, if it was tested there."""
-    return next(iter(sorted(path.glob(f"evaluation-test*/{files.EPISODES}"))), None)
+def evaluation_of(job: Job) -> Path | None:
+    """The rows of a run in the unseen world, if its policy was tested there as those of all are."""
+    return job.path / TESTED.folder / files.EPISODES if job.is_evaluated(TESTED) else None
 
 
 def _is_whole(job: Job) -> bool:
     rows = read_table(job.path / files.UPDATES)
-    return job.is_trained() and evaluation_of(job.path) is not None and len(rows) > 0
+    return job.is_trained() and evaluation_of(job) is not None and len(rows) > 0

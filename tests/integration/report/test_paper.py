@@ -13,16 +13,33 @@ from PIL import Image
 
 import compare
 import report
+from navigation import files
 from navigation.records import write_table
 from navigation.report.paper_figures import plot_claims, reward_of_blocks
 from navigation.report.paper_tables import trained_table, unseen_table
 from navigation.settings.train import GROUPS, Stage
 from navigation.studies.jobs import Job
-from navigation.studies.paper import NAMES, PHIS, TABLE_2, TABLE_4, missing, read_runs, studies
+from navigation.studies.paper import (
+    NAMES,
+    PHIS,
+    TABLE_2,
+    TABLE_4,
+    evaluation_of,
+    missing,
+    read_runs,
+    studies,
+)
 from tests.integration.report.test_figures import colored, heights
 from tests.integration.tiny_runs import tiny, train
 
 FIGURES = ["claims", *(f"figure_{n}" for n in (3, 5, 8, 9, 10, 11, 13))]
+
+
+def say_tested(job: Job, **other: object) -> None:
+    """Say of the rows of a run that they are those of its policy, in the unseen world."""
+    said: dict[str, object] = {"words": ["test"], "episodes": 200, "seed": 0, "physics": None}
+    said["sha256"] = files.digest(job.path / files.POLICY)
+    (job.path / "evaluation-test" / "settings.json").write_text(json.dumps({**said, **other}))
 
 
 @pytest.fixture(scope="session")
@@ -44,6 +61,7 @@ def paper_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rows["collision"] = ~rows["success"]
             (job.path / "evaluation-test").mkdir()
             write_table(rows, job.path / "evaluation-test" / "episodes.csv")
+            say_tested(job)
     return folder
 
 
@@ -88,10 +106,21 @@ def test_a_run_that_is_not_at_its_end_is_missing_and_in_no_table(tmp_path: Path)
     for name in ("updates.csv", "episodes.csv", "evaluation-test/episodes.csv"):
         write_table(pd.DataFrame({"total_steps": [1]}), job.path / name)
     (job.path / "policy.npz").write_bytes(b"policy")
+    say_tested(job)
     for finished in (False, True):
         (job.path / "status.json").write_text(json.dumps({"finished": finished}))
         assert (job.name in missing(first)) != finished
-        assert ("per" in read_runs(wanted, lambda path: path / "episodes.csv")) == finished
+        assert ("per" in read_runs(wanted, lambda job: job.path / "episodes.csv")) == finished
+    tested = job.path / "evaluation-test"
+    assert evaluation_of(job) == tested / "episodes.csv"
+    # Of other worlds, or by other rules.
+    tested.rename(job.path / "evaluation-test+A")
+    assert evaluation_of(job) is None
+    (job.path / "evaluation-test+A").rename(tested)
+    for said in ({"episodes": 20}, {"seed": 1}, {"sha256": "of another policy"}):
+        say_tested(job, **said)
+        assert evaluation_of(job) is None
+        assert job.name in missing(first)
 
 
 def test_a_folder_without_runs_gets_the_commands(

@@ -152,9 +152,10 @@ def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(study: Path) ->
             write_table(table, study / f"ddpg-{method}-{seed}" / "evaluations.csv")
     report.main([str(study)])
     text = (study / "tables.md").read_text(encoding="utf-8")
-    assert "| ddpg | mpfa_per | 90% | 1,500 | 15 | 0 of 2 |" in text
-    assert "| ddpg | mpfa_per | 95% | never | never | 1 of 2 |" in text
-    assert "| ddpg | per | 90% | never | never | 1 of 2 |" in text
+    assert "| ddpg | mpfa_per | 90% | 1,000 | 10 | 0 of 2 |" in text
+    assert "| ddpg | mpfa_per | 95% | 3,000 | 30 | 1 of 2 |" in text
+    assert "| ddpg | per | 90% | 1,000 | 10 | 1 of 2 |" in text
+    assert "| ddpg | per | 95% | 2,000 | 20 | 1 of 2 |" in text
     # Runs of which their time is not known.
     table = pd.DataFrame({"total_steps": steps, "success": [0, 1, 1]})
     for seed in (0, 1):
@@ -173,6 +174,29 @@ def test_two_studies_together_have_the_runs_of_both(
     write_table(rows, more / "episodes.csv")
     report.main([str(study), str(more), "--output", str(tmp_path / "both")])
     assert "| ddpg | per | 0.0% | 0.0%, 0.0%, 0.0% |" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("tables_alone")
+def test_two_studies_of_one_name_have_the_runs_of_both(study: Path, tmp_path: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv").query("method == 'per'")
+    folders = [tmp_path / parent / "cmp" for parent in "ab"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        write_table(rows, folder / "episodes.csv")
+    assert report.main([*map(str, folders), "--output", str(tmp_path / "both")]) == 0
+    text = (tmp_path / "both" / "tables.md").read_text("utf-8")
+    assert "| ddpg | per | 0.0% | 0.0%, 0.0%, 0.0%, 0.0% |" in text
+    assert set(report.read_studies(folders)["run"]) == {f"{f}/{n}" for f in folders for n in (0, 1)}
+    assert set(report.read_studies([study, folders[0]])["run"]) == {
+        *(f"{study.name}/{seed}" for seed in (0, 1)),
+        *(f"cmp/{seed}" for seed in (0, 1)),
+    }
+
+
+def test_a_study_is_not_counted_twice(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        report.main([str(study), f"{study}/../{study.name}"])
+    assert "is named twice: its runs count once" in capsys.readouterr().err
 
 
 def test_the_figures_may_go_elsewhere(study: Path, tmp_path: Path) -> None:
