@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
@@ -15,7 +14,7 @@ from mpfa_envs.lidar import Lidar
 from mpfa_envs.live_view import LiveView, RenderMode
 from mpfa_envs.noise import NoisyMotion, RobotNoise, resolve_noise
 from mpfa_envs.observation import Memory, observation_bounds, observation_slices
-from mpfa_envs.reward import RewardFunction, navigation_reward
+from mpfa_envs.reward import RewardFunction, resolve_reward
 from mpfa_envs.robot import RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.worlds import World
 
@@ -68,15 +67,11 @@ class TaskArguments(LiveView):
         self.robot = resolve_robot(robot)
         if physics not in get_args(Physics):
             raise ValueError(f"physics must be one of {get_args(Physics)}, got {physics!r}")
-        if reward is not None and not callable(reward):
-            raise ValueError(f"reward must be callable or None, got {reward!r}")
         if progress not in get_args(Progress):
             raise ValueError(f"progress must be one of {get_args(Progress)}, got {progress!r}")
         scale = check_number("progress_scale", progress_scale)
         self.progress = progress
-        self.reward: RewardFunction = reward or partial(
-            navigation_reward, progress_scale=0.0 if progress == "none" else scale
-        )
+        self.reward = resolve_reward(reward, progress=progress, progress_scale=scale)
         self.physics = physics
         if memory not in get_args(Memory):
             raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")

@@ -20,12 +20,7 @@ from mpfa_envs.episodes import draw_episode, keeping
 from mpfa_envs.live_view import RenderMode
 from mpfa_envs.noise import RobotNoise
 from mpfa_envs.observation import INFO_TYPES, Memory
-from mpfa_envs.reward import (
-    PROGRESS_SCALE,
-    RewardFunction,
-    RewardTerms,
-    StepOutcome,
-)
+from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction, RewardTerms, StepOutcome, read_terms
 from mpfa_envs.robot import RobotModel
 from mpfa_envs.senses import Senses
 from mpfa_envs.tasks import Task, check_task
@@ -116,7 +111,8 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             in Eq. (25); ``"shortest_path"``, the way to it that keeps the collision distance
             (:class:`~mpfa_envs.DistanceField`); or ``"none"``, only goal and collision count.
         reward: Computes the reward in place of Eq. (25), and without progress_scale;
-            ``functools.partial(navigation_reward, goal_reward=20.0)``, say.
+            ``functools.partial(navigation_reward, goal_reward=20.0)``, say. Another function pays
+            as it likes; with ``progress="none"`` it is told the straight distances.
         lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``.
         memory: ``"map"``: the robot keeps a map of what its lidar hit in this episode and senses
             the way to the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it
@@ -334,7 +330,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         collision = not success and to_obstacle <= self.collision_distance
         speeds = motion.linear_speed, motion.angular_speed
         outcome = StepOutcome(previous, self._way, success, collision, clearance, *speeds)
-        terms = self.reward(outcome)
+        terms = read_terms(self.reward(outcome))
         truncated = not (success or collision) and self._steps >= self.max_steps
         self._running = not (success or collision or truncated)
         if self.render_mode == "human":

@@ -6,9 +6,12 @@ The equation is from https://doi.org/10.3389/fnbot.2023.1281166.
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
+
+from mpfa_envs.checks import check_number
 
 PROGRESS_SCALE: Final = 5.0
 """ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
@@ -96,6 +99,65 @@ def navigation_reward(
     return RewardTerms(progress=progress_scale * (outcome.previous_distance - outcome.distance))
 
 
+def resolve_reward(
+    reward: RewardFunction | None, *, progress: str, progress_scale: float
+) -> RewardFunction:
+    """Find the function that rewards a task.
+
+    Args:
+        reward: One of the user's; None: Eq. (25).
+        progress: What an approach is measured by; ``"none"``: Eq. (25) does not pay it, whatever
+            its scales are.
+        progress_scale: ε_p of Eq. (25) unless a function is given [1/m].
+
+    Returns:
+        The function.
+
+    Raises:
+        ValueError: If it cannot be called, or Eq. (25) is to pay what is no number.
+    """
+    if reward is None:
+        return partial(
+            navigation_reward, progress_scale=0.0 if progress == "none" else progress_scale
+        )
+    if not callable(reward):
+        raise ValueError(f"reward must be callable or None, got {reward!r}")
+    if payments_of(reward) is not None and progress == "none":
+        equation: Callable[..., RewardTerms] = reward
+        return partial(equation, progress_scale=0.0)
+    return reward
+
+
+def read_terms(terms: Any) -> RewardTerms:
+    """Read what a reward function gave.
+
+    Args:
+        terms: The goal's, the collision's, the progress's and other reward.
+
+    Returns:
+        The same as floats.
+
+    Raises:
+        ValueError: If they are not four finite numbers.
+
+    Examples:
+        >>> from mpfa_envs.reward import read_terms
+        >>> read_terms(1.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: reward must give RewardTerms of four finite numbers, got 1.0
+    """
+    try:
+        goal, collision, progress, other = terms
+        # It takes no text, which float would read as a number.
+        sound = all(map(math.isfinite, (goal, collision, progress, other)))
+    except (TypeError, ValueError, OverflowError):
+        sound = False
+    if not sound:
+        raise ValueError(f"reward must give RewardTerms of four finite numbers, got {terms!r}")
+    return RewardTerms(float(goal), float(collision), float(progress), float(other))
+
+
 def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
     """Read what Eq. (25) pays.
 
@@ -105,17 +167,21 @@ def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
     Returns:
         Rewards for the goal, for a collision and per meter of approach; None if the function is
         neither :func:`~mpfa_envs.navigation_reward` nor a ``functools.partial`` of it by keywords.
+
+    Raises:
+        ValueError: If a keyword is not one of its own, or its value no finite number.
     """
     function = reward.func if isinstance(reward, partial) else reward
     if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
         return None
-    given = inspect.signature(navigation_reward).bind_partial(
-        **(reward.keywords if isinstance(reward, partial) else {})
-    )
+    keywords = reward.keywords if isinstance(reward, partial) else {}
+    try:
+        given = inspect.signature(navigation_reward).bind_partial(**keywords)
+    except TypeError as error:
+        raise ValueError(f"reward must have keywords of navigation_reward: {error}") from error
     given.apply_defaults()
-    scales = given.arguments
-    return (
-        float(scales["goal_reward"]),
-        float(scales["collision_reward"]),
-        float(scales["progress_scale"]),
+    goal, collision, progress = (
+        check_number(name, given.arguments[name])
+        for name in ("goal_reward", "collision_reward", "progress_scale")
     )
+    return goal, collision, progress

@@ -27,7 +27,7 @@ from mpfa_envs.kernels.step import (
 from mpfa_envs.map_memory import MapMemory
 from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
-from mpfa_envs.reward import StepOutcome, payments_of
+from mpfa_envs.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.tasks import read_task
 from mpfa_envs.vector_drives import make_drives
 from mpfa_envs.vector_state import read_array, read_list
@@ -283,7 +283,7 @@ class RobotBatch:
                 float(episodes.clearances[index]),
                 *episodes.motions[index, 3:].tolist(),
             )
-            episodes.numbers[REWARD : REWARD + 4, index] += self._rules.reward(outcome)
+            episodes.numbers[REWARD : REWARD + 4, index] += read_terms(self._rules.reward(outcome))
 
     def sense(self, chosen: NDArray[np.bool_], rngs: Sequence[np.random.Generator]) -> None:
         """Sense the worlds and build the observations.

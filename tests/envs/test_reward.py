@@ -1,8 +1,18 @@
 from __future__ import annotations
 
+import math
+from functools import partial
+
+import numpy as np
 import pytest
 
-from mpfa_envs import StepOutcome, navigation_reward
+from mpfa_envs import (
+    NavigationEnv,
+    RewardTerms,
+    StepOutcome,
+    VectorNavigationEnv,
+    navigation_reward,
+)
 
 
 def outcome(before: float, after: float, *, success: bool = False, collision: bool = False):
@@ -25,3 +35,55 @@ def test_the_scales_are_arguments() -> None:
     assert navigation_reward(outcome(2.0, 1.0), **scales).progress == 7.0
     assert navigation_reward(outcome(2.0, 1.0, success=True), **scales).total == 30.0
     assert navigation_reward(outcome(2.0, 1.0, collision=True), **scales).total == -20.0
+
+
+def one_robot(**arguments: object) -> float:
+    """The reward of one step."""
+    with NavigationEnv(physics="kinematic", action_repeat=1, **arguments) as env:
+        env.reset(seed=0)
+        return env.step(np.ones(2))[1]
+
+
+def two_robots(**arguments: object) -> float:
+    """The first one's reward of one step."""
+    env = VectorNavigationEnv(2, physics="kinematic", action_repeat=1, **arguments)
+    env.reset(seed=0)
+    return float(env.step(np.ones((2, 2)))[1][0])
+
+
+@pytest.mark.parametrize("step", [one_robot, two_robots])
+@pytest.mark.parametrize(
+    ("terms", "shown"),
+    [
+        (1.0, "got 1.0"),
+        (None, "got None"),
+        ((1.0, 2.0), r"got \(1.0, 2.0\)"),
+        (np.ones(1), r"got array\(\[1.\]\)"),
+        ("1234", "got '1234'"),
+        (RewardTerms(progress=math.nan), "got RewardTerms.*nan"),
+    ],
+)
+def test_a_reward_that_gives_no_four_finite_numbers_is_refused(step, terms, shown) -> None:
+    with pytest.raises(ValueError, match=f"reward must give RewardTerms of four .*{shown}"):
+        step(reward=lambda outcome: terms)
+
+
+@pytest.mark.parametrize("step", [one_robot, two_robots])
+def test_any_four_numbers_are_the_terms_of_a_reward(step) -> None:
+    assert step(reward=lambda outcome: np.array([1, 2, 3, 4])) == 10.0
+
+
+@pytest.mark.parametrize("make", [NavigationEnv, partial(VectorNavigationEnv, 2)])
+def test_a_bad_payment_of_the_equation_is_named_before_anything_is_built(make) -> None:
+    reward = partial(navigation_reward, goal_reward=math.inf)
+    with pytest.raises(ValueError, match="goal_reward must be a finite number, got inf"):
+        make(reward=reward)
+    with pytest.raises(ValueError, match=r"reward must have keywords of .*'goal'"):
+        make(reward=partial(navigation_reward, goal=20.0))
+
+
+@pytest.mark.parametrize("step", [one_robot, two_robots])
+def test_without_progress_no_payment_of_the_equation_pays_an_approach(step) -> None:
+    reward = partial(navigation_reward, goal_reward=20.0, progress_scale=3.0)
+    assert step(reward=reward) != 0.0
+    assert step(reward=reward, progress="none") == 0.0
