@@ -30,6 +30,19 @@ def check_number(name: str, value: Any) -> float:
     return number
 
 
+def all_finite(values: Iterable[Any]) -> bool:
+    """Tell whether all are finite numbers; neither text nor a truth value is one.
+
+    Examples:
+        >>> all_finite((1, 2.5)), all_finite((1, "2.5")), all_finite((True,))
+        (True, False, False)
+    """
+    try:
+        return all(math.isfinite(value) and not isinstance(value, bool) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
 def check_positive(name: str, value: Any) -> float:
     """A finite number above zero.
 

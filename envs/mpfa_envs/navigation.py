@@ -245,7 +245,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
                 the episode goes on then.
         """
         if seed is not None:
-            check_count("seed", seed, least=0)
+            seed = check_count("seed", seed, least=0)
         task = self.check_task(options) if options else None
         source = (self.np_random, self.np_random_seed) if seed is None else seeding.np_random(seed)
         with keeping(source[:1]):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from mpfa_envs.checks import did_you_mean
+from mpfa_envs.checks import all_finite, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -283,9 +283,9 @@ def resolve_collision_distance(
     """
     if value is None:
         return robot.collision_distance
-    if value == "contact":
+    if isinstance(value, str) and value == "contact":
         return robot.radius
-    if isinstance(value, str) or not (math.isfinite(value) and value >= robot.radius):
+    if not (all_finite((value,)) and float(value) >= robot.radius):
         raise ValueError(
             "collision_distance must be 'contact', None or at least the robot's radius "
             f"{robot.radius}, got {value!r}"

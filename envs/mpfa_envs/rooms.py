@@ -107,7 +107,7 @@ class RoomsEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float3
         """
         given = self._read(options or {})
         if seed is not None:
-            check_count("seed", seed, least=0)
+            seed = check_count("seed", seed, least=0)
         observations, infos = self.robots.reset(
             seed=None if seed is None else [seed], options=given
         )

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from mpfa_envs.checks import all_finite
+
 Point = tuple[float, float]
 """A position (x, y) [m]."""
 
@@ -43,7 +45,7 @@ class Box:
     y_max: float
 
     def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x_min, self.y_min, self.x_max, self.y_max))):
+        if not all_finite((self.x_min, self.y_min, self.x_max, self.y_max)):
             raise ValueError(f"box must have finite edges, got {self}")
         if self.x_min >= self.x_max or self.y_min >= self.y_max:
             raise ValueError(f"box must have x_min < x_max and y_min < y_max, got {self}")
@@ -77,7 +79,7 @@ class Cylinder:
     radius: float
 
     def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x, self.y, self.radius))):
+        if not all_finite((self.x, self.y, self.radius)):
             raise ValueError(f"cylinder must have finite numbers, got {self}")
         if self.radius <= 0:
             raise ValueError(f"cylinder must have a positive radius, got {self}")
@@ -115,15 +117,15 @@ class Polygon:
     vertices: tuple[Point, ...]
 
     def __post_init__(self) -> None:
-        if not 3 <= len(self.vertices) <= MOST_VERTICES:
-            raise ValueError(
-                f"polygon must have 3 to {MOST_VERTICES} vertices, got {len(self.vertices)}"
-            )
-        if not all(
-            len(vertex) == 2 and all(map(math.isfinite, vertex)) for vertex in self.vertices
-        ):
+        try:
+            given = [tuple(vertex) for vertex in self.vertices]
+        except TypeError:
+            raise ValueError(f"polygon must have a list of vertices, got {self.vertices}") from None
+        if not 3 <= len(given) <= MOST_VERTICES:
+            raise ValueError(f"polygon must have 3 to {MOST_VERTICES} vertices, got {len(given)}")
+        if not all(len(vertex) == 2 and all_finite(vertex) for vertex in given):
             raise ValueError(f"polygon must have two finite numbers a vertex, got {self.vertices}")
-        vertices = tuple((float(x), float(y)) for x, y in self.vertices)
+        vertices = tuple((float(x), float(y)) for x, y in given)
         area = _signed_area(vertices)
         # The dataclass is frozen; this is its only change, before anyone sees it.
         object.__setattr__(self, "vertices", vertices if area > 0 else vertices[::-1])

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
+from mpfa_envs.checks import all_finite
+
 if TYPE_CHECKING:
     from mpfa_envs.shapes import Point
 
@@ -65,25 +67,31 @@ class Walker:
     waypoints: tuple[Point, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.radius) and self.radius > 0.0):
+        if not (all_finite((self.radius,)) and self.radius > 0.0):
             raise ValueError(f"radius must be a positive number, got {self.radius!r}")
-        if not 0.0 < self.speed <= FASTEST:
+        if not (all_finite((self.speed,)) and 0.0 < self.speed <= FASTEST):
             raise ValueError(f"speed must be above 0 and at most {FASTEST:g}, got {self.speed!r}")
         if self.behavior not in get_args(Behavior):
             raise ValueError(f"behavior must be one of {get_args(Behavior)}, got {self.behavior!r}")
+        try:
+            given = [tuple(point) for point in self.waypoints]
+        except TypeError:
+            raise ValueError(
+                f"waypoints must be a list of positions, got {self.waypoints}"
+            ) from None
         if self.behavior == "straight":
-            if self.waypoints:
+            if given:
                 raise ValueError(
                     f"waypoints must be empty with behavior='straight', got {self.waypoints}"
                 )
-        elif not 2 <= len(self.waypoints) <= MOST_WAYPOINTS:
+        elif not 2 <= len(given) <= MOST_WAYPOINTS:
             raise ValueError(
                 f"waypoints must be 2 to {MOST_WAYPOINTS} with behavior={self.behavior!r}, got "
-                f"{len(self.waypoints)}"
+                f"{len(given)}"
             )
-        points = tuple((float(x), float(y)) for x, y in self.waypoints)
-        if not all(math.isfinite(number) for point in points for number in point):
-            raise ValueError(f"waypoints must be finite, got {self.waypoints}")
+        if not all(len(point) == 2 and all_finite(point) for point in given):
+            raise ValueError(f"waypoints must be finite positions (x, y), got {self.waypoints}")
+        points = tuple((float(x), float(y)) for x, y in given)
         # The dataclass is frozen; nobody has seen the walker yet.
         object.__setattr__(self, "waypoints", points)
         for one, other in self.legs:

@@ -14,7 +14,7 @@ from mpfa_envs.plain_worlds import walker_to_plain
 from mpfa_envs.shapes import Box, Cylinder, Polygon
 from mpfa_envs.walkers import Walker
 from mpfa_envs.worlds import World
-from mpfa_envs.yaml_nodes import NodeReader, is_map, read_nodes
+from mpfa_envs.yaml_nodes import NodeReader, WorldFileError, is_map, parse_nodes, read_nodes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -228,7 +228,9 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
         path: The file; an existing one is overwritten.
 
     Raises:
-        ValueError: If the world has the cells of a map, which :meth:`World.to_map` writes.
+        ValueError: If the world has the cells of a map, which :meth:`World.to_map` writes, or
+            :func:`load_world` would refuse the file, as it does one without a name; nothing is
+            written then.
 
     Examples:
         >>> import tempfile
@@ -263,4 +265,9 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
     if world.walkers:
         content["walkers"] = [walker_to_plain(walker) for walker in world.walkers]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
-    Path(path).write_text(text, encoding="utf-8")
+    path = Path(path)
+    try:
+        _Reader(path).world(parse_nodes(text, path))
+    except WorldFileError as error:
+        raise ValueError(f"world must be one that can be loaded again: {error}") from error
+    path.write_text(text, encoding="utf-8")

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
+from mpfa_envs.checks import all_finite
 from mpfa_envs.occupancy import OccupancyGrid
 from mpfa_envs.shapes import Box, Cylinder, Polygon, Shape
 from mpfa_envs.walkers import MOST_WALKERS, Walker
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -31,6 +34,15 @@ _APART: Final = 0.05
 """Places of a line whose clearance is looked at are this far apart, at most [m]."""
 _CHUNK: Final = 2_000_000
 """Distances between points and obstacles that are computed at once."""
+_PARTS: Final[Mapping[str, type[Shape | Walker]]] = {
+    "boxes": Box,
+    "cylinders": Cylinder,
+    "polygons": Polygon,
+    "start_regions": Box,
+    "goal_regions": Box,
+    "walkers": Walker,
+}
+"""What the fields of a world hold that are tuples."""
 
 
 class WorldArrays(NamedTuple):
@@ -67,8 +79,9 @@ class World:
             too, any number of them.
 
     Raises:
-        ValueError: If the size is out of its range, there are too many obstacles or walkers, or
-            something does not lie in the room or a walker cannot go between its waypoints.
+        ValueError: If a field is of another kind, the size is out of its range, there are too many
+            obstacles or walkers, or something does not lie in the room or a walker cannot go
+            between its waypoints.
 
     Examples:
         >>> from mpfa_envs import Box, World
@@ -88,7 +101,8 @@ class World:
     occupancy: OccupancyGrid | None = None
 
     def __post_init__(self) -> None:
-        if len(self.size) != 2 or not all(math.isfinite(side) and side > 0 for side in self.size):
+        self._check_kinds()
+        if len(self.size) != 2 or not all(side > 0 for side in self.size):
             raise ValueError(f"size must be two positive lengths, got {self.size}")
         if max(self.size) > LARGEST_SIDE:
             raise ValueError(f"size must be at most {LARGEST_SIDE:g} m, got {self.size}")
@@ -105,6 +119,25 @@ class World:
         if grid is not None and not np.allclose(grid.size, self.size, rtol=1e-9, atol=0.0):
             raise ValueError(f"size must be that of the occupancy, {grid.size}, got {self.size}")
         self._check_walkers()
+
+    def _check_kinds(self) -> None:
+        """Refuse fields of another kind, and make tuples of lists, as worlds are keys."""
+        if not isinstance(self.name, str):
+            raise ValueError(f"name must be text, got {self.name!r}")
+        size = tuple(self.size) if isinstance(self.size, Iterable) else ()
+        if not all_finite(size or (math.nan,)):
+            raise ValueError(f"size must be two positive lengths, got {self.size}")
+        # The dataclass is frozen; these are its only changes, before anyone sees it.
+        object.__setattr__(self, "size", size)
+        for field, kind in _PARTS.items():
+            given = getattr(self, field)
+            parts = tuple(given) if isinstance(given, Iterable) else (given,)
+            for part in parts:
+                if not isinstance(part, kind) or part is given:
+                    raise ValueError(f"{field} must be a tuple of {kind.__name__}, got {given!r}")
+            object.__setattr__(self, field, parts)
+        if not isinstance(self.occupancy, OccupancyGrid | None):
+            raise ValueError(f"occupancy must be an OccupancyGrid, got {self.occupancy!r}")
 
     def _check_walkers(self) -> None:
         """Refuse walkers that have no room."""
@@ -160,9 +193,13 @@ class World:
 
     @cached_property
     def _hash(self) -> int:
-        """Hash of all numbers; without the name it is the same in every process."""
+        """Hash of all but the name."""
         regions = self.start_regions, self.goal_regions
         return hash((self.size, self.obstacles, *regions, self.walkers, self.occupancy))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the hash, which differs between processes as those of texts and None do."""
+        return {name: value for name, value in self.__dict__.items() if name != "_hash"}
 
     def renamed(self, name: str) -> World:
         """Give the same world another name; what was computed of it is kept."""

@@ -34,6 +34,22 @@ def read_nodes(path: Path) -> yaml.Node | None:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise WorldFileError(f"{path}: cannot be read: {error}") from error
+    return parse_nodes(text, path)
+
+
+def parse_nodes(text: str, path: Path) -> yaml.Node | None:
+    """Turn the text of a file into nodes.
+
+    Args:
+        text: The text.
+        path: The file, for messages.
+
+    Returns:
+        The outermost node; None if there is none.
+
+    Raises:
+        WorldFileError: If the text is too long, or not YAML.
+    """
     if len(text) > _LARGEST_FILE:
         raise WorldFileError(f"{path}: has {len(text)} characters, more than {_LARGEST_FILE}")
     try:

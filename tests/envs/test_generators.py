@@ -111,6 +111,12 @@ def test_the_tasks_of_the_tables_are_the_same_for_ever(
     assert (*start, *goal) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.parametrize("difficulty", [1e-7, 1 / 3, 0.5, 1.0])
+def test_a_world_is_found_by_its_name_whatever_its_difficulty(difficulty: float) -> None:
+    world = generate_world("mazes", 7, difficulty=difficulty)
+    assert resolve_world(world.name) == world
+
+
 def test_rooms_are_those_of_earlier_results() -> None:
     for seed, place, edges in (
         (7, 0, (4.5, 2.733799, 5.0, 3.380495)),

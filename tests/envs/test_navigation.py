@@ -322,6 +322,8 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
         ("detour_chance", math.nan, "detour_chance must be a finite number, got nan"),
         ("progress_scale", math.inf, "progress_scale must be a finite number, got inf"),
         ("collision_distance", 0.1, "collision_distance must be .*0.18, got 0.1"),
+        ("collision_distance", True, "collision_distance must be .*got True"),
+        ("collision_distance", [1], r"collision_distance must be .*got \[1\]"),
         ("collision_distance", "touch", "collision_distance must be .*got 'touch'"),
         ("reward", 3, "reward must be callable or None, got 3"),
         ("render_mode", "ansi", "render_mode must be None or 'human' or 'rgb_array', got 'ansi'"),
@@ -336,6 +338,12 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
 def test_a_bad_argument_is_named_with_its_value(argument: str, value: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         NavigationEnv(**{"physics": "kinematic", argument: value})
+
+
+def test_a_seed_may_be_an_integer_of_numpy() -> None:
+    env = paper_env(physics="kinematic")
+    first, second = (env.reset(seed=seed)[0] for seed in (5, np.int64(5)))
+    np.testing.assert_array_equal(first, second)
 
 
 def test_closeness_is_one_at_its_distance_and_falls_beyond() -> None:

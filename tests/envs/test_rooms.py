@@ -58,7 +58,7 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: RoomsEnv) -> None:
 
 def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: RoomsEnv) -> None:
     seen = []
-    for seed in (3, None, None, None, 3, None):
+    for seed in (3, None, None, None, np.int64(3), None):
         observation, info = env.reset(seed=seed)
         assert env.observation_space.contains(observation)
         assert tuple(info) == tuple(INFO_TYPES)

@@ -8,7 +8,9 @@ import pytest
 from mpfa_envs import (
     EXAMPLE_WORLD,
     WORLDS,
+    Box,
     NavigationEnv,
+    World,
     WorldFileError,
     generate_world,
     load_world,
@@ -164,6 +166,24 @@ start:
 """
     (tmp_path / "slit.yaml").write_text(text)
     assert len(load_world(tmp_path / "slit.yaml").start_regions) == 1
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        (World(name=" "), "name must be text"),
+        (
+            World(name="edge", start_regions=(Box(-5, -5, -4.8, 5),)),
+            "an entry of start has no point 0.5 m",
+        ),
+    ],
+)
+def test_what_could_not_be_loaded_is_not_saved(world: World, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "world.yaml"
+    path.write_text("kept")
+    with pytest.raises(ValueError, match=f"world must be one that can be loaded.*{message}"):
+        save_world(world, path)
+    assert path.read_text() == "kept"
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

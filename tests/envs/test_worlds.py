@@ -1,11 +1,25 @@
 from __future__ import annotations
 
 import math
+import os
+import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, World, evaluation_pairs, sample_task
+from mpfa_envs import (
+    WORLDS,
+    Box,
+    Cylinder,
+    NavigationEnv,
+    Polygon,
+    Walker,
+    World,
+    evaluation_pairs,
+    sample_task,
+)
 from mpfa_envs.path import planner_for
 
 
@@ -31,6 +45,20 @@ def test_clearance_is_the_distance_to_the_nearest_face() -> None:
         (lambda: World(name="x", boxes=(Box(4, 0, 6, 1),)), "boxes must lie in the room"),
         (lambda: World(name="x", cylinders=(Cylinder(5, 0, 1),)), "cylinders must lie in the room"),
         (lambda: World(name="x", goal_regions=(Box(4, 0, 6, 1),)), "goal_regions must lie in"),
+        (lambda: Box("1", 0, 2, 2), "box must have finite edges, got .*'1'"),
+        (lambda: Box(0, 0, True, 2), "box must have finite edges, got .*True"),
+        (lambda: Cylinder(None, 0, 1), "cylinder must have finite numbers, got .*None"),
+        (lambda: Polygon(3), "polygon must have a list of vertices, got 3"),
+        (lambda: Polygon(("ab", "cd", "ef")), "polygon must have two finite numbers .*'ab'"),
+        (lambda: World(name=None), "name must be text, got None"),
+        (lambda: World(name="x", size=8), "size must be two positive lengths, got 8"),
+        (lambda: World(name="x", size=("1", "2")), "size must be two positive .*'1'"),
+        (lambda: World(name="x", size=()), r"size must be two positive lengths, got \(\)"),
+        (lambda: World(name="x", boxes=Box(0, 0, 1, 1)), "boxes must be a tuple of Box, got Box"),
+        (lambda: World(name="x", boxes=((1, 1, 2, 2),)), "boxes must be a tuple of Box, got"),
+        (lambda: World(name="x", cylinders=(Box(0, 0, 1, 1),)), "cylinders must be a tuple of Cyl"),
+        (lambda: World(name="x", walkers=Walker()), "walkers must be a tuple of Walker, got"),
+        (lambda: World(name="x", occupancy=3), "occupancy must be an OccupancyGrid, got 3"),
     ],
 )
 def test_a_bad_shape_is_refused(make: object, message: str) -> None:
@@ -148,6 +176,40 @@ def test_equal_worlds_are_one_key_and_a_renamed_one_is_another() -> None:
     assert other.name == "y" and one.name == "x" and other != one
     assert other.boxes == one.boxes and {one: 1}.get(other) is None
     assert hash(World(name="x")) != hash(one)
+
+
+def test_a_world_of_lists_equals_one_of_tuples_and_can_be_driven_in() -> None:
+    parts = {
+        "size": (8.0, 9.0),
+        "boxes": (Box(0, 0, 1, 1),),
+        "start_regions": (Box(-3, -3, -2, -2),),
+        "walkers": (Walker(),),
+    }
+    world = World(name="x", **parts)
+    listed = World(name="x", **{name: list(values) for name, values in parts.items()})
+    assert listed == world and hash(listed) == hash(world)
+    with NavigationEnv(world=listed, physics="kinematic") as env:
+        env.reset(seed=0)
+
+
+def test_equal_worlds_have_one_hash_after_one_came_from_another_process() -> None:
+    code = (
+        "import pickle, sys\n"
+        "from mpfa_envs import Walker, World\n"
+        "world = World(name='x', walkers=(Walker(),))\n"
+        "hash(world)\n"
+        "sys.stdout.buffer.write(pickle.dumps(world))"
+    )
+    # Of the seeds one at least is not this process's own.
+    for seed in "12":
+        out = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            check=True,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        ).stdout
+        world = pickle.loads(out)
+        assert {World(name="x", walkers=(Walker(),)): 1}.get(world) == 1
 
 
 def test_clearances_of_many_points_are_those_of_each() -> None:

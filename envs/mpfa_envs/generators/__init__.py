@@ -182,7 +182,10 @@ def _world_name(name: str, seed: int, difficulty: float | None) -> str:
     """What a world is called, and can be asked for by."""
     split, index = divmod(seed, _SPLIT_SIZE)
     middle = "" if split == 0 else f"-{get_args(Split)[split]}"
-    return f"{name}{middle}-{index}" + ("" if difficulty is None else f"@{difficulty:g}")
+    if difficulty is None:
+        return f"{name}{middle}-{index}"
+    # All digits, and none as an exponent: the name stands for this world and no other.
+    return f"{name}{middle}-{index}@{np.format_float_positional(difficulty, trim='-')}"
 
 
 def _can_be_driven(world: World) -> bool:
