@@ -90,6 +90,7 @@ class TaskArguments(LiveView):
             )
         self.detour_chance = check_share("detour_chance", detour_chance)
         self.collision_distance = resolve_collision_distance(collision_distance, self.robot)
+        self._check_step()
         self.closeness_distance = (
             self.robot.collision_distance
             if closeness_distance is None
@@ -104,6 +105,21 @@ class TaskArguments(LiveView):
                 if name in self._lidar_arguments:
                     raise ValueError(f"lidar must not hold {name!r} beside noise={self.noise}")
                 self._lidar_arguments[name] = value
+
+    def _check_step(self) -> None:
+        """Refuse time steps in which a robot could get through a wall.
+
+        Collisions are looked for at the ends of time steps. Of a robot that does not drive farther
+        than the collision distance in one, the center cannot get into an obstacle before.
+        """
+        robot = self.robot
+        fastest = max(abs(robot.min_wheel_speed), abs(robot.max_wheel_speed))
+        if self.time_step * fastest > self.collision_distance:
+            raise ValueError(
+                f"time_step must be at most {self.collision_distance / fastest:.4g} s, in which "
+                f"{robot.name!r} drives no farther than collision_distance = "
+                f"{self.collision_distance} m at its fastest, got {self.time_step}"
+            )
 
     def _make_lidar(self, world: World) -> Lidar:
         """The lidar in a world."""

@@ -99,7 +99,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
             exact arcs, several times faster, and needs no PyBullet. Lidar, clearance and
             collisions are computed from the same shapes in both.
         max_steps: Time limit of an episode in time steps.
-        time_step: Duration of a time step [s].
+        time_step: Duration of a time step [s]; the robot must not drive collision_distance in less.
         action_repeat: Time steps for which an action is held. Their rewards add up, and the episode
             may end after any of them. The default is half as many decisions as time steps.
         goal_radius: Distance of the robot's center from the goal that reaches it, walls or not [m].

@@ -27,6 +27,10 @@ GOAL_CLEARANCE = 0.5
 """No goal lies nearer to an obstacle or a wall than this [m]."""
 START_SLACK = 0.15
 """A start is at least this much farther from an obstacle than a collision is [m]."""
+_GRID_SLACK = 0.04
+"""A way on a grid keeps so much less than the distance that it was made for, at most [m]."""
+_AROUND = [(math.cos(turn), math.sin(turn)) for turn in np.arange(16) * math.tau / 16]
+"""Directions in which it is looked for what reaches a goal."""
 _STARTS = 60
 _GOALS_PER_START = 50
 _ATTEMPTS = 1000
@@ -174,7 +178,7 @@ def check_task(
 
     Raises:
         ValueError: If the keys or the numbers are wrong, the start is a collision or at the goal,
-            or no path leads to the goal.
+            no path leads to the goal, or none without a collision to where it is reached.
     """
     if set(options) != {"start", "goal"}:
         raise ValueError(f"options must have the keys 'start' and 'goal', got {sorted(options)}")
@@ -202,7 +206,32 @@ def check_task(
         )
     if shortest_length(world, radius, (x, y), goal) == math.inf:
         raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
+    kept = max(radius, collision_distance - _GRID_SLACK)
+    if kept > radius and not _can_be_won(world, kept, (x, y), goal, goal_radius):
+        raise ValueError(
+            f"goal must be within reach of the start {(x, y)} by a way that keeps "
+            f"collision_distance = {collision_distance} m from obstacles and walls, got {goal}"
+        )
     return Task((x, y, heading), goal)
+
+
+def _can_be_won(
+    world: World,
+    distance: float,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    goal_radius: float,
+) -> bool:
+    """Tell whether a way that keeps the distance leads to the goal, or near enough to reach it."""
+    # A goal may lie nearer to a wall than a robot comes, and is reached from beside it then.
+    around = [
+        (goal[0] + share * goal_radius * across, goal[1] + share * goal_radius * up)
+        for share in (0.5, 0.99)
+        for across, up in _AROUND
+    ]
+    return any(
+        shortest_length(world, distance, start, place) < math.inf for place in (goal, *around)
+    )
 
 
 def _sample_point(

@@ -315,6 +315,11 @@ def test_a_bad_task_is_refused_and_the_episode_goes_on(
         ("time_step", 0.0, "time_step must be positive, got 0.0"),
         ("time_step", "1", "time_step must be a finite number, got '1'"),
         ("time_step", None, "time_step must be a finite number, got None"),
+        (
+            "time_step",
+            0.6,
+            "time_step must be at most 0.5 s, .*collision_distance = 0.25 m.*got 0.6",
+        ),
         ("goal_radius", math.nan, "goal_radius must be a finite number, got nan"),
         ("min_goal_distance", 0.3, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
         ("closeness_distance", 0.0, "closeness_distance must be positive, got 0.0"),

@@ -178,6 +178,27 @@ def test_equal_worlds_are_one_key_and_a_renamed_one_is_another() -> None:
     assert hash(World(name="x")) != hash(one)
 
 
+def test_a_task_is_refused_whose_way_is_too_narrow_for_the_collision_distance() -> None:
+    gap = World(name="gap", boxes=(Box(-0.1, -5.0, 0.1, -0.2), Box(-0.1, 0.2, 0.1, 5.0)))
+    task = {"start": (-2.0, 0.0, 0.0), "goal": (2.0, 0.0)}
+    with (
+        NavigationEnv(world=gap, physics="kinematic") as env,
+        pytest.raises(ValueError, match=r"goal must be .* collision_distance = 0.25 m .*\(2.0, 0"),
+    ):
+        env.reset(options=task)
+    with NavigationEnv(world=gap, physics="kinematic", collision_distance="contact") as env:
+        env.reset(options=task)
+
+
+def test_a_goal_beside_a_wall_is_a_task_as_its_radius_is_reached() -> None:
+    task = {"start": (0.0, 0.0, 0.0), "goal": (4.8, 0.0)}
+    with NavigationEnv(physics="kinematic", collision_distance=0.35) as env:
+        env.reset(options=task)
+        while not (ended := env.step([1.0, 1.0]))[2]:
+            pass
+    assert ended[4]["success"]
+
+
 def test_a_world_of_lists_equals_one_of_tuples_and_can_be_driven_in() -> None:
     parts = {
         "size": (8.0, 9.0),
