@@ -22,7 +22,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -231,6 +233,17 @@ def show_live(options: argparse.Namespace, how: Mapping[str, Any]) -> pd.DataFra
     return pd.DataFrame(rows)
 
 
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold the folder of the results; one that another process holds is refused."""
+    try:
+        with files.lock(folder):
+            yield
+    except files.FolderInUse as error:
+        print(f"evaluate.py: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
 def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     """Evaluate, print, write.
 
@@ -252,7 +265,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     results: list[EpisodeResult] = []
     driven: list[Drives] = []
     rows = []
-    with files.lock(folder):
+    with held(folder):
         for world in options.names:
             drives = drive(
                 policy, world, noise=options.noise, progress=not options.no_pictures, **asked

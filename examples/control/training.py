@@ -80,6 +80,12 @@ class Regime:
                 raise ValueError(
                     f"{name} must be a multiple of {self.actions_at_once}, got {value}"
                 )
+        # A run without an evaluation would have no rows.
+        least = max(self.first_actions, self.every)
+        if self.actions < least:
+            raise ValueError(
+                f"actions must be at least first_actions and every, {least}, got {self.actions}"
+            )
 
 
 @dataclass(frozen=True)

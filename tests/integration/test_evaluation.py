@@ -153,6 +153,16 @@ def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Pa
     assert job.is_evaluated(asked)
 
 
+def test_a_folder_in_use_is_refused_in_one_sentence(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with files.lock(run / "evaluation-A"), pytest.raises(SystemExit) as caught:
+        evaluate.main([str(run), "--worlds", "A", "--episodes", "1", "--no-pictures"])
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"evaluate.py: another process is using {run / 'evaluation-A'}")
+
+
 def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> None:
     words = ["bars:validation", "mazes:validation", "D"]
     summary = evaluate.main([str(run), "--worlds", *words, "--episodes", "20"])

@@ -14,6 +14,7 @@ import cliffwalk
 import compare
 import evaluate
 import export
+import gym_study
 import plot_sampling
 import report
 import study
@@ -65,6 +66,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (train.main, "run_dir=file", A_FILE),
         (train.main, "run_dir=file/run", r"file/run cannot be a folder, as .*file is a file"),
         (train.main, "run_dir=", "run_dir must be no empty word, got ''"),
+        (train.main, f"seed={2**62}", f"seed must be at most 4294967295, got {2**62}"),
         (train.main, "tracking.project=", "tracking.project must be no empty word, got ''"),
         (train.main, "tracking.group=", "tracking.group must be a word of at most 128 letters"),
         (train.main, "method.signals=[rewad]", "method.signals must be of .*, got 'rewad'"),
@@ -105,6 +107,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (export.main, "damaged.npz", "damaged.npz"),
         (export.main, f"{POLICY} --output file/policy.onnx", f"--output: {A_FILE}"),
         (export.main, f"{POLICY} --output rows", "--output must end in .onnx, got rows"),
+        (gym_study.main, "--actions 400", "actions must be at least .*, 1000, got 400"),
         (cliffwalk.main, "--lengths 1", "--lengths"),
         (cliffwalk.main, "--eps inf", "--eps must be positive and finite, got inf"),
         (cliffwalk.main, "--output file", f"--output: {A_FILE}"),

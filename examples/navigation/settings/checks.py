@@ -57,6 +57,8 @@ MOST_ROBOTS = 4096
 
 WORD: Rule = (lambda value: bool(value.strip()), "no empty word")
 
+LAST_SEED = 2**32 - 1
+"""Each stage has a seed of its own, a million times as large, which is to fit in 64 bits."""
 RULES: dict[str, Rule] = {
     "run_dir": WORD,
     "tracking.project": WORD,
@@ -171,6 +173,8 @@ def check_settings(settings: TrainSettings) -> None:
             allowed, wanted = RULES[name]
             if not allowed(value):
                 raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    if settings.seed > LAST_SEED:
+        raise ValueError(f"seed must be at most {LAST_SEED}, got {settings.seed}")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
     _check_stages(settings)
     _resolve(

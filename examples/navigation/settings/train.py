@@ -79,7 +79,8 @@ class CurriculumSettings:
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
     """All of them count episodes, or all of them count actions."""
     carry: bool = True
-    """Whether networks and buffer carry on from world to world, or start anew."""
+    """Whether networks and buffer carry on from world to world, or start anew; learning rates, beta
+    and random steps go by the whole run in either case."""
 
 
 CURRICULA = {

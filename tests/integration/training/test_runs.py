@@ -21,6 +21,7 @@ import train
 from navigation import files
 from navigation.files import CHECKPOINT, FolderInUse, lock
 from navigation.records import read_table
+from navigation.settings.checks import LAST_SEED
 from navigation.settings.command_line import composed, parse_overrides
 from navigation.settings.resuming import changed
 from navigation.settings.train import register
@@ -108,6 +109,10 @@ def test_a_finished_run_that_shall_go_on_is_not_finished_before_it_has_begun(
     with pytest.raises(SystemExit):
         go_on(job.path, STAGES.format(2))
     assert not job.is_trained()
+
+
+def test_the_last_seed_that_is_taken_can_be_trained_with(tmp_path: Path) -> None:
+    assert begin(tmp_path, f"seed={LAST_SEED}", episodes=1) == 0
 
 
 def test_a_second_run_in_the_same_folder_is_refused_while_the_first_is_at_work(
