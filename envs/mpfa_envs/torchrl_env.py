@@ -274,7 +274,8 @@ def make_navigation_env(
         world: As in :class:`~mpfa_envs.VectorNavigationEnv`: a world, several, or the name of a
             generator.
         num_envs: Number of robots; None: one, without a batch dimension.
-        parallel: Run each robot in a process of its own, all in the same worlds.
+        parallel: Run each robot in a process of its own, all in one world or in the worlds of one
+            generator.
         device: Where the tensors live.
         seed: Seed of the environments; None: random.
         **kwargs: Further arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
@@ -284,8 +285,8 @@ def make_navigation_env(
         ``[]``.
 
     Raises:
-        ValueError: If num_envs is not a positive integer, parallel environments have no number, or
-            another argument is out of its range.
+        ValueError: If num_envs is not a positive integer, parallel environments have no number or
+            several worlds, or another argument is out of its range.
 
     Examples:
         >>> from mpfa_envs import make_navigation_env
@@ -299,6 +300,10 @@ def make_navigation_env(
     if parallel:
         if num_envs is None:
             raise ValueError("num_envs must be a positive integer with parallel=True, got None")
+        if isinstance(world, list | tuple) and len(world) > 1:
+            raise ValueError(
+                f"world must be one, or the name of a generator, with parallel=True, got {world}"
+            )
         env: EnvBase = ParallelEnv(
             num_envs,
             EnvCreator(partial(NavigationTorchEnv, world=world, **kwargs)),

@@ -206,13 +206,14 @@ def test_info_keys_choose_what_is_handed_on() -> None:
     [
         ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
         ({"parallel": True}, "num_envs must be a positive integer with parallel=True, got None"),
+        ({"parallel": True, "num_envs": 2, "world": ["A", "B"]}, "world must be one, .*, got"),
         ({"info_keys": ("succes",)}, "info_keys must be among .*got 'succes'"),
         ({"max_steps": -1}, "max_steps must be a positive integer, got -1"),
     ],
 )
 def test_a_bad_argument_is_named(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make_navigation_env("A", physics="kinematic", **arguments)
+        make_navigation_env(**{"world": "A", "physics": "kinematic"} | arguments)
 
 
 def test_the_specs_hold_in_the_worlds_of_a_generator() -> None:
