@@ -350,7 +350,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
         """Render the room from above.
 
         Returns:
-            Picture of shape ``[480, 480, 3]``, or None without a render mode or in a window.
+            Picture, ``[H, W, 3]``, 480 the longer side; None without a render mode or in a window.
 
         Raises:
             ResetNeeded: If no episode has started.

@@ -337,7 +337,7 @@ class RobotBatch:
         return [(x, y) for x, y in rows.tolist()]
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """A picture of each robot's room from above, ``[480, 480, 3]``."""
+        """A picture of each robot's room from above, ``[H, W, 3]``."""
         # Imported here because training does not render.
         from mpfa_envs.render import render_scene
 

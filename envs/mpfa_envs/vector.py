@@ -425,7 +425,7 @@ class VectorNavigationEnv(
         """Render each robot's room from above.
 
         Returns:
-            A picture of shape ``[480, 480, 3]`` for each robot, or None without a render mode.
+            A picture for each robot, ``[H, W, 3]``, 480 the longer side; None without a mode.
 
         Raises:
             ResetNeeded: If no episode has started.

@@ -19,15 +19,17 @@ _KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 def gather_infos(
     flags: NDArray[np.bool_], numbers: NDArray[np.float64], chosen: NDArray[np.bool_] | None
 ) -> dict[str, Any]:
-    """An array for each key of the info, and a mask of the chosen robots.
+    """An array for each key of the info, and a mask of the chosen robots, each one's own.
 
     Args:
         flags: One row for each of :data:`~mpfa_envs.robot_batch.FLAGS`, ``[3, N]``.
         numbers: One row for each of :data:`~mpfa_envs.robot_batch.NUMBERS`, ``[15, N]``.
         chosen: Whose infos they are, ``[N]``; None: those of all robots.
     """
-    mask = np.ones(flags.shape[1], dtype=np.bool_) if chosen is None else chosen
-    return dict(zip(_KEYS, (*flags, *numbers, *(mask,) * len(_MASKS)), strict=True))
+    # Rows of one table, as copies one by one would take longer than all the rest.
+    masks = np.empty((len(_MASKS), flags.shape[1]), dtype=np.bool_)
+    masks[:] = True if chosen is None else chosen
+    return dict(zip(_KEYS, (*flags, *numbers, *masks), strict=True))
 
 
 def final_infos(

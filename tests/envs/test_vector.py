@@ -383,3 +383,11 @@ def test_pictures_show_each_world() -> None:
 def test_what_was_never_built_can_be_closed() -> None:
     # gymnasium 1.2 closes an environment whose arguments were refused, when it is collected.
     VectorNavigationEnv.__new__(VectorNavigationEnv).close_extras()
+
+
+def test_each_mask_of_the_infos_is_its_own() -> None:
+    env = VectorNavigationEnv(3, world="A", physics="kinematic")
+    _, infos = env.reset(seed=0)
+    infos["_x"][:] = False
+    assert infos["_success"].all() and not infos["_x"].any()
+    env.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -129,3 +131,14 @@ def test_gymnasium_can_play_it_by_keyboard() -> None:
     game.process_event(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_w))
     assert set(game.pressed_keys) == {ord("w")}
     env.close()
+
+
+def test_triton_can_be_imported_after_a_window_was_opened() -> None:
+    pytest.importorskip("triton")
+    code = (
+        "import numpy as np; from mpfa_envs.render.window import Window\n"
+        "window = Window('test', fps=30); window.show(np.zeros((9, 9, 3), np.uint8)); import triton"
+    )
+    # Where there is neither screen nor setting, SDL picks a driver that renders in software.
+    env = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=env, capture_output=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 from gymnasium.error import DependencyNotInstalled
@@ -35,6 +36,9 @@ class Window:
             raise DependencyNotInstalled(
                 "a live window needs pygame: pip install 'torchrl-mpfa[live]'"
             ) from error
+        # A picture needs no 3D, and a driver that renders in software brings an LLVM of its own:
+        # importing PyTorch's Triton after that ends the process.
+        os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
         self._pygame: Any = pygame
         self._title = title
         self._fps = check_positive("fps", fps)
