@@ -41,12 +41,14 @@ def make(
     return Controller(Pilot(seeing, network or ahead), **options), asked
 
 
-def ready(**options: Any) -> tuple[Controller, list[np.ndarray]]:
+def ready(
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0), **options: Any
+) -> tuple[Controller, list[np.ndarray]]:
     """One that has all that it needs at time 10."""
     controller, asked = make(**options)
     controller.aim((4.0, 0.0))
     controller.see(scan(), 10.0)
-    controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
+    controller.feel(pose, STILL, 10.0)
     return controller, asked
 
 
@@ -88,7 +90,7 @@ def test_without_a_goal_it_says_nothing_and_after_one_it_stops_once() -> None:
 
 
 def test_at_the_goal_it_stops_once_and_sets_out_for_the_next() -> None:
-    controller, asked = ready()
+    controller, asked = ready((3.45, 0.2, 0.0))
     controller.tick(10.0)
     controller.feel((3.6, 0.2, 0.0), (0.5, 0.0), 10.1)
     assert controller.tick(10.1) == Order(0.0, 0.0, "arrived")
@@ -127,6 +129,20 @@ def test_what_comes_from_the_future_is_stale() -> None:
     assert reasons(controller, [10.0]) == ["stale scan: nan s old"]
 
 
+def test_a_scan_a_little_ahead_of_the_clock_is_driven_by() -> None:
+    controller, _ = ready()
+    controller.see(scan(), 10.1)
+    assert reasons(controller, [10.0]) == ["driving"]
+    controller.see(scan(), 10.2)
+    assert reasons(controller, [10.0]) == ["stale scan: -0.2 s old"]
+
+
+def test_odometry_from_the_future_stops_it() -> None:
+    controller, _ = ready()
+    controller.feel((0.0, 0.0, 0.0), STILL, 10.3)
+    assert reasons(controller, [10.0]) == ["stale odometry: -0.3 s old"]
+
+
 def test_stale_odometry_stops_it() -> None:
     controller, _ = ready(scan_timeout=9.0)
     assert reasons(controller, [10.5, 10.6]) == ["driving", "stale odometry: 0.6 s old"]
@@ -147,6 +163,77 @@ def test_an_obstacle_inside_the_stop_distance_stops_it(nearest: float, stops: bo
         assert reasons(controller, [10.1]) == ["driving"]
     else:
         assert order.reason == "driving"
+
+
+@pytest.mark.parametrize(
+    ("robot", "every", "delay"),
+    [("turtlebot2", 5, 0), ("turtlebot2", 10, 5), ("turtlebot4", 7, 7), ("burger", 10, 10)],
+)
+def test_a_wall_is_not_touched_however_late_scans_are(robot: str, every: int, delay: int) -> None:
+    pilot = Pilot(card(), lambda seen: np.ones((1, 2), np.float32), robot=robot)
+    controller = Controller(pilot, stop_distance=0.05, check_period=0.02)
+    controller.aim((40.0, 0.0))
+    x, speed, scans, wall = 0.0, 0.0, [], 1.0 + pilot.robot.radius
+    for step in range(600):
+        now = 0.02 * step
+        controller.feel((x, 0.0, 0.0), (speed, 0.0), now)
+        if step % every == 0:
+            scans.append((now, scan(wall - x)))
+        if step >= delay and (step - delay) % every == 0:
+            controller.see(scans[(step - delay) // every][1], scans[(step - delay) // every][0])
+        order = controller.tick(now)
+        assert order is not None
+        speed = order.linear
+        x += 0.02 * speed
+        assert wall - x - pilot.robot.radius > 0.04
+    assert order is not None and order.reason.startswith("obstacle")
+    assert wall - x - pilot.robot.radius < 0.1
+
+
+def test_a_scan_that_ages_stops_it_before_what_it_showed_is_reached() -> None:
+    controller, _ = ready(stop_distance=0.05, scan_timeout=5.0, odometry_timeout=5.0)
+    controller.see(scan(0.18 + 0.3), 10.0)
+    # At 0.5 m/s 0.05 m remain after 0.5 s; the next check would come 0.05 s later.
+    assert reasons(controller, [10.0, 10.4, 10.46]) == [
+        "driving", "driving", "obstacle: 0.30 m from the rim",
+    ]  # fmt: skip
+    controller.feel((0.2, 0.0, 0.0), (0.5, 0.0), 10.48)
+    controller.feel((0.2, 0.0, 0.0), STILL, 10.5)
+    assert reasons(controller, [10.5]) == ["obstacle: 0.30 m from the rim"]  # It drove since.
+    controller.see(scan(0.18 + 0.06), 10.52)
+    assert reasons(controller, [10.52]) == ["driving"]  # It stands, and saw it standing.
+
+
+def test_odometry_that_jumps_gives_up_the_goal() -> None:
+    controller, _ = ready((3.0, 2.0, 1.0))
+    controller.tick(10.0)
+    controller.feel((3.02, 2.01, 1.0), (0.5, 0.0), 10.05)
+    assert reasons(controller, [10.05]) == ["driving"]
+    controller.feel((math.nan, 0.0, 0.0), (0.5, 0.0), 10.07)
+    controller.feel((0.0, 0.0, 0.0), (0.5, 0.0), 10.1)
+    assert controller.tick(10.1) == Order(0.0, 0.0, "odometry jumped: 3.6 m in 0.05 s")
+    assert controller.tick(10.15) is None
+    controller.aim((4.0, 0.0))
+    assert reasons(controller, [10.2]) == ["driving"]
+
+
+def test_odometry_that_comes_late_has_not_jumped() -> None:
+    controller, _ = ready()
+    controller.feel((0.9, 0.0, 0.0), (0.5, 0.0), 11.0)
+    controller.see(scan(), 11.0)
+    assert reasons(controller, [11.0]) == ["driving"]
+
+
+def test_what_is_held_stands_still_until_it_is_let_go() -> None:
+    controller, asked = ready()
+    controller.tick(10.0)
+    controller.hold("stale transform: 3.0 s old")
+    assert controller.tick(10.05) == Order(0.0, 0.0, "stale transform: 3.0 s old")
+    controller.hold("")
+    assert reasons(controller, [10.1]) == ["driving"] and len(asked) == 2
+    controller.hold("stale transform: 3.0 s old")
+    controller.aim((3.0, 0.0))
+    assert reasons(controller, [10.15]) == ["driving"]
 
 
 @pytest.mark.parametrize("field_of_view", [180.0, 360.0])
@@ -225,6 +312,7 @@ def test_an_action_that_is_not_finite_stops_it() -> None:
         ({"stop_distance": math.nan}, "stop_distance must be a finite number, got nan"),
         ({"scan_timeout": 0.0}, "scan_timeout must be positive, got 0.0"),
         ({"odometry_timeout": math.inf}, "odometry_timeout must be a finite number, got inf"),
+        ({"check_period": 0.0}, "check_period must be positive, got 0.0"),
     ],
 )
 def test_limits_that_are_none_are_refused(options: dict[str, float], message: str) -> None:

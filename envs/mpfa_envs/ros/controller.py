@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -15,6 +16,12 @@ if TYPE_CHECKING:
 
 _EARLY: Final = 0.2
 """By how much of its period a decision may come early: scans do not come like clockwork."""
+_AHEAD: Final = 0.15
+"""By how much a stamp may be ahead of the clock [s]: simulated clocks tick some tenths late."""
+_MEMORY: Final = 1.0
+"""How long odometry is remembered [s]; a longer timeout of scans keeps it as long as that."""
+_SLACK: Final = 0.2
+"""How far a pose may move besides what the robot drives [m], as where wheels slip."""
 
 
 class Order(NamedTuple):
@@ -52,15 +59,17 @@ class Controller:
 
     It stands still, and says so, while there is no goal, scan or odometry, while one of the two is
     older than it may be (or from the future), while something in front is nearer to the robot's rim
-    than the stop distance, and whenever a number is not finite or a scan does not tell enough. The
-    goal stays, and it drives on once the reason is gone. Without a goal it publishes one stop and
-    then nothing, so that others may drive.
+    than the stop distance, or will be before the next check, and whenever a number is not finite or
+    a scan does not tell enough. The goal stays, and it drives on once the reason is gone. Odometry
+    that jumps gives up the goal, whose place is then unknown. Without a goal it publishes one stop
+    and then nothing, so that others may drive.
 
     Args:
         pilot: The policy.
         stop_distance: Clearance of the robot's rim at or below which it stops [m].
         scan_timeout: Oldest scan that it drives by [s].
         odometry_timeout: Oldest odometry [s].
+        check_period: Longest time from one :meth:`tick` to the next [s].
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -73,6 +82,7 @@ class Controller:
         stop_distance: float = 0.05,
         scan_timeout: float = 0.5,
         odometry_timeout: float = 0.5,
+        check_period: float = 0.05,
     ) -> None:
         if check_number("stop_distance", stop_distance) < 0.0:
             raise ValueError(f"stop_distance must not be negative, got {stop_distance}")
@@ -80,8 +90,12 @@ class Controller:
         self.stop_distance = stop_distance
         self.scan_timeout = check_positive("scan_timeout", scan_timeout)
         self.odometry_timeout = check_positive("odometry_timeout", odometry_timeout)
+        self.check_period = check_positive("check_period", check_period)
         self._seen: _Seen | None = None
         self._felt: _Felt | None = None
+        self._track: deque[_Felt] = deque()
+        self._ordered = 0.0
+        self._held = ""
         self._command: Command | None = None
         self._decided = -math.inf
         self._idle = "no goal"
@@ -112,8 +126,24 @@ class Controller:
             pose: Of the robot (x, y, heading) [m, m, rad].
             speeds: Forward and turning speed [m/s, rad/s].
             time: When [s].
+
+        A pose farther from the last than the robot drives gives up the goal: ``odometry jumped``.
         """
-        self._felt = _Felt(pose, speeds, time)
+        self._felt = felt = _Felt(pose, speeds, time)
+        if not all(map(math.isfinite, (*pose, *speeds, time))):
+            return
+        if self._track:
+            last = self._track[-1]
+            moved, passed = math.dist(pose[:2], last.pose[:2]), max(time - last.time, 0.0)
+            if moved > 2.0 * self.pilot.robot.max_wheel_speed * passed + _SLACK:
+                if self.pilot.goal is not None:
+                    self.aim(None, f"odometry jumped: {moved:.1f} m in {passed:.2f} s")
+                self._track.clear()
+            elif time < last.time:
+                self._track.clear()
+        self._track.append(felt)
+        while self._track[0].time < time - max(_MEMORY, self.scan_timeout):
+            self._track.popleft()
 
     def aim(self, goal: tuple[float, float] | None, reason: str = "no goal") -> None:
         """Set out for a goal, or give up the one there is.
@@ -124,7 +154,9 @@ class Controller:
             reason: Why there is none.
         """
         self._command, self._told = None, False
-        self._idle = reason
+        self._idle, self._held = reason, ""
+        # Where the goal is, is meant by the odometry from now on.
+        self._track.clear()
         self.pilot.stop()
         if goal is not None:
             try:
@@ -144,6 +176,14 @@ class Controller:
             except ValueError as error:
                 self.aim(None, str(error))
 
+    def hold(self, reason: str) -> None:
+        """Stand still for a reason that is known elsewhere, until told that it is gone.
+
+        Args:
+            reason: Why; empty: no longer. A new goal is not held.
+        """
+        self._held = reason
+
     def tick(self, now: float) -> Order | None:
         """Say what to publish now; to be asked at each scan, and some times a second besides.
 
@@ -153,6 +193,12 @@ class Controller:
         Returns:
             What to publish; None: nothing.
         """
+        order = self._choose(now)
+        self._ordered = 0.0 if order is None else order.linear
+        return order
+
+    def _choose(self, now: float) -> Order | None:
+        """What to publish; None: nothing."""
         if self.pilot.goal is None:
             if self._told:
                 return None
@@ -163,7 +209,7 @@ class Controller:
         if reason is None and seen is not None and felt is not None:
             if self.pilot.arrived(felt.pose):
                 self.aim(None, "arrived")
-                return self.tick(now)
+                return self._choose(now)
             try:
                 return self._drive(seen, felt, now)
             except ValueError as error:
@@ -173,22 +219,30 @@ class Controller:
 
     def _missing(self, seen: _Seen | None, felt: _Felt | None, now: float) -> str | None:
         """What keeps the robot from driving; None: nothing."""
+        if self._held:
+            return self._held
         if seen is None:
             return "no scan"
         if felt is None:
             return "no odometry"
-        if not abs(now - seen.time) <= self.scan_timeout:
+        if not -_AHEAD <= now - seen.time <= self.scan_timeout:
             return f"stale scan: {now - seen.time:.1f} s old"
-        if not abs(now - felt.time) <= self.odometry_timeout:
+        if not -_AHEAD <= now - felt.time <= self.odometry_timeout:
             return f"stale odometry: {now - felt.time:.1f} s old"
         if not all(map(math.isfinite, (*felt.pose, *felt.speeds))):
             return "odometry is not finite"
         if seen.fault:
             return seen.fault
         clearance = seen.nearest - self.pilot.robot.radius
-        if clearance <= self.stop_distance:
+        if clearance - self._covered(seen, felt, now) <= self.stop_distance:
             return f"obstacle: {max(clearance, 0.0):.2f} m from the rim"
         return None
+
+    def _covered(self, seen: _Seen, felt: _Felt, now: float) -> float:
+        """How far the robot may come from where it saw to where the next check is [m]."""
+        since = [each.speeds[0] for each in self._track if each.time >= seen.time]
+        fastest = max(0.0, self._ordered, felt.speeds[0], *since)
+        return fastest * (max(now - seen.time, 0.0) + self.check_period)
 
     def _drive(self, seen: _Seen, felt: _Felt, now: float) -> Order:
         """The command that holds, or a new one where it is due."""

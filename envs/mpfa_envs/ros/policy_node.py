@@ -60,7 +60,7 @@ class PolicyNode(Node):
             **options,
         )
         limits = {n: value(n) for n in ("stop_distance", "scan_timeout", "odometry_timeout")}
-        self.controller = Controller(pilot, **limits)
+        self.controller = Controller(pilot, **limits, check_period=1.0 / value("rate"))
         self._stamped = value("stamped")
         self._trust_stamps = value("trust_stamps")
         self._base_frame = value("base_frame")
