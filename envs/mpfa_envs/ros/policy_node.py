@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import signal
+from contextlib import suppress
 from functools import partial
 from typing import Any, Final
 
@@ -15,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
 
+from mpfa_envs.checks import check_positive
 from mpfa_envs.deploy import Pilot
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.messages import odometry_of, scan_of, seconds, transformed
@@ -30,6 +33,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "stop_distance": 0.05,
     "scan_timeout": 0.5,
     "odometry_timeout": 0.5,
+    "transform_timeout": 1.0,
     "rate": 20.0,
     "trust_stamps": True,
     "stamped": False,
@@ -64,8 +68,11 @@ class PolicyNode(Node):
         self._stamped = value("stamped")
         self._trust_stamps = value("trust_stamps")
         self._base_frame = value("base_frame")
-        self._odometry_frame = ""
+        self._transform_timeout = check_positive("transform_timeout", value("transform_timeout"))
+        self._odometry_frame: str | None = None
         self._goal: tuple[tuple[float, float], str] | None = None
+        self._waits = ""
+        self._stamp, self._stamped_at = -math.inf, -math.inf
         self._reason = ""
         self._transforms = self._listen()
         kind = TwistStamped if self._stamped else Twist
@@ -100,18 +107,35 @@ class PolicyNode(Node):
         self._tick()
 
     def _on_odometry(self, message: Any) -> None:
-        self._odometry_frame = message.header.frame_id
+        last, self._odometry_frame = self._odometry_frame, message.header.frame_id
+        if last not in (None, self._odometry_frame) and self._goal is not None:
+            self._goal, self._waits = None, ""
+            there = f"from frame {last!r} to {self._odometry_frame!r}"
+            self.controller.aim(None, f"odometry jumped: {there}")
         self.controller.feel(*odometry_of(message), self._time_of(message.header))
 
     def _on_goal(self, message: Any) -> None:
         place = message.pose.position.x, message.pose.position.y
-        self._goal = place, message.header.frame_id
+        self._goal, self._waits = (place, message.header.frame_id), ""
+        self._stamp = self._stamped_at = -math.inf
+        self.controller.aim(None)
+        self._set_out()
+        self._tick()
+
+    def _set_out(self) -> None:
+        """Set out for the goal if its place is known; else it is tried again at each check."""
+        if self._goal is None:
+            return
         try:
-            self.controller.aim(self._in_odometry(place, message.header.frame_id))
+            self.controller.aim(self._in_odometry(*self._goal))
         # What tf2 raises has no public base class.
         except Exception as error:
-            self.controller.aim(None, f"goal in frame {message.header.frame_id!r}: {error}")
-        self._tick()
+            reason = f"goal in frame {self._goal[1]!r}: {error}"
+            if not self._waits:
+                self.controller.aim(None, reason)
+            self._waits = reason
+        else:
+            self._waits = ""
 
     def _in_odometry(self, place: tuple[float, float], frame: str) -> tuple[float, float]:
         """A place of another frame in that of the odometry."""
@@ -119,18 +143,49 @@ class PolicyNode(Node):
             return place
         if self._transforms is None:
             raise LookupError("tf2_ros is not installed")
-        if not self._odometry_frame:
+        if self._odometry_frame is None:
             raise LookupError("there was no odometry yet")
+        if not self._odometry_frame:
+            raise LookupError("the odometry names no frame")
         found = self._transforms.lookup_transform(self._odometry_frame, frame, Time())
+        stamp = seconds(found.header.stamp)
+        if stamp != self._stamp:
+            self._stamp, self._stamped_at = stamp, self._now()
         return transformed(place, found.transform)
 
+    def _correct(self) -> None:
+        """The goal by the newest transform; an old one keeps the robot from driving."""
+        if self._goal is None or self._goal[1] in ("", self._odometry_frame):
+            return
+        try:
+            self.controller.correct_goal(self._in_odometry(*self._goal))
+        # As above; a correction that fails once is made later.
+        except Exception as error:
+            warn = self.get_logger().warning
+            warn(f"goal not corrected: {error}", throttle_duration_sec=5.0)
+        age = self._now() - (self._stamp if self._trust_stamps else self._stamped_at)
+        # Transforms that never change have no time.
+        old = self._stamp != 0.0 and not age <= self._transform_timeout
+        self.controller.hold(f"stale transform: {age:.1f} s old" if old else "")
+
     def _tick(self) -> None:
-        if self.controller.pilot.goal is not None and self._goal is not None:
-            try:
-                self.controller.correct_goal(self._in_odometry(*self._goal))
-            # As above; a correction that fails once is made later.
-            except Exception as error:
-                self.get_logger().warning(f"goal not corrected: {error}")
+        try:
+            self._check()
+        # Whatever it is: a robot that no one checks must not drive on.
+        except Exception as error:
+            self.get_logger().error(f"stopped by {error!r}")
+            self._goal, self._waits = None, ""
+            self.controller.aim(None, "failed")
+            self.stop()
+
+    def _check(self) -> None:
+        """Publish what the controller says."""
+        if self._waits:
+            self._set_out()
+        elif self.controller.pilot.goal is None:
+            self._goal = None
+        else:
+            self._correct()
         order = self.controller.tick(self._now())
         if order is None:
             return
@@ -160,12 +215,19 @@ def main() -> None:
     # The signal handlers of rclpy would end all publishing before the robot is stopped.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    hangup = getattr(signal, "SIGHUP", None)
+    # Who has it ignored wants the node to outlive the terminal.
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        signal.signal(hangup, signal.default_int_handler)
     node = PolicyNode()
     try:
         rclpy.spin(node)
     except KeyboardInterrupt:
-        node.stop()
+        pass
     finally:
+        # Where this fails nothing can be published, and why the node ends is to be told.
+        with suppress(Exception):
+            node.stop()
         node.destroy_node()
         rclpy.try_shutdown()
 

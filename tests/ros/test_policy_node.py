@@ -1,0 +1,243 @@
+"""The policy's node on fakes of rclpy and tf2: what it makes of messages, failures and its end."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
+
+from mpfa_envs import Policy, export_policy
+from mpfa_envs.layers import Linear
+from tests.envs.exported import ENV_ARGUMENTS
+from tests.ros.fake_rclpy import World, install
+
+names = SimpleNamespace
+DRIVES, STANDS = (0.5, 0.0), (0.0, 0.0)
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """With a policy that drives straight ahead."""
+    layer = Linear(np.zeros((2, 24), np.float32), np.ones(2, np.float32))
+    policy = Policy([layer], env_arguments=ENV_ARGUMENTS)
+    found = World()
+    found.parameters["policy"] = str(export_policy(policy, tmp_path / "policy.onnx"))
+    return found
+
+
+@pytest.fixture
+def module(world: World, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    handlers = {name: signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield install(monkeypatch, world)
+    for name, handler in handlers.items():
+        signal.signal(name, handler)
+
+
+def stamp(time: float) -> Any:
+    return names(sec=int(time), nanosec=round((time - int(time)) * 1e9))
+
+
+def odometry(time: float, x: float = 0.0, frame: str = "odom") -> Any:
+    pose = names(position=names(x=x, y=0.0), orientation=names(x=0.0, y=0.0, z=0.0, w=1.0))
+    twist = names(linear=names(x=0.5), angular=names(z=0.0))
+    header = names(stamp=stamp(time), frame_id=frame)
+    return names(header=header, pose=names(pose=pose), twist=names(twist=twist))
+
+
+def scan(time: float) -> Any:
+    header = names(stamp=stamp(time))
+    field = {"angle_min": -math.pi, "angle_increment": math.pi / 180}
+    return names(header=header, **field, ranges=np.full(360, 5.0), range_min=0.1, range_max=8.0)
+
+
+def goal(frame: str, x: float = 4.0) -> Any:
+    return names(header=names(frame_id=frame), pose=names(position=names(x=x, y=0.0)))
+
+
+def transform(time: float, x: float = 0.0) -> Any:
+    rotation = names(x=0.0, y=0.0, z=0.0, w=1.0)
+    found = names(translation=names(x=x, y=0.0), rotation=rotation)
+    return names(header=names(stamp=stamp(time)), transform=found)
+
+
+def feed(node: Any, world: World, time: float, frame: str = "odom") -> tuple[float, float]:
+    """Odometry and a scan of now; what is sent then."""
+    world.now = time
+    node._on_odometry(odometry(time, frame=frame))
+    node._on_scan(scan(time))
+    return world.sent[-1]
+
+
+def driving(module: Any, world: World, frame: str = "odom") -> Any:
+    """A node on its way."""
+    node = module.PolicyNode()
+    node._on_odometry(odometry(10.0))
+    node._on_goal(goal(frame))
+    assert feed(node, world, 10.0) == DRIVES
+    return node
+
+
+def test_it_stops_the_robot_when_it_dies_of_an_exception(module: Any, world: World) -> None:
+    def spin(node: Any) -> None:
+        node._on_odometry(odometry(10.0))
+        node._on_goal(goal("odom"))
+        node._on_scan(scan(10.0))
+        assert world.sent[-1] == DRIVES
+        raise RuntimeError("a bad message")
+
+    world.spin = spin
+    with pytest.raises(RuntimeError, match="a bad message"):
+        module.main()
+    assert world.sent[-1] == STANDS
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_it_stops_the_robot_when_it_is_told_to_end(module: Any, world: World, name: str) -> None:
+    def spin(node: Any) -> None:
+        node._on_odometry(odometry(10.0))
+        node._on_goal(goal("odom"))
+        assert feed(node, world, 10.0) == DRIVES
+        signal.raise_signal(getattr(signal, name))
+
+    world.spin = spin
+    module.main()
+    assert world.sent[-1] == STANDS
+
+
+def test_a_hangup_that_is_ignored_does_not_end_it(module: Any, world: World) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    ended = []
+
+    def spin(node: Any) -> None:
+        signal.raise_signal(signal.SIGHUP)
+        ended.append(False)
+
+    world.spin = spin
+    module.main()
+    assert ended == [False]
+
+
+def test_a_stop_that_fails_does_not_hide_why_it_died(module: Any, world: World) -> None:
+    def spin(node: Any) -> None:
+        world.broken = True
+        raise KeyError("why")
+
+    world.spin = spin
+    with pytest.raises(KeyError, match="why"):
+        module.main()
+
+
+def test_a_check_that_fails_stops_the_robot_and_is_logged(
+    module: Any, world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = driving(module, world)
+
+    def fail(now: float) -> None:
+        raise ZeroDivisionError("of the pilot")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(node.controller, "tick", fail)
+        node._tick()
+    assert world.sent[-1] == STANDS and node.controller.pilot.goal is None
+    assert world.logged[-1] == ("error", "stopped by ZeroDivisionError('of the pilot')")
+    assert feed(node, world, 10.05) == STANDS
+
+
+def test_a_transform_that_grows_old_stops_it_until_there_is_a_new_one(
+    module: Any, world: World
+) -> None:
+    world.transform = transform(10.0)
+    node = driving(module, world, "map")
+    assert feed(node, world, 10.9) == DRIVES
+    assert feed(node, world, 11.1) == STANDS
+    assert world.logged[-1] == ("info", "stale transform: 1.1 s old")
+    world.transform = transform(11.1)
+    assert feed(node, world, 11.2) == DRIVES
+    world.transform = None
+    assert feed(node, world, 12.0) == DRIVES
+    assert feed(node, world, 12.2) == STANDS
+
+
+def test_a_transform_that_never_changes_stays_valid(module: Any, world: World) -> None:
+    world.transform = transform(0.0)
+    node = driving(module, world, "map")
+    assert feed(node, world, 70.0) == DRIVES
+
+
+def test_without_stamps_a_transform_ages_from_when_it_last_came(module: Any, world: World) -> None:
+    world.parameters["trust_stamps"] = False
+    world.transform = transform(500.0)
+    node = driving(module, world, "map")
+    assert feed(node, world, 10.9) == DRIVES
+    assert feed(node, world, 11.1) == STANDS
+    world.transform = transform(501.0)
+    assert feed(node, world, 11.2) == DRIVES
+
+
+@pytest.mark.parametrize("frame", ["odom", "map"])
+def test_a_goal_before_the_first_odometry_is_set_out_for_once_it_is_there(
+    module: Any, world: World, frame: str
+) -> None:
+    world.transform = transform(10.0)
+    node = module.PolicyNode()
+    node._on_goal(goal(frame))
+    node._tick()
+    assert world.sent == [STANDS]  # One stop, then none.
+    assert world.logged[-1][1] == f"goal in frame {frame!r}: there was no odometry yet"
+    assert feed(node, world, 10.0) == DRIVES
+    assert node.controller.pilot.goal == (4.0, 0.0)
+
+
+def test_a_goal_without_a_transform_waits_for_one(module: Any, world: World) -> None:
+    node = module.PolicyNode()
+    node._on_odometry(odometry(10.0))
+    node._on_goal(goal("map"))
+    assert feed(node, world, 10.0) == STANDS
+    assert world.logged[-1][1] == "goal in frame 'map': no such transform"
+    assert len(world.sent) == 1
+    world.transform = transform(10.1, x=2.0)
+    assert feed(node, world, 10.1) == DRIVES
+    assert node.controller.pilot.goal == (6.0, 0.0)
+
+
+def test_odometry_without_a_frame_is_named(module: Any, world: World) -> None:
+    node = module.PolicyNode()
+    node._on_odometry(odometry(10.0, frame=""))
+    node._on_goal(goal("odom"))
+    assert world.logged[-1][1] == "goal in frame 'odom': the odometry names no frame"
+    node._on_goal(goal(""))
+    assert feed(node, world, 10.0, frame="") == DRIVES
+
+
+@pytest.mark.parametrize("frame", ["odom", "map"])
+def test_odometry_of_another_frame_gives_up_the_goal(module: Any, world: World, frame: str) -> None:
+    world.transform = transform(10.0)
+    node = driving(module, world, frame)
+    assert feed(node, world, 10.05, frame="odom2") == STANDS
+    assert world.logged[-1] == ("info", "odometry jumped: from frame 'odom' to 'odom2'")
+    sent = len(world.sent)
+    node._tick()
+    assert len(world.sent) == sent
+    node._on_goal(goal("odom2"))
+    assert feed(node, world, 10.1, frame="odom2") == DRIVES
+
+
+def test_a_goal_that_was_given_up_is_not_taken_up_again(module: Any, world: World) -> None:
+    world.transform = transform(10.0)
+    node = driving(module, world, "map")
+    node._on_odometry(odometry(10.05, x=3.0))
+    node._tick()
+    assert world.sent[-1] == STANDS
+    assert world.logged[-1] == ("info", "odometry jumped: 3.0 m in 0.05 s")
+    world.now = 10.1
+    node._tick()
+    assert node.controller.pilot.goal is None
