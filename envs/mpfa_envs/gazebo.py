@@ -78,7 +78,8 @@ def load_gazebo_world(
 
     They are those of the collisions of static models, models in models included, where the
     ``state`` of the file puts them. What is left out is counted in a warning: includes, models that
-    may move, meshes and other geometry, what is tilted, and poses in frames that have a name.
+    may move, meshes and other geometry, what is tilted, poses in frames that
+    have a name, and those whose turn is written as a quaternion.
 
     Args:
         path: A ``.world`` or ``.sdf`` file, or one that is compressed (``.gz``).
@@ -195,6 +196,9 @@ class _Reader:
         if not static:
             self.left_out["models that may move"] += 1
             return
+        if inner is not None and model.attributes.get("placement_frame"):
+            self.left_out["poses in named frames"] += 1
+            inner = None
         self.left_out["includes"] += sum(1 for _ in model.all("include"))
         if inner is None:
             return
@@ -215,7 +219,12 @@ class _Reader:
         if pose.attributes.get("frame") or pose.attributes.get("relative_to"):
             self.left_out["poses in named frames"] += 1
             return None
+        if pose.attributes.get("rotation_format", "euler_rpy") != "euler_rpy":
+            self.left_out["poses that are not written as roll, pitch and yaw"] += 1
+            return None
         x, y, z, roll, pitch, yaw = self._numbers(pose, 6)
+        if pose.attributes.get("degrees", "").strip().lower() in ("1", "true"):
+            roll, pitch, yaw = (math.radians(angle) for angle in (roll, pitch, yaw))
         if max(abs(roll), abs(pitch)) > _STRAIGHT:
             self.left_out["tilted parts"] += 1
             return None

@@ -66,6 +66,21 @@ def test_poses_of_model_link_and_collision_add_up(tmp_path):
     assert max(x for x, _ in world.polygons[0].vertices) == pytest.approx(1.5 * math.sqrt(0.5))
 
 
+def test_turns_may_be_written_in_degrees(tmp_path):
+    pose = "0 0 0 180 0 90"  # Upside down, which is tilted.
+    wall = "<box><size>4 0.2 1</size></box>"
+    models = [
+        model(wall, "1 0 0.5 0 0 90").replace("frame=''", f"degrees='{flag}'")
+        for flag in ("true", "1")
+    ]
+    models.append(model(wall, pose).replace("frame=''", "degrees='true'"))
+    with pytest.warns(UserWarning, match="left out 1 tilted parts$"):
+        world = load_gazebo_world(write(tmp_path, "".join(models)), size=(9, 9), center=(0, 0))
+    assert not world.polygons and len(world.boxes) == 2
+    for box in world.boxes:
+        assert tuple(box.bounds) == pytest.approx((0.9, -2.0, 1.1, 2.0))
+
+
 def test_the_state_of_the_file_says_where_models_are(tmp_path):
     state = "<state><model name='m'><pose>3 4 0 0 0 0</pose></model></state>"
     world = load_gazebo_world(
@@ -101,6 +116,8 @@ def test_what_is_left_out_is_counted(tmp_path):
             model("<mesh><uri>x</uri></mesh>"),
             model("<plane><normal>0 0 1</normal></plane>"),
             model(CYLINDER).replace("frame=''", "relative_to='other'"),
+            model(CYLINDER).replace("<model", "<model placement_frame='l'"),
+            model(CYLINDER, "0 0 0 0 0 0 1").replace("frame=''", "rotation_format='quat_xyzw'"),
             "<include><uri>model://sun</uri></include>" * 3,
         )
     )
@@ -113,7 +130,8 @@ def test_what_is_left_out_is_counted(tmp_path):
         "2 models that may move",
         "1 tilted parts",
         "1 geometries of the kind mesh",
-        "1 poses in named frames",
+        "2 poses in named frames",
+        "1 poses that are not written as roll, pitch and yaw",
     ):
         assert part in text
     assert "plane" not in text
