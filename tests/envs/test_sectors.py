@@ -19,6 +19,8 @@ def plain(scan: Scan, reduction: str, mount: tuple[float, float, float]) -> list
     for number, measured in enumerate(np.asarray(scan.ranges).tolist()):
         angle = scan.angle_min + number * scan.angle_increment + mount[2]
         far = measured >= scan.range_max
+        if measured == -math.inf or 0.0 < measured < scan.range_min:
+            measured = scan.range_min  # Something, nearer than the lidar can measure.
         if not far and not measured >= max(scan.range_min, 0.0):
             continue
         distance = 10.0
@@ -86,6 +88,60 @@ def test_sectors_without_a_valid_ray_are_refused_or_free() -> None:
         Sectors(card()).read(scan)
     found, _ = Sectors(card(), silent="far").read(scan)
     assert found[8] == 10.0 and np.delete(found, 8).tolist() == [2.0] * 17
+
+
+@pytest.mark.parametrize("silent", ["refuse", "far"])
+@pytest.mark.parametrize("near", [0.05, 0.119, -math.inf])
+def test_what_is_too_near_to_be_measured_is_as_near_as_can_be(near: float, silent: str) -> None:
+    ranges = np.full(360, 2.0)
+    ranges[181:188] = near  # From 1 to 7 degrees, to the left; at 8 and 9 there is a wall.
+    scan = Scan(-math.pi, math.pi / 180, ranges, range_min=0.12, range_max=3.5)
+    found, points = Sectors(card(), silent=silent).read(scan)
+    assert found[8] == 0.12 and np.delete(found, 8).tolist() == [2.0] * 17
+    assert (points.ranges == 0.12).sum() == 7
+
+
+@pytest.mark.parametrize("gone", [0.0, math.nan])
+def test_a_near_return_stays_while_the_lidar_is_silent_there(gone: float) -> None:
+    sectors = Sectors(card(), silent="far")
+
+    def read(measured: float) -> float:
+        ranges = np.full(360, 2.0)
+        ranges[180:190] = measured
+        return float(sectors.read(Scan(-math.pi, math.pi / 180, ranges, 0.12, 3.5))[0][8])
+
+    assert [read(each) for each in (0.21, gone)] == [0.21, 10.0]  # Not as near as that.
+    assert [read(each) for each in (0.15, gone, gone, gone)] == [0.15] * 4
+    assert [read(each) for each in (1.0, gone)] == [1.0, 10.0]
+    assert [read(each) for each in (0.15, gone, math.inf, gone)] == [0.15, 0.15, 10.0, 10.0]
+
+
+@pytest.mark.parametrize("silent", ["refuse", "far"])
+@pytest.mark.parametrize("mount", [(-0.04, 0.0, 0.0), (0.0, 0.03, 1.0)])
+def test_a_sensor_off_the_center_has_invalid_sectors_as_well(
+    mount: tuple[float, float, float], silent: str
+) -> None:
+    directions = np.arange(-180.0, 180.0, 0.5)
+    ranges = np.full(720, 3.0)
+    seen = (directions + math.degrees(mount[2]) + 180.0) % 360.0 - 180.0
+    ranges[(seen > -0.8) & (seen < 10.8)] = math.nan
+    scan = Scan(-math.pi, math.pi / 360, ranges, 0.1, 8.0)
+    sectors = Sectors(card(), mount=mount, silent=silent)
+    if silent == "far":
+        assert sectors.read(scan)[0][8] == 10.0
+    else:
+        with pytest.raises(ScanError, match="no ray of the sector at 5 degrees is valid"):
+            sectors.read(scan)
+
+
+@pytest.mark.parametrize(
+    ("least", "most"),
+    [(0.1, 0.0), (0.1, -1.0), (5.0, 1.0), (-0.1, 8.0), (math.nan, 8.0), (0.1, math.nan)],
+)
+def test_limits_that_would_make_walls_free_are_refused(least: float, most: float) -> None:
+    scan = Scan(-math.pi, math.pi / 180, np.full(360, 0.2), least, most)
+    with pytest.raises(ScanError, match=f"range_min must be .* range_max, got {least} and {most}"):
+        Sectors(card(), silent="far").read(scan)
 
 
 @pytest.mark.parametrize("broken", [0.0, math.nan, -math.inf])

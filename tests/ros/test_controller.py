@@ -148,11 +148,9 @@ def test_stale_odometry_stops_it() -> None:
     assert reasons(controller, [10.5, 10.6]) == ["driving", "stale odometry: 0.6 s old"]
 
 
-@pytest.mark.parametrize(
-    ("nearest", "stops"), [(0.2, True), (0.279, True), (0.281, False), (0.05, False)]
-)
+@pytest.mark.parametrize(("nearest", "stops"), [(0.2, True), (0.279, True), (0.281, False)])
 def test_an_obstacle_inside_the_stop_distance_stops_it(nearest: float, stops: bool) -> None:
-    # 0.18 m is the robot's radius; 0.05 m is below what this lidar can measure.
+    # 0.18 m is the robot's radius.
     controller, _ = ready(stop_distance=0.1)
     controller.see(scan(2.0, nearest, 2.0), 10.0)
     order = controller.tick(10.0)
@@ -234,6 +232,15 @@ def test_what_is_held_stands_still_until_it_is_let_go() -> None:
     controller.hold("stale transform: 3.0 s old")
     controller.aim((3.0, 0.0))
     assert reasons(controller, [10.15]) == ["driving"]
+
+
+@pytest.mark.parametrize("nearest", [0.05, -math.inf])
+def test_what_is_nearer_than_the_lidar_can_measure_stops_it(nearest: float) -> None:
+    controller, _ = ready(stop_distance=0.1)
+    controller.see(scan(2.0, nearest, 2.0), 10.0)
+    assert controller.tick(10.0) == Order(0.0, 0.0, "obstacle: 0.00 m from the rim")
+    controller.see(scan(), 10.1)
+    assert reasons(controller, [10.1]) == ["driving"]
 
 
 @pytest.mark.parametrize("field_of_view", [180.0, 360.0])

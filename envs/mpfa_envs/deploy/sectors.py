@@ -19,6 +19,8 @@ Silent = Literal["refuse", "far"]
 """What to make of a sector whose rays have all measured nothing valid."""
 _EDGE = 1e-4
 """By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
+_NEAR = 0.08
+"""Returns up to this beyond the least valid range may be too near for the next scan [m]."""
 
 
 class ScanError(ValueError):
@@ -28,8 +30,9 @@ class ScanError(ValueError):
 class Scan(NamedTuple):
     """What a planar lidar has measured, as ``sensor_msgs/LaserScan`` puts it.
 
-    A range of ``range_max`` or more, infinity too, has met nothing. One below ``range_min``, and
-    NaN, is not valid.
+    A range of ``range_max`` or more, infinity too, has met nothing. One between 0 and
+    ``range_min``, and minus infinity, has met something nearer than the sensor can measure. Zero,
+    negative numbers and NaN are not valid.
     """
 
     angle_min: float
@@ -42,6 +45,17 @@ class Scan(NamedTuple):
     """The least valid range [m]."""
     range_max: float = math.inf
     """The range up to which it sees [m]."""
+
+
+class _Rays(NamedTuple):
+    """The rays of a scan, from the sensor but in directions of the robot's frame."""
+
+    directions: NDArray[np.float64]
+    """Directions in [-π, π) [rad], ``[R]``."""
+    valid: NDArray[np.bool_]
+    """Which of them have told something, ``[R]``."""
+    step: float
+    """Angle from ray to ray [rad]."""
 
 
 class Points(NamedTuple):
@@ -59,7 +73,8 @@ class Sectors:
 
     All valid rays of a sector count, whatever their number: with ``min`` the nearest return,
     with ``median`` the median, with ``single`` the ray nearest to the middle. A sector between two
-    rays of a coarse scan has the nearer one.
+    rays of a coarse scan has the nearer one. What is too near to be measured counts as a return at
+    the scan's ``range_min``.
 
     Args:
         card: Of the policy.
@@ -68,8 +83,10 @@ class Sectors:
         unseen: Range to report for sectors outside of the scan's field of view [m]; None refuses
             such a scan.
         silent: What to do where no ray of a sector is valid: ``"refuse"`` the scan, or hold that
-            nothing is there, ``"far"``, for a lidar that reports 0 or NaN for it. A scan without
-            any valid ray is refused in both.
+            nothing is there, ``"far"``, for a lidar that reports 0 or NaN for it. As such a lidar
+            may report the same for what is too near, a return within 0.08 m of ``range_min`` then
+            stays where it was until its ray is valid again. A scan without any valid ray is refused
+            in both.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -93,6 +110,7 @@ class Sectors:
         width = 2.0 * self._edge / card.sectors
         self._width = width
         self._middles = self._edge - width * (np.arange(card.sectors) + 0.5)
+        self._near: tuple[NDArray[np.float64], NDArray[np.float64]] = np.empty(0), np.empty(0)
 
     def read(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
         """Read a scan.
@@ -106,7 +124,7 @@ class Sectors:
         Raises:
             ScanError: If it is no scan, or does not tell the range of every sector.
         """
-        directions, points = self._measured(scan)
+        rays, points = self._measured(scan)
         card = self.card
         sector = self._index(points.angles)
         key = points.ranges
@@ -125,7 +143,7 @@ class Sectors:
         else:
             ranges[full] = ordered[start]
         for index in np.flatnonzero(~full).tolist():
-            ranges[index] = self._beside(index, scan, directions, points)
+            ranges[index] = self._beside(index, rays, points)
         return ranges, points
 
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -133,52 +151,89 @@ class Sectors:
         index = ((self._edge - angles) / self._width).astype(np.int64)
         return np.clip(index, 0, self.card.sectors - 1)
 
-    def _measured(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
-        """Directions of all rays in the robot's frame, ``[R]``, and the points in view."""
+    def _measured(self, scan: Scan) -> tuple[_Rays, Points]:
+        """All rays, and the points in view."""
         ranges = np.asarray(scan.ranges, dtype=np.float64)
         start, step = scan.angle_min, scan.angle_increment
+        least, most = scan.range_min, scan.range_max
         if ranges.ndim != 1 or not ranges.size:
             raise ScanError(f"ranges must have shape [R], got {ranges.shape}")
         if not (math.isfinite(start) and math.isfinite(step) and step):
             raise ScanError(f"a scan needs a first angle and a step, got {start} and {step}")
-        across, up, turn = self.mount
+        if not 0.0 <= least < most:
+            raise ScanError(
+                f"range_min must be at least 0 and below range_max, got {least} and {most}"
+            )
+        turn = self.mount[2]
         directions = _wrapped(start + turn + step * np.arange(ranges.size, dtype=np.float64))
-        far = self.card.max_range
-        missed = ranges >= scan.range_max
-        valid = missed | (ranges >= scan.range_min) & (ranges >= 0.0)
-        # A lidar that is broken is not one that meets nothing, whatever that reports.
+        valid = ranges >= least
+        # A lidar that is broken, or covered, is not one that meets nothing, whatever it reports.
         if not valid.any():
             raise ScanError(f"none of the scan's {ranges.size} rays is valid")
-        angles, distances = directions, np.where(missed, far, ranges)
-        if across or up:
-            met_x = across + distances * np.cos(directions)
-            met_y = up + distances * np.sin(directions)
-            # What met nothing is too far away to be seen in another direction from the center.
-            angles = np.where(missed, directions, np.arctan2(met_y, met_x))
-            distances = np.where(missed, far, np.hypot(met_x, met_y))
-        with np.errstate(invalid="ignore"):
-            front = valid & (np.abs(angles) <= self._edge + _EDGE)
-        return directions, Points(angles[front], np.minimum(distances[front], far))
+        too_near = (ranges < least) & ((ranges > 0.0) | (ranges == -math.inf))
+        ranges = np.where(too_near, least, ranges)
+        rays = _Rays(directions, valid | too_near, abs(step))
+        angles, distances = directions[rays.valid], ranges[rays.valid]
+        if self.silent == "far":
+            angles, distances = self._with_near(rays, angles, distances, least + _NEAR)
+        return rays, self._around_center(angles, distances, distances >= most)
 
-    def _beside(
-        self, index: int, scan: Scan, directions: NDArray[np.float64], points: Points
-    ) -> float:
-        """Range of a sector in which no valid ray lies [m]."""
+    def _with_near(
+        self,
+        rays: _Rays,
+        angles: NDArray[np.float64],
+        distances: NDArray[np.float64],
+        near: float,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Add the near returns of earlier scans where a lidar has fallen silent since.
+
+        They keep their directions, so that reading a scan twice is reading it once.
+        """
+        held_angles, held = self._near
+        if held.size:
+            off = np.abs(_wrapped(rays.directions - held_angles[:, None]))
+            nearest = off.argmin(axis=1)
+            stays = ~rays.valid[nearest] & (off.min(axis=1) <= rays.step)
+            held_angles, held = held_angles[stays], held[stays]
+        angles = np.concatenate((angles, held_angles))
+        distances = np.concatenate((distances, held))
+        self._near = angles[distances <= near], distances[distances <= near]
+        return angles, distances
+
+    def _around_center(
+        self, angles: NDArray[np.float64], distances: NDArray[np.float64], missed: NDArray[np.bool_]
+    ) -> Points:
+        """The points in view from the robot's center of what the sensor has measured."""
+        across, up, _ = self.mount
+        far = self.card.max_range
+        distances = np.where(missed, far, distances)
+        if across or up:
+            met_x = across + distances * np.cos(angles)
+            met_y = up + distances * np.sin(angles)
+            # What met nothing is too far away to be seen in another direction from the center.
+            angles = np.where(missed, angles, np.arctan2(met_y, met_x))
+            distances = np.where(missed, far, np.hypot(met_x, met_y))
+        front = np.abs(angles) <= self._edge + _EDGE
+        return Points(angles[front], np.minimum(distances[front], far))
+
+    def _beside(self, index: int, rays: _Rays, points: Points) -> float:
+        """Range of a sector in which no valid ray has met anything [m]."""
         middle, half = float(self._middles[index]), 0.5 * self._width
-        off = np.abs(_wrapped(directions - middle))
-        # A sensor that is not at the center sees near points in other directions.
-        reach = half + abs(scan.angle_increment)
+        off = np.abs(_wrapped(rays.directions - middle))
+        reach = half + rays.step
         degrees = round(math.degrees(middle))
         if off.min() > reach + _EDGE:
             if self.unseen is None:
                 raise ScanError(f"the scan does not reach the sector at {degrees} degrees")
             return min(self.unseen, self.card.max_range)
-        inside = bool((self._index(directions[off <= half + _EDGE]) == index).any())
-        shifted = bool(self.mount[0] or self.mount[1])
-        if points.angles.size and (shifted or not inside):
+        within = off <= half + _EDGE
+        own = rays.valid[within][self._index(rays.directions[within]) == index]
+        # A sensor that is not at the center sees near points in other directions.
+        moved = bool(own.any())
+        if points.angles.size and (moved or not own.size):
             beside = np.abs(_wrapped(points.angles - middle))
             nearest = int(beside.argmin())
-            if beside[nearest] <= reach + shifted * half + _EDGE:
+            if beside[nearest] <= reach + moved * half + _EDGE:
                 return float(points.ranges[nearest])
         if self.silent == "refuse":
             raise ScanError(f"no ray of the sector at {degrees} degrees is valid")
