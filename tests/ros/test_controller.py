@@ -202,6 +202,39 @@ def test_a_scan_that_ages_stops_it_before_what_it_showed_is_reached() -> None:
     assert reasons(controller, [10.52]) == ["driving"]  # It stands, and saw it standing.
 
 
+@pytest.mark.parametrize("late", [0.0, 0.05, 0.15, 0.2])
+def test_a_late_scan_is_entered_in_the_map_where_it_was_taken(late: float) -> None:
+    pytest.importorskip("numba", reason="maps need Numba")
+    pilot = Pilot(
+        card(memory="map", observation_size=27), lambda seen: np.zeros((1, 2), np.float32)
+    )
+    entered = []
+    assert pilot._way is not None
+    sense = pilot._way.sense
+
+    def noting(pose: Any, goal: Any, points: Any) -> np.ndarray:
+        angles = points.angles + pose[2]
+        nearest = int(points.ranges.argmin())
+        x = pose[0] + points.ranges[nearest] * math.cos(angles[nearest])
+        entered.append((x, pose[1] + points.ranges[nearest] * math.sin(angles[nearest])))
+        return sense(pose, goal, points)
+
+    pilot._way.sense = noting  # type: ignore[method-assign]
+    controller = Controller(pilot)
+    controller.aim((9.0, 0.0))
+    # It turns to the left at 2 rad/s, over the direction in which headings begin anew.
+    for step in range(4):
+        time = 10.0 + 0.1 * step
+        heading = math.remainder(3.0 + 2.0 * (time - 10.0), math.tau)
+        controller.feel((0.1 * step, 0.0, heading), (1.0, 2.0), time)
+    taken = 10.3 - late
+    controller.see(scan(2.0, free=9.0), taken)
+    controller.tick(10.3)
+    heading, x = 3.0 + 2.0 * (taken - 10.0), taken - 10.0
+    want = x + 2.0 * math.cos(heading), 2.0 * math.sin(heading)
+    assert entered == [pytest.approx(want, abs=1e-6)]
+
+
 def test_odometry_that_jumps_gives_up_the_goal() -> None:
     controller, _ = ready((3.0, 2.0, 1.0))
     controller.tick(10.0)

@@ -169,7 +169,12 @@ class Pilot:
         return self._goal is not None and math.dist(pose[:2], self._goal) <= self.card.goal_radius
 
     def observe(
-        self, scan: Scan, pose: tuple[float, float, float], speeds: tuple[float, float]
+        self,
+        scan: Scan,
+        pose: tuple[float, float, float],
+        speeds: tuple[float, float],
+        *,
+        scan_pose: tuple[float, float, float] | None = None,
     ) -> NDArray[np.float32]:
         """What the policy senses, once for each decision.
 
@@ -177,6 +182,8 @@ class Pilot:
             scan: What the lidar has measured.
             pose: Of the robot (x, y, heading) in the frame of the odometry [m, m, rad].
             speeds: Forward and turning speed [m/s, rad/s].
+            scan_pose: Pose at the time of the scan, from which it is entered in the map; None: it
+                is of now.
 
         Returns:
             The observation, ``[O]``.
@@ -190,11 +197,14 @@ class Pilot:
         x, y, heading = check_finite("pose", pose, 3)
         linear, angular = check_finite("speeds", speeds, 2)
         card = self.card
+        taken = None if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
         ranges, points = self.sectors.read(scan)
         way = None
         if self._way is not None:
             if self._fresh:
                 self._way.begin(self._center or (x, y))
+            if taken is not None and taken != (x, y, heading):
+                points = points.seen_from((x, y, heading), taken, card.max_range)
             way = self._way.sense((x, y, heading), self._goal, points)
         motion: Any = (x, y, heading, linear / self.pace, angular / self.pace)
         distance = math.dist((x, y), self._goal)
@@ -207,7 +217,12 @@ class Pilot:
         return seen
 
     def decide(
-        self, scan: Scan, pose: tuple[float, float, float], speeds: tuple[float, float]
+        self,
+        scan: Scan,
+        pose: tuple[float, float, float],
+        speeds: tuple[float, float],
+        *,
+        scan_pose: tuple[float, float, float] | None = None,
     ) -> Command:
         """Choose what to do for the next :attr:`period`.
 
@@ -215,6 +230,7 @@ class Pilot:
             scan: As in :meth:`observe`.
             pose: As there.
             speeds: As there.
+            scan_pose: As there.
 
         Returns:
             The speeds.
@@ -223,7 +239,7 @@ class Pilot:
             ScanError: If the scan does not tell the range of every sector.
             ValueError: If there is no goal, or a number is not finite.
         """
-        action = self._network(self.observe(scan, pose, speeds)[None])[0]
+        action = self._network(self.observe(scan, pose, speeds, scan_pose=scan_pose)[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
         left, right = self.card.robot.wheel_speeds(action)

@@ -67,6 +67,28 @@ class Points(NamedTuple):
     """Distances from the robot's center [m], ``[P]``; the card's ``max_range`` where nothing was
     met."""
 
+    def seen_from(
+        self,
+        pose: tuple[float, ...],
+        taken: tuple[float, ...],
+        max_range: float,
+    ) -> Points:
+        """What was met, around where the robot is now.
+
+        Args:
+            pose: Where it is (x, y, heading) [m, m, rad].
+            taken: Where it was when it measured this.
+            max_range: Range at which nothing was met [m].
+
+        Returns:
+            The points that were met, in the robot's frame of now.
+        """
+        met = self.ranges < max_range
+        angles = self.angles[met] + taken[2]
+        x = taken[0] - pose[0] + self.ranges[met] * np.cos(angles)
+        y = taken[1] - pose[1] + self.ranges[met] * np.sin(angles)
+        return Points(_wrapped(np.arctan2(y, x) - pose[2]), np.hypot(x, y))
+
 
 class Sectors:
     """Reads scans as a policy does.

@@ -248,6 +248,20 @@ class Controller:
         """The command that holds, or a new one where it is due."""
         due = self._decided + (1.0 - _EARLY) * self.pilot.period
         if self._command is None or not self._decided <= now < due:
-            self._command = self.pilot.decide(seen.scan, felt.pose, felt.speeds)
+            taken = self._pose_at(seen.time, felt)
+            self._command = self.pilot.decide(seen.scan, felt.pose, felt.speeds, scan_pose=taken)
             self._decided = now
         return Order(self._command.linear, self._command.angular, "driving")
+
+    def _pose_at(self, time: float, felt: _Felt) -> tuple[float, float, float]:
+        """Pose at a time, between the two odometries around it; outside of all the last one."""
+        later = felt
+        for each in reversed(self._track):
+            if each.time <= time < later.time:
+                share = (time - each.time) / (later.time - each.time)
+                x, y, turn = (b - a for a, b in zip(each.pose, later.pose, strict=True))
+                turn = math.remainder(turn, math.tau)
+                start = each.pose
+                return start[0] + share * x, start[1] + share * y, start[2] + share * turn
+            later = each
+        return felt.pose
