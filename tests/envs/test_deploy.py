@@ -15,10 +15,10 @@ import pytest
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import mpfa_envs
-from mpfa_envs import NavigationEnv
+from mpfa_envs import NavigationEnv, RobotModel
 from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
 from mpfa_envs.observation import observation_slices
-from tests.envs.exported import exported
+from tests.envs.exported import card, exported
 
 Recorded = tuple[Scan, tuple[float, float, float], tuple[float, float]]
 
@@ -108,6 +108,53 @@ def test_a_map_is_forgotten_with_the_goal_and_looked_at_anew_when_it_moves(tmp_p
     assert behind[24] == pytest.approx(-1.0, abs=0.1) and behind[26] == pytest.approx(0.4)
     pilot.begin((4.0, 0.0))
     assert pilot.observe(free, *still)[26] == pytest.approx(0.4)
+
+
+def test_a_goal_beyond_the_map_is_refused_as_soon_as_the_map_is_known(tmp_path: Path) -> None:
+    pilot = Pilot.load(exported(tmp_path, 27, memory="map"), map_size=10.0)
+    free = Scan(-math.pi / 2, math.pi / 90, np.full(91, math.inf))
+    refused = r"goal must be on the map, 10 m \(map_size\) around \(1.00, 0.00\), got "
+    with pytest.raises(ValueError, match=refused + r"\(6.10, 0.00\)"):
+        pilot.begin((6.1, 0.0), map_center=(1.0, 0.0))
+    assert pilot.goal is None
+    pilot.begin((6.1, 0.0))
+    for _ in range(2):
+        with pytest.raises(ValueError, match=refused):
+            pilot.decide(free, (1.0, 0.0, 0.0), (0.0, 0.0))
+    pilot.begin((5.9, 0.0))
+    pilot.decide(free, (1.0, 0.0, 0.0), (0.0, 0.0))
+    with pytest.raises(ValueError, match=refused + r"\(0.00, -5.10\)"):
+        pilot.move_goal((0.0, -5.1))
+    assert pilot.goal == (5.9, 0.0)
+    pilot.decide(free, (4.0, 0.0, 0.0), (0.0, 0.0))  # The map stays where it began.
+    without = Pilot.load(exported(tmp_path), map_size=10.0)
+    without.begin((60.0, 0.0))
+    without.decide(free, (1.0, 0.0, 0.0), (0.0, 0.0))
+
+
+def own_robot(wheel_base: float, slowest: float) -> RobotModel:
+    return RobotModel(
+        name="own", radius=0.18, height=0.3, mass=5.0, wheel_base=wheel_base, wheel_radius=0.05,
+        min_wheel_speed=slowest, max_wheel_speed=0.5,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("robot", ["turtlebot2", "turtlebot4", "burger", own_robot(0.35, -0.5)])
+def test_no_wheel_is_told_a_speed_that_it_does_not_have(robot: str | RobotModel) -> None:
+    scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))
+    for action in ((-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, -1.0)):
+        pilot = Pilot(card(), lambda _, a=action: np.array([a], np.float32), robot=robot)
+        pilot.begin((4.0, 0.0))
+        command, own = pilot.decide(scan, *still), pilot.robot
+        spare = 0.021 * (own.max_wheel_speed - own.min_wheel_speed)
+        for speed in (command.left, command.right):
+            assert own.min_wheel_speed - spare <= speed <= own.max_wheel_speed + spare
+
+
+def test_a_robot_that_cannot_drive_the_sharpest_arcs_is_refused() -> None:
+    message = "a wheel of own would turn at -0.0557 m/s, its min_wheel_speed is 0.0: train a policy"
+    with pytest.raises(CardError, match=message):
+        Pilot(card(), lambda _: np.zeros((1, 2), np.float32), robot=own_robot(0.35, 0.0))
 
 
 def test_it_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _WIDER: Final = 0.01
 """By how much a robot may be wider than that of the training [m]."""
+_BEYOND: Final = 0.02
+"""By what share of its speed range a wheel may be told to go beyond it."""
 
 
 class Command(NamedTuple):
@@ -83,16 +85,24 @@ class Pilot:
                 f"the policy learned with a robot of radius {learned.radius} m, "
                 f"{self.robot.name} has {self.robot.radius} m"
             )
-        most = min(1.0, self.robot.max_wheel_speed / learned.max_wheel_speed)
+        most = _fastest_pace(self.robot, learned)
         self.pace = most if pace is None else check_share("pace", pace)
         if not 0.0 < self.pace <= most:
             raise ValueError(
                 f"pace must be above 0 and at most {most:.3g}, as {self.robot.name} drives "
                 f"{self.robot.max_wheel_speed} m/s, got {pace}"
             )
+        least = self.pace * _wheel_range(self.robot, learned)[0]
+        if least < self.robot.min_wheel_speed - _tolerance(self.robot):
+            raise CardError(
+                f"on the sharpest arcs of the policy a wheel of {self.robot.name} would turn at "
+                f"{least:.3g} m/s, its min_wheel_speed is {self.robot.min_wheel_speed}: train a "
+                "policy with it, or give a lower min_wheel_speed if its wheels can do that"
+            )
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
-        self._way = self._make_way(check_positive("map_size", map_size))
+        self._map_size = check_positive("map_size", map_size)
+        self._way = self._make_way(self._map_size)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
@@ -138,11 +148,12 @@ class Pilot:
                 is at its first decision.
 
         Raises:
-            ValueError: If a number is not finite.
+            ValueError: If a number is not finite, or the goal is not on the map.
         """
         center = None if map_center is None else _pair("map_center", map_center)
-        self._goal = _pair("goal", goal)
-        self._center, self._fresh = center, True
+        goal = _pair("goal", goal)
+        self._check_on_map(goal, center)
+        self._goal, self._center, self._fresh = goal, center, True
 
     def stop(self) -> None:
         """Give up the goal."""
@@ -155,11 +166,12 @@ class Pilot:
             goal: Position (x, y) in the frame of the odometry [m].
 
         Raises:
-            ValueError: If it is not finite, or the robot has not set out.
+            ValueError: If it is not finite or not on the map, or the robot has not set out.
         """
         if self._goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
         if (goal := _pair("goal", goal)) != self._goal:
+            self._check_on_map(goal, self._center)
             self._goal = goal
             if self._way is not None:
                 self._way.look_anew()
@@ -190,7 +202,7 @@ class Pilot:
 
         Raises:
             ScanError: If the scan does not tell the range of every sector.
-            ValueError: If there is no goal, or a number is not finite.
+            ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
         if self._goal is None:
             raise ValueError("goal must be given to begin() first")
@@ -198,11 +210,14 @@ class Pilot:
         linear, angular = check_finite("speeds", speeds, 2)
         card = self.card
         taken = None if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
+        center = self._center or (x, y)
+        self._check_on_map(self._goal, center)
         ranges, points = self.sectors.read(scan)
         way = None
         if self._way is not None:
             if self._fresh:
-                self._way.begin(self._center or (x, y))
+                self._way.begin(center)
+                self._center = center
             if taken is not None and taken != (x, y, heading):
                 points = points.seen_from((x, y, heading), taken, card.max_range)
             way = self._way.sense((x, y, heading), self._goal, points)
@@ -237,7 +252,7 @@ class Pilot:
 
         Raises:
             ScanError: If the scan does not tell the range of every sector.
-            ValueError: If there is no goal, or a number is not finite.
+            ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
         action = self._network(self.observe(scan, pose, speeds, scan_pose=scan_pose)[None])[0]
         if not np.isfinite(action).all():
@@ -248,6 +263,16 @@ class Pilot:
         turn = 0.5 * angular * self.robot.wheel_base
         return Command(linear - turn, linear + turn, linear, angular)
 
+    def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
+        """Refuse a goal beyond the map, over which ways lead back, once its center is known."""
+        if self._way is None or center is None:
+            return
+        if max(abs(goal[0] - center[0]), abs(goal[1] - center[1])) > 0.5 * self._map_size:
+            raise ValueError(
+                f"goal must be on the map, {self._map_size:g} m (map_size) around "
+                f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
+            )
+
     def _make_way(self, size: float) -> Way | None:
         """The map, if the policy has one; compiled before the first decision is due."""
         if self.card.memory != "map":
@@ -257,6 +282,26 @@ class Pilot:
         way = Way(self.card, size=size)
         way.warm_up()
         return way
+
+
+def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:
+    """Least and greatest speed of its wheels on the arcs of another robot, at its pace [m/s]."""
+    middle = 0.5 * (learned.max_wheel_speed + learned.min_wheel_speed)
+    span = 0.5 * (learned.max_wheel_speed - learned.min_wheel_speed)
+    # Wheels that are farther apart differ more on the same arc, others never drive faster.
+    span *= max(1.0, robot.wheel_base / learned.wheel_base)
+    return middle - span, middle + span
+
+
+def _tolerance(robot: RobotModel) -> float:
+    """By how much its wheels may be told to go beyond their range [m/s]."""
+    return _BEYOND * (robot.max_wheel_speed - robot.min_wheel_speed)
+
+
+def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
+    """The greatest share of the other robot's speed with which it can drive the same arcs."""
+    turning = (robot.max_wheel_speed + _tolerance(robot)) / _wheel_range(robot, learned)[1]
+    return min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, turning)
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:
