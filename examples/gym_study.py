@@ -30,7 +30,7 @@ from control.table import FOLDER, SEEDS, TABLE_F, read_runs
 from control.tasks import TASKS
 from control.training import METHODS
 from navigation import files
-from navigation.report.study_rows import keep
+from navigation.report.kept_rows import keep
 from navigation.stopping import Stop
 from navigation.studies.protocol import ROOT
 

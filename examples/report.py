@@ -35,10 +35,10 @@ import pandas as pd
 from navigation import files
 from navigation.figures import Runs, plot_evaluations, plot_training
 from navigation.records import read_table
+from navigation.report.kept_rows import is_kept
 from navigation.report.paper_figures import plot_paper
 from navigation.report.paper_tables import paper_tables
 from navigation.report.study_pages import write_study
-from navigation.report.study_rows import is_kept
 from navigation.report.tables import (
     comparison_table,
     interval_table,

@@ -4,7 +4,8 @@
     python examples/study.py                          all of them
     python examples/study.py C D --jobs 4             two tables, four runs at a time
     python examples/study.py --seeds 3                three runs of each arm first
-    python examples/study.py --keep docs/results/study    copy the rows of what is done
+    python examples/study.py --keep docs/results/study    add the rows of finished runs to it
+    python examples/study.py --kept docs/results/study    make only runs that it lacks
 
 Every run is made by ``compare.py``, with the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is in progress, and the same command continues it. Tables
@@ -18,13 +19,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import compare
 from navigation import files
-from navigation.report.study_rows import keep, read_runs
-from navigation.studies.protocol import ROOT, Table, tables
-from navigation.studies.remaining import counts, free_checkpoints, hours_left
+from navigation.report.kept_rows import is_kept, joined, keep, of_arms, read_all_kept
+from navigation.report.study_rows import Rows, read_runs, without_rows
+from navigation.studies.protocol import ROOT, Table, label_of, tables
+from navigation.studies.remaining import counts, free_checkpoints, hours_left, parts_left
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -40,8 +43,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time (default: 2)")
     parser.add_argument("--seeds", type=int, help="runs of each arm at most (default: all)")
     parser.add_argument("--list", action="store_true", help="list what there is; run nothing")
-    parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="write the rows there; run nothing"
+    rows = parser.add_mutually_exclusive_group()
+    rows.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="add the rows to those there; run nothing"
+    )
+    rows.add_argument(
+        "--kept", type=Path, metavar="FOLDER", help="runs whose rows are there are not made again"
     )
     options = parser.parse_args(arguments)
     for name in options.tables:
@@ -56,9 +63,24 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
             files.check_folder(folder)
         except ValueError as error:
             parser.error(str(error))
+    if options.kept and not is_kept(options.kept):
+        parser.error(f"--kept {options.kept}: no rows of the study are there, which --keep writes")
     found = tables(options.folder, most=options.seeds)
     options.tables = [found[name] for name in options.tables or names]
+    if options.kept:
+        there = read_all_kept(options.kept)
+        options.tables = [left_of(table, there, options.folder) for table in options.tables]
     return options
+
+
+def left_of(table: Table, rows: Rows, root: Path) -> Table:
+    """A table with the runs alone that are not among the rows."""
+    parts = (
+        part
+        for study in table.studies
+        for part in parts_left(study, without_rows(study, rows, root))
+    )
+    return replace(table, studies=tuple(parts))
 
 
 def summary(chosen: Sequence[Table], *, jobs: int) -> str:
@@ -85,9 +107,13 @@ def listing(chosen: Sequence[Table]) -> str:
 
 def kept(chosen: Sequence[Table], root: Path, folder: Path) -> str:
     """Keep the rows of some tables, and say what was written."""
-    lines = []
+    lines, others = [], read_all_kept(folder)
     for table in chosen:
         rows = read_runs(table, root)
+        if len(rows.curves):
+            # Runs that it shares with another table may be kept there alone.
+            labels = {label_of(job, root) for study in table.studies for job in study.jobs}
+            rows = joined(rows, of_arms(others, labels))
         for path in keep(rows, folder, table.name) if len(rows.curves) else []:
             lines.append(f"written: {path}, {path.stat().st_size / 1e6:.2f} MB")
     return "\n".join(lines) or f"no run is at its end in {root}: nothing is written"

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from control import table as off_navigation
 from control.table import FOLDER, TABLE_F
+from navigation.report.kept_rows import is_kept, read_kept
 from navigation.report.study_figures import plot_study
-from navigation.report.study_rows import Rows, is_kept, missing, read_kept, read_runs
+from navigation.report.study_rows import Rows, missing, read_runs
 from navigation.report.study_tables import study_tables
 from navigation.studies.protocol import ROOT, Table, tables
 from torchrl_mpfa.saving import write_text_atomically

@@ -1,13 +1,10 @@
-"""The rows of the study: curves and tests of each run, out of its folder or out of what is kept."""
+"""The rows of the study: curves and tests of each run, and the measures that are made of them."""
 
 from __future__ import annotations
 
-import gzip
 import math
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +13,15 @@ import pandas as pd
 from navigation import files
 from navigation.records import read_table
 from navigation.report.tables import area_under
+from navigation.studies.jobs import Job, Study
 from navigation.studies.protocol import Table, label_of
+from navigation.studies.remaining import parts_left
 from navigation.worlds import family
 
 GOAL = 0.9
 """Greedy success in validation that the speed of a run is told by."""
-_CURVES = ["arm", "seed", "total_steps", "success"]
-_TESTS = ["arm", "seed", "world", "episode", "success", "collision", "spl", "time_s"]
+CURVES = ["arm", "seed", "total_steps", "success"]
+TESTS = ["arm", "seed", "world", "episode", "success", "collision", "spl", "time_s"]
 _DIGITS = {"success": 6, "spl": 3, "time_s": 1}
 
 
@@ -33,7 +32,7 @@ class Rows:
     curves: pd.DataFrame
     """A row for each evaluation during training: arm, seed, total_steps, success; of table F
     success is the score, and the return is beside it."""
-    tests: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=_TESTS))
+    tests: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=TESTS))
     """A row for each episode of a last policy; what neither succeeded nor collided ran out of time.
     """
 
@@ -55,60 +54,11 @@ def read_runs(table: Table, root: Path) -> Rows:
             if not job.is_trained():
                 continue
             run = label_of(job, root), job.seed
-            curves[run] = _rows(run, job.path / files.EVALUATIONS, _CURVES)
+            curves[run] = _rows(run, job.path / files.EVALUATIONS, CURVES)
             if job.is_evaluated(study.evaluation):
                 folder = study.evaluation.folder
-                tests[(*run, folder)] = _rows(run, job.path / folder / files.EPISODES, _TESTS)
-    return Rows(_together(curves.values(), _CURVES), _together(tests.values(), _TESTS))
-
-
-def keep(rows: Rows, folder: Path, name: str) -> list[Path]:
-    """Write rows as two compressed files, the same bytes for the same rows.
-
-    Args:
-        rows: The rows.
-        folder: Where they go.
-        name: Of the table.
-
-    Returns:
-        The files.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = _kept(folder, name)
-    flags = rows.tests.astype({"success": int, "collision": int})
-    for path, found in zip(paths, (rows.curves, flags), strict=True):
-        text = found.to_csv(index=False, lineterminator="\n")
-        # Neither a date nor a name is in it, so that the same rows are the same bytes.
-        half_written = path.with_suffix(".part")
-        half_written.write_bytes(gzip.compress(text.encode(), mtime=0))
-        os.replace(half_written, path)
-    return list(paths)
-
-
-def read_kept(folder: Path, name: str) -> Rows:
-    """The rows that :func:`keep` wrote; none if it did not.
-
-    Args:
-        folder: Where they lie.
-        name: Of the table.
-
-    Returns:
-        The rows.
-    """
-    found = []
-    for path, columns in zip(_kept(folder, name), (_CURVES, _TESTS), strict=True):
-        if not path.exists():
-            found.append(_together([], columns))
-            continue
-        text = gzip.decompress(path.read_bytes()).decode()
-        found.append(pd.read_csv(StringIO(text), keep_default_na=False, na_values=[""]))
-    curves, tests = found
-    return Rows(curves, tests.astype({"success": bool, "collision": bool}))
-
-
-def is_kept(folder: Path) -> bool:
-    """Whether a folder holds kept rows, and not runs."""
-    return any(folder.glob("*-curves.csv.gz"))
+                tests[(*run, folder)] = _rows(run, job.path / folder / files.EPISODES, TESTS)
+    return Rows(together(curves.values(), CURVES), together(tests.values(), TESTS))
 
 
 def scores_of(rows: Rows, table: Table) -> dict[str, pd.DataFrame]:
@@ -172,22 +122,41 @@ def _success(worlds: pd.DataFrame) -> dict[int, float]:
     return {int(str(seed)): float(value) for seed, value in means.items()}
 
 
-def missing(table: Table, rows: Rows, root: Path) -> str:
-    """Which runs have no rows, or were not tested, and the commands that make them."""
+def without_rows(study: Study, rows: Rows, root: Path) -> list[Job]:
+    """The runs of a study that have no rows, or were not tested where they shall be.
+
+    Args:
+        study: The runs.
+        rows: What there is.
+        root: Folder of the study that the names of its arms begin from.
+
+    Returns:
+        The runs.
+    """
     trained = set(rows.curves[["arm", "seed"]].itertuples(index=False, name=None))
     kinds = rows.tests[["arm", "seed"]].assign(kind=rows.tests["world"].map(family))
     tested = set(kinds.drop_duplicates().itertuples(index=False, name=None))
+    asked = {_kind(word) for word in study.evaluation.words}
+    return [
+        job
+        for job in study.jobs
+        for run in [(label_of(job, root), job.seed)]
+        if run not in trained or any((*run, kind) not in tested for kind in asked)
+    ]
+
+
+def missing(table: Table, rows: Rows, root: Path) -> str:
+    """Which runs have no rows, or were not tested, and the commands that make them."""
     lines = []
     for study in table.studies:
-        asked = {_kind(word) for word in study.evaluation.words}
         absent: dict[str, list[int]] = {}
-        for job in study.jobs:
-            run = label_of(job, root), job.seed
-            if run not in trained or any((*run, kind) not in tested for kind in asked):
-                absent.setdefault(run[0], []).append(job.seed)
+        jobs = without_rows(study, rows, root)
+        for job in jobs:
+            absent.setdefault(label_of(job, root), []).append(job.seed)
         if absent:
             names = "; ".join(f"{arm} {_span(seeds)}" for arm, seeds in absent.items())
-            lines += [f"Missing: {names}.", f"\n    {study.command}\n"]
+            lines.append(f"Missing: {names}.\n")
+            lines += [f"    {part.command}\n" for part in parts_left(study, jobs)]
     return "\n".join(lines).rstrip()
 
 
@@ -202,17 +171,14 @@ def _span(seeds: list[int]) -> str:
     return f"{seeds[0]} to {seeds[-1]}" if whole else ", ".join(map(str, seeds))
 
 
-def _kept(folder: Path, name: str) -> tuple[Path, Path]:
-    return folder / f"{name}-curves.csv.gz", folder / f"{name}-tests.csv.gz"
-
-
 def _rows(run: tuple[str, int], path: Path, columns: list[str]) -> pd.DataFrame:
     found = read_table(path)
     if not len(found):
-        return _together([], columns)
+        return together([], columns)
     return found.assign(arm=run[0], seed=run[1])[columns].round(_DIGITS)
 
 
-def _together(tables: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
+def together(tables: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
+    """Tables as one, with these columns if none of them has rows."""
     found: list[Any] = [each for each in tables if len(each)]
     return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
 from navigation import files
 from navigation.records import read_table
+from navigation.studies.arms import Arm
 from navigation.studies.jobs import Job, Study
 
 
@@ -20,6 +22,33 @@ def free_checkpoints(study: Study) -> None:
     """Remove the checkpoints of runs that are done: thousands of them fill a disk."""
     for job in jobs_done(study):
         (job.path / files.CHECKPOINT).unlink(missing_ok=True)
+
+
+def parts_left(study: Study, missing: Collection[Job]) -> list[Study]:
+    """What of a study its missing runs are made by.
+
+    Args:
+        study: The runs.
+        missing: Those of them that have to be made.
+
+    Returns:
+        Studies that have these runs and no others, methods and arms that lack the same seeds
+        together.
+    """
+    lacking: dict[tuple[str, Arm, str], list[int]] = {}
+    for job in study.jobs:
+        if job in missing:
+            lacking.setdefault((job.learner, job.arm, job.method), []).append(job.seed)
+    methods: dict[tuple[str, Arm, tuple[int, ...]], list[str]] = {}
+    for (learner, arm, method), seeds in lacking.items():
+        methods.setdefault((learner, arm, tuple(seeds)), []).append(method)
+    arms: dict[tuple[str, tuple[str, ...], tuple[int, ...]], list[Arm]] = {}
+    for (learner, arm, of_arm), names in methods.items():
+        arms.setdefault((learner, tuple(names), of_arm), []).append(arm)
+    return [
+        replace(study, learners=(learner,), methods=names, seeds=of_arms, arms=tuple(alike))
+        for (learner, names, of_arms), alike in arms.items()
+    ]
 
 
 def seconds_of(job: Job, study: Study) -> tuple[float, float] | None:

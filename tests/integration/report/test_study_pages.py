@@ -17,12 +17,11 @@ import study
 from navigation import files
 from navigation.records import write_table
 from navigation.report import study_pages
+from navigation.report.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
 from navigation.report.study_figures import mean_curve, plot_curves, plot_study, plot_volumes
 from navigation.report.study_rows import (
     Rows,
-    keep,
     missing,
-    read_kept,
     read_runs,
     scores_of,
     worlds_of,
@@ -136,8 +135,9 @@ def test_what_is_kept_comes_back_and_is_the_same_bytes_each_time(
     rows = read_runs(small_table(runs), runs)
     paths = keep(rows, tmp_path / "a", "C")
     again = read_kept(tmp_path / "a", "C")
-    pd.testing.assert_frame_equal(again.curves, rows.curves, check_dtype=False)
-    pd.testing.assert_frame_equal(again.tests, rows.tests, check_dtype=False)
+    for mine, theirs in ((again.curves, rows.curves), (again.tests, rows.tests)):
+        in_order = theirs.sort_values(["arm", "seed"], kind="stable", ignore_index=True)
+        pd.testing.assert_frame_equal(mine, in_order, check_dtype=False)
     assert len(rows.tests) == 3 * 4 * 8 and len(rows.curves) == 3 * 4 * 2
     assert not rows.tests["collision"].all() and rows.tests["collision"].any()
     for path, other in zip(paths, keep(again, tmp_path / "b", "C"), strict=True):
@@ -145,6 +145,62 @@ def test_what_is_kept_comes_back_and_is_the_same_bytes_each_time(
     # No name and no date of the file.
     assert paths[0].read_bytes()[3:8] == bytes(5)
     assert not len(read_kept(tmp_path / "a", "D").curves)
+
+
+def halves(rows: Rows, *, by: int) -> tuple[Rows, Rows]:
+    """The rows of seeds below a number, and of the others."""
+    below, above = (
+        Rows(
+            rows.curves[(rows.curves["seed"] < by) == less],
+            rows.tests[(rows.tests["seed"] < by) == less],
+        )
+        for less in (True, False)
+    )
+    return below, above
+
+
+def test_rows_are_added_to_those_that_are_kept_in_whatever_order_they_come(
+    runs: Path, tmp_path: Path
+) -> None:
+    rows = read_runs(small_table(runs), runs)
+    first, second = halves(rows, by=2)
+    whole = keep(rows, tmp_path / "whole", "C")
+    for name, parts in (("a", (first, second)), ("b", (second, first)), ("c", (rows, first))):
+        for part in parts:
+            paths = keep(part, tmp_path / name, "C")
+        for path, other in zip(paths, whole, strict=True):
+            assert path.read_bytes() == other.read_bytes()
+
+
+def test_a_run_that_was_made_anew_takes_the_place_of_what_was_kept_once_it_is_tested(
+    runs: Path, tmp_path: Path
+) -> None:
+    rows = read_runs(small_table(runs), runs)
+    keep(rows, tmp_path, "C")
+    tests = rows.tests.assign(success=~rows.tests["success"])
+    anew = Rows(rows.curves.assign(success=0.5), tests)
+    one, _ = halves(anew, by=1)
+    keep(Rows(one.curves, one.tests[:0]), tmp_path, "C")
+    found = read_kept(tmp_path, "C")
+    assert found.tests["success"].sum() == rows.tests["success"].sum()
+    assert not (found.curves["success"] == 0.5).all()
+    keep(one, tmp_path, "C")
+    found = read_kept(tmp_path, "C")
+    assert len(found.curves) == len(rows.curves) and len(found.tests) == len(rows.tests)
+    assert (found.curves.query("seed == 0")["success"] == 0.5).all()
+    assert not (found.curves.query("seed != 0")["success"] == 0.5).all()
+
+
+def test_a_run_that_two_tables_keep_is_read_once(runs: Path, tmp_path: Path) -> None:
+    rows = read_runs(small_table(runs), runs)
+    first, second = halves(rows, by=2)
+    keep(rows, tmp_path, "C")
+    keep(first, tmp_path, "D")
+    found = read_all_kept(tmp_path)
+    assert len(found.curves) == len(rows.curves) and len(found.tests) == len(rows.tests)
+    two = of_arms(joined(second, first), {"s/td3/per", "s/td3/uniform/wide"})
+    assert set(two.curves["arm"]) == set(two.tests["arm"]) == {"s/td3/per", "s/td3/uniform/wide"}
+    assert len(two.curves) == 2 * 4 * 2 and len(two.tests) == 2 * 4 * 8
 
 
 def test_the_pages_of_the_runs_and_of_what_is_kept_of_them_are_the_same(
@@ -222,7 +278,8 @@ def test_runs_that_are_missing_are_named_with_their_command(runs: Path, tmp_path
     more = small_table(runs, seeds=7)
     said = missing(more, read_runs(more, runs), runs)
     assert "Missing: s/td3/uniform 4 to 6; s/td3/per 4 to 6." in said
-    assert more.studies[1].command in said
+    assert "--methods uniform per --seeds 4 5 6 --worlds" in said
+    assert "--methods uniform --seeds 4 5 6 --worlds" in said
     # Trained, and not tested in all its worlds.
     rows = read_runs(table, runs)
     fewer = rows.tests.query("arm != 's/td3/per' or seed != 2 or not world.str.startswith('halls')")

@@ -7,15 +7,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
 import compare
 import study
 from navigation import files
+from navigation.report.kept_rows import read_kept
 from navigation.settings.command_line import composed
 from navigation.settings.train import TrainSettings, register
-from navigation.studies.arms import with_defaults
+from navigation.studies.arms import Arm, with_defaults
 from navigation.studies.jobs import Evaluation, Study
 from navigation.studies.protocol import (
     FIRST_SEED,
@@ -25,7 +27,7 @@ from navigation.studies.protocol import (
     label_of,
     tables,
 )
-from navigation.studies.remaining import counts, hours_left
+from navigation.studies.remaining import counts, hours_left, parts_left
 from navigation.training import running
 from navigation.worlds import parse_worlds
 from tests.integration.studies.test_compare import InThisProcess
@@ -259,6 +261,50 @@ def test_a_study_makes_what_is_missing_and_trains_no_arm_twice(
     listed = capsys.readouterr().out
     assert "Why?  2 of 2 runs" in listed
     assert "--methods per --seeds 100 101 --worlds B --episodes 2" in listed
+
+
+def test_runs_that_are_kept_are_not_made_again(
+    small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = small / "kept"
+    study.main(["--folder", str(small / "one"), "D", "--seeds", "1"])
+    study.main(["--folder", str(small / "one"), "--keep", str(kept), "D"])
+    assert {path.name for path in kept.iterdir()} == {"D-curves.csv.gz", "D-tests.csv.gz"}
+    # On another machine, whose runs are in another folder.
+    there = ["--folder", str(small / "two"), "--kept", str(kept)]
+    study.main([*there, "--list"])
+    listed = capsys.readouterr().out
+    assert "--methods uniform --seeds 100 101 " in listed and "--methods per --seeds 101 " in listed
+    assert "Why?  0 of 3 runs" in listed and "Why?  0 of 1 runs" in listed
+    assert study.main(there) == 0
+    made = {path.parent.name for path in (small / "two").rglob(files.POLICY)}
+    assert made == {"ddpg-per-101", "ddpg-uniform-100", "ddpg-uniform-101"}
+    study.main(["--folder", str(small / "two"), "--keep", str(kept)])
+    capsys.readouterr()
+    # C has what D kept of the arm that they share.
+    study.main([*there, "--list"])
+    assert capsys.readouterr().out.count("Why?  0 of 0 runs") == 2
+    rows = read_kept(kept, "C")
+    assert set(rows.curves[["arm", "seed"]].itertuples(index=False, name=None)) == {
+        (f"s/ddpg/{method}", seed) for method in ("per", "uniform") for seed in (100, 101)
+    }
+    with pytest.raises(SystemExit):
+        study.main(["--kept", str(small / "three")])
+    assert "three: no rows of the study are there" in capsys.readouterr().err
+
+
+def test_the_parts_of_a_study_that_are_left_have_the_missing_runs_and_no_others() -> None:
+    arms = (Arm("", ()), Arm("wide", ("learner.width=128",)))
+    whole = Study(ROOT, ("per", "uniform", "lap"), (), range(4), ("td3", "ddpg"), arms)
+    rng = np.random.default_rng(0)
+    missing = [job for job in whole.jobs if rng.random() < 0.6]
+    parts = parts_left(whole, missing)
+    made = [job for part in parts for job in part.jobs]
+    assert sorted(made, key=str) == sorted(missing, key=str)
+    assert parts_left(whole, whole.jobs) == [
+        replace(whole, learners=(learner,), seeds=(0, 1, 2, 3)) for learner in ("td3", "ddpg")
+    ]
+    assert parts_left(whole, []) == []
 
 
 def test_a_study_stops_where_a_signal_stopped_its_runs(
