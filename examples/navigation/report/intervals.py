@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Statistic = Callable[..., Array]
 _LEVEL = 0.95
 _ENDS = (0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2)
-_RESAMPLES = 2000
+_RESAMPLES = 10_000
 _BATCH = 100
 
 
@@ -172,6 +172,23 @@ def difference_interval(ours: Array, theirs: Array, *, rng: np.random.Generator)
     return Interval(float(ours.mean() - theirs.mean()), float(low), float(high))
 
 
+def interquartile_interval(scores: Array, *, rng: np.random.Generator) -> Interval:
+    """Mean of the middle half of runs, with a bootstrap interval that is widened for few of them.
+
+    Args:
+        scores: A number for each run, shape ``[runs]``; a quarter of the runs, rounded down, is cut
+            at each end.
+        rng: Source of the resamples.
+
+    Returns:
+        The mean and its interval, which is NaN for one run.
+    """
+    chosen = rng.integers(len(scores), size=(_RESAMPLES, len(scores)))
+    found = np.asarray(stats.trim_mean(scores[chosen], 0.25, axis=-1))
+    low, high = widened_ends(found, len(scores))
+    return Interval(float(stats.trim_mean(scores, 0.25)), float(low), float(high))
+
+
 def resampled_means(scores: Array, rng: np.random.Generator) -> Array:
     """Means of runs that are sampled with replacement.
 
@@ -217,27 +234,38 @@ def improvement_interval(
     Args:
         ours: A number for each run, the higher the better; shape ``[runs]``.
         theirs: Shape ``[other runs]``.
-        paired: Whether the runs are of the same seeds in the same order, resampled together.
+        paired: Whether the runs are of the same seeds in the same order, resampled together. Runs
+            of the same seed have much in common, and are not set against each other.
         rng: Source of the resamples.
 
     Returns:
-        The probability and its 95 % percentile interval; ties count half.
+        The probability and its 95 % interval, widened for few runs; ties count half. NaN if
+        there is nothing to compare.
     """
+    # What is equal but for rounding is equal.
+    ours, theirs = ours.round(9), theirs.round(9)
     wins = (ours[:, None] > theirs) + 0.5 * (ours[:, None] == theirs)
-    value = float(wins.mean())
+    counted = 1.0 - np.eye(len(ours)) if paired else np.ones(wins.shape)
+    if not counted.any():
+        return Interval(math.nan, math.nan, math.nan)
+    value = float((wins * counted).sum() / counted.sum())
     if min(wins.shape) < 2:
         return Interval(value, math.nan, math.nan)
     mine = _resampled(len(ours), rng)
     others = mine if paired else _resampled(len(theirs), rng)
-    low, high = np.quantile(((mine @ wins) * others).sum(axis=1), _ENDS)
-    return Interval(value, float(low), float(high))
+    shares = ((mine @ counted) * others).sum(axis=1)
+    found = ((mine @ (wins * counted)) * others).sum(axis=1)
+    # A resample of one seed alone has no pairs.
+    sides = (len(ours),) if paired else (len(ours), len(theirs))
+    low, high = widened_ends(found[shares > 0.0] / shares[shares > 0.0], *sides)
+    return Interval(value, max(0.0, float(low)), min(1.0, float(high)))
 
 
 def mean_over_worlds(scores: Array, kinds: Sequence[str], *, rng: np.random.Generator) -> Interval:
     """Mean with an interval for other runs *and* worlds.
 
-    Runs are resampled, and worlds in their kind. The interval is on the wide side (Owen, 2007,
-    https://doi.org/10.1214/07-AOAS122).
+    Runs are resampled, and worlds in their kind (Owen, 2007, https://doi.org/10.1214/07-AOAS122);
+    the interval is widened for few runs.
 
     Args:
         scores: Of two methods their difference, as both were tested in the same worlds; shape
@@ -257,7 +285,7 @@ def mean_over_worlds(scores: Array, kinds: Sequence[str], *, rng: np.random.Gene
     found = sum(
         ((runs @ scores[:, kind]) * _resampled(int(kind.sum()), rng)).sum(axis=1) for kind in each
     )
-    low, high = np.quantile(found / len(each), _ENDS)
+    low, high = widened_ends(np.asarray(found / len(each)), len(scores))
     return Interval(value, float(low), float(high))
 
 

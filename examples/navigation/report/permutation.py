@@ -60,10 +60,10 @@ def deal_p(ours: Array, theirs: Array, *, most: int = MOST_DEALS) -> Array:
     together = np.concatenate((ours, theirs), axis=-1)
     if not np.isfinite(together).all():
         raise ValueError("the runs must have finite numbers, got one that is not: use rank_p")
-    deals = _deals(ours.shape[-1], theirs.shape[-1], most)
+    ways = deals(ours.shape[-1], theirs.shape[-1], most)
     sets = together.reshape(-1, together.shape[-1])
-    step = max(1, _AT_ONCE // len(deals))
-    found = [_p(sets[i : i + step], deals) for i in range(0, len(sets), step)]
+    step = max(1, _AT_ONCE // len(ways))
+    found = [_p(sets[i : i + step], ways) for i in range(0, len(sets), step)]
     return np.concatenate(found).reshape(together.shape[:-1])
 
 
@@ -105,9 +105,7 @@ def flip_p(gaps: Array) -> Array:
         raise ValueError("differences must be finite, got one that is not")
     seeds = gaps.shape[-1]
     if seeds > _ALL_FLIPS:
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (MOST_FLIPS, seeds))
-        signs[0] = 1.0
-        sums = gaps @ signs.T
+        sums = gaps @ flips(seeds, MOST_FLIPS).T
     else:
         # The sign of the first may stay: the other half has the same sizes.
         sums = gaps[..., :1]
@@ -129,6 +127,54 @@ def rank_flip_p(ours: Array, theirs: Array) -> Array:
     """
     ranks = stats.rankdata(np.concatenate((ours, theirs), axis=-1), axis=-1)
     return flip_p(ranks[..., : ours.shape[-1]] - ranks[..., ours.shape[-1] :])
+
+
+@lru_cache(maxsize=4)
+def deals(ours: int, theirs: int, most: int) -> Array:
+    """Weights that make the difference of means of each deal, that which there is first.
+
+    Args:
+        ours: Runs of one side.
+        theirs: Runs of the other.
+        most: Deals at most. If there are more, these are a sample.
+
+    Returns:
+        The weights, shape ``[deals, runs of both]``.
+    """
+    runs = ours + theirs
+    if math.comb(runs, ours) <= most:
+        chosen = np.array(list(combinations(range(runs), ours)))
+    else:
+        rng = np.random.default_rng(0)
+        chosen = rng.random((most, runs)).argpartition(ours - 1, axis=1)[:, :ours]
+        chosen[0] = np.arange(ours)
+    weights = np.full((len(chosen), runs), -1.0 / theirs)
+    np.put_along_axis(weights, chosen, 1.0 / ours, axis=1)
+    return weights
+
+
+def flips(seeds: int, most: int) -> Array:
+    """Signs of differences, all of them positive first.
+
+    Args:
+        seeds: Differences.
+        most: Choices at most. If there are more, these are a sample.
+
+    Returns:
+        The signs, shape ``[choices, seeds]``; all choices are half of them, as the others have the
+        same sizes.
+    """
+    if 2 ** (seeds - 1) <= most:
+        bits = np.arange(2 ** (seeds - 1))[:, None] >> np.arange(seeds)
+        return np.where(bits & 1, -1.0, 1.0)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (most, seeds))
+    signs[0] = 1.0
+    return signs
+
+
+def least_flip_p(seeds: int) -> float:
+    """Least value that :func:`flip_p` can have for this number of seeds."""
+    return 2.0 ** (1 - seeds)
 
 
 def least_p(ours: int, theirs: int) -> float:
@@ -158,9 +204,9 @@ def holm(p: Array) -> Array:
     return corrected
 
 
-def _p(sets: Array, deals: Array) -> Array:
+def _p(sets: Array, ways: Array) -> Array:
     """Share of deals that differ as much as the first one, for each set of data."""
-    return _as_far(np.abs(sets @ deals.T), np.abs(sets).max(axis=1))
+    return _as_far(np.abs(sets @ ways.T), np.abs(sets).max(axis=1))
 
 
 def _as_far(sizes: Array, scale: Array) -> Array:
@@ -168,21 +214,3 @@ def _as_far(sizes: Array, scale: Array) -> Array:
     # What is equal but for rounding counts as equal.
     found: Array = (sizes >= sizes[..., :1] - 1e-12 * scale[..., None]).mean(axis=-1)
     return found
-
-
-@lru_cache(maxsize=4)
-def _deals(ours: int, theirs: int, most: int) -> Array:
-    """Weights that make the difference of means of each deal, shape ``[deals, runs of both]``.
-
-    The first one is the deal that there is.
-    """
-    runs = ours + theirs
-    if math.comb(runs, ours) <= most:
-        chosen = np.array(list(combinations(range(runs), ours)))
-    else:
-        rng = np.random.default_rng(0)
-        chosen = rng.random((most, runs)).argpartition(ours - 1, axis=1)[:, :ours]
-        chosen[0] = np.arange(ours)
-    deals = np.full((len(chosen), runs), -1.0 / theirs)
-    np.put_along_axis(deals, chosen, 1.0 / ours, axis=1)
-    return deals

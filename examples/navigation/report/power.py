@@ -1,20 +1,28 @@
 """What a number of runs can tell: the runs that a difference needs, the difference that they find.
 
-Both are of a two-sided t-test, to which the permutation test of means comes very near.
+The runs that are needed are those of a two-sided t-test. The difference that is found is that of
+the permutation test which is made: it has a least p, and with few runs finds no difference at all
+where many comparisons are corrected for each other.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from functools import lru_cache
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import stats
+
+from navigation.report.intervals import Array
+from navigation.report.permutation import deals, flips, least_flip_p, least_p
 
 MOST = 10_000
 """Runs that anyone is told to make."""
-_EFFECTS = 1e-3, 1e3
-"""The least and the greatest effect that is looked for, in standard deviations."""
+_TRIALS = 1000
+"""Sets of runs that power is measured with."""
+_WAYS = 4096
+"""Deals or signs of each at most."""
 
 
 def runs_needed(deviation: float, difference: float, *, power: float = 0.8) -> int:
@@ -42,27 +50,25 @@ def runs_needed(deviation: float, difference: float, *, power: float = 0.8) -> i
 def difference_found(
     deviation: float, ours: int, theirs: int, *, level: float = 0.05, power: float = 0.8
 ) -> float:
-    """True difference of means that a t-test would have found.
+    """True difference of means that the permutation test of runs would have found.
 
     Args:
-        deviation: Standard deviation from run to run.
+        deviation: Standard deviation from run to run, of normally distributed runs.
         ours: Runs of one method.
         theirs: Runs of the other.
         level: Level of the test; divided by their number where there are several.
         power: Chance to find it.
 
     Returns:
-        The difference, in units of the deviation's; NaN for one run of each, and where not even a
-        thousand deviations would be found.
+        The difference, in units of the deviation's; infinite where the least p is above the level.
 
     Examples:
-        >>> round(difference_found(1.0, 20, 20), 3)
-        0.909
+        >>> round(difference_found(1.0, 20, 20), 1), difference_found(1.0, 1, 18)
+        (0.9, inf)
     """
-    if ours + theirs < 3:
-        return math.nan
-    shift = math.sqrt(ours * theirs / (ours + theirs))
-    return deviation * _effect(ours + theirs - 2, shift, level, power)
+    if least_p(ours, theirs) > level:
+        return math.inf
+    return deviation * _dealt_effect(ours, theirs, level, power)
 
 
 def paired_difference_found(
@@ -77,27 +83,53 @@ def paired_difference_found(
         power: Chance to find it.
 
     Returns:
-        The difference, in units of the deviation's; NaN for one seed, and where not even a thousand
-        deviations would be found.
+        The difference, in units of the deviation's; infinite where the least p is above the level.
 
     Examples:
-        >>> round(paired_difference_found(1.0, 20), 3)
-        0.66
+        >>> round(paired_difference_found(1.0, 20), 1), paired_difference_found(1.0, 5)
+        (0.7, inf)
     """
-    if seeds < 2:
-        return math.nan
-    return deviation * _effect(seeds - 1, math.sqrt(seeds), level, power)
+    if least_flip_p(seeds) > level:
+        return math.inf
+    return deviation * _flipped_effect(seeds, level, power)
 
 
-def _effect(freedom: int, shift: float, level: float, power: float) -> float:
-    """Effect in standard deviations that is found with some chance; NaN beyond a thousand."""
+@lru_cache(maxsize=64)
+def _dealt_effect(ours: int, theirs: int, level: float, power: float) -> float:
+    return _effect(deals(ours, theirs, _WAYS), np.repeat([1.0, 0.0], (ours, theirs)), level, power)
 
-    def missing(effect: float) -> float:
-        return _chance(freedom, effect * shift, level) - power
 
-    if not missing(_EFFECTS[0]) < 0.0 < missing(_EFFECTS[1]):
-        return math.nan
-    return float(optimize.brentq(missing, *_EFFECTS))
+@lru_cache(maxsize=64)
+def _flipped_effect(seeds: int, level: float, power: float) -> float:
+    return _effect(flips(seeds, _WAYS) / seeds, np.ones(seeds), level, power)
+
+
+def _effect(ways: Array, moved: Array, level: float, power: float) -> float:
+    """Effect in standard deviations that a test finds with some chance.
+
+    Args:
+        ways: Weights that make the statistic of each deal, that of the data first; shape
+            ``[ways, runs]``.
+        moved: 1 for runs that have the effect, 0 for the others; shape ``[runs]``.
+        level: Of the test.
+        power: The chance.
+    """
+    runs = np.random.default_rng(0).standard_normal((_TRIALS, len(moved)))
+    still, shift = runs @ ways.T, ways @ moved
+
+    def found(effect: float) -> float:
+        sizes = np.abs(still + effect * shift)
+        p = (sizes >= sizes[:, :1] - 1e-9).mean(axis=1)
+        return float((p <= level).mean())
+
+    high = 1.0
+    while found(high) < power:
+        high *= 2.0
+    low = high / 2.0 if high > 1.0 else 0.0
+    for _ in range(9):
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if found(middle) >= power else (middle, high)
+    return high
 
 
 def _chance(freedom: int, shift: float, level: float) -> float:

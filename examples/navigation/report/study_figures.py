@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from navigation.report.intervals import (
     widened_ends,
 )
 from navigation.report.study_rows import Rows, by_run, scores_of
-from navigation.report.study_tables import MEASURES
-from navigation.studies.protocol import HEIGHT, OF_VOLUMES, VOLUMES, Table, short_names
+from navigation.report.study_tables import FEWEST, MEASURES
+from navigation.studies.protocol import HEIGHT, KEY, OF_VOLUMES, VOLUMES, Table, short_names
+from torchrl_mpfa.methods import METHODS
 
 _LEVELS = np.linspace(0.0, 1.0, 201)
 _SIZE = (5.0, 3.6)
@@ -28,7 +30,9 @@ _SIZE = (5.0, 3.6)
 
 
 def plot_study(table: Table, rows: Rows, folder: Path) -> list[Path]:
-    """Plot the figures of a table, of what runs there are.
+    """Plot the figures of a table, of the arms that have enough runs to be compared.
+
+    While no arm has, those with the most runs are shown.
 
     Args:
         table: The table.
@@ -41,30 +45,41 @@ def plot_study(table: Table, rows: Rows, folder: Path) -> list[Path]:
     scores = scores_of(rows, table)
     if not scores:
         return []
-    panels = {title: arms for title, arms in table.panels.items() if set(arms) & set(scores)}
+    enough = min(FEWEST, max(len(runs) for runs in scores.values()))
+    told = {arm: runs for arm, runs in scores.items() if len(runs) >= enough}
+    panels: dict[str, tuple[str, ...]] = {}
+    for title, arms in table.panels.items():
+        there = tuple(arm for arm in arms if arm in told)
+        # What an earlier panel has as well is there for comparison alone.
+        if there and not any(set(there) <= set(other) for other in panels.values()):
+            panels[title] = there
     table = replace(table, panels=panels)
     paths = [folder / f"{table.name}_{name}.png" for name in ("curves", "profiles", "arms")]
     plot_curves(table, rows, paths[0])
-    plot_profiles(table, scores, paths[1])
-    plot_arms(table, scores, paths[2])
+    plot_profiles(table, told, paths[1])
+    plot_arms(table, told, paths[2])
     if table.name == "D":
         paths.append(folder / f"{table.name}_volumes.png")
         plot_volumes(scores, paths[-1])
     return paths
 
 
-def mean_curve(curves: Sequence[pd.Series[Any]], rng: np.random.Generator) -> Array:
-    """Mean of curves that begin at zero, with the 95 % interval of the bootstrap over runs.
+def mean_curve(
+    curves: Sequence[pd.Series[Any]], rng: np.random.Generator, *, from_zero: bool = True
+) -> Array:
+    """Mean of curves, with the 95 % interval of the bootstrap over runs.
 
     Args:
         curves: Greedy success by action, one for each run.
         rng: Source of the resamples.
+        from_zero: Whether they begin at zero before the first action; else at their first point.
 
     Returns:
         Actions, mean, lower and upper end, shape ``[4, points]``, to the end of the shortest run.
     """
     last = min(curve.index.max() for curve in curves)
     steps = np.unique([0, *(step for curve in curves for step in curve.index if step <= last)])
+    steps = steps if from_zero else steps[1:]
     heights = np.stack(
         [np.interp(steps, [0, *curve.index], [0.0, *curve.to_numpy()]) for curve in curves], axis=1
     )
@@ -87,13 +102,16 @@ def plot_curves(table: Table, rows: Rows, path: Path) -> None:
         curves.setdefault(arm, []).append(series)
     figure, axes = _panels(table)
     for axis, labels in zip(axes, table.panels.values(), strict=True):
-        for place, name, label in _shown(labels, curves):
-            steps, mean, low, high = mean_curve(curves[label], rng)
+        for place, name, label in looks_of(labels, curves):
+            # A score is not zero before the training, other than the share of goals reached.
+            zero = table.height == HEIGHT
+            steps, mean, low, high = mean_curve(curves[label], rng, from_zero=zero)
             style = look(place)
             axis.plot(steps, mean, **style, label=f"{name} ({len(curves[label])})")
             if len(curves[label]) > 1:
                 axis.fill_between(steps, low, high, color=style["color"], alpha=0.15, lw=0)
-        axis.set(xlabel="actions", ylabel=table.height, ylim=(-0.02, 1.02))
+        axis.set(xlabel="thousand actions", ylabel=table.height, ylim=(-0.02, 1.02))
+        axis.xaxis.set_major_formatter(lambda actions, _: f"{actions / 1000:g}")
         _legend(axis)
     finish(figure, axes, path)
 
@@ -109,7 +127,7 @@ def plot_profiles(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) 
     figure, axes = _panels(table)
     known = {arm: runs[table.primary].dropna().to_numpy() for arm, runs in scores.items()}
     for axis, labels in zip(axes, table.panels.values(), strict=True):
-        for place, name, label in _shown(labels, known):
+        for place, name, label in looks_of(labels, known):
             share, low, high = performance_profile(known[label], _LEVELS)
             style = look(place)
             axis.plot(_LEVELS, share, **style, label=name, drawstyle="steps-post")
@@ -134,9 +152,10 @@ def plot_arms(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) -> N
     """
     rng = np.random.default_rng(0)
     known = {arm: runs[table.primary].dropna().to_numpy() for arm, runs in scores.items()}
-    figure, axes = _panels(table, tall=max(map(len, table.panels.values())) * 0.24 + 1.0)
+    tall = max(map(len, table.panels.values())) * 0.24 + 1.0
+    figure, axes = _panels(table, tall=tall, sharex=True)
     for axis, labels in zip(axes, table.panels.values(), strict=True):
-        shown = sorted(_shown(labels, known), key=lambda each: known[each[2]].mean())
+        shown = sorted(looks_of(labels, known), key=lambda each: known[each[2]].mean())
         for height, (place, _, label) in enumerate(shown):
             runs, color = known[label], look(place)["color"]
             found = mean_interval(runs, rng=rng)
@@ -173,41 +192,61 @@ def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
                 shared = (areas - uniform["area"]).dropna() if uniform is not None else areas[:0]
                 if len(shared) > 1:
                     gaps[row, column] = gap = shared.mean()
-                    text += f", {gap:+.2f}" if row else ""
+                    # No minus before what is nothing when rounded.
+                    text += f", {round(gap, 2) + 0.0:+.2f}" if row else ""
                 color = "white" if abs(np.nan_to_num(gaps[row, column])) > 0.14 else "black"
                 text += f"\n{len(runs)} runs" if len(runs) > 1 else "\n1 run"
                 axis.text(column, row, text, ha="center", va="center", color=color)
+        axis.set_facecolor("0.85")  # of cells without runs
         image = axis.imshow(gaps, cmap="RdBu", vmin=-0.2, vmax=0.2, aspect="auto")
         axis.set_xticks(range(len(of)), [str(volume) for volume in of])
         axis.set_yticks(range(len(OF_VOLUMES)), OF_VOLUMES)
         axis.set(xlabel="replay volume", title=f"{reward} reward")
     axes[1].set_yticks([])
-    figure.colorbar(image, ax=axes, label="area less that of uniform replay")
+    figure.colorbar(image, ax=axes, label="minus that of uniform replay")
     figure.suptitle(MEASURES["area"].format(height=HEIGHT))
     finish(figure, [], path)
 
 
-def _panels(table: Table, *, tall: float = _SIZE[1]) -> tuple[Any, list[Any]]:
+def _panels(table: Table, *, tall: float = _SIZE[1], sharex: bool = False) -> tuple[Any, list[Any]]:
     """A figure with a panel for each group of arms."""
-    count = len(table.panels)
-    columns = count if count < 4 else -(-count // 2)
-    lines = -(-count // columns)
+    number = len(table.panels)
+    columns = number if number < 4 else -(-number // 2)
+    lines = -(-number // columns)
     figure, axes = new_figure(lines, columns, panel=(_SIZE[0], tall))
+    for axis in axes[1:number] if sharex else ():
+        axis.sharex(axes[0])
     for axis, title in zip(axes, table.panels, strict=False):
         axis.set_title(title)
-    for axis in axes[count:]:
+    for axis in axes[number:]:
         axis.remove()
-    return figure, axes[:count]
+    return figure, axes[:number]
 
 
-def _shown(labels: Sequence[str], there: Mapping[str, Any]) -> list[tuple[int, str, str]]:
-    """Arms of a panel of which there are runs: place, name and label."""
+def looks_of(labels: Sequence[str], there: Mapping[str, Any]) -> list[tuple[int, str, str]]:
+    """Arms of a panel of which there are runs: number of their look, name and label.
+
+    A method has the same look in all figures, whichever others stand beside it.
+    """
     names = short_names(labels)
+    of_methods = [KEY.index(name) if name in KEY else None for name in map(_method_of, labels)]
+    known = [look for look in of_methods if look is not None]
+    free = (number for number in count() if number not in known)
+    looks = []
+    for place, number in enumerate(of_methods):
+        # The second arm of a method has a look of its own.
+        first = number is not None and number not in of_methods[:place]
+        looks.append(number if first and number is not None else next(free))
     return [
-        (place, names[label], label)
-        for place, label in enumerate(labels)
+        (number, names[label], label)
+        for number, label in zip(looks, labels, strict=True)
         if label in there and len(there[label])
     ]
+
+
+def _method_of(label: str) -> str:
+    """The method of an arm, which is followed by the name of the arm if it has any."""
+    return next((part for part in label.split("/") if part in METHODS), "")
 
 
 def _legend(axis: Any) -> None:

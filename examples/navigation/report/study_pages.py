@@ -15,9 +15,9 @@ from torchrl_mpfa.saving import write_text_atomically
 
 _TITLES = {
     "curves": "Mean of the runs and its 95 % interval, over actions",
-    "profiles": "Share of the runs above each value of the primary measure",
+    "profiles": "Share of runs above each value of the primary measure; bands: three arms",
     "arms": "The primary measure of each run, with mean and 95 % interval of each arm",
-    "volumes": "Area by replay volume and method",
+    "volumes": "Area by replay volume and method; grey: not run, or too few to compare",
 }
 
 

@@ -14,10 +14,9 @@ import pandas as pd
 from mpfa_envs import Interval
 from navigation.report.intervals import (
     Array,
-    bootstrap_runs,
     difference_interval,
     improvement_interval,
-    interquartile_mean,
+    interquartile_interval,
     mean_interval,
     mean_over_worlds,
 )
@@ -32,14 +31,18 @@ from navigation.worlds import family
 NOTES = """\
 The unit is the run. Area: mean height of the curve of {height}, from zero on.
 Actions to {goal}: those until the first evaluation that reaches it, median of the runs. {note}
-Where two arms have the same seeds, differences are between runs with the same seed.
+Of an even number of runs the median is the lower of the two in the middle. Arms with at least {few}
+seeds in common are compared by these, seed by seed; others by the means of all their runs. An arm
+with fewer than {fewest} runs is not compared.
 
 Intervals: bootstrap over seeds, or over seeds and worlds (of a single world: its pairs of start and
-goal). *p*: permutation test of the signs of the differences; where the seeds differ, of the runs
-themselves; for actions to the goal, of ranks. Corrected by Holm's method; comparisons without runs
-count with p = 1. *Found with 80 %*: the true difference that this number of runs would have found
-with a probability of 80 %, at a level of 0.05 divided by the number of comparisons. *Better run*:
-probability that a run of the first arm is better than one of the second."""
+goal), widened for few runs. *p*: permutation test of the signs of the differences, or of the means
+of runs; for actions to the goal, of ranks. Corrected by Holm's method within this table and
+measure; comparisons without runs count with p = 1. The primary measure decides, and while runs are
+missing every p is provisional. *Found with 80 %*: the true difference that this test would have
+found with a probability of 80 %, at a level of 0.05 divided by the number of comparisons, if runs
+are normally distributed; *none* if even the least p of so few runs is above that level. *Better
+run*: probability that a run of the first arm is better than one of the second with another seed."""
 MEASURES = {
     "area": "area under the curve of {height}",
     "success": "success of the last policy",
@@ -47,29 +50,39 @@ MEASURES = {
 }
 """What they are called, with what is over actions in a table, and how much of it is the goal."""
 Scores = Mapping[str, pd.DataFrame]
+FEWEST = 3
+"""Runs that an arm must have to be compared."""
+_PAIRS = 6
+"""Seeds in common from which on the test of signs can find anything: its p is at least 2 / 2^6."""
 _WIDTH = 100
 """Characters of a line of prose."""
 
 
 @dataclass(frozen=True)
 class Sides:
-    """The runs of two arms, of the same seeds in the same order if there are no others."""
+    """The runs of two arms, of the same seeds in the same order if they are paired."""
 
     ours: Array
     theirs: Array
     paired: bool
-    seeds: tuple[list[int], list[int]]
 
 
 def sides_of(scores: Scores, pair: Pair, measure: str) -> Sides | None:
-    """The runs of two arms that have a measure; None where an arm has none."""
-    if any(label not in scores for label in pair):
+    """The runs of two arms that are compared; None where an arm has fewer than :data:`FEWEST`."""
+    ours, theirs = (runs_of(scores, label, measure) for label in pair)
+    if min(len(ours), len(theirs)) < FEWEST:
         return None
-    ours, theirs = (scores[label][measure].dropna().sort_index() for label in pair)
-    if not len(ours) or not len(theirs):
-        return None
-    seeds = list(map(int, ours.index)), list(map(int, theirs.index))
-    return Sides(ours.to_numpy(), theirs.to_numpy(), seeds[0] == seeds[1], seeds)
+    common = ours.index.intersection(theirs.index)
+    if len(common) < _PAIRS:
+        return Sides(ours.to_numpy(), theirs.to_numpy(), paired=False)
+    return Sides(ours[common].to_numpy(), theirs[common].to_numpy(), paired=True)
+
+
+def runs_of(scores: Scores, label: str, measure: str) -> pd.Series:
+    """A measure of the runs of an arm by their seed, of those that have it."""
+    if label not in scores:
+        return pd.Series(dtype=float)
+    return scores[label][measure].dropna().sort_index()
 
 
 def p_of(sides: Sides, measure: str) -> float:
@@ -109,15 +122,17 @@ def comparison_lines(
     p = {pair: p_of(sides, measure) for pair, sides in known.items()}
     # Those that are still missing are not left out of the correction.
     corrected = dict(zip(pairs, holm(np.array([p.get(pair, 1.0) for pair in pairs])), strict=True))
-    rng = np.random.default_rng(0)
     lines = []
     short = short_names([label for pair in pairs for label in pair])
     for pair in pairs if absent else known:
         names = " − ".join(short[label] for label in pair)
         if pair not in known:
-            lines.append([names, "0", *[""] * _width(measure)])
+            counts = dict.fromkeys(str(len(runs_of(scores, label, measure))) for label in pair)
+            lines.append([names, ", ".join(counts), *[""] * _width(measure)])
             continue
         sides = known[pair]
+        # The same runs have the same interval in whatever table they are.
+        rng = np.random.default_rng(0)
         runs = str(len(sides.ours)) if sides.paired else f"{len(sides.ours)}, {len(sides.theirs)}"
         better = _improvement(sides, measure, rng)
         lines.append(
@@ -142,16 +157,15 @@ def arm_lines(
     scores: Scores, labels: Sequence[str], primary: str, worlds: Mapping[str, pd.DataFrame]
 ) -> str:
     """A table of the measures of each arm, that with the highest primary measure first."""
-    rng = np.random.default_rng(0)
     lines = []
     short = short_names(labels)
     there = [label for label in labels if label in scores]
     tested = any(scores[label]["success"].notna().any() for label in there)
     for label in sorted(there, key=lambda each: -_mean(scores[each][primary])):
-        runs = scores[label]
+        runs, rng = scores[label], np.random.default_rng(0)
         area, success = runs["area"].to_numpy(), runs["success"].dropna().to_numpy()
         of_area = mean_interval(area, rng=rng)
-        middle = bootstrap_runs(interquartile_mean, area[:, None], rng=rng)
+        middle = interquartile_interval(area, rng=rng)
         never = int(np.isinf(runs["actions"]).sum())
         cells = [short[label], str(len(runs))]
         cells += [f"{of_area.value:.3f} {_ends(of_area)}", f"{middle.value:.3f} {_ends(middle)}"]
@@ -206,6 +220,7 @@ def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
     order = sorted(MEASURES, key=lambda name: name != table.primary)
     arms = arm_lines(scores, labels, table.primary, worlds)
     words = {"height": table.height, "goal": f"{GOAL:.0%}", "note": table.note}
+    words |= {"few": str(_PAIRS), "fewest": str(FEWEST)}
     notes = map(_filled, NOTES.format(**words).split("\n\n"))
     parts = [f"# {table.name}: {table.question}", *notes, "## Arms", arms]
     if kinds := kind_lines(rows, labels):
@@ -250,20 +265,24 @@ def _cells(
         return [median_of(ours), median_of(theirs)]
     if sides.paired:
         gap = mean_interval(ours - theirs, rng=rng)
-        deviation = float((ours - theirs).std(ddof=1)) if len(ours) > 1 else math.nan
+        deviation = float((ours - theirs).std(ddof=1))
         least = paired_difference_found(deviation, len(ours), level=level)
     else:
         gap = difference_interval(ours, theirs, rng=rng)
-        freedom = max(1, len(ours) + len(theirs) - 2)
+        freedom = len(ours) + len(theirs) - 2
         squares = sum(float(((each - each.mean()) ** 2).sum()) for each in (ours, theirs))
         deviation = math.sqrt(squares / freedom)
         least = difference_found(deviation, len(ours), len(theirs), level=level)
-    cells = [f"{gap.value:+.3f}", _ends(gap, "+.3f"), "" if math.isnan(least) else f"{least:.3f}"]
+    cells = [
+        f"{gap.value:+.3f}",
+        _ends(gap, "+.3f"),
+        "none" if math.isinf(least) else f"{least:.3f}",
+    ]
     if measure == "success":
         a, b = (worlds[label] for label in pair)
         both = ""
         if sides.paired:
-            common = a.sort_index() - b.sort_index()[a.columns]
+            common = (a - b[a.columns]).dropna()
             both = _ends(mean_over_worlds(*_matrix(common), rng=rng), "+.3f")
         cells.insert(2, both)
     return cells

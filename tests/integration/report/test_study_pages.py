@@ -18,7 +18,14 @@ from navigation import files
 from navigation.records import write_table
 from navigation.report import study_pages
 from navigation.report.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
-from navigation.report.study_figures import mean_curve, plot_curves, plot_study, plot_volumes
+from navigation.report.permutation import deal_p
+from navigation.report.study_figures import (
+    looks_of,
+    mean_curve,
+    plot_curves,
+    plot_study,
+    plot_volumes,
+)
 from navigation.report.study_rows import (
     Rows,
     missing,
@@ -30,7 +37,7 @@ from navigation.report.study_tables import comparison_lines, study_tables
 from navigation.studies.arms import Arm
 from navigation.studies.jobs import Evaluation, Job, Study
 from navigation.studies.paper import NAMES, PHIS
-from navigation.studies.protocol import OF_VOLUMES, Table, paper_studies, tables
+from navigation.studies.protocol import KEY, OF_VOLUMES, Table, paper_studies, tables
 from tests.integration.report.test_figures import BLUE, ORANGE, colored, heights
 
 TEST = Evaluation(("bars:test", "halls:test"), 4, "wheels")
@@ -225,11 +232,11 @@ def test_the_pages_of_the_runs_and_of_what_is_kept_of_them_are_the_same(
 def test_the_page_says_what_the_rows_say(runs: Path) -> None:
     table = small_table(runs)
     text = study_tables(table, read_runs(table, runs), absent="")
-    # 0.3 and 0.4 of area more at every height, in each of four seeds: two of 16 ways.
-    assert "| per − uniform | 4 | +0.300 | [+0.300, +0.300] | 0.000 | 0.125 | 0.125 |" in text
-    assert (
-        "| uniform/wide − uniform | 4 | +0.000 | [+0.000, +0.000] | 0.000 | 1.000 | 1.000 |" in text
-    )
+    # 0.3 of area more in each of four seeds, which are too few to compare them seed by seed.
+    ours, theirs = ([0.35 + 0.075 * n + 0.3 * more for n in range(4)] for more in (1, 0))
+    p = float(deal_p(np.array(ours), np.array(theirs)))
+    assert f"| {p:.3f} | {p:.3f} |" in next(x for x in text.splitlines() if "| 4, 4 | +0.300" in x)
+    assert "| uniform/wide − uniform | 4, 4 | +0.000 |" in text
     assert "| per | 75.0% | 75.0% |" in text
     assert "| uniform | 75.0% | 50.0% |" in text
     # Primary first.
@@ -243,33 +250,45 @@ def test_the_page_says_what_the_rows_say(runs: Path) -> None:
 def test_a_comparison_without_runs_counts_in_the_correction() -> None:
     scores = {
         name: pd.DataFrame({"area": values})
-        for name, values in (("a", np.arange(5.0)), ("b", np.arange(5.0) - 1), ("d", np.zeros(1)))
+        for name, values in (("a", np.arange(6.0)), ("b", np.arange(6.0) - 1), ("d", np.zeros(3)))
     }
     lines = comparison_lines(scores, [("a", "b"), ("a", "c")], "area", {}).splitlines()
-    # Five seeds: two of 32 ways, and of two comparisons.
-    assert lines[2].startswith("| a − b | 5 | +1.000 |")
-    assert "| 0.062 | 0.125 |" in lines[2]
-    assert lines[3].split("|")[1:4] == [" a − c ", " 0 ", "  "]
+    # Six seeds: two of 64 ways, and of two comparisons, for which they are too few.
+    assert lines[2].startswith("| a − b | 6 | +1.000 | [+1.000, +1.000] | none |")
+    assert "| 0.031 | 0.062 |" in lines[2]
+    assert lines[3].split("|")[1:4] == [" a − c ", " 6, 0 ", "  "]
     assert {line.count("|") for line in lines} == {lines[0].count("|")}
     fewer = comparison_lines(scores, [("a", "b"), ("a", "c")], "area", {}, absent=False)
     assert fewer.splitlines() == lines[:3]
-    # Arms of other seeds are compared by the means of their runs.
+    # Arms with few seeds in common are compared by the means of their runs.
     (line,) = comparison_lines(scores, [("a", "d")], "area", {}).splitlines()[2:]
-    assert "| 5, 1 | +2.000 | one run |" in line
+    assert "| 6, 3 | +2.500 |" in line
     assert comparison_lines(scores, [("x", "c")], "area", {}) == ""
 
 
-def test_too_few_runs_to_find_any_difference_leave_a_cell_empty() -> None:
-    index = pd.Index([0, 1], name="seed")
+def test_arms_are_compared_by_the_seeds_that_they_have_in_common() -> None:
+    rng = np.random.default_rng(0)
+    hard = pd.Series(rng.uniform(0, 0.6, 20), index=range(100, 120))
     scores = {
-        "a": pd.DataFrame({"area": [0.9]}, index[:1]),
-        "b": pd.DataFrame({"area": [0.4, 0.6]}, index),
-        "c": pd.DataFrame({"area": [0.4]}, index[:1]),
+        "all": pd.DataFrame({"area": hard}),
+        "ten": pd.DataFrame({"area": hard[hard.sort_values().index[:10]] + 0.1}),
     }
-    pairs = [("a", "b"), ("a", "c"), *(("a", f"x{n}") for n in range(50))]
-    two, one = comparison_lines(scores, pairs, "area", {}, absent=False).splitlines()[2:]
-    assert two.startswith("| a − b | 1, 2 | +0.400 | one run |  | ")
-    assert one.startswith("| a − c | 1 | +0.500 | one run |  | ")
+    # Ten of the worst seeds, which are above the same seeds and below the mean of all.
+    assert scores["ten"]["area"].mean() < hard.mean()
+    (line,) = comparison_lines(scores, [("ten", "all")], "area", {}).splitlines()[2:]
+    assert line.startswith("| ten − all | 10 | +0.100 | [+0.100, +0.100] |")
+    assert "| 0.002 | 0.002 |" in line
+
+
+def test_an_arm_with_one_run_or_two_is_not_compared() -> None:
+    index = pd.Index(range(8), name="seed")
+    scores = {
+        "a": pd.DataFrame({"area": np.linspace(0, 1, 8)}, index),
+        "b": pd.DataFrame({"area": [0.4, 0.6]}, index[:2]),
+    }
+    assert comparison_lines(scores, [("a", "b")], "area", {}) == ""
+    lines = comparison_lines({**scores, "c": scores["a"]}, [("a", "b"), ("a", "c")], "area", {})
+    assert lines.splitlines()[2].split("|")[1:4] == [" a − b ", " 8, 2 ", "  "]
 
 
 def test_runs_that_are_missing_are_named_with_their_command(runs: Path, tmp_path: Path) -> None:
@@ -306,7 +325,7 @@ def test_the_figures_of_the_paper_are_made_of_table_a() -> None:
             assert name not in found
             found[name] = jobs
     assert set(found) == {*NAMES, *(f"phi{phi}" for phi in PHIS)}
-    assert len(found["mpfa_per"]) == 10 and len(found["klper"]) == 5
+    assert len(found["mpfa_per"]) == 10 and len(found["klper"]) == 10
 
 
 def test_a_mean_curve_begins_at_zero_and_ends_where_the_shortest_run_does() -> None:
@@ -327,9 +346,33 @@ def test_a_curve_is_where_its_values_are(tmp_path: Path) -> None:
         for seed in (0, 1)
     ]
     plot_curves(table, Rows(pd.concat(curves), pd.DataFrame()), tmp_path / "c.png")
-    per, uniform = (colored(tmp_path / "c.png", color) for color in (BLUE, ORANGE))
+    uniform, per = (colored(tmp_path / "c.png", color) for color in (BLUE, ORANGE))
     upper = slice(0, 330)
     assert heights(per[upper], quarter=1) > heights(uniform[upper], quarter=1) + 0.3
+
+
+def test_a_method_has_the_same_look_whichever_others_stand_beside_it() -> None:
+    for labels in (
+        ["s/td3/uniform", "s/td3/per", "s/td3/mpfa_plus"],
+        ["s/td3/geometric", "s/td3/mpfa_plus", "s/td3/uniform", "s/td3/lap", "s/td3/lap/median"],
+    ):
+        looks = {
+            label: number for number, _, label in looks_of(labels, {each: [0] for each in labels})
+        }
+        assert looks["s/td3/uniform"] == 0 and looks["s/td3/mpfa_plus"] == KEY.index("mpfa_plus")
+        assert len(set(looks.values())) == len(labels)
+
+
+def test_arms_of_one_run_have_no_line_beside_those_of_several(runs: Path, tmp_path: Path) -> None:
+    table = small_table(runs)
+    rows, pictures = read_runs(table, runs), []
+    of_per = rows.curves["arm"] == "s/td3/per"
+    one = rows.curves[~of_per | (rows.curves["seed"] == 0)]
+    for name, curves in (("one", one), ("none", rows.curves[~of_per])):
+        (tmp_path / name).mkdir()
+        for path in plot_study(table, Rows(curves, rows.tests), tmp_path / name):
+            pictures.append(path.read_bytes())
+    assert pictures[:3] == pictures[3:]
 
 
 def test_a_panel_without_runs_is_left_out(runs: Path, tmp_path: Path) -> None:
@@ -362,7 +405,7 @@ def test_the_real_tables_are_made_of_rows_of_every_arm(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     table = tables(Path("x"))["D"]
     arms = list(dict.fromkeys(label for panel in table.panels.values() for label in panel))
-    runs = [(arm, seed) for arm in arms for seed in (100, 101)]
+    runs = [(arm, seed) for arm in arms for seed in range(100, 106)]
     curves = pd.DataFrame(runs, columns=["arm", "seed"])
     curves["total_steps"], curves["success"] = 24_000, rng.uniform(size=len(curves))
     tests = curves.drop(columns="total_steps").merge(
