@@ -23,8 +23,10 @@ Array = NDArray[np.float64]
 Statistic = Callable[..., Array]
 _LEVEL = 0.95
 _ENDS = (0.5 - _LEVEL / 2, 0.5 + _LEVEL / 2)
-_RESAMPLES = 10_000
+_RESAMPLES = 2000
 _BATCH = 100
+_OF_RUNS = 10_000
+"""Resamples where each run is one number, which costs little."""
 
 
 def mean(scores: Array) -> Array:
@@ -183,7 +185,7 @@ def interquartile_interval(scores: Array, *, rng: np.random.Generator) -> Interv
     Returns:
         The mean and its interval, which is NaN for one run.
     """
-    chosen = rng.integers(len(scores), size=(_RESAMPLES, len(scores)))
+    chosen = rng.integers(len(scores), size=(_OF_RUNS, len(scores)))
     found = np.asarray(stats.trim_mean(scores[chosen], 0.25, axis=-1))
     low, high = widened_ends(found, len(scores))
     return Interval(float(stats.trim_mean(scores, 0.25)), float(low), float(high))
@@ -310,4 +312,4 @@ def performance_profile(scores: Array, levels: Array) -> tuple[Array, Array, Arr
 
 def _resampled(runs: int, rng: np.random.Generator) -> Array:
     """Weights of runs that are sampled with replacement, shape ``[resamples, runs]``."""
-    return rng.multinomial(runs, np.full(runs, 1.0 / runs), size=_RESAMPLES) / runs
+    return rng.multinomial(runs, np.full(runs, 1.0 / runs), size=_OF_RUNS) / runs
