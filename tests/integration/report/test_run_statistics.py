@@ -147,6 +147,19 @@ def test_the_intervals_cover_the_truth_as_often_as_they_say(runs: int, others: i
     assert mean_interval(a[0], rng=rng).value == pytest.approx(a[0].mean())
 
 
+@pytest.mark.parametrize(
+    ("runs", "least", "most"), [(5, 0.6, 0.8), (10, 0.84, 0.93), (20, 0.9, 0.97)]
+)
+def test_where_one_run_in_five_fails_the_intervals_of_few_runs_miss_it(
+    runs: int, least: float, most: float
+) -> None:
+    # As docs/study.md says: no interval can know of a bad run that it has not seen.
+    rng = np.random.default_rng(14)
+    scores = np.where(rng.random((2000, runs)) < 0.2, 0.1, 0.9) + rng.normal(0, 0.02, (2000, runs))
+    low, high = widened_ends(resampled_means(scores, rng), runs)
+    assert least <= ((low <= 0.74) & (high >= 0.74)).mean() <= most
+
+
 def test_an_interval_of_one_run_is_none() -> None:
     rng = np.random.default_rng(0)
     one = np.array([0.5])
