@@ -246,7 +246,8 @@ def looks_of(labels: Sequence[str], there: Mapping[str, Any]) -> list[tuple[int,
 
 def _method_of(label: str) -> str:
     """The method of an arm, which is followed by the name of the arm if it has any."""
-    return next((part for part in label.split("/") if part in METHODS), "")
+    # From the end: a learner may have the name of a method.
+    return next((part for part in reversed(label.split("/")) if part in METHODS), "")
 
 
 def _legend(axis: Any) -> None:

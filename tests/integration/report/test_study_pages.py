@@ -352,14 +352,16 @@ def test_a_curve_is_where_its_values_are(tmp_path: Path) -> None:
 
 
 def test_a_method_has_the_same_look_whichever_others_stand_beside_it() -> None:
-    for labels in (
-        ["s/td3/uniform", "s/td3/per", "s/td3/mpfa_plus"],
-        ["s/td3/geometric", "s/td3/mpfa_plus", "s/td3/uniform", "s/td3/lap", "s/td3/lap/median"],
+    for learner, names in (
+        ("td3", ["uniform", "per", "mpfa_plus"]),
+        # A method is called so as well.
+        ("ddpg", ["uniform", "per", "mpfa_plus"]),
+        ("td3", ["geometric", "mpfa_plus", "uniform", "lap", "lap/median"]),
     ):
-        looks = {
-            label: number for number, _, label in looks_of(labels, {each: [0] for each in labels})
-        }
-        assert looks["s/td3/uniform"] == 0 and looks["s/td3/mpfa_plus"] == KEY.index("mpfa_plus")
+        labels = [f"s/{learner}/{name}" for name in names]
+        found = looks_of(labels, {label: [0] for label in labels})
+        looks = {label.split("/", 2)[2]: number for number, _, label in found}
+        assert looks["uniform"] == 0 and looks["mpfa_plus"] == KEY.index("mpfa_plus")
         assert len(set(looks.values())) == len(labels)
 
 
