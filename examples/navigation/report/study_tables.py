@@ -164,15 +164,15 @@ def arm_lines(
     for label in sorted(there, key=lambda each: -_mean(scores[each][primary])):
         runs, rng = scores[label], np.random.default_rng(0)
         area, success = runs["area"].to_numpy(), runs["success"].dropna().to_numpy()
-        of_area = mean_interval(area, rng=rng)
-        middle = interquartile_interval(area, rng=rng)
+        of_area = _cut(mean_interval(area, rng=rng))
+        middle = _cut(interquartile_interval(area, rng=rng))
         never = int(np.isinf(runs["actions"]).sum())
         cells = [short[label], str(len(runs))]
         cells += [f"{of_area.value:.3f} {_ends(of_area)}", f"{middle.value:.3f} {_ends(middle)}"]
         cells += [median_of(runs["actions"]), f"{never} of {len(runs)}"]
         if len(success):
-            rate = mean_interval(success, rng=rng)
-            both = mean_over_worlds(*_matrix(worlds[label]), rng=rng)
+            rate = _cut(mean_interval(success, rng=rng))
+            both = _cut(mean_over_worlds(*_matrix(worlds[label]), rng=rng))
             cells += [f"{rate.value:.1%} {_ends(rate, '.1%')}", _ends(both, ".1%")]
         lines.append([*cells, *[""] * (8 - len(cells))] if tested else cells)
     head = ["runs", "area, 95 % over runs", "its interquartile mean", f"actions to {GOAL:.0%}"]
@@ -307,6 +307,11 @@ def _matrix(success: pd.DataFrame) -> tuple[Array, list[str]]:
 def _mean(values: pd.Series) -> float:
     found = float(values.mean())
     return -math.inf if math.isnan(found) else found
+
+
+def _cut(share: Interval) -> Interval:
+    """The part of an interval that a share can lie in."""
+    return Interval(share.value, *np.clip([share.low, share.high], 0.0, 1.0))
 
 
 def _ends(interval: Interval, form: str = ".3f") -> str:

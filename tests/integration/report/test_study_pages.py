@@ -33,7 +33,7 @@ from navigation.report.study_rows import (
     scores_of,
     worlds_of,
 )
-from navigation.report.study_tables import comparison_lines, study_tables
+from navigation.report.study_tables import arm_lines, comparison_lines, study_tables
 from navigation.studies.arms import Arm
 from navigation.studies.jobs import Evaluation, Job, Study
 from navigation.studies.paper import NAMES, PHIS
@@ -278,6 +278,16 @@ def test_arms_are_compared_by_the_seeds_that_they_have_in_common() -> None:
     (line,) = comparison_lines(scores, [("ten", "all")], "area", {}).splitlines()[2:]
     assert line.startswith("| ten − all | 10 | +0.100 | [+0.100, +0.100] |")
     assert "| 0.002 | 0.002 |" in line
+
+
+def test_no_share_is_said_to_be_below_nothing_or_above_everything() -> None:
+    runs = pd.DataFrame({"area": [0.1, 0.9, 0.95], "success": [0.5, 1.0, 1.0], "actions": 100.0})
+    columns = pd.MultiIndex.from_tuples([("bars-test-1", 0), ("bars-test-2", 0)])
+    worlds = pd.DataFrame([[1.0, 0.0], [1.0, 1.0], [1.0, 1.0]], columns=columns)
+    worlds.columns.names = ["world", "pair"]
+    line = arm_lines({"a": runs}, ["a"], "area", {"a": worlds}).splitlines()[-1]
+    assert "0.650 [0.000, 1.000]" in line
+    assert line.count("100.0%]") == 2
 
 
 def test_an_arm_with_one_run_or_two_is_not_compared() -> None:
