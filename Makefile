@@ -7,7 +7,7 @@
 #                                  is installed before the project: the wheel file of a CPU
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
-#   COMPILE=false                  demo, train: no compiled updates; default: true if a C++ compiler is found
+#   COMPILE=false                  demo, train: no compiled updates; default: true if a C++ compiler and Python.h are found
 #   REGIME=paper                   train: the paper's task and numbers; default: rooms
 #   DEMO_ACTIONS=40000             length of demo's training, in actions
 #   EPISODES=100                   evaluation episodes of demo in the worlds of each generator
@@ -25,7 +25,9 @@ ARGS ?=
 REGIME ?= rooms
 DEMO_ACTIONS ?= 40000
 EPISODES ?= 100
-COMPILE ?= $(if $(shell command -v "$${CXX:-g++}" 2>/dev/null),true,false)
+# Compiled updates need a C++ compiler and the headers of Python; other learners have none.
+COMPILE ?= $(if $(filter learner=sac learner=dqn learner=q_learning,$(ARGS)),false,$(if $(COMPILES),true,false))
+COMPILES = $(shell command -v "$${CXX:-g++}" >/dev/null 2>&1 && $(BIN)/python -c "$(HEADERS)" 2>/dev/null && echo yes)
 SLOW ?=
 WORKERS ?= 2
 
@@ -43,7 +45,8 @@ ALSO := $(if $(filter check,$(MAKECMDGOALS)),$(DOCTESTS) tests)
 CANDIDATES := python3.11 python3.10 python3 python python3.13 python3.12
 FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))
 LATER := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 12))
-HOME_OF := import sys; print(sys.base_prefix)
+HOME_OF := import sys; print(sys.base_prefix, sys.version_info[:2])
+HEADERS := import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_path('include') + '/Python.h'))
 WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
 NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simulated wheels; demo and train use physics=kinematic
 # Arguments of the scripts on such a Python, evaluated when they are called: there may be no .venv before.
@@ -102,6 +105,15 @@ wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and t
 clean: ## Remove builds and caches; runs/ and .venv stay
 	rm -rf dist build site .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/latest.json
 	find . -name .venv -prune -o -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Another Python than that of .venv is not ignored: it is installed for.
+ifneq ($(PYTHON),)
+ifneq ($(wildcard $(STAMP)),)
+ifneq ($(shell $(BIN)/python -c "$(HOME_OF)" 2>/dev/null),$(shell "$(PYTHON)" -c "$(HOME_OF)" 2>/dev/null))
+.PHONY: $(STAMP)
+endif
+endif
+endif
 
 # The stamp is written last, so that an interrupted installation is repeated.
 $(STAMP): pyproject.toml

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.skipif(MAKE is None, reason="make is not installed")
 # Answers as Python does to what the Makefile asks of it, and writes down what pip is told.
 PRETENDER = """#!/bin/sh
 case "$*" in
+  *base_prefix*version_info*) echo /somewhere 3.11 ;;
   *base_prefix*) echo /somewhere ;;
   "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
   "-m pip install"*) echo "$*" >> pip.log; [ ! -e no_network ] ;;
@@ -203,6 +204,48 @@ def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: 
     assert done.returncode == 0
     assert len(pip_calls(copy)) == 2
     assert "making .venv" not in done.stdout  # The environment itself is kept.
+
+
+def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    other = LATER.replace("/somewhere 3.11", "/somewhere 3.12")
+    add_program(copy / "bin" / "python3.12", other)
+    for program, calls, anew in (
+        ("python3.12", 1, True),
+        ("python3.12", 1, False),
+        ("python3.11", 2, True),
+        ("python3.11", 2, False),
+    ):
+        done = make(copy, f"PYTHON={program}", "test")
+        assert done.returncode == 0, done.stderr
+        assert len(pip_calls(copy)) == calls
+        assert (f"making .venv with {program}\n" in done.stdout) == anew
+    refused = make(copy, "PYTHON=/nonexistent", "test")
+    assert refused.returncode != 0
+    assert "PYTHON=/nonexistent is not a Python" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("compiler", "headers", "argument", "compiled"),
+    [
+        (True, True, "method=per", "true"),
+        (False, True, "method=per", "false"),
+        (True, False, "method=per", "false"),
+        (True, True, "learner=td3", "true"),
+        (True, True, "learner=sac", "false"),
+    ],
+)
+def test_updates_are_compiled_where_they_can_be(
+    installed: Path, compiler: bool, headers: bool, argument: str, compiled: str
+) -> None:
+    if compiler:
+        add_program(installed / "bin" / "g++", "#!/bin/sh\n")
+    if not headers:
+        without = PRETENDER.replace("esac", "  *Python.h*) exit 1 ;;\nesac")
+        add_program(installed / ".venv" / "bin" / "python", without)
+        (installed / ".venv" / ".installed").touch()
+    done = make(installed, "-n", "train", f"ARGS={argument}")
+    assert f"learner.compile={compiled} " in done.stdout
 
 
 def test_an_install_that_failed_is_made_again(copy: Path) -> None:

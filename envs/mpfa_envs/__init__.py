@@ -207,12 +207,20 @@ _MODULES = {
 }
 """Where each name is. A module is imported when a name of it is first asked for: a robot that runs
 :mod:`mpfa_envs.deploy` has neither gymnasium nor torch, and Numba takes half a second."""
+_OF_THE_EXTRA = ("gymnasium", "networkx", "numba", "PIL", "yaml", "scipy")
 
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first asked for."""
     if name in _MODULES:
-        return getattr(import_module(f"mpfa_envs.{_MODULES[name]}"), name)
+        try:
+            return getattr(import_module(f"mpfa_envs.{_MODULES[name]}"), name)
+        except ModuleNotFoundError as error:
+            package = str(error.name).partition(".")[0]
+            if package not in _OF_THE_EXTRA:
+                raise
+            needs = f"mpfa_envs.{name} needs {package}: pip install 'torchrl-mpfa[envs]'"
+            raise ImportError(needs, name=error.name) from error
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -185,9 +185,14 @@ def onnx_content(layers: Sequence[Layer], observation_size: int, *, quantize: bo
 
     Raises:
         CardError: If a layer is a table.
+        ImportError: If there is no onnx.
     """
-    import onnx
-    from onnx import TensorProto, helper
+    try:
+        import onnx
+        from onnx import TensorProto, helper
+    except ImportError as error:
+        needs = f"the export of a policy needs onnx ({error})"
+        raise ImportError(f"{needs}: pip install 'torchrl-mpfa[onnx]'") from error
 
     graph = _Graph(np.float32 if quantize else np.float64)
     graph.add("Cast", "observation", to=graph.kind)

@@ -6,11 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-try:
-    import onnxruntime
-except ImportError as error:
-    raise ImportError(f"an exported policy needs onnxruntime ({error})") from error
-
 from mpfa_envs.deploy.card import CardError
 
 if TYPE_CHECKING:
@@ -27,9 +22,15 @@ class Network:
 
     Raises:
         CardError: If the content is no such network.
+        ImportError: If there is no onnxruntime.
     """
 
     def __init__(self, content: bytes, observation_size: int, action_size: int) -> None:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            needs = f"an exported policy needs onnxruntime ({error})"
+            raise ImportError(f"{needs}: pip install 'torchrl-mpfa[onnx]'") from error
         options = onnxruntime.SessionOptions()
         # More threads wait for one another longer than so small a network takes.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
