@@ -93,7 +93,7 @@ def test_every_public_name_is_in_the_reference_once(package: str, names: list[st
     assert {name for name in names if counts[name] != 1 and name not in kit} == set()
 
 
-@pytest.mark.slow  # 40 s
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
     tmp_path: Path,
 ) -> None:
