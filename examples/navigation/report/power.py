@@ -113,7 +113,12 @@ def _effect(ways: Array, moved: Array, level: float, power: float) -> float:
         moved: 1 for runs that have the effect, 0 for the others; shape ``[runs]``.
         level: Of the test.
         power: The chance.
+
+    Raises:
+        ValueError: If so many ways are too few for such a level.
     """
+    if level * len(ways) < 1.0:
+        raise ValueError(f"level must be at least 1 / {len(ways)}, got {level}")
     runs = np.random.default_rng(0).standard_normal((_TRIALS, len(moved)))
     still, shift = runs @ ways.T, ways @ moved
 

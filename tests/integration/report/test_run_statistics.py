@@ -343,6 +343,16 @@ def test_where_all_signs_alike_are_not_rare_enough_nothing_is_found(
     assert least_flip_p(seeds) == flip_p(np.ones(seeds)) > 0.05 / comparisons
 
 
+def test_a_level_below_what_the_samples_resolve_is_refused() -> None:
+    for find in (
+        lambda level: paired_difference_found(1.0, 20, level=level),
+        lambda level: difference_found(1.0, 20, 20, level=level),
+    ):
+        assert np.isfinite(find(0.05 / 200))
+        with pytest.raises(ValueError, match="level must be at least 1 / 4096, got"):
+            find(0.05 / 300)
+
+
 def test_one_run_against_eighteen_finds_nothing_and_against_twenty_at_most_alone() -> None:
     assert np.isinf(difference_found(1.0, 1, 1))
     assert np.isinf(difference_found(1.0, 1, 18))
