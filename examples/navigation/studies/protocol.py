@@ -196,7 +196,7 @@ def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
 
     Examples:
         >>> [len(table.studies) for table in tables(Path("runs/study")).values()]
-        [3, 4, 2, 7, 1]
+        [3, 4, 2, 8, 1]
     """
     if most is not None and most < 1:
         raise ValueError(f"most must be at least 1, got {most}")

@@ -1,0 +1,29 @@
+"""Examples in the docstrings of the scripts' modules run and give what they say."""
+
+from __future__ import annotations
+
+import doctest
+import pkgutil
+from importlib import import_module
+
+import pytest
+
+import control
+import navigation
+
+MODULES = [
+    module.name
+    for package in (control, navigation)
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_the_examples_of_a_module_give_what_they_say(name: str) -> None:
+    assert doctest.testmod(import_module(name)).failed == 0
+
+
+def test_there_are_examples_to_run() -> None:
+    finder = doctest.DocTestFinder()
+    found = finder.find(import_module("navigation.studies.protocol"))
+    assert sum(bool(each.examples) for each in found) >= 3
