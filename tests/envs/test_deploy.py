@@ -218,6 +218,8 @@ def test_numbers_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
     pilot.begin((1.0, 0.0))
     with pytest.raises(ValueError, match="pose must be a finite number, got nan"):
         pilot.decide(scan, (0.0, math.nan, 0.0), (0.0, 0.0))
+    with pytest.raises(ValueError, match=r"pose must be within 1e\+07 m of the origin, got \(-1"):
+        pilot.decide(scan, (-1e8, 0.0, 0.0), (0.0, 0.0))
     with pytest.raises(ValueError, match="speeds must be a finite number, got inf"):
         pilot.decide(scan, (0.0, 0.0, 0.0), (math.inf, 0.0))
     broken = Pilot(pilot.card, lambda seen: np.full((1, 2), np.nan, np.float32))

@@ -101,6 +101,30 @@ def test_what_is_too_near_to_be_measured_is_as_near_as_can_be(near: float, silen
     assert (points.ranges == 0.12).sum() == 7
 
 
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (-0.1, 0.05, math.pi / 2)])
+def test_around_the_robot_too_near_is_no_distance_and_silence_is_none(
+    mount: tuple[float, float, float],
+) -> None:
+    ranges = np.array([1.0, 0.45, 0.3, -math.inf, 0.0, math.nan, -1.0, math.inf, 20.0])
+    scan = Scan(0.0, 0.5, ranges, range_min=0.45, range_max=8.0)
+    found = Sectors(card(), mount=mount).around(scan)
+    near, silent = found.ranges == 0.0, np.isnan(found.ranges)
+    assert (near.sum(), silent.sum(), (found.ranges == 10.0).sum()) == (3, 3, 2)
+    # At 0.5, 1 and 1.5 rad is what is too near, seen from the center of the robot.
+    angles = mount[2] + np.array([0.5, 1.0, 1.5])
+    x, y = mount[0] + 0.45 * np.cos(angles), mount[1] + 0.45 * np.sin(angles)
+    assert found.angles[near] == pytest.approx(np.arctan2(y, x))
+    (met,) = found.ranges[(found.ranges > 0.0) & (found.ranges < 10.0)]
+    assert met == pytest.approx(
+        math.hypot(mount[0] + math.cos(mount[2]), mount[1] + math.sin(mount[2]))
+    )
+
+
+def test_rays_that_overlap_a_little_are_a_scan() -> None:
+    scan = Scan(-math.pi, math.tau / 360, np.full(370, 2.0))
+    assert (Sectors(card()).read(scan)[0] == 2.0).all()
+
+
 @pytest.mark.parametrize("gone", [0.0, math.nan])
 def test_a_near_return_stays_while_the_lidar_is_silent_there(gone: float) -> None:
     sectors = Sectors(card(), silent="far")
@@ -158,6 +182,7 @@ def test_a_lidar_that_measures_nothing_valid_is_not_one_that_sees_free_space(bro
         (Scan(0.0, 0.1, [[1.0]]), r"ranges must have shape \[R\], got \(1, 1\)"),
         (Scan(math.nan, 0.1, [1.0]), "a scan needs a first angle and a step, got nan and 0.1"),
         (Scan(0.0, 0.0, [1.0]), "a scan needs a first angle and a step, got 0.0 and 0.0"),
+        (Scan(0.0, -1.0, [1.0] * 9), "must go round once at most, got 9 in steps of -1.0 rad"),
     ],
 )
 def test_what_is_no_scan_is_refused(scan: Scan, message: str) -> None:

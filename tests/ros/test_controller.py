@@ -318,6 +318,16 @@ def test_a_goal_that_is_not_finite_gives_up_the_goal() -> None:
     assert reasons(controller, [10.3, 10.4]) == ["goal must be a finite number, got inf", None]
 
 
+def test_a_goal_that_no_observation_holds_is_rejected() -> None:
+    controller, asked = ready()
+    for give in (controller.aim, controller.correct_goal):
+        controller.aim((1.0, 0.0))
+        give((1e300, 0.0))
+        message = "goal must be within 1e+07 m of the origin, got (1e+300, 0.0)"
+        assert reasons(controller, [10.0, 10.1]) == [message, None]
+    assert not asked
+
+
 def test_a_corrected_goal_is_driven_to_and_none_is_not_made_up() -> None:
     controller, asked = ready()
     controller.correct_goal((0.0, 4.0))

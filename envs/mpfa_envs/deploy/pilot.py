@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _WIDER: Final = 0.01
 """By how much a robot may be wider than that of the training [m]."""
+_FARTHEST: Final = 1e7
+"""Largest coordinate of a place [m]; those of UTM are smaller."""
 _BEYOND: Final = 0.02
 """By what share of its speed range a wheel may be told to go beyond it."""
 
@@ -148,7 +150,7 @@ class Pilot:
                 is at its first decision.
 
         Raises:
-            ValueError: If a number is not finite, or the goal is not on the map.
+            ValueError: If a number is not finite or beyond 1e7 m, or the goal is not on the map.
         """
         center = None if map_center is None else _pair("map_center", map_center)
         goal = _pair("goal", goal)
@@ -166,7 +168,8 @@ class Pilot:
             goal: Position (x, y) in the frame of the odometry [m].
 
         Raises:
-            ValueError: If it is not finite or not on the map, or the robot has not set out.
+            ValueError: If it is not finite, beyond 1e7 m or not on the map, or the robot has not
+                set out.
         """
         if self._goal is None:
             raise ValueError(f"goal must be given to begin() before it moves, got {goal}")
@@ -207,6 +210,7 @@ class Pilot:
         if self._goal is None:
             raise ValueError("goal must be given to begin() first")
         x, y, heading = check_finite("pose", pose, 3)
+        _pair("pose", (x, y))
         linear, angular = check_finite("speeds", speeds, 2)
         card = self.card
         taken = None if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
@@ -305,6 +309,8 @@ def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:
-    """Two finite numbers."""
+    """Two finite numbers, and none that the observation could not hold."""
     x, y = check_finite(name, place, 2)
+    if max(abs(x), abs(y)) > _FARTHEST:
+        raise ValueError(f"{name} must be within {_FARTHEST:g} m of the origin, got {place}")
     return x, y

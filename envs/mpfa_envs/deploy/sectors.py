@@ -21,6 +21,8 @@ _EDGE = 1e-4
 """By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
 _NEAR = 0.08
 """Returns up to this beyond the least valid range may be too near for the next scan [m]."""
+_TURNS = 1.05
+"""How often the rays may go round: those of some drivers overlap a little."""
 
 
 class ScanError(ValueError):
@@ -59,7 +61,7 @@ class _Rays(NamedTuple):
 
 
 class Points(NamedTuple):
-    """What was measured in the policy's field of view, around the robot's center."""
+    """What was measured, around the robot's center."""
 
     angles: NDArray[np.float64]
     """Directions in the robot's frame, in [-π, π] [rad], ``[P]``."""
@@ -95,8 +97,8 @@ class Sectors:
 
     All valid rays of a sector count, whatever their number: with ``min`` the nearest return,
     with ``median`` the median, with ``single`` the ray nearest to the middle. A sector between two
-    rays of a coarse scan has the nearer one. What is too near to be measured counts as a return at
-    the scan's ``range_min``.
+    rays of a coarse scan has the nearer one. To the policy, what is too near to be measured is at
+    the scan's ``range_min``; for whether the robot may drive, :meth:`around`, it is at 0 m.
 
     Args:
         card: Of the policy.
@@ -146,8 +148,10 @@ class Sectors:
         Raises:
             ScanError: If it is no scan, or does not tell the range of every sector.
         """
-        rays, points = self._measured(scan)
+        rays, points, _ = self._measured(scan)
         card = self.card
+        view = np.abs(points.angles) <= self._edge + _EDGE
+        points = Points(points.angles[view], points.ranges[view])
         sector = self._index(points.angles)
         key = points.ranges
         if card.reduction == "single":
@@ -168,13 +172,34 @@ class Sectors:
             ranges[index] = self._beside(index, rays, points)
         return ranges, points
 
+    def around(self, scan: Scan) -> Points:
+        """Read a scan for whether a robot may drive on.
+
+        Args:
+            scan: What the lidar has measured.
+
+        Returns:
+            What is in all directions, in the policy's field of view or not: 0 m for what is too
+            near to be measured, whatever ``range_min`` is, and NaN for a ray that is not valid.
+
+        Raises:
+            ScanError: If it is no scan.
+        """
+        rays, points, distances = self._measured(scan)
+        silent = rays.directions[~rays.valid]
+        ranges = np.where(distances <= scan.range_min, 0.0, points.ranges)
+        return Points(
+            np.concatenate((points.angles, silent)),
+            np.concatenate((ranges, np.full(silent.size, math.nan))),
+        )
+
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
         """Number of the sector of each angle in view."""
         index = ((self._edge - angles) / self._width).astype(np.int64)
         return np.clip(index, 0, self.card.sectors - 1)
 
-    def _measured(self, scan: Scan) -> tuple[_Rays, Points]:
-        """All rays, and the points in view."""
+    def _measured(self, scan: Scan) -> tuple[_Rays, Points, NDArray[np.float64]]:
+        """All rays, the points around the robot, and how far these are from the sensor [m]."""
         ranges = np.asarray(scan.ranges, dtype=np.float64)
         start, step = scan.angle_min, scan.angle_increment
         least, most = scan.range_min, scan.range_max
@@ -182,6 +207,11 @@ class Sectors:
             raise ScanError(f"ranges must have shape [R], got {ranges.shape}")
         if not (math.isfinite(start) and math.isfinite(step) and step):
             raise ScanError(f"a scan needs a first angle and a step, got {start} and {step}")
+        if abs(step) * (ranges.size - 1) > _TURNS * math.tau:
+            raise ScanError(
+                f"the rays of a scan must go round once at most, got {ranges.size} in steps of "
+                f"{step} rad"
+            )
         if not 0.0 <= least < most:
             raise ScanError(
                 f"range_min must be at least 0 and below range_max, got {least} and {most}"
@@ -198,7 +228,7 @@ class Sectors:
         angles, distances = directions[rays.valid], ranges[rays.valid]
         if self.silent == "far":
             angles, distances = self._with_near(rays, angles, distances, least + _NEAR)
-        return rays, self._around_center(angles, distances, distances >= most)
+        return rays, self._around_center(angles, distances, distances >= most), distances
 
     def _with_near(
         self,
@@ -225,7 +255,7 @@ class Sectors:
     def _around_center(
         self, angles: NDArray[np.float64], distances: NDArray[np.float64], missed: NDArray[np.bool_]
     ) -> Points:
-        """The points in view from the robot's center of what the sensor has measured."""
+        """From the robot's center what the sensor has measured."""
         across, up, _ = self.mount
         far = self.card.max_range
         distances = np.where(missed, far, distances)
@@ -235,8 +265,7 @@ class Sectors:
             # What met nothing is too far away to be seen in another direction from the center.
             angles = np.where(missed, angles, np.arctan2(met_y, met_x))
             distances = np.where(missed, far, np.hypot(met_x, met_y))
-        front = np.abs(angles) <= self._edge + _EDGE
-        return Points(angles[front], np.minimum(distances[front], far))
+        return Points(angles, np.minimum(distances, far))
 
     def _beside(self, index: int, rays: _Rays, points: Points) -> float:
         """Range of a sector in which no valid ray has met anything [m]."""
