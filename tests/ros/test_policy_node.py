@@ -231,6 +231,12 @@ def test_odometry_of_another_frame_gives_up_the_goal(module: Any, world: World, 
     assert feed(node, world, 10.1, frame="odom2") == DRIVES
 
 
+def test_a_rate_of_zero_is_rejected(module: Any, world: World) -> None:
+    world.parameters["rate"] = 0.0
+    with pytest.raises(ValueError, match="rate must be positive, got 0"):
+        module.PolicyNode()
+
+
 def test_a_goal_that_was_given_up_is_not_taken_up_again(module: Any, world: World) -> None:
     world.transform = transform(10.0)
     node = driving(module, world, "map")

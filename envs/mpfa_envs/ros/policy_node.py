@@ -63,8 +63,9 @@ class PolicyNode(Node):
             unseen=value("unseen") or None,
             **options,
         )
+        rate = check_positive("rate", value("rate"))
         limits = {n: value(n) for n in ("stop_distance", "scan_timeout", "odometry_timeout")}
-        self.controller = Controller(pilot, **limits, check_period=1.0 / value("rate"))
+        self.controller = Controller(pilot, **limits, check_period=1.0 / rate)
         self._stamped = value("stamped")
         self._trust_stamps = value("trust_stamps")
         self._base_frame = value("base_frame")
@@ -81,7 +82,7 @@ class PolicyNode(Node):
         sensor(LaserScan, value("scan_topic"), self._on_scan)
         sensor(Odometry, value("odometry_topic"), self._on_odometry)
         self.create_subscription(PoseStamped, value("goal_topic"), self._on_goal, 1)
-        self.create_timer(1.0 / value("rate"), self._tick)
+        self.create_timer(1.0 / rate, self._tick)
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
