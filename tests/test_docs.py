@@ -24,7 +24,13 @@ from mpfa_envs import World, deploy, export_policy, load_policy, planners, rende
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+TEXTS = ["../README.md", "../CONTRIBUTING.md", "../examples/policies/README.md", *PAGES]
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)(?:#([^)\s]+))?\)")
+ITEM = r"^(?:[-*]|\d+\.) .*\n"
+PART_OF_A_LIST = re.compile(ITEM + r"(?: .*\n)*\n+    [^`\s].*", re.MULTILINE)
+"""An indented line after a list, which is a paragraph of its last item."""
+NO_LIST = re.compile(r"^(?![-*|#>]|\d+\. )\S.*\n" + ITEM, re.MULTILINE)
+"""An item right after a line of text, which is a list in the repository, but not on the site."""
 
 
 def without_code(text: str) -> str:
@@ -59,9 +65,7 @@ def test_every_page_is_in_the_navigation_once() -> None:
     assert sorted(nav) == sorted([*PAGES, "index.md"])
 
 
-@pytest.mark.parametrize(
-    "page", ["../README.md", "../CONTRIBUTING.md", "../examples/policies/README.md", *PAGES]
-)
+@pytest.mark.parametrize("page", TEXTS)
 def test_every_link_of_a_page_leads_somewhere(page: str) -> None:
     path = (DOCS / page).resolve()
     for link, anchor in LINK.findall(without_code(path.read_text(encoding="utf-8"))):
@@ -70,6 +74,15 @@ def test_every_link_of_a_page_leads_somewhere(page: str) -> None:
         assert target.is_relative_to(ROOT), link
         if anchor:
             assert anchor in slugs(target), f"{link}#{anchor}"
+
+
+def test_code_after_a_list_is_fenced_and_a_list_begins_after_an_empty_line() -> None:
+    texts = {page: without_code((DOCS / page).read_text(encoding="utf-8")) for page in TEXTS}
+    found = {
+        page: [match[0] for rule in (PART_OF_A_LIST, NO_LIST) for match in rule.finditer(text)]
+        for page, text in texts.items()
+    }
+    assert {page: wrong for page, wrong in found.items() if wrong} == {}
 
 
 @pytest.mark.parametrize(
