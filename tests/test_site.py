@@ -1,0 +1,102 @@
+"""The documentation site: it is built without a warning and works when opened as a file."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-quic"]
+DESKTOP, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
+NEEDED = "document.documentElement.scrollWidth"
+CUT = """() => [...document.querySelectorAll(".md-content pre > code, .md-typeset__scrollwrap")]
+    .filter((part) => part.scrollWidth > part.clientWidth + 1)
+    .map((part) => part.textContent.trim().slice(0, 60))"""
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built with warnings as errors."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium without a window."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is of the extra dev")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed, in which to look at the site")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        yield started
+        started.close()
+
+
+def test_the_site_names_nothing_to_load_from_elsewhere(site: Path) -> None:
+    loaded = re.compile(r'(?:src="|<link rel="stylesheet" href=")(https?://[^"]+)')
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not loaded.findall(text), page
+        assert "arithmatex" not in text, page
+    for page in (site / "reference").glob("*.html"):
+        assert not re.search(r":(?:class|func|meth|attr|data):", page.read_text("utf-8")), page
+
+
+def test_no_page_is_wider_than_its_window_and_nothing_is_cut_on_a_desktop(
+    site: Path, browser: Any
+) -> None:
+    page = browser.new_page()
+    elsewhere: list[str] = []
+    page.on("request", lambda request: elsewhere.append(request.url))
+    wrong: dict[str, Any] = {}
+    for file in sorted(site.rglob("*.html")):
+        page.set_viewport_size(DESKTOP)
+        page.goto(file.as_uri())
+        cut, needed = page.evaluate(CUT), page.evaluate(NEEDED)
+        # There code and tables scroll in boxes of their own.
+        page.set_viewport_size(PHONE)
+        on_phone = page.evaluate(NEEDED)
+        if cut or needed > DESKTOP["width"] or on_phone > PHONE["width"]:
+            wrong[file.relative_to(site).as_posix()] = needed, on_phone, cut
+    page.close()
+    assert wrong == {}
+    assert [url for url in elsewhere if not url.startswith(("file:", "data:"))] == []
+
+
+def test_the_search_of_a_site_that_is_opened_as_a_file_finds_pages_and_no_code(
+    site: Path, browser: Any
+) -> None:
+    page = browser.new_page(viewport=DESKTOP)
+    page.goto((site / "index.html").as_uri())
+    box = page.locator(".md-search__input")
+    assert box.is_visible()
+    box.press_sequentially("positive_above")
+    page.wait_for_selector(".md-search-result__link", timeout=20_000)
+    links = [each.get_attribute("href") for each in page.locator(".md-search-result__link").all()]
+    found = [link.removeprefix(f"{site.as_uri()}/").partition("?")[0] for link in links]
+    page.close()
+    assert "methods/mpfa_per.html" in found
+    assert [link for link in found if link.startswith("source/")] == []
+
+
+def test_a_picture_of_a_page_is_a_link_to_itself(site: Path, browser: Any) -> None:
+    page = browser.new_page(viewport=DESKTOP)
+    page.goto((site / "results.html").as_uri())
+    page.locator(".md-content img").first.click()
+    page.wait_for_url(re.compile(r"\.(?:png|gif)$"))
+    page.close()
