@@ -76,12 +76,14 @@ def relinked(text: str, folder: str, page: str) -> str:
 
 
 def home_page() -> str:
-    """The README with cards in place of its list of pages, which is the site's navigation."""
+    """The README with cards, at its first heading, in place of its list of pages."""
     cards = (ROOT / ".ci" / "site_cards.md").read_text(encoding="utf-8")
-    text, found = _LIST_OF_PAGES.subn(cards + "\n", (ROOT / "README.md").read_text("utf-8"))
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    text, found = _LIST_OF_PAGES.subn("", readme)
     if not found:
         raise PluginError("README.md has no section 'What is where', in place of which are cards")
-    return f"---\nhide: [navigation]\n---\n\n{text}"
+    head, mark, rest = text.partition("\n## ")
+    return f"---\nhide: [navigation]\n---\n\n{head}\n{cards}{mark}{rest}"
 
 
 def source_page(path: str) -> str:

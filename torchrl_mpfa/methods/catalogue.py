@@ -20,6 +20,7 @@ class Method:
     """
 
     name: str = "mpfa_per"
+    """What the method is called."""
     signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
     """Signals of the priority."""
     fusion: str = "entropy"
@@ -58,9 +59,9 @@ class Method:
     replay_cap: int = 1024
     """Replays after which ``capped`` excludes a transition."""
     capacity: int = 100_000
-    """Table 1."""
+    """Transitions that the buffer holds (the paper's Table 1)."""
     batch_size: int = 256
-    """Table 1."""
+    """Transitions in a batch (the paper's Table 1)."""
     alpha: float = 0.6
     """Priority exponent, Eq. 8, and the exponent of PAL."""
     beta: float = 0.4

@@ -10,23 +10,24 @@ class LearnerSettings:
     """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
 
     name: str = "ddpg"
+    """Part of the run's folder and of its group in wandb."""
     algorithm: str = "ddpg"
     """``ddpg``, ``td3``, ``sac``, ``dqn`` or ``q_learning``; ``learner=td3`` chooses it with what
     goes with it. The last two choose among seven pairs of wheel speeds."""
     actor_lr: float = 1e-4
-    """Table 1."""
+    """Learning rate of the actor at the start; 1e-4 is the paper's (Table 1)."""
     critic_lr: float = 1e-4
-    """Table 1."""
+    """Learning rate of the critics at the start; 1e-4 is the paper's (Table 1)."""
     lr_end_factor: float = 0.0
-    """Learning rates fall with the episodes from Table 1's to this fraction; 1: constant. At a
+    """Learning rates fall with the episodes to this fraction of the first; 1: constant. At a
     constant rate DDPG forgets and relearns, and the last policy is a matter of luck."""
     lr_power: float | None = None
     """Shape of the fall: 1 is linear, right for a thousand episodes; 3 has halved the rates after a
     fifth of them, right for a hundred. Null: 1 from 500 episodes on, 3 below."""
     gamma: float = 0.99
-    """Table 1."""
+    """Discount of the next action's value (Table 1)."""
     tau: float = 0.01
-    """Table 1."""
+    """Share of a network by which its target moves in an update; 0.01 is the paper's (Table 1)."""
     width: int = 64
     """Units of a hidden layer."""
     layers: int = 2
@@ -57,7 +58,7 @@ class LearnerSettings:
     alpha_init: float = 0.01
     """SAC: temperature of the entropy at the start, of rewards that are scaled."""
     alpha_lr: float = 3e-4
-    """SAC: learning rate of its logarithm."""
+    """SAC: learning rate of the temperature's logarithm."""
     double: bool = True
     """DQN: whether the next action is that of the network, and not of the target network."""
     table_lr: float = 0.2

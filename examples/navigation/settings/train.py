@@ -46,7 +46,7 @@ class ExplorationSettings:
     epsilon_end: float = 0.1
     """DQN and Q learning: chance at the end."""
     annealing_steps: int = 5_000
-    """Steps from one to the other."""
+    """Steps in which the noise, or the chance, goes from its start to its end."""
     varied: bool = True
     """Whether each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
     one size the robot is thrown out of every loop, and never learns what a loop is worth."""
@@ -77,10 +77,10 @@ class CurriculumSettings:
     name: str | None = None
     """Part of the run's folder and of its group in wandb; null: named after the stages."""
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
-    """All of them count episodes, or all of them count actions."""
+    """The worlds in their order; all of them count episodes, or all of them count actions."""
     carry: bool = True
-    """Whether networks and buffer carry on from world to world, or start anew; learning rates, beta
-    and random steps go by the whole run in either case."""
+    """Whether networks and buffer carry on from world to world, or start again; learning rates,
+    beta and random steps go by the whole run in either case."""
 
 
 CURRICULA = {
@@ -162,7 +162,7 @@ class AssessmentSettings:
     episodes: int = 0
     """Whole episodes that assess a policy before the next updates, 20 in TD7; 0: none do."""
     early_episodes: int = 1
-    """The same in the early part of a run, which this speeds up."""
+    """Episodes that do so in the early part of a run, which fewer of them speed up."""
     early_share: float = 0.15
     """How much of the run that part is, TD7's 750,000 of 5 million steps."""
     best_factor: float = 0.9
@@ -179,8 +179,8 @@ class RaySettings:
     workers: int = 0
     """Processes that drive the robots, each an equal part of them; 0: the run drives them."""
     address: str | None = None
-    """Of a cluster's head; null: that of ``RAY_ADDRESS``, one that was started on this machine, or
-    else the cores of this machine."""
+    """Address of a cluster's head; null: that of ``RAY_ADDRESS``, one that was started on this
+    machine, or else the cores of this machine."""
     steps: int = 16
     """Actions of each robot of a worker before it writes them and gets new weights."""
     sync: bool = False
@@ -223,12 +223,13 @@ class TrainSettings:
     regime: str = "paper"
     """``regime=rooms``: many robots in new worlds; ``regime=paper``: Table 1, one robot, A to D."""
     seed: int = 0
+    """Seed of the networks, the exploration, the replay and the generated worlds."""
     device: str = "cpu"
     """Where the networks are; the buffer stays in main memory."""
     threads: int = 1
     """Threads of PyTorch; with networks this small a second one gains nothing."""
     overwrite: bool = False
-    """Whether to start anew in a folder that holds a run; its files are moved to ``previous/``."""
+    """Whether to start again in a folder that holds a run; its files are moved to ``previous/``."""
     resume: str | None = None
     """Folder of a run to continue, with its own settings. More episodes, tracking, threads and
     how often to evaluate and to save may be changed; anything else is refused."""
@@ -240,9 +241,14 @@ class TrainSettings:
     updates: int = 1
     """Updates for one action of each robot."""
     method: Method = field(default_factory=Method)
+    """One of the methods by name; its settings can be changed one by one."""
     learner: LearnerSettings = field(default_factory=LearnerSettings)
+    """``ddpg``, ``td3``, ``sac``, ``plain``, ``dqn`` or ``q_learning``."""
     curriculum: CurriculumSettings = field(default_factory=CurriculumSettings)
+    """``A``, ``B``, ``C`` or ``D``: a world of the paper; ``paper``: all four; or ``rooms``."""
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    """``wandb`` (or ``offline``), ``online``, ``tensorboard``, ``csv``, or several of them as
+    ``[wandb,csv]``; or ``off``."""
     exploration: ExplorationSettings = field(default_factory=ExplorationSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
