@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.deploy.card import FORMAT, SCALES, Card, CardError, card_file
+from mpfa_envs.files import write_atomically
 from mpfa_envs.layers import Choice, LayerNorm, Linear, ReLU, Scale, Tanh
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.navigation import NavigationEnv
 from mpfa_envs.observation import observation_slices
-from mpfa_envs.policy import write_atomically
 from mpfa_envs.robot import resolve_robot
 from mpfa_envs.worlds import World
 

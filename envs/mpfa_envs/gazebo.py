@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import gzip
+import io
 import math
 import os
 import warnings
+import zlib
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from xml.parsers import expat
 
+from mpfa_envs.files import read_file
 from mpfa_envs.shapes import Box, Cylinder, Polygon, Shape
 from mpfa_envs.worlds import World
-from mpfa_envs.yaml_nodes import WorldFileError
+from mpfa_envs.yaml_nodes import WorldFileError, read_number
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,6 +28,8 @@ _DEEPEST: Final = 100
 """Elements in each other, at most."""
 _FLOOR: Final = 0.01
 """What is no higher than this can be driven over [m]."""
+_FARTHEST: Final = 1e9
+"""No number is as large as this [m, rad]."""
 _STRAIGHT: Final = 1e-6
 """Angles below this are none [rad]."""
 
@@ -36,8 +41,13 @@ class _Element:
     tag: str
     attributes: dict[str, str]
     line: int
-    text: str = ""
+    pieces: list[str] = field(default_factory=list)
     children: list[_Element] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """What it holds beside its children."""
+        return "".join(self.pieces).strip()
 
     def all(self, tag: str) -> Iterator[_Element]:
         """Its children of a kind."""
@@ -120,19 +130,20 @@ def load_gazebo_world(
 def _read(path: Path) -> bytes:
     """Read a file, or what is compressed in it, up to the largest size."""
     try:
-        opened = gzip.open if path.suffix.lower() == ".gz" else open
-        with opened(path, "rb") as file:
-            text = file.read(_LARGEST_FILE + 1)
-    except (OSError, EOFError) as error:
+        content = read_file(path, _LARGEST_FILE)
+        if path.suffix.lower() == ".gz":
+            content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(_LARGEST_FILE + 1)
+    except (OSError, EOFError, zlib.error) as error:
         raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    if len(text) > _LARGEST_FILE:
+    if len(content) > _LARGEST_FILE:
         raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
-    return bytes(text)
+    return content
 
 
 def _parse(path: Path, text: bytes) -> _Element:
     """Read the elements; without a document type there are no entities that could grow."""
     parser = expat.ParserCreate()
+    parser.buffer_text = True  # Else each line end is a piece of its own.
     document = _Element("", {}, 1)
     open_ones = [document]
 
@@ -150,7 +161,7 @@ def _parse(path: Path, text: bytes) -> _Element:
         open_ones.pop()
 
     def add(text: str) -> None:
-        open_ones[-1].text += text
+        open_ones[-1].pieces.append(text)
 
     def refuse(*_: object) -> None:
         raise error("must not have a document type, as that may define entities")
@@ -159,8 +170,10 @@ def _parse(path: Path, text: bytes) -> _Element:
     parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = add, refuse
     try:
         parser.Parse(text, True)
-    except expat.ExpatError as reason:
-        raise WorldFileError(f"{path}:{reason.lineno}: is not XML: {reason}") from reason
+    except WorldFileError:
+        raise
+    except (expat.ExpatError, LookupError, ValueError) as reason:  # The last two: its encoding.
+        raise error(f"is not XML: {reason}") from reason
     return document.children[0]
 
 
@@ -191,7 +204,7 @@ class _Reader:
             static: Whether the model that it is in is static.
         """
         flag = model.first("static")
-        static |= flag is not None and flag.text.strip().lower() in ("1", "true")
+        static |= flag is not None and flag.text.lower() in ("1", "true")
         inner = self._pose(moved or model.first("pose"))
         if not static:
             self.left_out["models that may move"] += 1
@@ -245,7 +258,10 @@ class _Reader:
             elif kind.tag == "box":
                 width, depth, tall = self._lengths(kind, "size", 3)
                 if self._is_in_the_way(pose.z, tall):
-                    self.shapes.append(_turned_box(pose, width, depth))
+                    try:
+                        self.shapes.append(_turned_box(pose, width, depth))
+                    except ValueError as error:  # A side vanishes beside where it is.
+                        raise self._error(kind, str(error)) from error
             elif kind.tag != "plane":  # The ground.
                 self.left_out[f"geometries of the kind {kind.tag}"] += 1
 
@@ -260,18 +276,17 @@ class _Reader:
             raise self._error(element, f"{element.tag} lacks {tag}")
         numbers = self._numbers(child, count)
         if min(numbers) <= 0.0:
-            raise self._error(child, f"{tag} must be positive, got {child.text.strip()!r}")
+            raise self._error(child, f"{tag} must be positive, got {child.text!r}")
         return numbers
 
     def _numbers(self, element: _Element, count: int) -> list[float]:
         """Read finite numbers."""
-        try:
-            numbers = [float(word) for word in element.text.split()]
-        except ValueError:
-            numbers = []
-        if len(numbers) != count or not all(map(math.isfinite, numbers)):
-            got = element.text.strip()
-            raise self._error(element, f"{element.tag} must be {count} numbers, got {got!r}")
+        numbers = [read_number(word) for word in element.text.split()]
+        # Sums and squares of what is farther away are not finite.
+        if len(numbers) != count or not all(abs(number) < _FARTHEST for number in numbers):
+            raise self._error(
+                element, f"{element.tag} must be {count} numbers, got {element.text!r}"
+            )
         return numbers
 
     def _error(self, element: _Element, text: str) -> WorldFileError:

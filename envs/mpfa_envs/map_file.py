@@ -9,6 +9,7 @@ are p in percent, and above that unknown.
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from pathlib import Path
@@ -19,6 +20,7 @@ import yaml
 from PIL import Image
 
 from mpfa_envs.checks import check_positive
+from mpfa_envs.files import read_file
 from mpfa_envs.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds import LARGEST_SIDE, World
 from mpfa_envs.yaml_nodes import NodeReader, WorldFileError, read_nodes
@@ -35,6 +37,8 @@ Unknown = Literal["occupied", "free"]
 _KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _FORMATS: Final = ("PPM", "PNG", "BMP")
 """Kinds of images; PGM is among the first."""
+_LARGEST_IMAGE: Final = 2**28
+"""A larger file is no image of so few cells [bytes]."""
 _RESOLUTION: Final = 0.05
 """Side of a cell of a map that is written of shapes [m]."""
 _FREE: Final = 254
@@ -164,18 +168,19 @@ class _Reader(NodeReader):
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
         """Read the shades of an image ``[rows, columns]``, and which pixels are transparent."""
         path = self.path.parent / self.text(node, "image")
-        if not path.is_file():
-            raise self.error(node, f"image must be a file, and there is no {path}")
         try:
+            content = io.BytesIO(read_file(path, _LARGEST_IMAGE))
             with warnings.catch_warnings():
                 # Pillow warns of what is refused below.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                image = Image.open(path, formats=_FORMATS)
+                image = Image.open(content, formats=_FORMATS)
             with image:
                 self._check_size(node, image.size, resolution)
                 return _shades(image)
         except WorldFileError:
             raise
+        except FileNotFoundError:
+            raise self.error(node, f"image must be a file, and there is no {path}") from None
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             kinds = ", ".join(("PGM", *_FORMATS))
             text = f"image must be one of {kinds}, and {path} cannot be read: {error}"

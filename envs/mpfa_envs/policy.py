@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from mpfa_envs.files import check_replaceable, read_file, write_atomically
 from mpfa_envs.layers import KINDS, Layer, arrays_of, check_layers, from_torch
 
 if TYPE_CHECKING:
@@ -132,17 +132,19 @@ class Policy:
         return f"Policy({self.observation_size} -> {self.action_size}: {kinds})"
 
 
-def save_policy(policy: Policy, path: str | os.PathLike[str]) -> Path:
+def save_policy(policy: Policy, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
     """Write a policy to a file, whole or not at all.
 
     Args:
         policy: The policy.
-        path: The file; in a folder it is called ``policy.npz``.
+        path: The file; in a folder it is called ``policy.npz``. Another policy there is replaced.
+        overwrite: Whether anything else there is replaced, too.
 
     Returns:
         The file.
 
     Raises:
+        FileExistsError: If there is a file that holds no policy, and overwrite is false.
         ValueError: If it is out of an ONNX file, which holds no layers.
 
     Examples:
@@ -179,6 +181,7 @@ def save_policy(policy: Policy, path: str | os.PathLike[str]) -> Path:
     packed = io.BytesIO()
     text = json.dumps(about, indent=1).encode()
     np.savez(packed, allow_pickle=False, **{_ABOUT: np.frombuffer(text, np.uint8)}, **arrays)
+    check_replaceable(file, load_policy, "policy", overwrite=overwrite)
     write_atomically(packed.getvalue(), file)
     return file
 
@@ -203,11 +206,9 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
         return OnnxPolicy(file)
     try:
-        content = file.read_bytes()
+        return _read(read_file(file, _LARGEST))
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no policy at {file}") from None
-    try:
-        return _read(content)
     # A damaged archive fails in many ways: a wrong checksum, header, length, number, password.
     except Exception as error:
         raise PolicyFileError(f"{file} holds no policy, or is damaged: {error}") from error
@@ -243,21 +244,6 @@ def _read(content: bytes) -> Policy:
 def _file(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     return path / FILE_NAME if path.is_dir() else path
-
-
-def write_atomically(content: bytes, path: Path) -> None:
-    """Write a file in one step: the old one or the new one, never half."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
-        try:
-            new.write(content)
-            new.flush()
-            os.fsync(new.fileno())
-            # Temporary files are for their owner alone; this one is for whom the folder is.
-            os.chmod(new.name, 0o644)
-            os.replace(new.name, path)
-        except BaseException:
-            os.unlink(new.name)
-            raise
 
 
 def _plain(name: str, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import yaml
 
+from mpfa_envs.files import check_replaceable, write_atomically
 from mpfa_envs.plain_worlds import walker_to_plain
 from mpfa_envs.shapes import Box, Cylinder, Polygon
 from mpfa_envs.walkers import Walker
@@ -220,14 +221,16 @@ def _has_room(world: World, region: Box) -> bool | None:
     return None
 
 
-def save_world(world: World, path: str | os.PathLike[str]) -> None:
+def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Write a world to a YAML file that :func:`load_world` reads back as an equal world.
 
     Args:
         world: The world.
-        path: The file; an existing one is overwritten.
+        path: The file; another world there is replaced.
+        overwrite: Whether anything else there is replaced, too.
 
     Raises:
+        FileExistsError: If there is a file that is no world, and overwrite is false.
         ValueError: If the world has the cells of a map, which :meth:`World.to_map` writes, or
             :func:`load_world` would refuse the file, as it does one without a name; nothing is
             written then.
@@ -265,9 +268,10 @@ def save_world(world: World, path: str | os.PathLike[str]) -> None:
     if world.walkers:
         content["walkers"] = [walker_to_plain(walker) for walker in world.walkers]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
-    path = Path(path)
+    path, content = Path(path), text.encode()
     try:
-        _Reader(path).world(parse_nodes(text, path))
+        _Reader(path).world(parse_nodes(content, path))
     except WorldFileError as error:
         raise ValueError(f"world must be one that can be loaded again: {error}") from error
-    path.write_text(text, encoding="utf-8")
+    check_replaceable(path, load_world, "world", overwrite=overwrite)
+    write_atomically(content, path)

@@ -9,9 +9,12 @@ from typing import Final
 import yaml
 
 from mpfa_envs.checks import did_you_mean
+from mpfa_envs.files import read_file
 
 _LARGEST_FILE: Final = 1_000_000
-"""Longest text that is read [characters]."""
+"""Longest text that is read [bytes]."""
+_MOST_ENTRIES: Final = 1000
+"""No list has more: a line of ten letters may stand for a polygon of a hundred corners."""
 
 
 class WorldFileError(ValueError):
@@ -31,35 +34,45 @@ def read_nodes(path: Path) -> yaml.Node | None:
         WorldFileError: If the file cannot be read, is too large, or is not YAML.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        content = read_file(path, _LARGEST_FILE)
+    except OSError as error:
         raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    return parse_nodes(text, path)
+    return parse_nodes(content, path)
 
 
-def parse_nodes(text: str, path: Path) -> yaml.Node | None:
-    """Turn the text of a file into nodes.
+def parse_nodes(content: bytes, path: Path) -> yaml.Node | None:
+    """Turn the content of a file into nodes.
 
     Args:
-        text: The text.
+        content: The content.
         path: The file, for messages.
 
     Returns:
         The outermost node; None if there is none.
 
     Raises:
-        WorldFileError: If the text is too long, or not YAML.
+        WorldFileError: If the content is too long, or not YAML.
     """
-    if len(text) > _LARGEST_FILE:
-        raise WorldFileError(f"{path}: has {len(text)} characters, more than {_LARGEST_FILE}")
+    if len(content) > _LARGEST_FILE:  # Not yet looked at where it is about to be written.
+        raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
     try:
-        return yaml.compose(text, Loader=yaml.SafeLoader)
+        return yaml.compose(content.decode(), Loader=yaml.SafeLoader)
+    except UnicodeDecodeError as error:
+        raise WorldFileError(f"{path}: is not UTF-8: {error}") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
     except RecursionError:
         raise WorldFileError(f"{path}: is nested too deeply") from None
+
+
+def read_number(text: str) -> float:
+    """The number that a text stands for, or NaN: Python also takes ``1_0`` and foreign digits."""
+    try:
+        return float(text) if text.isascii() and "_" not in text else math.nan
+    except ValueError:
+        return math.nan
 
 
 def is_map(root: yaml.Node | None) -> bool:
@@ -105,14 +118,14 @@ class NodeReader:
         """Read a list."""
         if not isinstance(node, yaml.SequenceNode):
             raise self.error(node, f"{what} must be a list")
+        if len(node.value) > _MOST_ENTRIES:
+            count = len(node.value)
+            raise self.error(node, f"{what} must have at most {_MOST_ENTRIES} entries, got {count}")
         return list(node.value)
 
     def number(self, node: yaml.Node, what: str, unit: str = " in meters") -> float:
         """Read a finite number; the unit is what an error says behind "a number"."""
-        try:
-            value = float(node.value) if isinstance(node, yaml.ScalarNode) else math.nan
-        except ValueError:
-            value = math.nan
+        value = read_number(node.value) if isinstance(node, yaml.ScalarNode) else math.nan
         if not math.isfinite(value):
             got = node.value if isinstance(node, yaml.ScalarNode) else "something else"
             raise self.error(node, f"{what} must be a number{unit}, got {got!r}")

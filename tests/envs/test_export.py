@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from mpfa_envs import (
     save_policy,
 )
 from mpfa_envs.binning import Binning
-from mpfa_envs.deploy import CardError
+from mpfa_envs.deploy import CardError, Pilot
 from mpfa_envs.layers import Choice, Linear, ReLU, Scale, Table, Tanh
 from tests.envs.exported import ENV_ARGUMENTS, SHIPPED, exported, make_policy
 
@@ -153,13 +154,33 @@ def test_a_card_that_does_not_fit_is_refused(
         load_policy(file)
 
 
+def test_weights_that_lie_in_another_file_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import onnx
+
+    file = exported(tmp_path)
+    model = onnx.load(file)
+    onnx.external_data_helper.convert_model_to_external_data(
+        model, location="innocent.bin", size_threshold=0
+    )
+    monkeypatch.chdir(tmp_path)  # Where onnxruntime looks for what is not in the file.
+    onnx.save(model, file)
+    assert (tmp_path / "innocent.bin").exists()
+    change_card(file, sha256=hashlib.sha256(file.read_bytes()).hexdigest())
+    for load in (load_policy, Pilot.load):
+        with pytest.raises(ValueError, match="the network must hold its weights, and this one nam"):
+            load(file)
+
+
 def test_a_missing_or_damaged_file_is_told(tmp_path: Path) -> None:
     file = exported(tmp_path)
     card = tmp_path / "policy.json"
     kept = card.read_text()
-    card.write_text("{")
-    with pytest.raises(PolicyFileError, match="is no card of a policy"):
-        load_policy(file)
+    for damaged in ("{", "[" * 100_000):
+        card.write_text(damaged)
+        with pytest.raises(PolicyFileError, match="is no card of a policy"):
+            load_policy(file)
     card.unlink()
     with pytest.raises(FileNotFoundError, match="there is no card of the policy at"):
         load_policy(file)

@@ -2,6 +2,7 @@
 
 import gzip
 import math
+import time
 
 import pytest
 
@@ -16,6 +17,7 @@ from mpfa_envs import (
 from mpfa_envs.builtin_worlds import resolve_world
 
 BARN_CENTER = (-2.25, 7.0)
+SPECK = "<box><size>1e-200 1e-200 1</size></box>"
 CYLINDER = "<cylinder><radius>0.075</radius><length>1</length></cylinder>"
 
 
@@ -147,12 +149,30 @@ def test_what_is_left_out_is_counted(tmp_path):
         ("<model>", 4, "is not XML: mismatched tag"),
         ("", 3, "has no obstacle"),
         ("<a>" * 200, 4, "nested too deeply"),
+        (model(CYLINDER.replace("0.075", "1_0")), 5, "radius must be 1 numbers, got '1_0'"),
+        (model(CYLINDER, "1e308 0 0 0 0 0"), 4, "pose must be 6 numbers, got '1e308 0 0 0 0 0'"),
+        (model(SPECK, "0 0 0 0 0 0.3"), 5, "polygon must have an area"),
     ],
 )
 def test_a_bad_file_is_refused_with_the_line_and_the_reason(content, line, reason, tmp_path):
     with pytest.raises(WorldFileError, match=reason) as caught:
         load_gazebo_world(write(tmp_path, content))
     assert f"room.world:{line}: " in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["foo", "utf-7", "idna", "hex"])
+def test_an_encoding_that_is_none_is_refused(encoding, tmp_path):
+    path = write(tmp_path, model(CYLINDER))
+    path.write_text(path.read_text().replace("?>", f" encoding='{encoding}'?>"))
+    with pytest.raises(WorldFileError, match=r"room.world:1: is not XML"):
+        load_gazebo_world(path)
+
+
+def test_a_compressed_file_of_line_ends_is_read_soon(tmp_path):
+    path = write(tmp_path, model(CYLINDER) + "\n" * 1_000_000, name="room.world.gz")
+    start = time.process_time()
+    assert len(load_gazebo_world(path).cylinders) == 1
+    assert time.process_time() - start < 2.0
 
 
 def test_entities_are_refused_before_they_grow(tmp_path):
@@ -167,9 +187,12 @@ def test_entities_are_refused_before_they_grow(tmp_path):
 def test_other_files_and_rooms_that_are_too_small_are_refused(tmp_path):
     with pytest.raises(WorldFileError, match="cannot be read"):
         load_gazebo_world(tmp_path / "none.world")
-    (tmp_path / "bad.world.gz").write_bytes(b"no gzip")
-    with pytest.raises(WorldFileError, match="cannot be read"):
-        load_gazebo_world(tmp_path / "bad.world.gz")
+    flipped = bytearray(gzip.compress(b"<sdf/>" * 50 + bytes(range(256))))
+    flipped[20] ^= 0xFF
+    for content in (b"no gzip", gzip.compress(b"<sdf/>" * 1000)[:30], flipped):
+        (tmp_path / "bad.world.gz").write_bytes(content)
+        with pytest.raises(WorldFileError, match="cannot be read"):
+            load_gazebo_world(tmp_path / "bad.world.gz")
     (tmp_path / "big.world.gz").write_bytes(gzip.compress(b" " * 30_000_000))
     with pytest.raises(WorldFileError, match="more than 20000000 bytes"):
         load_gazebo_world(tmp_path / "big.world.gz")

@@ -251,6 +251,7 @@ def test_images_may_have_comments_and_be_text(kind, tmp_path):
         ({"resolution": "fine"}, 2, "resolution must be a number in meters, got 'fine'"),
         ({"origin": "[0, 0]"}, 3, "origin must be .x, y, yaw., got 2 entries"),
         ({"origin": "[0, 0, 0.3]"}, 3, "yaw of 0"),
+        ({"image": "x" * 5000}, 1, "image must be one of .* cannot be read"),
         ({"negate": 2}, 4, "negate must be 0 or 1, got 2"),
         ({"occupied_thresh": 0.1}, 6, "free_thresh must be below occupied = 0.1, got 0.196"),
         ({"occupied_thresh": 1.5}, 5, r"occupied_thresh must be in \[0, 1\], got 1.5"),

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mpfa_envs.checks import check_count, check_number, check_positive
+from mpfa_envs.files import read_file
 from mpfa_envs.observation import (
     DISTANCE_SCALE,
     GOAL_CLOSENESS_DISTANCE,
@@ -33,6 +34,8 @@ SCALES: Final = {
 _REDUCTIONS = ("min", "median", "single")
 _LARGEST = 2**28
 """A file larger than this is no policy [bytes]."""
+_LARGEST_CARD = 2**24
+"""Nor is this one a card: what JSON holds may take fifty times the room [bytes]."""
 
 
 class CardError(ValueError):
@@ -156,16 +159,14 @@ def read_exported(path: str | os.PathLike[str]) -> tuple[Card, bytes]:
         CardError: If the card is no card, or of another file.
     """
     file, beside = Path(path), card_file(path)
-    for each, what in ((file, "policy"), (beside, "card of the policy")):
-        if not each.is_file():
-            raise FileNotFoundError(f"there is no {what} at {each}")
-        if each.stat().st_size > _LARGEST:
-            raise CardError(f"{each} is no {what}: it has {each.stat().st_size} bytes")
-    content = file.read_bytes()
+    content, text = (
+        _read(file, "policy", _LARGEST),
+        _read(beside, "card of the policy", _LARGEST_CARD),
+    )
     try:
-        document = json.loads(beside.read_text(encoding="utf-8"))
+        document = json.loads(text)
         wanted = document["sha256"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise CardError(f"{beside} is no card of a policy: {error!r}") from None
     if (found := hashlib.sha256(content).hexdigest()) != wanted:
         raise CardError(f"{beside} is the card of another file than {file}: sha256 {found}")
@@ -173,6 +174,16 @@ def read_exported(path: str | os.PathLike[str]) -> tuple[Card, bytes]:
         return Card.of(document), content
     except CardError as error:
         raise CardError(f"{beside}: {error}") from None
+
+
+def _read(path: Path, what: str, most: int) -> bytes:
+    """Read one of the two files of an exported policy."""
+    try:
+        return read_file(path, most)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no {what} at {path}") from None
+    except OSError as error:
+        raise CardError(f"{path} is no {what}: {error}") from error
 
 
 def check_finite(name: str, values: Any, size: int) -> tuple[float, ...]:

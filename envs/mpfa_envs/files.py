@@ -1,0 +1,70 @@
+"""Reading files that may be anything, and replacing none but those of the same kind."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+
+def read_file(path: Path, most: int) -> bytes:
+    """Read a file, unless it is a pipe or a device, which may never end, or too large.
+
+    Args:
+        path: The file.
+        most: Its largest size [bytes].
+
+    Returns:
+        Its content.
+
+    Raises:
+        OSError: If it is missing, not a regular file, too large, or cannot be read.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(f"{path} is not a regular file")
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(f"it has more than {most} bytes")
+    return content
+
+
+def check_replaceable(
+    path: Path, load: Callable[[Path], object], what: str, *, overwrite: bool
+) -> None:
+    """Check that a path is free, or that what would be replaced there is of the same kind.
+
+    Args:
+        path: Where something will be written.
+        load: Reads a file of that kind, and raises an OSError or a ValueError for another.
+        what: What messages call it.
+        overwrite: Whether anything may be replaced.
+
+    Raises:
+        FileExistsError: If there is something else.
+    """
+    if overwrite or not os.path.lexists(path):
+        return
+    try:
+        load(path)
+    except (OSError, ValueError) as error:
+        raise FileExistsError(
+            f"path must be free or hold a {what} unless overwrite=True, got {path}: {error}"
+        ) from error
+
+
+def write_atomically(content: bytes, path: Path) -> None:
+    """Write a file in one step: the old one or the new one, never half."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as new:
+        try:
+            new.write(content)
+            new.flush()
+            os.fsync(new.fileno())
+            # Temporary files are for their owner alone; this one is for whom the folder is.
+            os.chmod(new.name, 0o644)
+            os.replace(new.name, path)
+        except BaseException:
+            os.unlink(new.name)
+            raise

@@ -1,0 +1,92 @@
+"""Files that a user names: anything may lie there, and what is not ours stays."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    WORLDS,
+    Policy,
+    PolicyFileError,
+    World,
+    WorldFileError,
+    load_gazebo_world,
+    load_policy,
+    load_world,
+    save_policy,
+    save_world,
+)
+from mpfa_envs.deploy.card import CardError, read_exported
+from mpfa_envs.layers import Linear
+
+POLICY = Policy([Linear(np.ones((2, 24), np.float32), np.zeros(2, np.float32))])
+MAP = "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+
+
+def card_of_nothing(path: Path) -> object:
+    path.with_suffix(".onnx").write_bytes(b"")
+    return read_exported(path.with_suffix(".onnx"))
+
+
+def map_of(path: Path) -> object:
+    path.with_name("map.yaml").write_text(f"{MAP}free_thresh: 0.196\n")
+    return World.from_map(path.with_name("map.yaml"))
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="there are no pipes and no such device")
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize(
+    ("name", "load", "error"),
+    [
+        ("world.yaml", load_world, WorldFileError),
+        ("room.world", load_gazebo_world, WorldFileError),
+        ("room.world.gz", load_gazebo_world, WorldFileError),
+        ("map.pgm", map_of, WorldFileError),
+        ("policy.npz", load_policy, PolicyFileError),
+        ("policy.onnx", read_exported, CardError),
+        ("policy.json", card_of_nothing, CardError),
+    ],
+)
+def test_what_may_never_end_is_not_read(
+    name: str, kind: str, load: Callable[[Path], object], error: type[Exception], tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(error, match=f"{name} is not a regular file"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "save", "what"),
+    [
+        ("policy.npz", lambda path, **options: save_policy(POLICY, path, **options), "policy"),
+        ("b.yaml", lambda path, **options: save_world(WORLDS["B"], path, **options), "world"),
+    ],
+)
+def test_nothing_but_its_own_kind_is_replaced_unless_that_is_asked_for(
+    name: str, save: Callable[..., object], what: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text("root:x:0:0:root:/root:/bin/bash\n")
+    with pytest.raises(FileExistsError, match=f"path must be free or hold a {what} unless overw"):
+        save(path)
+    assert path.read_text() == "root:x:0:0:root:/root:/bin/bash\n"
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+    save(path, overwrite=True)
+    before = path.stat().st_mtime_ns, path.read_bytes()
+    save(path)
+    assert path.read_bytes() == before[1]
+
+
+def test_a_link_to_nothing_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "policy.npz").symlink_to(tmp_path / "later")
+    with pytest.raises(FileExistsError, match="path must be free or hold a policy"):
+        save_policy(POLICY, tmp_path)
