@@ -21,11 +21,15 @@ class Network:
         action_size: A.
 
     Raises:
-        CardError: If the content is no such network.
+        CardError: If the content is no such network, or its weights lie in another file, which a
+            card says nothing of and which is looked for in the working folder.
         ImportError: If there is no onnxruntime.
     """
 
     def __init__(self, content: bytes, observation_size: int, action_size: int) -> None:
+        # The key of each tensor that lies elsewhere, spelled out wherever in the file it is.
+        if b"location" in content:
+            raise CardError("the network must hold its weights, and this one names another file")
         try:
             import onnxruntime
         except ImportError as error:
