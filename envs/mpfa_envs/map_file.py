@@ -5,6 +5,9 @@ with ``negate``. Above ``occupied_thresh`` it is occupied, below ``free_thresh``
 between depends on ``mode``: with ``trinary`` it is unknown; with ``scale`` it is occupied from the
 middle of the two thresholds, and what is transparent is unknown. With ``raw`` shades of 0 to 100
 are p in percent, and above that unknown.
+
+With ``trinary`` and without ``negate`` the shade 205 is always unknown: ROS's own map_saver writes
+it for unknown cells beside a ``free_thresh`` of 0.25, under which it would be free.
 """
 
 from __future__ import annotations
@@ -43,6 +46,8 @@ _RESOLUTION: Final = 0.05
 """Side of a cell of a map that is written of shapes [m]."""
 _FREE: Final = 254
 """Shade of a free cell, as ROS's map_saver writes it."""
+_UNKNOWN: Final = 205
+"""Shade by which it marks a cell of which it knows nothing; p is 0.196."""
 
 
 class _Rule(NamedTuple):
@@ -88,6 +93,16 @@ def read_map(path: Path, root: yaml.Node | None, *, unknown: Unknown = "occupied
     rule = reader.rule(entries)
     shades, clear = reader.image(entries["image"], resolution)
     occupied, free = _classify(shades, rule)
+    marked = free & (shades == _UNKNOWN)
+    if rule.mode == "trinary" and not rule.negate and unknown == "occupied" and marked.any():
+        free &= ~marked
+        line = entries["free_thresh"].start_mark.line + 1
+        warnings.warn(
+            f"{path}:{line}: free_thresh = {rule.free} would make {marked.sum()} cells of shade "
+            f"{_UNKNOWN} free, by which map_saver marks unknown cells: they are read as unknown; "
+            "write free_thresh: 0.196, or pass unknown='free' if a robot may drive there",
+            stacklevel=2,
+        )
     if clear is not None and rule.mode == "scale":
         occupied, free = occupied & ~clear, free & ~clear
     if unknown == "free":

@@ -1,6 +1,7 @@
 """Maps of ROS: what is read and written, and what a robot meets in them."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -203,11 +204,32 @@ def test_what_lies_around_the_free_cells_is_cut_off(tmp_path):
     assert whole.occupancy.occupied.sum() == 20
 
 
+def test_what_map_saver_marks_as_unknown_is_not_made_free_by_its_own_threshold(tmp_path):
+    shades = np.full((140, 160), 205, dtype=np.uint8)
+    shades[20:120, 20:140] = 0  # A building with walls of one cell, and a margin of 1 m around it.
+    shades[21:119, 21:139] = 254
+    saved = write_map(tmp_path, shades, free_thresh=0.25)
+    with pytest.warns(UserWarning, match=r"map\.yaml:6: free_thresh = 0\.25 .* unknown") as caught:
+        world = World.from_map(saved)
+    assert len(caught) == 1
+    assert world.size == pytest.approx((120 * 0.05, 100 * 0.05))
+    env = VectorNavigationEnv(50, world=world, physics="kinematic")
+    for seed in range(4):
+        env.reset(seed=seed)
+        assert (np.abs(env.poses[:, :2]) < [59 * 0.05, 49 * 0.05]).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert World.from_map(write_map(tmp_path, shades, free_thresh=0.196)) == world
+        assert World.from_map(saved, unknown="free").size == pytest.approx((8.0, 7.0))
+
+
+@pytest.mark.filterwarnings("ignore:.*free_thresh = 0.21 would make 1 cells")
 @pytest.mark.parametrize(
     ("changes", "occupied"),
     [
         ({}, [1, 1, 1, 0]),  # 0, 100 and 205 are p of 1, 0.61 and 0.2, 254 of 0.004.
-        ({"occupied_thresh": 0.6, "free_thresh": 0.21}, [1, 1, 0, 0]),
+        ({"occupied_thresh": 0.6, "free_thresh": 0.21}, [1, 1, 1, 0]),
+        ({"free_thresh": 0.25, "mode": "scale"}, [1, 1, 0, 0]),
         ({"negate": 1}, [0, 1, 1, 1]),
         ({"mode": "scale"}, [1, 1, 0, 0]),
         ({"mode": "scale", "occupied_thresh": 0.99, "free_thresh": 0.5}, [1, 0, 0, 0]),
