@@ -23,6 +23,9 @@ Physics = Literal["kinematic", "wheels"]
 Progress = Literal["straight_line", "shortest_path", "none"]
 """What the reward's progress is measured along."""
 
+_MOST_STEPS: Final = 1_000_000
+"""No episode has more time steps: a policy that never arrives must come to an end."""
+
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "action_repeat": 1,
@@ -73,11 +76,9 @@ class TaskArguments(LiveView):
         self.progress = progress
         self.reward = resolve_reward(reward, progress=progress, progress_scale=scale)
         self.physics = physics
-        if memory not in get_args(Memory):
-            raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")
         self.memory: Memory = memory
-        self.history = check_count("history", history, least=0)
-        self.max_steps = check_count("max_steps", max_steps)
+        self.history = history
+        self.max_steps = check_count("max_steps", max_steps, most=_MOST_STEPS)
         self.time_step = check_positive("time_step", time_step)
         self.action_repeat = check_count("action_repeat", action_repeat)
         self._set_view(render_mode, self.time_step, self.action_repeat)

@@ -69,8 +69,7 @@ def barn_world(index: int) -> World:
         >>> world.name, len(world.cylinders)
         ('barn-0', 187)
     """
-    if check_count("index", index, least=0) >= len(BARN_WORLDS):
-        raise ValueError(f"index must be below {len(BARN_WORLDS)}, got {index}")
+    check_count("index", index, least=0, most=len(BARN_WORLDS) - 1)
     with np.load(_FILE, allow_pickle=False) as file:
         centers = file[f"cyl_{BARN_WORLDS[index]}"].astype(np.float64) - _CENTER
     return World(

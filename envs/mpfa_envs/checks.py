@@ -6,7 +6,11 @@ import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 from operator import index
-from typing import Any
+from typing import Any, Final
+
+MOST: Final = 100_000
+"""No count is larger unless it says so: of robots, episodes, worlds, rays, scans. What they stand
+for is made one by one or held at once, so that a slip of the pen takes all time or memory."""
 
 
 def check_number(name: str, value: Any) -> float:
@@ -73,8 +77,8 @@ def check_share(name: str, value: Any) -> float:
     return number
 
 
-def check_count(name: str, value: Any, *, least: int = 1) -> int:
-    """An integer of at least ``least``.
+def check_count(name: str, value: Any, *, least: int = 1, most: float = MOST) -> int:
+    """An integer from ``least`` to ``most``.
 
     Raises:
         ValueError: If it is not.
@@ -84,6 +88,10 @@ def check_count(name: str, value: Any, *, least: int = 1) -> int:
         Traceback (most recent call last):
         ...
         ValueError: seed must be an integer of at least 0, got -1
+        >>> check_count("episodes", 2**31)
+        Traceback (most recent call last):
+        ...
+        ValueError: episodes must be at most 100000, got 2147483648
     """
     try:
         number = None if isinstance(value, bool) else index(value)
@@ -92,7 +100,18 @@ def check_count(name: str, value: Any, *, least: int = 1) -> int:
     if number is None or number < least:
         what = "a positive integer" if least == 1 else f"an integer of at least {least}"
         raise ValueError(f"{name} must be {what}, got {value!r}")
+    if number > most:
+        raise ValueError(f"{name} must be at most {most}, got {value!r}")
     return number
+
+
+def check_seed(value: Any) -> int:
+    """A seed, an integer of any size that is not negative.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    return check_count("seed", value, least=0, most=math.inf)
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

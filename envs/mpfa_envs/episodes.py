@@ -295,7 +295,9 @@ class EpisodeSource:
         worlds = [None if each is None else world_from_plain(each) for each in values]
         if any(count and world is None for count, world in zip(left, worlds, strict=True)):
             raise ValueError("worlds of the state must hold a world wherever left is not 0")
-        return Whereabouts(check_count("refused", state.get("refused"), least=0), left, worlds)
+        return Whereabouts(
+            check_count("refused", state.get("refused"), least=0, most=math.inf), left, worlds
+        )
 
     def load(self, found: Whereabouts) -> None:
         """Go on from what :meth:`read` gave."""

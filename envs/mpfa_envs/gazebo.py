@@ -34,7 +34,7 @@ _STRAIGHT: Final = 1e-6
 """Angles below this are none [rad]."""
 
 
-@dataclass
+@dataclass(slots=True)
 class _Element:
     """An element of the file, with its line."""
 

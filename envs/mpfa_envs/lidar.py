@@ -77,7 +77,7 @@ class Lidar:
         if self.field_of_view > 360.0:
             raise ValueError(f"field_of_view must be at most 360 degrees, got {field_of_view}")
         self.dropout = check_share("dropout", dropout)
-        rays = sectors * self.rays_per_sector
+        rays = check_count("sectors * rays_per_sector", self.sectors * self.rays_per_sector)
         self.angles = math.radians(self.field_of_view) * (0.5 - (np.arange(rays) + 0.5) / rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
         room = world.room

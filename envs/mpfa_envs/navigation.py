@@ -14,7 +14,7 @@ from gymnasium.utils import seeding
 
 from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.checks import check_count
+from mpfa_envs.checks import check_seed
 from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
 from mpfa_envs.episodes import draw_episode, keeping
 from mpfa_envs.live_view import RenderMode
@@ -245,7 +245,7 @@ class NavigationEnv(TaskArguments, gymnasium.Env["NDArray[np.float32]", "NDArray
                 the episode goes on then.
         """
         if seed is not None:
-            seed = check_count("seed", seed, least=0)
+            seed = check_seed(seed)
         task = self.check_task(options) if options else None
         source = (self.np_random, self.np_random_seed) if seed is None else seeding.np_random(seed)
         with keeping(source[:1]):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, get_args
 
 import numpy as np
+
+from mpfa_envs.checks import check_count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -64,13 +66,18 @@ def observation_slices(
     Returns:
         Where each part lies, in order.
 
+    Raises:
+        ValueError: If an argument is out of its range.
+
     Examples:
         >>> from mpfa_envs import observation_slices
         >>> observation_slices()["goal_direction"]
         slice(18, 20, None)
     """
+    if memory not in get_args(Memory):
+        raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")
     widths = {
-        "lidar": sectors,
+        "lidar": check_count("sectors", sectors),
         "goal_direction": 2,
         "goal_closeness": 1,
         "goal_distance": 1,
@@ -79,8 +86,8 @@ def observation_slices(
     }
     if memory == "map":
         widths.update({"way_direction": 2, "way_length": 1})
-    if history:
-        widths["lidar_history"] = sectors * history
+    if check_count("history", history, least=0):
+        widths["lidar_history"] = check_count("sectors * history", sectors * history)
     slices, first = {}, 0
     for name, width in widths.items():
         slices[name] = slice(first, first + width)

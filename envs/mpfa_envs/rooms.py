@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from mpfa_envs.checks import check_count
+from mpfa_envs.checks import check_seed
 from mpfa_envs.live_view import LiveView, RenderMode
 from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.vector import VectorNavigationEnv
@@ -107,7 +107,7 @@ class RoomsEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float3
         """
         given = self._read(options or {})
         if seed is not None:
-            seed = check_count("seed", seed, least=0)
+            seed = check_seed(seed)
         observations, infos = self.robots.reset(
             seed=None if seed is None else [seed], options=given
         )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.checks import check_count
+from mpfa_envs.checks import check_count, check_seed
 from mpfa_envs.path import grid_for, is_small, planner_for, shortest_length
 from mpfa_envs.robot import (
     PAPER_CLEARANCE,
@@ -294,7 +294,7 @@ def evaluation_pairs(
         True
     """
     check_count("n", n)
-    check_count("seed", seed, least=0)
+    check_seed(seed)
     world = resolve_world(world)
     robot = resolve_robot(robot)
     # Not the distance of training: settings may change it, and the tasks must stay the same.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.checks import check_count
+from mpfa_envs.checks import check_seed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -135,9 +135,9 @@ def read_seed(
     if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
         if len(seed) != robots:
             raise ValueError(f"seed must have {robots} entries, got {len(seed)}")
-        checked = [None if one is None else check_count("seed", one, least=0) for one in seed]
+        checked = [None if one is None else check_seed(one) for one in seed]
         return [None if one is None else np.random.default_rng(one) for one in checked]
-    return spawn_generators(np.random.SeedSequence(check_count("seed", seed, least=0)), robots)
+    return spawn_generators(np.random.SeedSequence(check_seed(seed)), robots)
 
 
 def spawn_generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:

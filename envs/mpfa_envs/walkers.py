@@ -20,6 +20,8 @@ MOST_WAYPOINTS: Final = 100
 """No walker has more waypoints."""
 FASTEST: Final = 5.0
 """No walker is faster [m/s]."""
+_NARROWEST: Final = 0.01
+"""No walker is thinner [m]: it moves by its radius at a time, lest it get through a thin wall."""
 PERSONAL_SPACE: Final = 0.5
 """A robot that comes nearer to a walker, rim to rim, is in its personal space [m]."""
 FAR: Final = 10.0
@@ -37,7 +39,7 @@ class Walker:
     Where it starts is drawn in every episode, by the robot's seed.
 
     Args:
-        radius: Radius [m].
+        radius: Radius [m], at least 0.01.
         speed: Speed [m/s], at most 5.
         behavior: ``"straight"``: from anywhere in any direction, straight ahead until it meets a
             wall, an obstacle or another walker, off which it bounces. ``"waypoints"``: from one
@@ -67,8 +69,8 @@ class Walker:
     waypoints: tuple[Point, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (all_finite((self.radius,)) and self.radius > 0.0):
-            raise ValueError(f"radius must be a positive number, got {self.radius!r}")
+        if not (all_finite((self.radius,)) and self.radius >= _NARROWEST):
+            raise ValueError(f"radius must be at least {_NARROWEST} m, got {self.radius!r}")
         if not (all_finite((self.speed,)) and 0.0 < self.speed <= FASTEST):
             raise ValueError(f"speed must be above 0 and at most {FASTEST:g}, got {self.speed!r}")
         if self.behavior not in get_args(Behavior):

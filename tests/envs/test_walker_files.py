@@ -26,7 +26,7 @@ def test_a_world_with_walkers_comes_back_equal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ("{radius: -1}", "busy.yaml:3: radius must be a positive number, got -1.0"),
+        ("{radius: -1}", "busy.yaml:3: radius must be at least 0.01 m, got -1.0"),
         ("{speed: fast}", "busy.yaml:3: speed must be a number .*got 'fast'"),
         ("{behaviour: straight}", "busy.yaml:3: unknown key 'behaviour'.*did you mean 'behavior'"),
         ("{behavior: [1]}", r"busy.yaml:3: behavior must be text"),
@@ -46,11 +46,12 @@ def test_a_bad_walker_in_a_file_is_named_with_its_line(
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Walker(radius=0.0), "radius must be a positive number, got 0.0"),
-        (lambda: Walker(radius=math.nan), "radius must be a positive number, got nan"),
+        (lambda: Walker(radius=0.0), "radius must be at least 0.01 m, got 0.0"),
+        (lambda: Walker(radius=1e-9), "radius must be at least 0.01 m, got 1e-09"),
+        (lambda: Walker(radius=math.nan), "radius must be at least 0.01 m, got nan"),
         (lambda: Walker(speed=0.0), "speed must be above 0 and at most 5, got 0.0"),
         (lambda: Walker(speed=9.0), "speed must be above 0 and at most 5, got 9.0"),
-        (lambda: Walker(radius="wide"), "radius must be a positive number, got 'wide'"),
+        (lambda: Walker(radius="wide"), "radius must be at least 0.01 m, got 'wide'"),
         (lambda: Walker(speed=None), "speed must be above 0 and at most 5, got None"),
         (lambda: Walker(behavior="orca", waypoints=3), "waypoints must be a list of .*got 3"),
         (lambda: Walker(behavior="orca", waypoints=(1, 2)), r"waypoints must be .*got \(1, 2\)"),

@@ -121,8 +121,6 @@ class Card:
             raise ValueError(f"lidar.field_of_view must be at most 360, got {card.field_of_view}")
         if card.reduction not in _REDUCTIONS:
             raise ValueError(f"lidar.reduction must be one of {_REDUCTIONS}: {card.reduction!r}")
-        if card.memory not in ("none", "map"):
-            raise ValueError(f"memory must be 'none' or 'map', got {card.memory!r}")
         if card.action_size != 2:
             raise ValueError(f"action.size must be 2, a left and a right wheel: {card.action_size}")
         if card.observation_size != card._sensed:

@@ -111,9 +111,8 @@ def world_seed(split: Split, index: int) -> int:
     splits = get_args(Split)
     if split not in splits:
         raise ValueError(f"split must be one of {splits}, got {split!r}")
-    if check_count("index", index, least=0) >= _SPLIT_SIZE:
-        raise ValueError(f"index must be below {_SPLIT_SIZE}, got {index}")
-    return splits.index(split) * _SPLIT_SIZE + int(index)
+    number = check_count("index", index, least=0, most=_SPLIT_SIZE - 1)
+    return splits.index(split) * _SPLIT_SIZE + number
 
 
 def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> World:
@@ -142,8 +141,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         True
     """
     generator = _generator(name)
-    if check_count("seed", seed, least=0) >= len(get_args(Split)) * _SPLIT_SIZE:
-        raise ValueError(f"seed must be below {len(get_args(Split)) * _SPLIT_SIZE}, got {seed}")
+    check_count("seed", seed, least=0, most=len(get_args(Split)) * _SPLIT_SIZE - 1)
     if difficulty is not None:
         difficulty = check_share("difficulty", difficulty)
     for attempt in range(_ATTEMPTS):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.checks import check_count, check_number, check_positive, check_seed, check_share
 from mpfa_envs.planners.search import centers
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class AntColony:
         self.evaporation = check_share("evaporation", evaporation)
         self.greed = check_number("greed", greed)
         self.least_pheromone = check_share("least_pheromone", least_pheromone)
-        self.seed = check_count("seed", seed, least=0)
+        self.seed = check_seed(seed)
         self.time_limit = check_positive("time_limit", time_limit)
 
     def __call__(self, grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:

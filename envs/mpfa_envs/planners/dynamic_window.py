@@ -111,8 +111,8 @@ class DynamicWindow:
         )
         """By how much a wheel's speed can change until the next decision [m/s]."""
         self.length = check_positive("length", length)
-        self.sectors = check_count("sectors", sectors)
-        self._parts = observation_slices(self.sectors, memory=memory)
+        self._parts = observation_slices(sectors, memory=memory)
+        self.sectors = sectors
         self.observation_size = max(part.stop for part in self._parts.values())
         angles = math.pi * (0.5 - (np.arange(self.sectors) + 0.5) / self.sectors)
         self._directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.checks import check_count, check_positive
+from mpfa_envs.checks import check_count, check_positive, check_seed
 from mpfa_envs.deploy.card import check_finite
 from mpfa_envs.deploy.sectors import Scan
 from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
@@ -78,7 +78,7 @@ class SimulatedRobot:
         )
         self._lidar.angles = np.linspace(first, last, rays)
         self._timeout = check_positive("command_timeout", command_timeout)
-        self._rng = np.random.default_rng(check_count("seed", seed, least=0))
+        self._rng = np.random.default_rng(check_seed(seed))
         self._drive: Drive = (
             KinematicDrive(self.robot, time_step=self.time_step)
             if physics == "kinematic"
