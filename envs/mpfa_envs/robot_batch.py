@@ -233,6 +233,16 @@ class RobotBatch:
         plain, given = (read_list(state, name, len(self.tasks)) for name in ("worlds", "tasks"))
         worlds = [world_from_plain(each) for each in plain]
         tasks = [None if task is None else read_task(task) for task in given]
+        fields = None if self._fields is None else FieldBatch(len(tasks))
+        for index, (world, task) in enumerate(zip(worlds, tasks, strict=True)):
+            places = [values["motions"][index, :2], values["goals"][index]]
+            places += [] if task is None else [task.start[:2], task.goal]
+            if not (np.abs(places) <= np.divide(world.size, 2)).all():
+                raise ValueError(
+                    f"tasks, motions and goals of the state must lie in {world.room}, got {places}"
+                )
+            if task is not None and fields is not None:
+                fields[index] = distance_field(world, self._rules.collision_distance, task.goal)
         walkers = self.walkers.read(state.get("walkers", {}), worlds)
         drives = self.drives.read(state.get("drives", {}))
         # The compiled loops write a trail at the number of its steps.
@@ -247,17 +257,13 @@ class RobotBatch:
         self.trails[:, : last + 1] = trails
         for name, array in arrays.items():
             array[...] = values[name]
-        self.tasks = tasks
+        self.tasks, self._fields = tasks, fields
         starts = np.zeros((len(tasks), 3))
         for index, (world, task) in enumerate(zip(worlds, tasks, strict=True)):
             self.worlds[index] = world
-            if task is None:
-                continue
-            x, y, heading = task.start
-            starts[index] = x, y, math.remainder(heading, math.tau)
-            if self._fields is not None:
-                distance = self._rules.collision_distance
-                self._fields[index] = distance_field(world, distance, task.goal)
+            if task is not None:
+                x, y, heading = task.start
+                starts[index] = x, y, math.remainder(heading, math.tau)
         self.walkers.load(walkers)
         self.drives.load(drives, starts, self.episodes.motions.copy())
 

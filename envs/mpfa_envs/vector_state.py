@@ -113,11 +113,13 @@ def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArr
         A copy of it.
 
     Raises:
-        ValueError: If it is missing or of another shape.
+        ValueError: If it is missing, of another shape, or not finite.
     """
     values = np.array(state.get(name), dtype=like.dtype if name in state else object)
     if values.shape != like.shape:
         raise ValueError(f"{name} of the state must have shape {like.shape}, got {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} of the state must be finite numbers")
     return values
 
 
@@ -163,6 +165,6 @@ def read_generators(states: object, robots: int, *, begun: bool) -> list[np.rand
     for generator, state in zip(generators, states, strict=True):
         try:
             generator.bit_generator.state = state
-        except (TypeError, ValueError, KeyError) as error:
+        except (TypeError, ValueError, KeyError, OverflowError) as error:
             raise ValueError(f"rngs of the state must be of PCG64, got {state!r}") from error
     return generators

@@ -193,8 +193,6 @@ class WalkerBatch:
             "targets": np.zeros((len(worlds), *most), dtype=np.int64),
         }
         found = {name: read_array(state, name, like) for name, like in likes.items()}
-        if not np.isfinite(found["states"]).all():
-            raise ValueError("states of the state must be finite numbers")
         for world, targets in zip(worlds, found["targets"], strict=True):
             for walker, target in zip(world.walkers, targets.tolist(), strict=False):
                 # The compiled loops do not look where an array ends.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -124,8 +125,8 @@ def without(*keys: str) -> Callable[[dict[str, Any]], None]:
     return spoil
 
 
-def with_value(value: object, *keys: str) -> Callable[[dict[str, Any]], None]:
-    def spoil(state: dict[str, Any]) -> None:
+def with_value(value: object, *keys: str | int) -> Callable[[dict[str, Any]], None]:
+    def spoil(state: Any) -> None:
         *way, last = keys
         for key in way:
             state = state[key]
@@ -157,6 +158,17 @@ def with_value(value: object, *keys: str) -> Callable[[dict[str, Any]], None]:
         (with_value([1], "source", "left"), "left of the state must have 2 entries, got 1"),
         (with_value([-1, 0], "source", "left"), "left must be an integer of at least 0, got -1"),
         (with_value([None], "source", "worlds"), "worlds of the state must have 2 entries"),
+        (with_value([2**70, 0], "source", "left"), "left must be at most 100000, got"),
+        (with_value(np.full((2, 5), np.nan), "batch", "motions"), "motions .* must be finite"),
+        (with_value(np.full((2, 2), np.inf), "batch", "goals"), "goals .* must be finite"),
+        (with_value(np.full((2, 2), 9.0), "batch", "goals"), "must lie in Box.*got .*9"),
+        (
+            with_value(np.full((2, 5), 1e300), "batch", "motions"),
+            r"must lie in Box.*got .*1\.e\+300",
+        ),
+        (with_value([((0, 0, 0), (0, 9))] * 2, "batch", "tasks"), "must lie in Box.*got .*9"),
+        (with_value([((0, math.nan, 0), (0, 0))] * 2, "batch", "tasks"), "must lie in Box.*nan"),
+        (with_value(-1, "rngs", 0, "state", "inc"), "rngs of the state must be of PCG64"),
         (with_value([2, 0], "source", "left"), "worlds .* hold a world wherever left is not 0"),
     ],
 )
@@ -174,6 +186,35 @@ def test_what_is_no_state_of_this_environment_is_refused(
     with pytest.raises(ValueError, match=message):
         env.load_state_dict(state)
     assert drive(env, 8, 40) == drive(twin, 8, 40)
+
+
+@pytest.mark.parametrize("name", ["commands", "kept", "scales", "poses", "odometry"])
+def test_noise_that_is_no_number_is_refused(name: str) -> None:
+    env = VectorNavigationEnv(
+        2, world="B", physics="kinematic", noise={"slip": 0.1, "latency": 1, "drift": 0.1}
+    )
+    env.reset(seed=0)
+    state = env.state_dict()
+    state["batch"][f"noise_{name}"][1] = np.nan
+    with pytest.raises(ValueError, match=f"noise_{name} of the state must be finite numbers"):
+        env.load_state_dict(state)
+
+
+def test_a_state_whose_ways_cannot_be_measured_is_refused_before_anything_changes() -> None:
+    env, other = (
+        VectorNavigationEnv(2, world="rooms", physics="kinematic", progress="shortest_path")
+        for _ in range(2)
+    )
+    env.reset(seed=1)
+    other.reset(seed=2)
+    state = env.state_dict()
+    full = World(name="full", boxes=(Box(-5.0, -5.0, 5.0, 5.0),))
+    state["batch"]["worlds"][1] = world_to_plain(full)
+    poses, worlds, tasks = other.poses, other.worlds, other.tasks
+    with pytest.raises(ValueError, match="'full' has none"):
+        other.load_state_dict(state)
+    np.testing.assert_array_equal(other.poses, poses)
+    assert (other.worlds, other.tasks) == (worlds, tasks)
 
 
 def test_wheels_stay_where_they_are_without_what_they_have_driven() -> None:
