@@ -1,0 +1,73 @@
+"""Where one thing ends and the next begins: a reset of some, last steps, exact distances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpfa_envs import Box, NavigationEnv, Task, VectorNavigationEnv, World
+from mpfa_envs.plain_worlds import world_to_plain
+
+
+def test_the_seed_of_a_reset_is_that_of_the_robots_that_it_starts() -> None:
+    env, twin = (VectorNavigationEnv(2, world="B", physics="kinematic") for _ in range(2))
+    first, second = np.array([True, False]), np.array([False, True])
+    env.reset(seed=0)
+    twin.reset(seed=0)
+    env.reset(seed=9, options={"reset_mask": first})
+    for each in (env, twin):
+        each.reset(options={"reset_mask": second})
+    assert env.tasks[1] == twin.tasks[1]
+    assert env.tasks[0] != twin.tasks[0]
+
+
+def test_a_world_that_replaces_one_without_a_task_is_kept_for_as_many_episodes() -> None:
+    env = VectorNavigationEnv(1, world="clutter", physics="kinematic", episodes_per_world=3)
+    env.reset(seed=0)
+    state = env.state_dict()
+    full = World(name="full", boxes=(Box(-5.0, -5.0, 5.0, 5.0),))
+    state["source"].update(worlds=[world_to_plain(full)], left=[1])
+    env.load_state_dict(state)
+    names = []
+    for _ in range(4):
+        env.reset()
+        names.append(env.worlds[0].name)
+    assert len(set(names[:3])) == 1 and names[3] != names[0]
+
+
+@pytest.mark.parametrize("many", [True, False])
+def test_a_goal_that_is_reached_in_the_last_time_step_is_no_time_limit(many: bool) -> None:
+    task = Task((0.0, 0.0, 0.0), (2.02, 0.0))
+    ends = []
+    for max_steps in (500, 31, 30):  # The goal is 1.52 m away, and a step is 0.05 m.
+        arguments: dict[str, Any] = {"physics": "kinematic", "max_steps": max_steps}
+        if many:
+            env: Any = VectorNavigationEnv(1, **arguments)
+            env.reset(options={"tasks": [task]})
+        else:
+            env = NavigationEnv(**arguments)
+            env.reset(options=task._asdict())
+        ended = truncated = False
+        while not (ended or truncated):
+            _, _, ended, truncated, info = env.step(np.ones((1, 2)) if many else np.ones(2))
+        ends.append((bool(ended), bool(truncated), bool(np.all(info["success"]))))
+    assert ends == [(True, False, True), (True, False, True), (False, True, False)]
+
+
+@pytest.mark.parametrize("many", [True, False])
+def test_a_robot_at_the_very_collision_distance_has_collided(many: bool) -> None:
+    arguments: dict[str, Any] = {
+        "physics": "kinematic", "time_step": 0.125, "action_repeat": 1, "collision_distance": 0.25
+    }  # fmt: skip
+    task = Task((4.0, 0.0, 0.0), (-4.0, 0.0))  # A step is 1/16 m: 12 of them are exact.
+    if many:
+        env: Any = VectorNavigationEnv(1, **arguments)
+        env.reset(options={"tasks": [task]})
+    else:
+        env = NavigationEnv(**arguments)
+        env.reset(options=task._asdict())
+    ended = [env.step(np.ones((1, 2)) if many else np.ones(2))[2] for _ in range(12)]
+    assert env._batch.episodes.motions[0, 0] == 4.75 if many else env.trail[-1] == (4.75, 0.0)
+    assert [bool(each) for each in ended] == [False] * 11 + [True]
