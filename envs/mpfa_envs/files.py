@@ -23,7 +23,7 @@ def read_file(path: Path, most: int) -> bytes:
         OSError: If it is missing, not a regular file, too large, or cannot be read.
     """
     if not stat.S_ISREG(path.stat().st_mode):
-        raise OSError(f"{path} is not a regular file")
+        raise OSError("it is not a regular file")
     with path.open("rb") as file:
         content = file.read(most + 1)
     if len(content) > most:

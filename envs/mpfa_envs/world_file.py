@@ -268,10 +268,10 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
     if world.walkers:
         content["walkers"] = [walker_to_plain(walker) for walker in world.walkers]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
-    path, content = Path(path), text.encode()
+    path, encoded = Path(path), text.encode()
     try:
-        _Reader(path).world(parse_nodes(content, path))
+        _Reader(path).world(parse_nodes(encoded, path))
     except WorldFileError as error:
         raise ValueError(f"world must be one that can be loaded again: {error}") from error
     check_replaceable(path, load_world, "world", overwrite=overwrite)
-    write_atomically(content, path)
+    write_atomically(encoded, path)
