@@ -181,7 +181,7 @@ def save_policy(policy: Policy, path: str | os.PathLike[str], *, overwrite: bool
     packed = io.BytesIO()
     text = json.dumps(about, indent=1).encode()
     np.savez(packed, allow_pickle=False, **{_ABOUT: np.frombuffer(text, np.uint8)}, **arrays)
-    check_replaceable(file, load_policy, "policy", overwrite=overwrite)
+    check_replaceable(file, _load, "policy", overwrite=overwrite)
     write_atomically(packed.getvalue(), file)
     return file
 
@@ -205,6 +205,11 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
         from mpfa_envs.onnx_policy import OnnxPolicy
 
         return OnnxPolicy(file)
+    return _load(file)
+
+
+def _load(file: Path) -> Policy:
+    """Read a policy that :func:`save_policy` wrote."""
     try:
         return _read(read_file(file, _LARGEST))
     except FileNotFoundError:

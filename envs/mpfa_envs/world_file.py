@@ -68,6 +68,11 @@ def load_world(path: str | os.PathLike[str]) -> World:
     return _Reader(path).world(root)
 
 
+def _load(path: Path) -> World:
+    """Read a world that is no map, which another function writes."""
+    return _Reader(path).world(read_nodes(path))
+
+
 class _Reader(NodeReader):
     """Turns the nodes of one file into a world."""
 
@@ -273,5 +278,5 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
         _Reader(path).world(parse_nodes(encoded, path))
     except WorldFileError as error:
         raise ValueError(f"world must be one that can be loaded again: {error}") from error
-    check_replaceable(path, load_world, "world", overwrite=overwrite)
+    check_replaceable(path, _load, "world", overwrite=overwrite)
     write_atomically(encoded, path)

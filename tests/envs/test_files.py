@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from mpfa_envs.deploy.card import CardError, read_exported
 from mpfa_envs.layers import Linear
 
 POLICY = Policy([Linear(np.ones((2, 24), np.float32), np.zeros(2, np.float32))])
+TEXT = "root:x:0:0:root:/root:/bin/bash\n"
 MAP = "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
 
 
@@ -65,25 +67,27 @@ def test_what_may_never_end_is_not_read(
 
 
 @pytest.mark.parametrize(
-    ("name", "save", "what"),
+    ("name", "content", "save", "what"),
     [
-        ("policy.npz", lambda path, **options: save_policy(POLICY, path, **options), "policy"),
-        ("b.yaml", lambda path, **options: save_world(WORLDS["B"], path, **options), "world"),
+        ("policy.npz", TEXT, partial(save_policy, POLICY), "policy"),
+        ("policy.onnx", TEXT, partial(save_policy, POLICY), "policy"),
+        ("b.yaml", TEXT, partial(save_world, WORLDS["B"]), "world"),
+        ("b.yaml", f"{MAP}free_thresh: 0.196\n", partial(save_world, WORLDS["B"]), "world"),
     ],
 )
 def test_nothing_but_its_own_kind_is_replaced_unless_that_is_asked_for(
-    name: str, save: Callable[..., object], what: str, tmp_path: Path
+    name: str, content: str, save: Callable[..., object], what: str, tmp_path: Path
 ) -> None:
     path = tmp_path / name
-    path.write_text("root:x:0:0:root:/root:/bin/bash\n")
+    path.write_text(content)
     with pytest.raises(FileExistsError, match=f"path must be free or hold a {what} unless overw"):
         save(path)
-    assert path.read_text() == "root:x:0:0:root:/root:/bin/bash\n"
+    assert path.read_text() == content
     assert [each.name for each in tmp_path.iterdir()] == [name]
     save(path, overwrite=True)
-    before = path.stat().st_mtime_ns, path.read_bytes()
+    written = path.read_bytes()
     save(path)
-    assert path.read_bytes() == before[1]
+    assert path.read_bytes() == written != content.encode()
 
 
 def test_a_link_to_nothing_is_not_replaced(tmp_path: Path) -> None:
