@@ -385,7 +385,7 @@ class TrainingRun:
             "log": self.log.state_dict(),
         }
         save_atomically(state, self.folder / files.CHECKPOINT)
-        save_policy(self._exported(), self.folder / files.POLICY)
+        save_policy(self._exported(), self.folder / files.POLICY, overwrite=True)
         write_table(as_table(self.records, EpisodeRecord), self.folder / files.EPISODES)
         if self.evaluations:
             table = as_table(self.evaluations, EvaluationRecord)

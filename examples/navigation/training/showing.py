@@ -47,7 +47,7 @@ def show_policy(
     if settings.tracking.pictures_every is None or not tracker.shows:
         return 0.0
     begun, wanted = time.perf_counter(), settings.evaluation
-    save_policy(policy, folder / files.POLICY)
+    save_policy(policy, folder / files.POLICY, overwrite=True)
     drives = drive(
         policy, wanted.world, episodes=wanted.episodes, seed=SEED, physics=None, progress=False
     )
