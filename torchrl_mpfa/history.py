@@ -43,7 +43,7 @@ class ReplayHistory:
         ['priority', 'reward', 'weight']
     """
 
-    def __init__(self, *, bins: int = 8) -> None:
+    def __init__(self, *, bins: int = 24) -> None:
         check_counts(bins=bins)
         count = round(np.log10(_HIGH / _LOW)) * bins
         self.edges: Any = np.geomspace(_LOW, _HIGH, count + 1)

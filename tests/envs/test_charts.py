@@ -31,8 +31,6 @@ def test_a_band_is_the_interval_of_the_mean_of_runs() -> None:
     np.testing.assert_allclose(mean, values.mean(0))
     np.testing.assert_allclose(low, expected.low)
     np.testing.assert_allclose(high, expected.high)
-    _, _, low, high = seed_band([(STEPS, each) for each in values], band="range")
-    np.testing.assert_array_equal((low, high), (values.min(0), values.max(0)))
 
 
 def test_a_mean_ends_with_the_shortest_run_and_begins_with_the_last_one() -> None:
@@ -51,8 +49,8 @@ def test_the_median_of_the_runs_is_marked_on_the_level(tmp_path: Path) -> None:
     steps = np.arange(0, 101)
     curves = [(steps, (steps >= at) * 1.0) for at in (20, 50, 80)]
     path = tmp_path / "seeds.png"
-    plot_seeds({"one": curves}, path, band="range")
-    plot_seeds({"one": curves}, tmp_path / "plain.png", band="range", level=None)
+    plot_seeds({"one": curves}, path)
+    plot_seeds({"one": curves}, tmp_path / "plain.png", level=None)
     marks = colored(path, LINES[0]) & ~colored(tmp_path / "plain.png", LINES[0], spread=60)
     rows, columns = np.nonzero(marks[: marks.shape[0] // 3])
     # Ticks of three runs and the triangle of the median, on the line at nine tenths.
@@ -61,6 +59,21 @@ def test_the_median_of_the_runs_is_marked_on_the_level(tmp_path: Path) -> None:
     groups = 1 + (np.diff(np.unique(columns)) > 0.1 * width).sum()
     assert groups == 3
     assert abs(np.median(columns) / width - 0.54) < 0.06
+
+
+def test_of_a_few_runs_each_is_a_line_and_no_band_fills_the_panel(tmp_path: Path) -> None:
+    curves = [(STEPS, np.full(11, height)) for height in (0.2, 0.5, 0.8)]
+    inks = {}
+    for band in ("interval", "runs"):
+        plot_seeds({"one": curves}, tmp_path / "seeds.png", band=band, level=None)
+        with Image.open(tmp_path / "seeds.png") as picture:
+            panel = np.asarray(picture.convert("RGB"))[50:400, 300:500].astype(int)
+        inks[band] = (panel.max(-1) - panel.min(-1) > 10).any(1)
+    # The interval of the mean of three fills the panel; its lines are at three heights.
+    assert inks["interval"].all()
+    assert 1 + (np.diff(np.flatnonzero(inks["runs"])) > 1).sum() == 3
+    with pytest.raises(ValueError, match="band must be 'interval' or 'runs', got 'range'"):
+        plot_seeds({"one": curves}, tmp_path / "no.png", band="range")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

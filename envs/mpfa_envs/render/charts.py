@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 Curve = tuple[Any, Any]
 """Steps and values of one run, each of shape ``[T]``."""
-Band = Literal["interval", "range"]
-"""What surrounds a mean: its 95 % interval for other runs, or all runs."""
+Band = Literal["interval", "runs"]
+"""What surrounds a mean: its 95 % interval for other runs, or each run."""
 
 _LEVEL = 0.95
 
@@ -39,7 +39,7 @@ def plot_seeds(
     limits: tuple[float, float] | None = (0.0, 1.0),
     title: str = "",
 ) -> None:
-    """Plot the mean of runs with a band around it, and when each first reached a level.
+    """Plot the mean of runs and what surrounds it, and when each first reached a level.
 
     The mean goes to the end of the shortest run. On the line of the level, a tick marks the step at
     which a run first reached it, a triangle the median of all runs, if at least half of them did;
@@ -51,8 +51,8 @@ def plot_seeds(
         xlabel: What steps are.
         ylabel: What values are.
         level: The level; None: no marks.
-        band: ``"interval"``: Student's 95 % interval of the mean; ``"range"``: from the lowest to
-            the highest run. A single run has neither.
+        band: ``"interval"``: Student's 95 % interval of the mean; ``"runs"``: each run as a thin
+            line, for so few of them that an interval says little. A single run has neither.
         limits: What values lie within, which cuts the band; None: anything.
         title: Of the chart.
 
@@ -67,6 +67,8 @@ def plot_seeds(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     plot_seeds(runs, f"{folder}/seeds.png")
     """
+    if band not in ("interval", "runs"):
+        raise ValueError(f"band must be 'interval' or 'runs', got {band!r}")
     figure, axes = new_figure()
     draw_seeds(axes[0], runs, level=level, band=band, limits=limits)
     axes[0].set(xlabel=xlabel, ylabel=ylabel, title=title)
@@ -100,11 +102,13 @@ def draw_seeds(
         if not curves:
             continue
         style = look(number if places is None else places[name])
-        steps, mean, low, high = seed_band(curves, band=band)
+        steps, mean, low, high = seed_band(curves)
         if limits is not None:
             low, high = low.clip(*limits), high.clip(*limits)
-        if len(curves) > 1:
+        if len(curves) > 1 and band == "interval":
             axis.fill_between(steps, low, high, color=style["color"], alpha=0.18, lw=0)
+        for curve in curves if len(curves) > 1 and band == "runs" else ():
+            axis.plot(*curve, **style, lw=0.8, alpha=0.5)
         label = name if len(curves) == 1 else f"{name} ({len(curves)})"
         if level is not None:
             median = _mark_level(axis, [first_step(each, level) for each in curves], level, style)
@@ -117,14 +121,11 @@ def draw_seeds(
     axis.legend(frameon=False)
 
 
-def seed_band(
-    curves: Sequence[Curve], *, band: Band = "interval"
-) -> tuple[Array, Array, Array, Array]:
-    """Steps, mean and the two ends of the band of some runs, each of shape ``[T]``.
+def seed_band(curves: Sequence[Curve]) -> tuple[Array, Array, Array, Array]:
+    """Steps, mean and the ends of its 95 % interval of some runs, each of shape ``[T]``.
 
     Args:
         curves: Steps and values of each run.
-        band: As in :func:`plot_seeds`.
 
     Returns:
         At all steps of all runs to the end of the shortest, from the latest beginning.
@@ -137,8 +138,6 @@ def seed_band(
         >>> steps.tolist(), mean.tolist()
         ([0.0, 2.0, 4.0], [1.0, 2.0, 3.0])
     """
-    if band not in ("interval", "range"):
-        raise ValueError(f"band must be 'interval' or 'range', got {band!r}")
     checked = [_checked(curve) for curve in curves]
     first = max(steps[0] for steps, _ in checked)
     last = min(steps[-1] for steps, _ in checked)
@@ -146,8 +145,8 @@ def seed_band(
     steps = steps[(steps >= first) & (steps <= last)]
     values = np.stack([np.interp(steps, *each) for each in checked])
     mean = values.mean(axis=0)
-    if band == "range" or len(values) == 1:
-        return steps, mean, values.min(axis=0), values.max(axis=0)
+    if len(values) == 1:
+        return steps, mean, mean, mean
     count = len(values)
     reach = stats.t.ppf(0.5 + _LEVEL / 2, count - 1) / math.sqrt(count) * values.std(axis=0, ddof=1)
     return steps, mean, mean - reach, mean + reach
@@ -185,13 +184,13 @@ def plot_histograms(
     histories: Mapping[str, tuple[Any, Any, Any]],
     path: str | os.PathLike[str],
     *,
-    columns: int = 3,
+    columns: int = 2,
     xlabel: str = "actions",
 ) -> None:
     """Plot how the distribution of some numbers changes with time, a panel each.
 
-    The darker a place, the larger the share of the numbers there at that time; the line is their
-    median. Bins are on a logarithmic scale.
+    The darker a place, the larger the share of the numbers there at that time; darkest is what only
+    one place in a hundred exceeds. The line is their median. Bins are on a logarithmic scale.
 
     Args:
         histories: Steps ``[T]``, edges of the bins ``[E + 1]`` and counts ``[T, E]`` of each kind
@@ -220,7 +219,7 @@ def plot_histograms(
         if np.shape(counts) != shape or 0 in shape:
             raise ValueError(f"counts of {name!r} must have shape {shape}, got {np.shape(counts)}")
     columns = min(columns, len(histories))
-    figure, axes = new_figure(-(-len(histories) // columns), columns, panel=(4.6, 2.7))
+    figure, axes = new_figure(-(-len(histories) // columns), columns, panel=(3.6, 2.5))
     from matplotlib.colors import LinearSegmentedColormap
 
     paled = LinearSegmentedColormap.from_list(
@@ -230,13 +229,19 @@ def plot_histograms(
         times = np.asarray(steps, dtype=np.float64)
         shares = np.asarray(counts, dtype=np.float64)
         shares = shares / np.maximum(shares.sum(axis=1, keepdims=True), 1.0)
-        heat = axis.pcolormesh(_ends(times), edges, shares.T, cmap=paled, vmin=0.0, rasterized=True)
-        axis.plot(times, _medians(np.asarray(edges, dtype=np.float64), shares), color="black", lw=1)
+        # Many equal numbers would leave all others pale.
+        most = float(np.quantile(shares[shares > 0], 0.99)) if shares.any() else 1.0
+        heat = axis.pcolormesh(
+            _ends(times), edges, shares.T, cmap=paled, vmin=0.0, vmax=most, rasterized=True
+        )
+        medians = _medians(np.asarray(edges, dtype=np.float64), shares)
+        axis.plot(times, medians, color="black", lw=1)
         used = np.flatnonzero(shares.max(axis=0) > 1e-3)
-        axis.set(yscale="log", title=name, xlabel=xlabel)
+        axis.set(yscale="log", ylabel=name, xlabel=xlabel)
         axis.set_ylim(edges[used[0]], edges[used[-1] + 1])
         axis.xaxis.set_major_formatter(_thousands)
         figure.colorbar(heat, ax=axis, format=lambda share, _: f"{share:.0%}")
+    figure.suptitle("share of the buffer; line: median", fontsize="medium")
     for axis in axes[len(histories) :]:
         axis.remove()
     finish(figure, [], path)
