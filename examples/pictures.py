@@ -1,17 +1,17 @@
-"""Make the pictures of docs/pictures.md, from a run in ``regime=rooms`` and the policies here.
+"""Make the pictures of docs/pictures.md and of the README.
 
-    python examples/pictures.py RUN                      all of them
-    python examples/pictures.py RUN values episode       some
-    python examples/pictures.py RUN --output runs/pictures
+    python examples/pictures.py                            of the shipped policies and kept rows
+    python examples/pictures.py episode --output runs/new  some, elsewhere
+    python examples/pictures.py --run runs/pictures        those that need a critic as well
 
-RUN is the folder of a run with its checkpoint, which has the critic.
+``--run`` names the folder of a run with its checkpoint, which has the critic.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
-import math
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,20 +27,21 @@ from mpfa_envs import (
     load_policy,
     make_navigation_env,
     make_planner,
-    world_tasks,
 )
 from mpfa_envs.render import (
+    draw_seeds,
     film_episode,
-    plot_seeds,
     render_methods,
     render_samples,
     render_values,
     write_animation,
 )
+from mpfa_envs.render.charts import finish, new_figure
 from navigation import files
 from navigation.evaluating import Drivable, drive
-from navigation.pictures import Values, trajectories_of
-from navigation.records import read_table
+from navigation.pictures import Values, longest, trajectories_of
+from navigation.report.kept_rows import read_kept
+from navigation.report.study_rows import by_run
 from navigation.training.values import load_learner, values_of
 from torchrl_mpfa import (
     Learner,
@@ -51,60 +52,82 @@ from torchrl_mpfa import (
 
 ROOT = Path(__file__).parents[1]
 POLICIES = Path(__file__).parent / "policies"
+SHIPPED = POLICIES / "td3-mpfa_per-rooms.npz"
+"""What drives in the pictures that need no critic."""
 WORLD = "test"
 MAZE = "mazes:test"
+PHYSICS = "kinematic"
+_FRAMES, _SPEED = 140, 8.0
+"""Of the animation: pictures at most, and how many times as fast as real."""
+_LEARNED = (
+    ("C", "sparse", "sparse reward"),
+    ("B", "dense", "dense reward"),
+)
+"""Of the learning curves: table of the study, its reward, and title."""
 _ROBOTS, _STEPS, _UPDATES = 16, 400, 300
 """Of the buffer whose samples are seen."""
+_HOW: dict[str, Any] = {"seed": 0, "physics": PHYSICS, "progress": False}
 
 
 @dataclass
 class Run:
-    """What pictures are made of."""
+    """A run, and its critic."""
 
+    folder: Path
     policy: Policy
     learner: Learner
     values: Values
-    output: Path
-
-    def save(self, picture: Any, name: str) -> None:
-        """Write a picture with 256 colors, which is all that it needs."""
-        image = Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE)
-        image.save(self.output / f"{name}.png", optimize=True)
 
 
-def rooms(run: Run) -> None:
+def save(picture: Any, path: Path) -> None:
+    """Write a picture with 256 colors, which is all that it needs."""
+    image = Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE)
+    image.save(path, optimize=True)
+
+
+def rooms(output: Path) -> None:
     """Paths in nine rooms of different kinds."""
     kinds = ("rooms", "clutter", "bars", "fields", "mazes")
-    driven = [
-        drive(run.policy, f"{kind}:test", episodes=200, seed=0, physics="kinematic", progress=False)
-        for kind in kinds
-    ]
-    run.save(trajectories_of(driven), "rooms")
+    policy = load_policy(SHIPPED)
+    driven = [drive(policy, f"{kind}:test", episodes=200, **_HOW) for kind in kinds]
+    save(trajectories_of(driven), output / "rooms.png")
 
 
-def methods(run: Run) -> None:
+def methods(output: Path) -> None:
     """Paths of a policy of today, one of the paper's task, and a planner, side by side."""
     drivers: dict[str, Drivable] = {
-        "TD3, many rooms": run.policy,
+        "TD3, many rooms": load_policy(SHIPPED),
         "TD3, one map": load_policy(POLICIES / "td3-mpfa_per.npz"),
         "dynamic window": make_planner("dwa"),
     }
-    how: dict[str, Any] = {"episodes": 20, "seed": 0, "physics": "kinematic", "progress": False}
-    driven = {name: drive(each, WORLD, **how) for name, each in drivers.items()}
+    driven = {name: drive(each, WORLD, episodes=20, **_HOW) for name, each in drivers.items()}
     first = driven["TD3, many rooms"]
-    run.save(
-        render_methods(
-            first.tasks[0].world,
-            {name: each.trails for name, each in driven.items()},
-            [task.task.goal for task in first.tasks],
-            {name: [result.outcome for result in each.results] for name, each in driven.items()},
-            columns=3,
-        ),
-        "methods",
+    picture = render_methods(
+        first.tasks[0].world,
+        {name: each.trails for name, each in driven.items()},
+        [task.task.goal for task in first.tasks],
+        {name: [result.outcome for result in each.results] for name, each in driven.items()},
+        columns=3,
     )
+    save(picture, output / "methods.png")
 
 
-def values(run: Run) -> None:
+def filmed(policy: Policy) -> tuple[int, WorldTask]:
+    """Number and task of the animation: the longest of twenty in mazes that ends in the goal."""
+    return longest([drive(policy, MAZE, episodes=20, **_HOW)])
+
+
+def episode(output: Path) -> None:
+    """A drive through a maze of the test set to its goal, with lidar, map and trail."""
+    policy = load_policy(SHIPPED)
+    number, task = filmed(policy)
+    how: dict[str, Any] = {"traces": False, "seed": number, "physics": PHYSICS}
+    film = film_episode(policy, task, most=_FRAMES, **how)
+    path, time = output / "episode.gif", film.frame_time
+    write_animation(film.frames, path, frame_time=time, speed=_SPEED, most=_FRAMES + 1)
+
+
+def values(run: Run, output: Path) -> None:
     """Q and the actions all over the test world, all robots facing east."""
     picture = render_values(
         WORLD,
@@ -116,10 +139,10 @@ def values(run: Run) -> None:
         size=640,
         **run.policy.env_arguments,
     )
-    run.save(picture, "values")
+    save(picture, output / "values.png")
 
 
-def samples(run: Run) -> None:
+def samples(run: Run, output: Path) -> None:
     """Transitions, their priorities and what is sampled, over the test world."""
     buffer, positions = filled_buffer(run.policy)
     counts = np.zeros(len(positions))
@@ -130,7 +153,7 @@ def samples(run: Run) -> None:
         run.learner.update(batch)
         buffer.update_tensordict_priority(batch)
     priorities = buffer.sampler.priorities().numpy()
-    run.save(render_samples(WORLD, positions, priorities, counts), "samples")
+    save(render_samples(WORLD, positions, priorities, counts), output / "samples.png")
 
 
 def filled_buffer(policy: Policy) -> tuple[SignalReplayBuffer, Any]:
@@ -156,30 +179,33 @@ def filled_buffer(policy: Policy) -> tuple[SignalReplayBuffer, Any]:
     return buffer, positions
 
 
-def seeds(run: Run) -> None:
-    """Greedy success of three methods, three seeds each, of the kept runs."""
-    curves: dict[str, list[Any]] = {}
-    for file in sorted((ROOT / "docs" / "results").glob(f"ddpg-*/{files.EVALUATIONS}")):
-        found = read_table(file)
-        name = file.parent.name.rsplit("-", 1)[0]
-        curves.setdefault(name, []).append((found["total_steps"], found["success"]))
-    plot_seeds(curves, run.output / "seeds.png", ylabel="greedy success", band="range")
+def histograms(run: Run, output: Path) -> None:
+    """Signals, priorities and weights in the buffer of the run, as its training drew them."""
+    shutil.copy(run.folder / files.HISTOGRAMS, output / files.HISTOGRAMS)
 
 
-def episode(run: Run) -> None:
-    """The way through a maze of the test set, with lidar, trail, Q and speeds."""
-    task = longest_task(world_tasks(MAZE, episodes=20))
-    film = film_episode(run.policy, task, values=run.values)
-    write_animation(film.frames, run.output / "episode.gif", frame_time=film.frame_time, speed=4.0)
+def curves(output: Path) -> None:
+    """Greedy success of three methods while they learn, of the rows that are kept."""
+    names = {"uniform": "uniform replay", "per": "PER", "mpfa_per": "MPFA-PER"}
+    figure, axes = new_figure(1, 2, panel=(3.6, 3.0), sharey=True)
+    for axis, (table, reward, title) in zip(axes, _LEARNED, strict=True):
+        rows = read_kept(ROOT / "docs/results/study", table).curves
+        found: dict[str, list[Any]] = {name: [] for name in names.values()}
+        for arm, _, each in by_run(rows):
+            study, learner, method, *other = arm.split("/")
+            if (study, learner) == (reward, "td3") and method in names and not other:
+                found[names[method]].append((each["total_steps"], each["success"]))
+        draw_seeds(axis, found, limits=(0.0, 1.0))
+        axis.set(title=title, xlabel="actions")
+    axes[0].set_ylabel("goals reached in unseen rooms")
+    finish(figure, axes, output / "curves.png", dpi=192)
 
 
-def longest_task(tasks: Sequence[WorldTask]) -> WorldTask:
-    """The task whose goal is farthest from its start."""
-    return max(tasks, key=lambda each: math.dist(each.task.start[:2], each.task.goal))
-
-
-PICTURES: dict[str, Callable[[Run], None]] = {
-    each.__name__: each for each in (rooms, methods, values, samples, seeds, episode)
+OF_RUN: dict[str, Callable[[Run, Path], None]] = {
+    each.__name__: each for each in (values, samples, histograms)
+}
+OTHERS: dict[str, Callable[[Path], None]] = {
+    each.__name__: each for each in (episode, curves, rooms, methods)
 }
 
 
@@ -192,25 +218,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path, help="folder of a run")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"among {', '.join(PICTURES)}")
+    every = [*OTHERS, *OF_RUN]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"among {', '.join(every)}")
+    parser.add_argument("--run", type=Path, help=f"folder of a run, for {', '.join(OF_RUN)}")
     parser.add_argument("--output", type=Path, default=ROOT / "docs/images/pictures", help="folder")
     options = parser.parse_args(arguments)
-    if unknown := [name for name in options.names if name not in PICTURES]:
-        parser.error(f"there is no picture {unknown[0]!r}: choose from {', '.join(PICTURES)}")
+    if unknown := [name for name in options.names if name not in every]:
+        parser.error(f"there is no picture {unknown[0]!r}: choose from {', '.join(every)}")
+    if options.run is None and (without := [name for name in options.names if name in OF_RUN]):
+        parser.error(f"{without[0]} needs --run, the folder of a run with its critic")
     # TorchRL announces each storage.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    try:
-        policy = load_policy(options.run)
-        learner, settings = load_learner(options.run, policy)
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
+    run = None
+    if options.run is not None:
+        try:
+            policy = load_policy(options.run)
+            learner, settings = load_learner(options.run, policy)
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
+        run = Run(options.run, policy, learner, values_of(learner, policy, settings))
     options.output.mkdir(parents=True, exist_ok=True)
-    run = Run(policy, learner, values_of(learner, policy, settings), options.output)
-    for name in options.names or PICTURES:
-        PICTURES[name](run)
+    for name in options.names or (every if run else OTHERS):
+        if name in OTHERS:
+            OTHERS[name](options.output)
+        elif run is not None:
+            OF_RUN[name](run, options.output)
         print(f"made: {name}")
 
 

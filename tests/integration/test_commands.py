@@ -17,6 +17,7 @@ import compare
 import evaluate
 import export
 import gym_study
+import pictures
 import play
 import report
 import stable_baselines
@@ -48,6 +49,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "evaluate": evaluate.main,
     "export": export.main,
     "gym_study": gym_study.main,
+    "pictures": pictures.main,
     "play": play.main,
     "report": report.main,
     "stable_baselines": stable_baselines.main,
