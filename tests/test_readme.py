@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
 import pytest
+
+from mpfa_envs import load_policy
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -13,12 +16,17 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 @pytest.mark.filterwarnings("ignore:.*:DeprecationWarning")
-def test_the_first_code_trains_and_prints_the_weights(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_first_code_trains_and_prints_three_different_shares(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     names: dict[str, object] = {}
     exec(BLOCKS[0], names)
     assert names["learner"].updates == 40  # type: ignore[attr-defined]
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in ("reward", "td_error", "action_gradient"))
+    printed = ast.literal_eval(capsys.readouterr().out)
+    assert {name.split("/")[1] for name in printed} == {"reward", "td_error", "action_gradient"}
+    # The entropy weights of the latter two are equal by definition, which looks like a mistake.
+    assert len(set(printed.values())) == 3
+    assert sum(printed.values()) == pytest.approx(1.0)
     names["env"].close()  # type: ignore[attr-defined]
 
 
@@ -48,3 +56,10 @@ def test_its_files_exist() -> None:
 
 def test_no_line_is_longer_than_a_page_is_wide() -> None:
     assert [line for line in README.splitlines() if len(line) > 120] == []
+
+
+def test_neighboring_lines_of_the_readme_compare_drives_with_the_same_physics() -> None:
+    lines = re.findall(r"examples/evaluate\.py (.*?)(?:  #|$)", README, re.MULTILINE)
+    (planner,) = (line for line in lines if "--policy" in line)
+    policy = load_policy(ROOT / next(line for line in lines if line.endswith(".npz")))
+    assert planner.split("--physics ")[1] == policy.env_arguments.get("physics", "wheels")
