@@ -14,10 +14,10 @@ from navigation.studies.protocol import ROOT, Table, tables
 from torchrl_mpfa.saving import write_text_atomically
 
 _TITLES = {
-    "curves": "Mean of the runs and its 95 % interval, over actions",
+    "curves": "Mean of the runs and its 95 % interval, over actions, beside uniform replay in gray",
     "profiles": "Share of runs above each value of the primary measure; bands: three arms",
     "arms": "The primary measure of each run, with mean and 95 % interval of each arm",
-    "volumes": "Area by replay volume and method; grey: not run, or too few to compare",
+    "volumes": "Area by replay volume and method; gray: not run, or too few to compare",
 }
 
 

@@ -354,8 +354,8 @@ def _table_a(root: Path) -> Table:
             (one, "paper/ddpg/mpfa_per"),
         ),
         {
-            "Table 2": _arms("paper/ddpg", *TABLE_2, "uniform"),
-            "Table 4": _arms("paper/ddpg", *TABLE_4),
+            "the paper's Table 2": _arms("paper/ddpg", *TABLE_2, "uniform"),
+            "the paper's Table 4": _arms("paper/ddpg", *TABLE_4),
             "to the letter": _arms("paper/plain", *first, suffix=f"/{LETTER.name}"),
             "one robot, sixteen": (one, "paper/ddpg/mpfa_per"),
         },

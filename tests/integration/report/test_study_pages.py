@@ -23,6 +23,7 @@ from navigation.report.study_figures import (
     looks_of,
     mean_curve,
     plot_curves,
+    plot_profiles,
     plot_study,
     plot_volumes,
 )
@@ -38,7 +39,7 @@ from navigation.studies.arms import Arm
 from navigation.studies.jobs import Evaluation, Job, Study
 from navigation.studies.paper import NAMES, PHIS
 from navigation.studies.protocol import KEY, OF_VOLUMES, Table, paper_studies, tables
-from tests.integration.report.test_figures import BLUE, ORANGE, colored, heights
+from tests.integration.report.test_figures import GRAY, ORANGE, colored
 
 TEST = Evaluation(("bars:test", "halls:test"), 4, "wheels")
 PAIRS = (("s/td3/per", "s/td3/uniform"), ("s/td3/uniform/wide", "s/td3/uniform"))
@@ -356,9 +357,10 @@ def test_a_curve_is_where_its_values_are(tmp_path: Path) -> None:
         for seed in (0, 1)
     ]
     plot_curves(table, Rows(pd.concat(curves), pd.DataFrame()), tmp_path / "c.png")
-    uniform, per = (colored(tmp_path / "c.png", color) for color in (BLUE, ORANGE))
-    upper = slice(0, 330)
-    assert heights(per[upper], quarter=1) > heights(uniform[upper], quarter=1) + 0.3
+    # The one panel has both: uniform replay, with which it is compared, is gray.
+    uniform, per = (colored(tmp_path / "c.png", color) for color in (GRAY, ORANGE))
+    middle = slice(None), slice(per.shape[1] // 2, None)
+    assert np.median(np.nonzero(per[middle])[0]) < np.median(np.nonzero(uniform[middle])[0]) - 50
 
 
 def test_a_method_has_the_same_look_whichever_others_stand_beside_it() -> None:
@@ -387,6 +389,27 @@ def test_arms_of_one_run_have_no_line_beside_those_of_several(runs: Path, tmp_pa
     assert pictures[:3] == pictures[3:]
 
 
+def test_an_arm_of_three_runs_has_thin_lines_and_no_picture_of_its_spread(
+    runs: Path, tmp_path: Path
+) -> None:
+    table = small_table(runs)
+    rows = read_runs(table, runs)
+    few = Rows(rows.curves[rows.curves["seed"] < 3], rows.tests[rows.tests["seed"] < 3])
+    assert [path.name for path in plot_study(table, few, tmp_path)] == ["C_curves.png"]
+
+
+def test_the_band_of_a_profile_ends_with_its_runs(tmp_path: Path) -> None:
+    table = replace(small_table(tmp_path), panels={"all": PAIRS[0][::-1]})
+    scores = {"s/td3/uniform": pd.DataFrame({"area": np.linspace(0.1, 0.3, 9)})}
+    plot_profiles(table, scores, tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    # Pale blue: less red than a grid line, which is gray.
+    band = (pixels[..., 2] - pixels[..., 0] > 15) & (pixels.min(-1) > 150)
+    columns = np.flatnonzero(band[:-60].sum(0) > 8)
+    assert columns.max() < 0.5 * band.shape[1]
+
+
 def test_a_panel_without_runs_is_left_out(runs: Path, tmp_path: Path) -> None:
     table = small_table(runs)
     rows, sizes = read_runs(table, runs), []
@@ -406,11 +429,16 @@ def test_where_a_method_is_better_than_uniform_replay_the_map_is_blue(tmp_path: 
     scores["sparse/td3/lap"] = pd.DataFrame({"area": [0.3, 0.3]})
     scores["sparse/td3/geometric"] = pd.DataFrame({"area": [0.0]})  # One run shows nothing.
     plot_volumes(scores, tmp_path / "v.png")
-    # The ends of the color map, in the one column that has runs.
-    for color, row in (((5, 48, 97), 1), ((103, 0, 31), 4)):
-        lines, columns = np.nonzero(colored(tmp_path / "v.png", color)[:, :700])
-        assert 300 < np.median(columns) < 370
-        assert np.median(lines) == pytest.approx(60 + (row + 0.5) * 61, abs=15)
+    # The ends of the color map, in the one column and the five rows that have runs to compare.
+    rows = []
+    for color in ((5, 48, 97), (103, 0, 31)):
+        marked = colored(tmp_path / "v.png", color)
+        # The bar of the scale is right of the map.
+        lines, columns = np.nonzero(marked[:, : int(0.8 * marked.shape[1])])
+        assert columns.max() - columns.min() > 0.4 * marked.shape[1]
+        rows.append(np.median(lines) / marked.shape[0])
+    assert 0.42 < rows[1] - rows[0] < 0.47
+    assert colored(tmp_path / "v.png", (217, 217, 217)).mean() < 0.02
 
 
 def test_the_real_tables_are_made_of_rows_of_every_arm(tmp_path: Path) -> None:
