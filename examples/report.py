@@ -6,8 +6,8 @@
     python examples/report.py runs/paper --paper          the paper's figures and tables
     python examples/report.py docs/results/study --study --output runs/pages    pages of the study
 
-Writes ``tables.md``, ``training.png`` (success and average reward over episodes and steps) and
-``evaluations.png`` (greedy success in the validation world over steps). The arms of a study
+Writes ``tables.md`` and ``evaluations.png`` (greedy success in the validation world over actions;
+the training of each run has a ``learning_curve.png`` in its folder). The arms of a study
 (``compare.py --arm``) have rows and lines of their own, and evaluations with other physics have
 tables of their own. The unit is the run, not the episode: intervals are over runs, or over runs and
 pairs of start and goal, and tests compare the means of runs; see
@@ -33,7 +33,7 @@ from pathlib import Path
 import pandas as pd
 
 from navigation import files
-from navigation.figures import Runs, plot_evaluations, plot_training
+from navigation.figures import Runs, plot_evaluations
 from navigation.records import read_table
 from navigation.report.kept_rows import is_kept
 from navigation.report.paper_figures import plot_paper
@@ -226,9 +226,6 @@ def report(options: argparse.Namespace, output: Path) -> int:
             ]
         if driven["family"].nunique() > 1:
             parts += [f"## Success in all worlds{how}", success_table(driven)]
-    training = tables_of_runs(rows, files.EPISODES)
-    if training:
-        plot_training(training, output / "training.png")
     evaluations = tables_of_runs(rows, files.EVALUATIONS)
     if evaluations:
         parts += [

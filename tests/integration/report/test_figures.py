@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from navigation.figures import plot_evaluations, plot_learning_curve, plot_training
+from navigation.figures import plot_evaluations, plot_learning_curve
 
 BLUE, ORANGE, GRAY = (0, 114, 178), (230, 159, 0), (128, 128, 128)
 
@@ -59,19 +60,6 @@ def test_a_learning_curve_rises_where_the_run_learned_and_marks_the_new_world(
     assert colored(tmp_path / "same.png", GRAY, spread=40)[: half - 40].sum(0).max() < marked.max()
 
 
-def test_the_training_of_two_arms_has_a_line_for_each_over_episodes_and_steps(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "training.png"
-    runs = {"learns": {"0": episodes(learned=True)}, "fails": {"0": episodes(learned=False)}}
-    plot_training(runs, path, window=1)
-    first, second = (colored(path, color, spread=30) for color in (BLUE, ORANGE))
-    half, middle = len(first) // 2, first.shape[1] // 2
-    for column in (slice(0, middle), slice(middle, None)):
-        top = first[:half, column], second[:half, column]
-        assert heights(top[0], quarter=3) > heights(top[1], quarter=3) + 0.3
-
-
 def test_evaluations_are_at_their_steps_and_rates(tmp_path: Path) -> None:
     path = tmp_path / "evaluations.png"
     up = pd.DataFrame({"total_steps": [1000, 5000, 9000], "success": [0.0, 0.5, 1.0]})
@@ -80,6 +68,20 @@ def test_evaluations_are_at_their_steps_and_rates(tmp_path: Path) -> None:
     rising, falling = (colored(path, color, spread=30) for color in (BLUE, ORANGE))
     assert heights(rising, quarter=0) < 0.4 < 0.6 < heights(rising, quarter=3)
     assert heights(falling, quarter=3) < 0.4 < 0.6 < heights(falling, quarter=0)
+
+
+@pytest.mark.parametrize("runs", [3, 6])
+def test_three_runs_are_lines_and_six_have_a_band(runs: int, tmp_path: Path) -> None:
+    path = tmp_path / "evaluations.png"
+    heights = np.linspace(0.2, 0.8, runs)
+    tables = {
+        str(n): pd.DataFrame({"total_steps": [0, 9], "success": h}) for n, h in enumerate(heights)
+    }
+    plot_evaluations({"one": tables}, path)
+    with Image.open(path) as picture:
+        panel = np.asarray(picture.convert("RGB"))[100:380, 300:500].astype(int)
+    tinted = (panel[..., 2] - panel[..., 0] > 10).any(1)
+    assert (tinted.mean() > 0.3) == (runs == 6)
 
 
 def test_the_eighth_arm_has_the_color_of_the_first_and_another_line(tmp_path: Path) -> None:
