@@ -283,7 +283,7 @@ def describe_world(world: World) -> dict[str, float]:
     return row
 
 
-def render_worlds(*, size: int = 320) -> np.ndarray[Any, Any]:
+def render_worlds(*, size: int = 224) -> np.ndarray[Any, Any]:
     """Render the built-in worlds, three in a row.
 
     Args:

@@ -10,6 +10,7 @@ import argparse
 import math
 import statistics
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -135,12 +136,15 @@ def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
     }
 
 
-def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any, Any]:
-    """Render worlds, four in a row, with their walkers at the start of an episode.
+def render_all(
+    worlds: Sequence[World], *, side: int = 224, columns: int = 3
+) -> np.ndarray[Any, Any]:
+    """Render worlds row by row, with their walkers at the start of an episode.
 
     Args:
         worlds: The worlds.
-        side: Longer side of each [px].
+        side: Longer side of each [px]; as they are, three stand in the column of a page.
+        columns: Worlds in a row.
 
     Returns:
         Picture of shape ``[height, width, 3]``.
@@ -152,7 +156,17 @@ def render_twelve(worlds: Sequence[World], *, side: int = 300) -> np.ndarray[Any
         tiles.append(
             render_trajectories(world, [], [], [], title=world.name, walkers=env.walkers, size=side)
         )
-    return tiled(tiles, columns=4, gap=12)
+    return tiled(tiles, columns=columns)
+
+
+def course_of(world: World) -> World:
+    """A world of BARN, cut to its corridor and the field across it."""
+    centers = np.array([(each.x, each.y) for each in world.cylinders])
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    x, y = (low + high) / 2
+    width, depth = high - low + 0.4
+    moved = tuple(replace(each, x=each.x - x, y=each.y - y) for each in world.cylinders)
+    return World(name=world.name, size=(width, depth), cylinders=moved)
 
 
 def save_pictures(folder: Path, names: Sequence[str] = ()) -> None:
@@ -167,11 +181,11 @@ def save_pictures(folder: Path, names: Sequence[str] = ()) -> None:
     for name in names or GENERATORS:
         steps = [round(step / 11, 2) for step in range(12)]
         worlds = [generate_world(name, seed, difficulty=step) for seed, step in enumerate(steps)]
-        Image.fromarray(render_twelve(worlds)).quantize(64).save(folder / f"generator-{name}.png")
+        Image.fromarray(render_all(worlds)).quantize(64).save(folder / f"generator-{name}.png")
     if names:
         return
-    worlds = [barn_world(index) for index in range(8, 20)]
-    Image.fromarray(render_twelve(worlds)).quantize(64).save(folder / "barn.png")
+    worlds = [course_of(barn_world(index)) for index in range(8, 20)]
+    Image.fromarray(render_all(worlds, columns=6)).quantize(64).save(folder / "barn.png")
 
 
 def main() -> None:
