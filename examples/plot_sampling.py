@@ -1,6 +1,7 @@
 """Plot what each method trains on: how often it samples which transitions of a common buffer.
 
-    python examples/plot_sampling.py                       all methods, to docs/methods/images
+    python examples/plot_sampling.py                       to docs/methods/images, all methods but
+                                                           those that sample uniformly
     python examples/plot_sampling.py per mpfa_per --output runs/figures
 
 The buffer is synthetic: a quarter of a navigation run, with few goals and collisions, widely spread
@@ -47,6 +48,8 @@ OBSERVATION_SIZE, ACTION_SIZE = 8, 2
 KINDS = ("approaching", "moving away", "goal", "collision")
 COLORS = ("#0072b2", "0.6", "#009e73", "#d55e00")
 """Of the kinds: those of :mod:`mpfa_envs.render`, and gray."""
+_RARE = 0.05
+"""Where what is sampled more rarely, or never, is drawn."""
 Array = NDArray[np.float64]
 
 
@@ -100,6 +103,12 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
     known = {"td_error": td_error, "action_gradient": gradient, "value": value}
     signals = {name: torch.as_tensor(v, dtype=torch.float) for name, v in known.items()}
     return Transitions(data, signals, kind)
+
+
+def samples_uniformly(method: Method) -> bool:
+    """Whether there is nothing to see: every transition is sampled as often as any other."""
+    selections = ("uniform", "halves", "near_policy")
+    return method.selection in selections and method.candidates == 1
 
 
 def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str, Array]]:
@@ -166,15 +175,18 @@ def plot(name: str, path: Path) -> None:
         path: The PNG file.
     """
     transitions, found = count_samples(METHODS[name])
-    figure, axes = new_figure(1, 3, panel=(10 / 3, 2.8))
+    figure, axes = new_figure(1, 3, panel=(2.4, 2.6))
     error = transitions.signals["td_error"].numpy()
     for number, (kind, color) in enumerate(zip(KINDS, COLORS, strict=True)):
         chosen = transitions.kind == number
-        axes[0].plot(
-            error[chosen], found["critic"][chosen], ".", ms=3, color=color, alpha=0.6, label=kind
-        )
-    axes[0].set(xscale="log", xlabel="|TD error|", ylabel="times as often as uniformly")
-    axes[0].legend(fontsize=7)
+        often = np.maximum(found["critic"][chosen], _RARE)
+        axes[0].plot(error[chosen], often, ".", ms=3, color=color, alpha=0.6, label=kind)
+    # On a logarithmic scale one transition that is sampled all the time flattens no others.
+    ends = max(found["critic"].min(), _RARE) / 1.5, found["critic"].max() * 1.5
+    limits = min(ends[0], 0.09), max(ends[1], 11.0)
+    axes[0].set(xscale="log", yscale="log", xlabel="|TD error|", ylim=limits)
+    axes[0].yaxis.set_major_formatter(lambda often, _: f"{often:g}")
+    axes[0].tick_params(which="minor", labelleft=False)
     width = 0.8 / len(found)
     edges = np.linspace(0, COUNT, 11).astype(int)
     for place, (who, often) in enumerate(found.items()):
@@ -184,16 +196,20 @@ def plot(name: str, path: Path) -> None:
         axes[1].bar(where, by_kind, width, color=COLORS, alpha=shade)
         by_age = [often[a:b].mean() for a, b in pairwise(edges)]
         axes[2].plot(np.arange(10) + 0.5, by_age, "o-", ms=3, color=look(place)["color"], label=who)
-    axes[1].set_xticks(np.arange(len(KINDS)), KINDS, fontsize=7)
-    axes[1].set_xlabel("kind" if len(found) == 1 else "kind; pale: the actor's batches")
+    axes[1].set_xticks([])
+    axes[1].set_xlabel("kind" if len(found) == 1 else "kind; pale: actor")
     low, high = axes[2].get_ylim()
-    axes[2].set(xlabel="tenth of the buffer, oldest first", ylim=(min(low, 0.8), max(high, 1.2)))
+    axes[2].set(xlabel="tenth of the buffer by age", ylim=(min(low, 0.8), max(high, 1.2)))
+    axes[2].set_xticks([0.5, 9.5], ["oldest", "newest"])
     if len(found) > 1:
-        axes[2].legend(fontsize=7)
-    for axis in axes[1:]:
+        axes[2].legend(fontsize="small", frameon=False)
+    for axis in axes:
         axis.axhline(1.0, color="0.3", lw=0.8, ls=":")
-    figure.suptitle(name)
-    finish(figure, axes, path, dpi=80)
+    figure.supylabel("times as often as uniformly", fontsize="medium")
+    # Above the panels, where no point lies.
+    kinds = axes[0].get_legend_handles_labels()
+    figure.legend(*kinds, loc="outside upper center", ncols=4, frameon=False, markerscale=3)
+    finish(figure, axes, path, dpi=160)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -218,7 +234,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_folder(options.output)
     except ValueError as error:
         parser.error(f"--output: {error}")
-    names = options.methods or [name for name in METHODS if name not in ALIASES]
+    names = options.methods or [
+        name
+        for name, method in METHODS.items()
+        if name not in ALIASES and not samples_uniformly(method)
+    ]
     torch.set_num_threads(1)
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)

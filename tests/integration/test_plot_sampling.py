@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 import plot_sampling
-from plot_sampling import COLORS, KINDS, count_samples, main
+from plot_sampling import COLORS, KINDS, count_samples, main, samples_uniformly
 from torchrl_mpfa.methods import ALIASES, METHODS
 
 DOCS = Path(__file__).parents[2] / "docs" / "methods"
@@ -83,7 +83,8 @@ def test_the_bars_of_a_figure_are_as_high_as_what_they_count(tmp_path: Path) -> 
     assert main(["per", "--output", str(tmp_path)]) == 0
     with Image.open(tmp_path / "per.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
-    bars = pixels[:, pixels.shape[1] // 3 : 2 * pixels.shape[1] // 3]
+    # The middle panel, without the legend above it.
+    bars = pixels[pixels.shape[0] // 5 :, pixels.shape[1] // 3 : 2 * pixels.shape[1] // 3]
     counted = means_by_kind("per")
     height = {}
     for kind, color in zip(KINDS, COLORS, strict=True):
@@ -101,15 +102,27 @@ def test_an_unknown_method_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_method_has_a_page_with_its_figure_and_its_source(name: str) -> None:
+def test_every_method_has_a_page_with_its_source_and_a_figure_unless_it_is_uniform(
+    name: str,
+) -> None:
     page = (DOCS / f"{name}.md").read_text(encoding="utf-8")
-    assert f"(images/{name}.png)" in page
-    assert (DOCS / "images" / f"{name}.png").exists()
+    pictured = not samples_uniformly(METHODS[name])
+    assert (f"(images/{name}.png)" in page) == pictured
+    assert (DOCS / "images" / f"{name}.png").exists() == pictured
     for part in ("## Formula", "## Source, and what is verified", "## Settings"):
         assert part in page
     overview = (DOCS / "README.md").read_text(encoding="utf-8")
     assert f"[`{name}`]({name}.md)" in overview
     assert "examples/train.py method=NAME" in overview
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if samples_uniformly(METHODS[name])])
+def test_what_has_no_figure_samples_every_transition_as_often(name: str) -> None:
+    transitions, found = count_samples(METHODS[name])
+    error = transitions.signals["td_error"].numpy()
+    for often in found.values():
+        assert abs(np.corrcoef(often, np.log(error))[0, 1]) < 0.15
+        assert abs(np.corrcoef(often, np.arange(len(often)))[0, 1]) < 0.15
 
 
 @pytest.mark.parametrize(
