@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,21 +30,23 @@ from mpfa_envs import (
 from mpfa_envs.render import (
     draw_seeds,
     film_episode,
+    plot_histograms,
     render_methods,
     render_samples,
     render_values,
     write_animation,
 )
 from mpfa_envs.render.charts import finish, new_figure
-from navigation import files
 from navigation.evaluating import Drivable, drive
 from navigation.pictures import Values, longest, trajectories_of
 from navigation.report.kept_rows import read_kept
 from navigation.report.study_rows import by_run
+from navigation.training.checkpoints import read_checkpoint
 from navigation.training.values import load_learner, values_of
 from torchrl_mpfa import (
     Learner,
     MPFASampler,
+    ReplayHistory,
     SignalReplayBuffer,
     SignalTensorStorage,
 )
@@ -64,6 +65,8 @@ _LEARNED = (
     ("B", "dense", "dense reward"),
 )
 """Of the learning curves: table of the study, its reward, and title."""
+_TILE = 224
+"""Side of one of three pictures in the column of a page, in which its words are legible [px]."""
 _ROBOTS, _STEPS, _UPDATES = 16, 400, 300
 """Of the buffer whose samples are seen."""
 _HOW: dict[str, Any] = {"seed": 0, "physics": PHYSICS, "progress": False}
@@ -90,24 +93,25 @@ def rooms(output: Path) -> None:
     kinds = ("rooms", "clutter", "bars", "fields", "mazes")
     policy = load_policy(SHIPPED)
     driven = [drive(policy, f"{kind}:test", episodes=200, **_HOW) for kind in kinds]
-    save(trajectories_of(driven), output / "rooms.png")
+    save(trajectories_of(driven, size=_TILE), output / "rooms.png")
 
 
 def methods(output: Path) -> None:
     """Paths of a policy of today, one of the paper's task, and a planner, side by side."""
     drivers: dict[str, Drivable] = {
-        "TD3, many rooms": load_policy(SHIPPED),
-        "TD3, one map": load_policy(POLICIES / "td3-mpfa_per.npz"),
-        "dynamic window": make_planner("dwa"),
+        "many rooms": load_policy(SHIPPED),
+        "four maps": load_policy(POLICIES / "td3-mpfa_per.npz"),
+        "planner": make_planner("dwa"),
     }
     driven = {name: drive(each, WORLD, episodes=20, **_HOW) for name, each in drivers.items()}
-    first = driven["TD3, many rooms"]
+    first = driven["many rooms"]
     picture = render_methods(
         first.tasks[0].world,
         {name: each.trails for name, each in driven.items()},
         [task.task.goal for task in first.tasks],
         {name: [result.outcome for result in each.results] for name, each in driven.items()},
         columns=3,
+        size=_TILE,
     )
     save(picture, output / "methods.png")
 
@@ -153,7 +157,7 @@ def samples(run: Run, output: Path) -> None:
         run.learner.update(batch)
         buffer.update_tensordict_priority(batch)
     priorities = buffer.sampler.priorities().numpy()
-    save(render_samples(WORLD, positions, priorities, counts), output / "samples.png")
+    save(render_samples(WORLD, positions, priorities, counts, size=_TILE), output / "samples.png")
 
 
 def filled_buffer(policy: Policy) -> tuple[SignalReplayBuffer, Any]:
@@ -180,8 +184,10 @@ def filled_buffer(policy: Policy) -> tuple[SignalReplayBuffer, Any]:
 
 
 def histograms(run: Run, output: Path) -> None:
-    """Signals, priorities and weights in the buffer of the run, as its training drew them."""
-    shutil.copy(run.folder / files.HISTOGRAMS, output / files.HISTOGRAMS)
+    """Signals, priorities and weights in the buffer of the run while it was trained."""
+    history = ReplayHistory()
+    history.load_state_dict(read_checkpoint(run.folder)["log"]["history"])
+    plot_histograms(history.histograms(), output / "histograms.png")
 
 
 def curves(output: Path) -> None:

@@ -51,12 +51,12 @@ def write_pictures(
         Image.fromarray(values_over(policy, task, values)).save(folder / VALUES, optimize=True)
 
 
-def trajectories_of(driven: Sequence[Drives]) -> NDArray[np.uint8]:
-    """The paths in up to nine worlds, shape ``[height, width, 3]``."""
+def trajectories_of(driven: Sequence[Drives], *, size: int = 360) -> NDArray[np.uint8]:
+    """The paths in up to nine worlds, each of a size [px], shape ``[height, width, 3]``."""
     # One world of each row, then a second one of each, and so on.
     in_turn = zip_longest(*map(worlds_in, driven))
     worlds = [each for nth in in_turn for each in nth if each is not None]
-    size = 640 if len(worlds) == 1 else 360
+    size = 640 if len(worlds) == 1 else size
     return tiled([picture_of(world, drives, size=size) for world, drives in worlds[:_PICTURED]])
 
 

@@ -19,6 +19,7 @@ import export
 import gym_study
 import pictures
 import play
+import plot_sampling
 import report
 import stable_baselines
 import study
@@ -51,6 +52,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "gym_study": gym_study.main,
     "pictures": pictures.main,
     "play": play.main,
+    "plot_sampling": plot_sampling.main,
     "report": report.main,
     "stable_baselines": stable_baselines.main,
     "study": study.main,

@@ -88,8 +88,8 @@ def render_samples(
     rate = counts / max(float(counts.mean()), 1e-300)
     pictures = {
         (title, "transitions"): there[shown],
-        ("", "mean priority"): per_cell(weights)[shown] / there[shown],
-        ("", "times as often as uniformly"): per_cell(rate)[shown] / there[shown],
+        ("", "priority"): per_cell(weights)[shown] / there[shown],
+        ("", "sampled"): per_cell(rate)[shown] / there[shown],
     }
     return tiled(
         [
