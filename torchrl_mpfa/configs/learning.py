@@ -30,7 +30,6 @@ class PerceptronConfig(NetworkConfig):
     layers: int = 2
     layer_norm: bool = True
     final_init: float | None = 3e-3
-    normalize_weights: bool = False
 
 
 @dataclass
@@ -58,8 +57,6 @@ class CriticConfig(PerceptronConfig):
     """
 
     late_action: bool = True
-    bins: int | None = None
-    value_range: Any = None
     _target_: str = "torchrl_mpfa.make_critic"
 
 

@@ -19,7 +19,6 @@ from torchrl_mpfa.checks import check_range
 from torchrl_mpfa.learners.states import check_state, refuse_copy, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
-from torchrl_mpfa.networks.unit import project_rows
 from torchrl_mpfa.selection import Draw, Trains
 
 OptimizerName = Literal["adam", "radam"]
@@ -120,9 +119,6 @@ class ActorCriticLearner:
         self._rates: tuple[float, ...] = (actor_lr, critic_lr)
         self.loss: Any = loss
         self.policy: TensorDictModule = getattr(loss, "actor_network")  # noqa: B009
-        self._unit: list[torch.nn.Parameter] = loss.unit_parameters()
-        # TorchRL starts the second of two critics with numbers of its own.
-        project_rows(self._unit)
         self.targets = MultiTensorSoftUpdate(loss, tau=tau)
         self.updates = 0
         """Training steps taken."""
@@ -179,7 +175,6 @@ class ActorCriticLearner:
         log = self._differentiate(batch, trains, loss_function)
         refuse_unfinished(log, batch)
         self.optimizer.step()
-        project_rows(weight for weight in self._unit if weight.grad is not None)
         if trains != "critic":
             self.targets.step()
         return log

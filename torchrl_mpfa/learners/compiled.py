@@ -103,11 +103,9 @@ class CompiledUpdate:
         parts = self._gradients.parts
         of_actor, of_critics = parts.target_parameters
         actor = dict(parts.actor.module.named_parameters())
-        unit = loss.unit_parameters()
-        self._actor = FlatParameters(
-            actor, of_actor if self._own_target_actor else None, optimizer, unit
-        )
-        self._critics = FlatParameters(parts.critic_parameters, of_critics, optimizer, unit)
+        own = of_actor if self._own_target_actor else None
+        self._actor = FlatParameters(actor, own, optimizer)
+        self._critics = FlatParameters(parts.critic_parameters, of_critics, optimizer)
         loss.forget_networks()
         # Apart from other learners, whose recompilations would count against this one's limit.
         self._call: Callable[..., Any] = torch.compile(
@@ -181,7 +179,7 @@ class CompiledUpdate:
             if gradients:
                 step = Step(*numbers[row].unbind())
                 moved = move(weights, flat.joined(gradients), of.mean, of.square, step)
-                weights = flat.projected(moved.weights)
+                weights = moved.weights
             if with_targets and own_targets:
                 targets = of.targets + self._tau * (weights - of.targets)
                 _write(finite, [of.targets], [targets])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.learners.steps import STEPS, Step
-from torchrl_mpfa.networks.unit import unit_rows
 
 Tensors = dict[str, Tensor]
 
@@ -25,7 +24,6 @@ class FlatParameters:
         parameters: Parameters by name.
         targets: Target parameters by the same names; None: they have none of their own.
         optimizer: The optimizer that keeps the moments; it takes no step itself any more.
-        unit: Parameters, of these or others, whose rows are set to length one after each step.
 
     Raises:
         ValueError: If the parameters are not all of one type.
@@ -36,7 +34,6 @@ class FlatParameters:
         parameters: Tensors,
         targets: Tensors | None,
         optimizer: torch.optim.Optimizer,
-        unit: Sequence[Tensor] = (),
     ) -> None:
         learned = {name: value for name, value in parameters.items() if value.requires_grad}
         kinds = sorted({str(value.dtype) for value in learned.values()})
@@ -46,7 +43,6 @@ class FlatParameters:
         self._fixed = {name: value for name, value in parameters.items() if name not in learned}
         self._parameters = list(learned.values())
         self._targets = None if targets is None else [targets[name] for name in learned]
-        self._unit = [name for name, value in learned.items() if any(value is u for u in unit)]
         self._optimizer = optimizer
         self.weights = self.targets = self.mean = self.square = torch.empty(0)
         self.hold()
@@ -79,13 +75,6 @@ class FlatParameters:
     def joined(self, tensors: Tensors) -> Tensor:
         """Tensors of the names of the parameters, as one vector."""
         return torch.cat([tensors[name].reshape(-1) for name in self._shapes])
-
-    def projected(self, vector: Tensor) -> Tensor:
-        """Parameters with those rows set to length one that are to have it."""
-        if not self._unit:
-            return vector
-        tensors = self.views(vector)
-        return self.joined({**tensors, **{name: unit_rows(tensors[name]) for name in self._unit}})
 
     @property
     def _group(self) -> Mapping[str, Any]:

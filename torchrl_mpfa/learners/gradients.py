@@ -15,7 +15,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import functional_call, grad, grad_and_value
 
-from torchrl_mpfa.categorical import LOGITS
 from torchrl_mpfa.losses.calling import Parts
 from torchrl_mpfa.losses.functional import (
     bootstrap_target,
@@ -84,7 +83,6 @@ class Gradients:
         self.parts: Parts = loss.parts()
         self._scale, self._pal_alpha = loss.reward_scale, loss.pal_alpha
         self._order, self._with_slope = loss.gradient_order, ACTION_GRADIENT.name in loss.signals
-        self._value_range = loss.value_range
         self._penalty, self._limit = loss.saturation_penalty, loss.saturation_limit
         keys = loss.tensor_keys
         self._action, self._value = keys.action, keys.state_action_value
@@ -207,15 +205,12 @@ class Gradients:
         def of_critics(parameters: Parameters) -> tuple[Tensor, Tensor]:
             each = [self._outputs(_with(module, p), state, action) for p in parts.split(parameters)]
             value = torch.stack([out[self._value].squeeze(-1) for out in each])
-            with_bins = LOGITS in each[0]
             loss = critic_loss(
                 value,
                 target,
                 loss_function,
                 unit=unit,
                 pal_alpha=self._pal_alpha,
-                logits=torch.stack([out[LOGITS] for out in each]) if with_bins else None,
-                value_range=self._value_range,
             )
             return (loss if weight is None else loss * weight).mean(), value
 

@@ -11,16 +11,15 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_mpfa.categorical import HL_GAUSS
 from torchrl_mpfa.checks import check_counts, check_range
 from torchrl_mpfa.losses.averaging import AveragedNetwork, PastCritics
 from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
 from torchrl_mpfa.losses.functional import DISTANCES, action_gradient, critic_loss, saturation
-from torchrl_mpfa.losses.refusals import check_networks, value_range_of
+from torchrl_mpfa.losses.refusals import check_networks
 from torchrl_mpfa.losses.targets import EstimatedTargets
 from torchrl_mpfa.losses.trust import read_trust, trusted_loss
 from torchrl_mpfa.losses.writing import DEFAULT_SIGNALS, WRITTEN, SignalWriting
-from torchrl_mpfa.networks import DirectModule, UnitLinear
+from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import ACTION_GRADIENT
 
@@ -118,11 +117,6 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         check_range("saturation_limit", saturation_limit, low=0.0)
         check_range("pal_alpha", pal_alpha, low=0.0)
         check_counts(target_average=target_average)
-        value_range = value_range_of(critic_network)
-        if kwargs.get("loss_function") == HL_GAUSS and value_range is None:
-            raise ValueError("loss_function 'hl_gauss' needs a critic with bins, got one without")
-        if target_average > 1 and value_range is not None:
-            raise ValueError(f"target_average must be 1 with bins, got {target_average}")
         if target_average > 1 and not isinstance(critic_network, DirectModule):
             raise ValueError(
                 f"target_average = {target_average} needs a DirectModule as critic, "
@@ -134,7 +128,6 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             use_prioritized_weights="auto" if importance == "torchrl" else False,
             **kwargs,
         )  # type: ignore[call-arg]
-        self.value_range = value_range
         self.signals = tuple(signals)
         self.gradient_order = gradient_order
         self.importance: Importance = importance
@@ -162,11 +155,8 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         """Critics that hold the parameters whose name has this prefix, and get no gradient."""
         raise NotImplementedError
 
-    def _values(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Q of the current critics, ``[C, B]``, and their histograms, ``[C, B, K]``, or None.
-
-        The action leads to the first critic alone.
-        """
+    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
+        """Q of the current critics, ``[C, B]``; the action leads to the first one alone."""
         raise NotImplementedError
 
     def _next_value(self, after: TensorDictBase) -> Tensor:
@@ -228,16 +218,6 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         """What the critics' loss moves."""
         return self._parameters_of(self._critic_name)
 
-    def unit_parameters(self) -> list[nn.Parameter]:
-        """Weights whose rows are to have length one after each step."""
-        found = []
-        for name in ("actor_network", self._critic_name):
-            held = getattr(self, f"{name}_params").flatten_keys(".")
-            for path, module in getattr(self, name).named_modules():
-                if isinstance(module, UnitLinear):
-                    found.append(held[f"{path}.weight"])
-        return found
-
     def _parameters_of(self, name: str) -> list[nn.Parameter]:
         flat = getattr(self, f"{name}_params").flatten_keys().values()
         return [value for value in flat if value.requires_grad]
@@ -257,9 +237,8 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         with torch.set_grad_enabled(with_slope or differentiable):
             if with_slope:
                 action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
-            value, logits = self._values(tensordict, action)
-            # A loss of histograms does not reach the action through Q.
-            if with_slope and defer_gradient and differentiable and name != HL_GAUSS:
+            value = self._values(tensordict, action)
+            if with_slope and defer_gradient and differentiable:
                 value.retain_grad()
                 self._deferred = action, value
             elif with_slope:
@@ -279,8 +258,6 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             name,
             unit=self.reward_scale * (1.0 if bend is None else bend.reshape(-1)),
             pal_alpha=self.pal_alpha,
-            logits=logits,
-            value_range=self.value_range,
         )
         return CriticStep(self._weigh(loss, tensordict), value, td_error, target, next_value)
 

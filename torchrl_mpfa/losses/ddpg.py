@@ -10,7 +10,6 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
-from torchrl_mpfa.categorical import LOGITS
 from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import Parts, bare, bind, call, read_inputs
 from torchrl_mpfa.losses.refusals import check_gamma
@@ -153,12 +152,10 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
         loss, log = self.loss_actor(batch)
         return {"loss_actor": loss}, log
 
-    def _values(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         critic, keys = self._networks().critic, self.tensor_keys
         found = call(critic, read_inputs(critic, tensordict, {keys.action: action}))
-        logits = found.get(LOGITS)
-        value = found[keys.state_action_value].squeeze(-1).unsqueeze(0)
-        return value, None if logits is None else logits.unsqueeze(0)
+        return found[keys.state_action_value].squeeze(-1).unsqueeze(0)
 
     def _next_value(self, after: TensorDictBase) -> Tensor:
         networks = self._networks()

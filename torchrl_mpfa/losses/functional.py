@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_mpfa.categorical import HL_GAUSS, Range, hl_gauss_loss
-
 PAL = "pal"
-DISTANCES = ("l1", "l2", "smooth_l1", PAL, HL_GAUSS)
+DISTANCES = ("l1", "l2", "smooth_l1", PAL)
 """Names of the loss functions, of which all but the last are for :func:`distance`."""
 
 
@@ -134,25 +132,21 @@ def critic_loss(
     *,
     unit: float | Tensor,
     pal_alpha: float,
-    logits: Tensor | None = None,
-    value_range: Range | None = None,
 ) -> Tensor:
     """Loss of each transition, summed over the critics (Eq. 4).
 
     Args:
         value: Q of each critic, shape ``[C, B]``.
         target: Targets, shape ``[B]``.
-        loss_function: As of :func:`distance`, as are the following two; or ``"hl_gauss"``.
+        loss_function: As of :func:`distance`, as are the following two.
         unit: Error at which the last two bend.
         pal_alpha: Priority exponent that PAL stands for.
-        logits: Histograms that the values are the means of, shape ``[C, B, K]``.
-        value_range: Least and greatest value of the histograms.
 
     Returns:
         Losses, shape ``[B]``.
 
     Raises:
-        ValueError: If the loss function is unknown, or ``"hl_gauss"`` without histograms.
+        ValueError: If the loss function is unknown.
 
     Examples:
         >>> value, target = torch.zeros(2, 3), torch.ones(3)
@@ -160,10 +154,6 @@ def critic_loss(
         [2.0, 2.0, 2.0]
     """
     target = target.expand_as(value)
-    if loss_function == HL_GAUSS:
-        if logits is None or value_range is None:
-            raise ValueError("loss_function 'hl_gauss' needs a critic with bins")
-        return hl_gauss_loss(logits, target, value_range).sum(0)
     return distance(value, target, loss_function, unit=unit, pal_alpha=pal_alpha).sum(0)
 
 
@@ -199,8 +189,8 @@ def distance(
         >>> distance(torch.zeros(1), torch.full((1,), 3.0), "smooth_l1").tolist()
         [2.5]
     """
-    if loss_function not in DISTANCES[:-1]:
-        raise ValueError(f"loss_function must be one of {DISTANCES[:-1]}, got {loss_function!r}")
+    if loss_function not in DISTANCES:
+        raise ValueError(f"loss_function must be one of {DISTANCES}, got {loss_function!r}")
     if loss_function == PAL:
         return pal_distance((target - value) / unit, alpha=pal_alpha) * unit**2
     if loss_function == "smooth_l1":

@@ -24,12 +24,6 @@ def check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
         )
 
 
-def value_range_of(critic: Any) -> tuple[float, float] | None:
-    """Least and greatest value of a critic whose values are means of histograms; else None."""
-    first = critic[0] if isinstance(critic, list) and critic else critic
-    return getattr(getattr(first, "module", None), "value_range", None)
-
-
 def check_gamma(gamma: float) -> float:
     """Refuse a discount outside [0, 1].
 

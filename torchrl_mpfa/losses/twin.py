@@ -9,7 +9,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_mpfa.categorical import LOGITS
 from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import Tensors, bind, read_inputs
 
@@ -56,13 +55,12 @@ class TwinCritics(SignalLoss):
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
         return self.value_loss(batch, **options)
 
-    def _values(self, tensordict: TensorDictBase, action: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         critics, key = self._networks().critics, self.tensor_keys.action
         actions = [action] + [action.detach()] * (self.num_qvalue_nets - 1)
         found = critics.call([read_inputs(critics.network, tensordict, {key: a}) for a in actions])
-        key, with_bins = self.tensor_keys.state_action_value, LOGITS in found[0]
-        logits = torch.stack([out[LOGITS] for out in found]) if with_bins else None
-        return torch.stack([out[key].squeeze(-1) for out in found]), logits
+        key = self.tensor_keys.state_action_value
+        return torch.stack([out[key].squeeze(-1) for out in found])
 
     def _target_values(self, after: TensorDictBase, chosen: Tensors) -> Tensor:
         """Q of the target critics at the next state, shape ``[C, B]``."""

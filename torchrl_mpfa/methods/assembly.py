@@ -81,7 +81,7 @@ WORDS: dict[str, set[str]] = {
     "decay_position": {"batch", "rank", "count"},
     "population": {"buffer", "batch"},
     "importance": {"critic", "torchrl", "none"},
-    "loss_function": {"l2", "smooth_l1", "pal", "hl_gauss"},
+    "loss_function": {"l2", "smooth_l1", "pal"},
     "optimizer": {"adam", "radam"},
 }
 """What the settings of a method that are words may be."""

@@ -93,8 +93,7 @@ class Method:
     importance: str = "critic"
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     loss_function: str = "l2"
-    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber), ``pal``, or, for a
-    critic with bins, ``hl_gauss``."""
+    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``."""
     target_average: int = 1
     """Critics of which the target is the mean, one more kept at each end of an episode."""
     optimizer: str = "adam"

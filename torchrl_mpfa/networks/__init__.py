@@ -9,7 +9,6 @@ from torchrl_mpfa.networks.stochastic import (
     make_stochastic_actor,
     sample_tanh_normal,
 )
-from torchrl_mpfa.networks.unit import UnitLinear
 from torchrl_mpfa.networks.values import make_value_network, make_value_table
 
 __all__ = [
@@ -19,7 +18,6 @@ __all__ = [
     "DirectModule",
     "StochasticActor",
     "StochasticNetwork",
-    "UnitLinear",
     "action_bounds",
     "make_actor",
     "make_critic",

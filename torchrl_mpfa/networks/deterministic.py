@@ -8,13 +8,10 @@ start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
-from torchrl_mpfa.categorical import LOGITS, mean_value
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
 from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
@@ -32,17 +29,11 @@ class Actor(nn.Module):
         layers: int,
         layer_norm: bool,
         final_init: float | None,
-        normalize_weights: bool = False,
         scale: ActionScale | None = None,
     ) -> None:
         super().__init__()
         # One flat sequence: in small networks each nested call is felt.
-        hidden = hidden_layers(
-            observation_size,
-            *[width] * layers,
-            layer_norm=layer_norm,
-            normalize_weights=normalize_weights,
-        )
+        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
         self.body = nn.Sequential(*hidden)
         self.head = last_layer(width, action_size, final_init)
         self.scale = scale
@@ -71,32 +62,25 @@ class Critic(nn.Module):
         layers: int,
         layer_norm: bool,
         final_init: float | None,
-        normalize_weights: bool = False,
         late_action: bool,
-        bins: int | None = None,
-        value_range: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
-        self.value_range = None if bins is None else value_range
         self.late_action = late_action
         first = observation_size if late_action else observation_size + action_size
         second = width + action_size if late_action else width
-        options = {"layer_norm": layer_norm, "normalize_weights": normalize_weights}
-        self.first = nn.Sequential(*hidden_layers(first, width, **options))
+        self.first = nn.Sequential(*hidden_layers(first, width, layer_norm=layer_norm))
         sizes = [second, *[width] * (layers - 1)]
-        rest = hidden_layers(*sizes, **options)
-        self.rest = nn.Sequential(*rest, last_layer(sizes[-1], bins or 1, final_init))
+        rest = hidden_layers(*sizes, layer_norm=layer_norm)
+        self.rest = nn.Sequential(*rest, last_layer(sizes[-1], 1, final_init))
 
-    def forward(self, observation: Tensor, action: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """From ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``, and a histogram with bins."""
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        """From ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``."""
         if self.late_action:
             joined = torch.cat((self.first(observation), action), -1)
         else:
             joined = self.first(torch.cat((observation, action), -1))
         found: Tensor = self.rest(joined)
-        if self.value_range is None:
-            return found
-        return mean_value(found, self.value_range).unsqueeze(-1), found
+        return found
 
 
 def make_actor(
@@ -108,7 +92,6 @@ def make_actor(
     layers: int = 2,
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
-    normalize_weights: bool = False,
 ) -> DirectModule:
     """Policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
 
@@ -122,8 +105,6 @@ def make_actor(
         layer_norm: Normalize each hidden layer, so that no feature grows without bound.
         final_init: The last layer starts uniformly within this, hence near the middle of the
             tanh; None leaves PyTorch's start.
-        normalize_weights: Whether a learner keeps the rows of the hidden layers' weights at length
-            one, see :mod:`torchrl_mpfa.networks.unit`.
 
     Returns:
         A module for TorchRL's losses and collectors.
@@ -148,7 +129,6 @@ def make_actor(
         layers=layers,
         layer_norm=layer_norm,
         final_init=final_init,
-        normalize_weights=normalize_weights,
         scale=action_scale(action_spec, action_size),
     )
     return DirectModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
@@ -162,10 +142,7 @@ def make_critic(
     layers: int = 2,
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
-    normalize_weights: bool = False,
     late_action: bool = True,
-    bins: int | None = None,
-    value_range: tuple[float, float] | None = None,
 ) -> DirectModule:
     """Critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
 
@@ -176,32 +153,23 @@ def make_critic(
         layers: Number of hidden layers; with ``late_action`` at least two.
         layer_norm: As in :func:`make_actor`.
         final_init: As in :func:`make_actor`.
-        normalize_weights: As in :func:`make_actor`.
         late_action: Whether the action joins at the second layer in place of the first.
-        bins: Bins ``K`` of a histogram whose mean is Q, for the loss function ``"hl_gauss"``; also
-            written, before its softmax, to ``"value_logits"``. None: Q is a number.
-        value_range: Least and greatest Q of the histogram, in units of the loss: of rewards times
-            ``reward_scale``. Q starts in its middle.
 
     Returns:
         A module for TorchRL's losses.
 
     Raises:
-        ValueError: If a size is not a positive integer, a late action has no second layer, or only
-            one of ``bins`` and ``value_range`` is given.
+        ValueError: If a size is not a positive integer, or a late action has no second layer.
 
     Examples:
         >>> make_critic(24, 2).out_keys
         ['state_action_value']
-        >>> make_critic(24, 2, bins=51, value_range=(-2.0, 2.0)).out_keys
-        ['state_action_value', 'value_logits']
     """
     check_counts(
         observation_size=observation_size, action_size=action_size, width=width, layers=layers
     )
     if late_action and layers < 2:
         raise ValueError(f"layers must be at least 2 with late_action, got {layers}")
-    _check_bins(bins, value_range)
     critic = Critic(
         observation_size,
         action_size,
@@ -209,26 +177,6 @@ def make_critic(
         layers=layers,
         layer_norm=layer_norm,
         final_init=final_init,
-        normalize_weights=normalize_weights,
         late_action=late_action,
-        bins=bins,
-        value_range=value_range,
     )
-    out_keys = ["state_action_value", *([] if bins is None else [LOGITS])]
-    return DirectModule(critic, in_keys=["observation", "action"], out_keys=out_keys)
-
-
-def _check_bins(bins: int | None, value_range: tuple[float, float] | None) -> None:
-    if (bins is None) != (value_range is None):
-        raise ValueError(
-            f"bins and value_range must both be given, got bins={bins}, value_range={value_range}"
-        )
-    if bins is None or value_range is None:
-        return
-    check_counts(bins=bins)
-    low, high = value_range
-    if bins < 2 or not -math.inf < low < high < math.inf:
-        raise ValueError(
-            f"bins must be at least 2 and value_range finite, low < high, got {bins} and "
-            f"{value_range}"
-        )
+    return DirectModule(critic, in_keys=["observation", "action"], out_keys=["state_action_value"])

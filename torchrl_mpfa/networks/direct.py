@@ -10,8 +10,6 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_mpfa.networks.unit import UnitLinear
-
 
 class DirectModule(TensorDictModule):
     """A :class:`~tensordict.nn.TensorDictModule` that is a plain function of its inputs as well.
@@ -57,9 +55,7 @@ class DirectModule(TensorDictModule):
         )
 
 
-def hidden_layers(
-    *sizes: int, layer_norm: bool, normalize_weights: bool = False
-) -> list[nn.Module]:
+def hidden_layers(*sizes: int, layer_norm: bool) -> list[nn.Module]:
     """Layers from the first size to the last, each followed by LayerNorm (if asked) and ReLU.
 
     Examples:
@@ -67,10 +63,9 @@ def hidden_layers(
         ['Linear', 'LayerNorm', 'ReLU']
     """
     layers: list[nn.Module] = []
-    linear = UnitLinear if normalize_weights else nn.Linear
     for inputs, outputs in pairwise(sizes):
         norm = [nn.LayerNorm(outputs)] if layer_norm else []
-        layers += [linear(inputs, outputs), *norm, nn.ReLU()]
+        layers += [nn.Linear(inputs, outputs), *norm, nn.ReLU()]
     return layers
 
 

@@ -72,15 +72,9 @@ class StochasticNetwork(nn.Module):
         layers: int,
         layer_norm: bool,
         final_init: float | None,
-        normalize_weights: bool = False,
     ) -> None:
         super().__init__()
-        hidden = hidden_layers(
-            observation_size,
-            *[width] * layers,
-            layer_norm=layer_norm,
-            normalize_weights=normalize_weights,
-        )
+        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
         self.body = nn.Sequential(*hidden)
         self.head = last_layer(width, action_size, final_init)
         self.scale_head = last_layer(width, action_size, final_init)
@@ -180,7 +174,6 @@ def make_stochastic_actor(
     layers: int = 2,
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
-    normalize_weights: bool = False,
 ) -> StochasticActor:
     """Policy from ``"observation"`` to ``"preactivation"``, ``"scale"`` and ``"action"``.
 
@@ -197,7 +190,6 @@ def make_stochastic_actor(
         layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
         final_init: The last layers start uniformly within this, hence means near zero and scales
             near one; None leaves PyTorch's start.
-        normalize_weights: As in :func:`~torchrl_mpfa.make_actor`.
 
     Returns:
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
@@ -222,7 +214,6 @@ def make_stochastic_actor(
         layers=layers,
         layer_norm=layer_norm,
         final_init=final_init,
-        normalize_weights=normalize_weights,
     )
     scale = action_scale(action_spec, action_size)
     return StochasticActor(network, action_size=action_size, scale=scale)

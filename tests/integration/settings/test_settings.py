@@ -14,6 +14,9 @@ from navigation.settings.checks import RULES, check_settings, settings_by_name
 from navigation.settings.command_line import composed, parse_overrides
 from navigation.settings.resuming import changed
 from navigation.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings, register
+from navigation.training.assembly import make_learner
+from tests.mpfa.losses import make_batch
+from torchrl_mpfa.methods.assembly import WORDS
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,6 +73,16 @@ def test_tracking_is_one_place_or_several(
         # A run that goes on is logged where it is told, not where it was.
         before = asdict(TrainSettings(tracking=TrackingSettings(tensorboard=True)))
         assert changed(before, parse_overrides(words)).tracking == found
+
+
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac"])
+@pytest.mark.parametrize("word", sorted(WORDS["loss_function"]))
+def test_a_learner_learns_with_every_loss_function_that_the_settings_take(
+    algorithm: str, word: str
+) -> None:
+    settings = one(f"learner={algorithm}", f"method.loss_function={word}", "learner.compile=false")
+    learner = make_learner(settings.learner, settings.method, 5, 2)
+    assert learner.update(make_batch())["loss_value"].isfinite()
 
 
 def test_an_override_reaches_the_typed_settings() -> None:
