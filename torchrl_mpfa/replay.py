@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ _MISSING = (
     "write batch[{key!r}] = ..., one number per transition"
 )
 _UNRETURNED = 100
-"""Batches in a row with signals that were not handed back, after which sampling is refused."""
+"""Batches without an update of priorities in between that are worth a warning."""
 
 
 class SignalReplayBuffer(FollowedReplayBuffer):
@@ -78,8 +79,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def __init__(self, *, generator: torch.Generator | None = None, **kwargs: Any) -> None:
         self.stale_updates = 0
-        self._unreturned = 0
-        self._handed_out: TensorDictBase | None = None
+        self._unreturned, self._warned = 0, False
         if (batch_size := kwargs.get("batch_size")) is not None:
             check_counts(batch_size=batch_size)
         # TorchRL sets it once the parts are made, which have to agree with it.
@@ -242,32 +242,38 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             The batch, or the batch and the information.
 
         Raises:
-            RuntimeError: If a loss wrote signals in the last hundred batches and none of them came
-                back to :meth:`update_tensordict_priority`.
             ValueError: If ``batch_size`` is not a positive integer.
+
+        Warns:
+            UserWarning: Once, if a hundred batches in a row were sampled by priority and none was
+                updated.
         """
         if batch_size is not None:
             check_counts(batch_size=batch_size)
+        if isinstance(self.sampler, PrioritizedSampler):
+            self._count_batch()
         if return_info or include_info is not None or not self._fuses:
             return super().sample(batch_size, return_info, include_info)
-        self._check_returned()
-        self._handed_out = batch = ReplayBuffer.sample(self, batch_size)
-        return batch
+        return ReplayBuffer.sample(self, batch_size)
 
-    def _check_returned(self) -> None:
-        """Refuse to go on where a training loop keeps the signals to itself."""
-        batch = self._handed_out
-        learned = [s for s in self._sampler.signals if s.known_at == "update"]
-        if batch is None or all(batch.get(s.key, None) is None for s in learned):
-            return
+    def _count_batch(self) -> None:
+        """Warn of a training loop that never updates priorities."""
         self._unreturned += 1
-        if self._unreturned >= _UNRETURNED:
-            raise RuntimeError(
-                f"the signals of {self._unreturned} batches in a row were computed and no priority "
-                "was updated: call update_tensordict_priority(batch) after the loss. A trainer of "
-                "TorchRL skips it once it has an optimization stepper whose step() does not; "
-                "torchrl_mpfa.trainer.PriorityStepper does"
-            )
+        if self._unreturned <= _UNRETURNED or self._warned or not self._sampler.alpha:
+            return
+        self._warned = True
+        warnings.warn(
+            f"{_UNRETURNED} batches in a row were sampled and no priority was updated: call "
+            "update_tensordict_priority(batch) after the loss. A trainer of TorchRL skips it once "
+            "it has an optimization stepper whose step() does not; "
+            "torchrl_mpfa.trainer.PriorityStepper does",
+            stacklevel=3,
+        )
+
+    def update_priority(self, index: Any, priority: Any) -> None:
+        """Set priorities directly, as in TorchRL."""
+        super().update_priority(index, priority)
+        self._unreturned = 0
 
     def update_tensordict_priority(self, data: TensorDictBase, *, batches: int = 1) -> None:
         """Update signals and priorities of a sampled batch.
@@ -307,7 +313,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 batches=batches,
             )
         self.stale_updates += stale
-        self._unreturned, self._handed_out = 0, None
+        self._unreturned = 0
 
     def anneal(self, beta: float, fraction: float) -> None:
         """Set beta, and the weights of a fusion that changes; no effect without priorities.
@@ -347,9 +353,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         if self.initialized and self._fuses:
             found.update(self._sampler.stats(self._storage))
         return found
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_handed_out": None}
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
         """Refuse a state that does not fit, before anything changes.

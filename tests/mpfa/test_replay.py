@@ -381,35 +381,6 @@ def test_the_paper_signal_of_the_reward_is_its_absolute_value():
     assert REWARD.priority(torch.tensor([-2.0])).tolist() == [2.0]
 
 
-def test_a_loop_that_keeps_the_signals_to_itself_is_stopped():
-    buffer = make_buffer()
-    buffer.extend(make_transitions(10))
-    for _ in range(300):
-        buffer.sample()  # To look at batches is no mistake.
-    with pytest.raises(RuntimeError, match=r"100 batches in a row .* update_tensordict_priority"):
-        for _ in range(300):
-            write_signals(buffer.sample())
-
-
-def test_a_loop_that_updates_priorities_now_and_then_is_not_stopped():
-    buffer = make_buffer()
-    buffer.extend(make_transitions(10))
-    for number in range(300):
-        batch = write_signals(buffer.sample())
-        if number % 50 == 0:
-            buffer.update_tensordict_priority(batch)
-
-
-def test_an_update_that_is_refused_does_not_count_as_one():
-    buffer = make_buffer()
-    buffer.extend(make_transitions(10))
-    with pytest.raises(RuntimeError, match="100 batches in a row"):
-        for _ in range(101):
-            batch = write_signals(buffer.sample())
-            with pytest.raises(KeyError, match="'index' is missing"):
-                buffer.update_tensordict_priority(batch.exclude("index"))
-
-
 @pytest.mark.parametrize("wrong", [0, -1, 2.5, True])
 def test_a_batch_size_that_is_no_count_is_refused(wrong):
     buffer = make_buffer()

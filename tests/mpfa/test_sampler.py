@@ -116,7 +116,7 @@ def test_a_histogram_of_50000_draws_has_the_probabilities_of_eq_8_after_a_wrap()
         buffer.update_tensordict_priority(write_signals(buffer.sample(), generator=generator))
     expected = torch.tensor(oracles.probabilities(priorities(buffer).tolist(), 0.6))
     assert expected.max() > 2 * expected.min()
-    sampled = torch.cat([buffer.sample()["index"] for _ in range(1000)])
+    sampled = torch.cat([buffer.sampler.sample(buffer.storage, 50)[0] for _ in range(1000)])
     found = torch.bincount(sampled, minlength=24) / 50_000
     tolerance = 5 * (expected * (1 - expected) / 50_000).sqrt()
     assert ((found - expected).abs() < tolerance).all()
