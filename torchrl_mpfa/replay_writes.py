@@ -8,6 +8,7 @@ from typing import Any
 
 from torchrl.data import TensorDictReplayBuffer
 
+from torchrl_mpfa.replay_transforms import TransformedReplayBuffer
 from torchrl_mpfa.storages.base import SignalStorageMixin
 
 
@@ -24,7 +25,7 @@ def _followed(write: Callable[..., Any]) -> Callable[..., Any]:
     return followed
 
 
-class FollowedReplayBuffer(TensorDictReplayBuffer):
+class FollowedReplayBuffer(TransformedReplayBuffer):
     """TorchRL's buffer with signals in its storage that follow every write in place."""
 
     set_ = _followed(TensorDictReplayBuffer.set_)

@@ -1,8 +1,9 @@
-"""What a buffer warns of: mistakes that would raise no error and end in uniform replay or worse."""
+"""Warnings of a buffer: mistakes that raise no error, and make its batches or targets wrong."""
 
 import pytest
 from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.envs.transforms import Compose, DoubleToFloat, MultiStepTransform
 
 from tests.mpfa.transitions import make_buffer, make_transitions, write_signals
 from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage, TreeSampler
@@ -14,9 +15,13 @@ PRIORITIZED = {
 }
 
 
-def buffer_with(sampler):
+def buffer_with(sampler, **options):
     storage = SignalTensorStorage(20, signals=["reward", "td_error", "action_gradient"])
-    buffer = SignalReplayBuffer(storage=storage, sampler=sampler, batch_size=4)
+    return SignalReplayBuffer(storage=storage, sampler=sampler, batch_size=4, **options)
+
+
+def filled_buffer(sampler):
+    buffer = buffer_with(sampler)
     buffer.extend(make_transitions(10))
     return buffer
 
@@ -24,7 +29,7 @@ def buffer_with(sampler):
 @pytest.mark.parametrize("info", [False, True])
 @pytest.mark.parametrize("kind", PRIORITIZED)
 def test_a_loop_that_never_updates_priorities_is_told_once_whatever_its_loss_writes(kind, info):
-    buffer = buffer_with(PRIORITIZED[kind](20))
+    buffer = filled_buffer(PRIORITIZED[kind](20))
     with pytest.warns(UserWarning, match=r"100 batches in a row .* update_tens") as told:
         for _ in range(300):
             buffer.sample(return_info=info)
@@ -33,7 +38,7 @@ def test_a_loop_that_never_updates_priorities_is_told_once_whatever_its_loss_wri
 
 @pytest.mark.parametrize("kind", PRIORITIZED)
 def test_a_loop_that_updates_priorities_now_and_then_is_not_told(kind):
-    buffer = buffer_with(PRIORITIZED[kind](20))
+    buffer = filled_buffer(PRIORITIZED[kind](20))
     for number in range(300):
         batch = write_signals(buffer.sample())
         if number % 50 == 0:
@@ -45,7 +50,7 @@ def test_a_loop_that_updates_priorities_now_and_then_is_not_told(kind):
     "sampler", [RandomSampler(), MPFASampler(20, alpha=0.0)], ids=["", "alpha"]
 )
 def test_a_loop_of_uniform_replay_is_not_told_to_update_priorities(sampler):
-    buffer = buffer_with(sampler)
+    buffer = filled_buffer(sampler)
     for _ in range(300):
         buffer.sample()
 
@@ -58,3 +63,36 @@ def test_an_update_that_is_refused_does_not_count_as_one():
             batch = write_signals(buffer.sample())
             with pytest.raises(KeyError, match="'index' is missing"):
                 buffer.update_tensordict_priority(batch.exclude("index"))
+
+
+def given(transform):
+    buffer_with(RandomSampler(), transform=transform)
+
+
+def made_at_first_use(transform):
+    buffer = buffer_with(RandomSampler(), transform_factory=lambda: transform)
+    assert buffer.storage is not None
+
+
+def appended(transform):
+    buffer_with(RandomSampler()).append_transform(transform)
+
+
+def inserted(transform):
+    buffer_with(RandomSampler()).insert_transform(0, transform)
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["", "composed"])
+@pytest.mark.parametrize("give", [given, made_at_first_use, appended, inserted])
+def test_steps_summed_past_the_end_of_an_episode_are_told_once_when_the_buffer_gets_them(
+    give, inside
+):
+    transform = MultiStepTransform(n_steps=3, gamma=0.99)
+    with pytest.warns(UserWarning, match=r"bootstrapped past .* done_keys=\['done'\]") as told:
+        give(Compose(DoubleToFloat(), transform) if inside else transform)
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("done_keys", [["done"], ["done", "truncated"], None])
+def test_steps_that_know_the_end_of_an_episode_are_not_told_of(done_keys):
+    appended(MultiStepTransform(3 if done_keys else 1, gamma=0.99, done_keys=done_keys))
