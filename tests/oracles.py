@@ -67,7 +67,8 @@ def boosted(priority, reward, boost):
 
 def decayed(priorities, rewards, sharpness):
     """Eqs. (23)-(24); j is the place in the batch, counted from 1."""
-    threshold = sum(priorities) / len(priorities)
+    # A sum of equal numbers is rounded, and what is equal to the mean is not above it.
+    threshold = math.fsum(priorities) / len(priorities) * (1 + 1e-12)
     after = []
     for j, (priority, reward) in enumerate(zip(priorities, rewards, strict=True), start=1):
         if reward > 0 and priority > threshold:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
+_ROUNDING = 64
+"""Units in the last place by which a priority has to exceed the mean of its batch."""
 
 
 def boost_positive(
@@ -282,7 +284,9 @@ class PositiveDecay:
         threshold = decay_threshold(priority)
         decayed = priority * self.factors(priority, batch)
         positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
-        return torch.where(positive & (priority > threshold), decayed, priority)
+        # The mean of equal numbers may be rounded to below them.
+        above = priority > threshold * (1.0 + _ROUNDING * torch.finfo(priority.dtype).eps)
+        return torch.where(positive & above, decayed, priority)
 
 
 @lru_cache(maxsize=64)

@@ -76,9 +76,22 @@ def test_a_large_sharpness_is_no_decay():
     torch.testing.assert_close(found, priority)
 
 
-def test_equal_priorities_do_not_decay():
-    priority = torch.full((8,), 0.5)
-    assert PositiveDecay()(priority, facts(torch.ones(8))).equal(priority)
+@pytest.mark.parametrize("dtype", [torch.float, torch.double])
+def test_equal_priorities_do_not_decay_whatever_their_mean_is_rounded_to(dtype):
+    values = torch.rand(40, generator=seeded(5), dtype=dtype) * 5
+    below = 0
+    for count in range(1, 31):
+        for value in values:
+            priority = value.expand(count).contiguous()
+            below += bool(priority.mean() < value)
+            assert PositiveDecay()(priority, facts(torch.ones(count))).equal(priority)
+            assert oracles.decayed(priority.tolist(), [1.0] * count, 0.01) == priority.tolist()
+    assert below > 50
+
+
+def test_a_priority_just_above_the_mean_decays():
+    found = PositiveDecay()(torch.tensor([1.0001, 1.0, 1.0]), facts(torch.ones(3)))
+    assert found.tolist() == pytest.approx([1.0001 / (1 + math.exp(-0.01)), 1.0, 1.0])
 
 
 def test_positions_by_rank_decay_the_highest_most_in_whatever_order_they_come():
