@@ -30,6 +30,7 @@ Shapes: ``N`` transitions in the buffer, ``B`` in a batch, ``K`` signals.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
@@ -101,7 +102,7 @@ def positive_entropy(reward: Tensor, *, positive_above: Level = 0.0) -> Tensor:
     Args:
         reward: Signed rewards of the population, shape ``[N]``.
         positive_above: A transition is positive when its reward is above this: 0 in the paper, or
-            ``"mean"``, the mean of ``reward``.
+            ``"mean"``, the mean of ``reward``, with which this is Eq. (16).
 
     Returns:
         Entropy in bits of the reward being positive, shape ``[]``.
@@ -226,15 +227,20 @@ class EntropyFusion:
     Args:
         reward_signals: Signals weighted by the entropy of the reward (Eq. 16), by default
             ``reward`` where it is fused; every other one gets that of positive training (Eq. 17),
-            a user's own too.
+            a user's own too. No signal is weighted by its own values: the weights of TD error and
+            action gradient are equal by definition.
         population: Transitions that the probabilities are counted over: the whole ``"buffer"``
             (default), or the ``"batch"``, which prioritized sampling biases.
-        positive_above: See :func:`positive_entropy`.
+        positive_above: See :func:`positive_entropy`. With ``"mean"`` both events are one, hence all
+            weights equal, whatever the data.
         floor: Smallest weight a signal may get before the weights are normalized again; 0 is the
             paper, whose TD weight vanishes once all rewards are positive.
 
     Raises:
         ValueError: If an argument is out of its range.
+
+    Warns:
+        UserWarning: If ``positive_above`` is ``"mean"``.
 
     Examples:
         >>> EntropyFusion().population
@@ -254,6 +260,13 @@ class EntropyFusion:
             raise ValueError(f"population must be 'buffer' or 'batch', got {self.population!r}")
         if not 0.0 <= self.floor < 1.0:
             raise ValueError(f"floor must be in [0, 1), got {self.floor}")
+        if self.positive_above == "mean":
+            warnings.warn(
+                "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
+                "all signals get equal weights, whatever the data. With a number between the "
+                "rewards the weights follow the data",
+                stacklevel=3,
+            )
 
     @property
     def signal_names(self) -> tuple[str, ...]:

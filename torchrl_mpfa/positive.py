@@ -43,6 +43,18 @@ def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor
     return reward > (mean if positive_above == "mean" else positive_above)
 
 
+def level_of(parts: Iterable[object]) -> Level:
+    """The level of the first of these parts that has one; 0 without any.
+
+    Examples:
+        >>> from torchrl_mpfa import FixedFusion, PositiveBoost
+        >>> level_of([FixedFusion(), PositiveBoost(positive_above=1.0)])
+        1.0
+    """
+    levels = (getattr(getattr(part, "fusion", part), "positive_above", None) for part in parts)
+    return next((level for level in levels if level is not None), 0.0)
+
+
 def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
     """What to say where all rewards of a buffer are on one side of a level that parts ask for.
 
@@ -68,7 +80,7 @@ def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
             return (
                 f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
                 f"above {level}: by Eq. (17) TD error and gradient get no weight beside the "
-                "reward, and boost and decay tell no transitions apart. Set "
-                "positive_above='mean', or to a level between the rewards"
+                "reward, and boost and decay tell no transitions apart. Set positive_above to a "
+                "level between the rewards, or to 'mean', with which all weights are equal"
             )
     return None

@@ -24,7 +24,7 @@ class Task:
         high: Return of an episode that counts as 1.
         repeat: Steps for which an action is held.
         positive_above: What a reward must exceed to be positive for a method; ``"mean"`` where all
-            rewards have one sign.
+            rewards have one sign, with which ``mpfa_per`` weights its signals equally.
         needs: Module that must be installed, if any.
     """
 

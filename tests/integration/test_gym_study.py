@@ -31,6 +31,9 @@ from navigation.report.kept_rows import read_kept
 from navigation.report.study_rows import Rows, scores_of
 from torchrl_mpfa.methods import Replay, loss_options, make_replay
 
+# Rewards of one sign: mpfa_per weights its signals equally there.
+pytestmark = pytest.mark.filterwarnings("ignore:positive_above='mean'")
+
 PENDULUM = TASKS["Pendulum-v1"]
 TINY = Regime(actions=96, first_actions=16, batch_size=16, width=8, every=48, episodes=1, updates=1)
 

@@ -57,6 +57,7 @@ def test_every_method_is_made_by_its_name(at_once, name):
     assert vars(replay.method) == expected
 
 
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
 @pytest.mark.parametrize("name", OF_ONE_BATCH)
 def test_a_method_of_one_batch_is_a_buffer_in_torchrls_group(at_once, name):
     buffer = instantiate(at_once.one[name])

@@ -67,6 +67,7 @@ def test_ties_count_as_not_greater():
     assert float(reward_entropy(torch.zeros(4))) == 0.0
 
 
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_positive_may_mean_above_a_level_or_above_the_mean():
     """Pendulum: all rewards are negative, so that none is positive by the letter."""
     rewards = torch.tensor([-8.0, -6.0, -1.0, -0.5])

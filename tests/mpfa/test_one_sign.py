@@ -31,9 +31,8 @@ def pendulum(count=1200, *, seed=0):
 def test_one_warning_names_the_cure():
     buffer = make_buffer(2000, 32, entropy_refresh=0)
     buffer.extend(pendulum())
-    with pytest.warns(
-        UserWarning, match=r"none of the 1200 rewards .*positive_above='mean'"
-    ) as seen:
+    cure = r"none of the 1200 rewards .*to 'mean', with which all weights are equal"
+    with pytest.warns(UserWarning, match=cure) as seen:
         train_rounds(buffer, 5)
     assert len(seen) == 1
     assert buffer.sampler.weights == {"td_error": 0.0, "action_gradient": 0.0, "reward": 1.0}
@@ -56,6 +55,7 @@ def test_rewards_that_are_all_equal_need_no_cure(reward):
     assert [*buffer.sampler.weights.values()] == pytest.approx([1 / 3] * 3)
 
 
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
 @pytest.mark.parametrize("level", ["mean", -8.0])
 def test_the_cure_gives_every_signal_its_weight(level):
     buffer = make_buffer(2000, 64, positive_above=level, entropy_refresh=0)
@@ -64,6 +64,37 @@ def test_the_cure_gives_every_signal_its_weight(level):
         warnings.simplefilter("error")
         train_rounds(buffer, 3)
     assert min(buffer.sampler.weights.values()) > 0.3
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: EntropyFusion(positive_above="mean"),
+        lambda: MPFASampler(8, positive_above="mean"),
+        lambda: make_replay("mpfa_per", capacity=8, positive_above="mean"),
+    ],
+)
+def test_the_mean_as_level_is_told_to_make_all_weights_equal(make):
+    with pytest.warns(UserWarning, match="equal weights, whatever the data") as told:
+        make()
+    assert len(told) == 1
+
+
+def test_weights_of_ones_own_beside_the_mean_are_not_told_of():
+    fusion = FixedFusion({"reward": 1.0, "td_error": 2.0})
+    MPFASampler(8, fusion=fusion, positive_above="mean")
+
+
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
+@pytest.mark.parametrize("share", [0.001, 0.3, 0.9])
+@pytest.mark.parametrize("population", ["buffer", "batch"])
+def test_the_mean_as_level_does_make_all_weights_equal(share, population):
+    rewards = torch.rand(400, generator=seeded(1)) - share
+    fusion = EntropyFusion(positive_above="mean", population=population)
+    buffer = make_buffer(400, 64, fusion=fusion, entropy_refresh=0)
+    buffer.extend(make_transitions(400, rewards=rewards))
+    train_rounds(buffer, 2)
+    assert [*buffer.sampler.weights.values()] == [1 / 3] * 3
 
 
 def test_the_mean_of_the_buffer_reaches_the_boost():
@@ -78,6 +109,7 @@ def test_the_mean_of_the_buffer_reaches_the_boost():
     assert buffer.sampler.priorities().tolist() == [2.0, 2.0, 1.0, 1.0]
 
 
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_one_argument_reaches_entropy_boost_and_decay():
     sampler = MPFASampler(8, positive_above="mean")
     assert sampler.fusion == EntropyFusion(positive_above="mean")
@@ -94,6 +126,7 @@ def test_one_argument_reaches_entropy_boost_and_decay():
         MPFASampler(8, positive_above="meen")
 
 
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_the_mean_is_that_of_the_buffer_and_saved():
     first, second = (make_buffer(64, 8, positive_above="mean") for _ in range(2))
     first.extend(make_transitions(64, rewards=torch.arange(-64.0, 0.0)))

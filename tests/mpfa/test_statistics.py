@@ -81,6 +81,17 @@ def test_fractions_of_positive_transitions(trained):
     assert stats["positive_fraction_batch"] == sum(r > 0 for r in sampled) / 12
 
 
+@pytest.mark.parametrize("level", [-1.0, "mean"])
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
+def test_fractions_of_positive_transitions_are_above_the_level_of_the_sampler(level):
+    buffer = make_buffer(4, 2, positive_above=level)
+    buffer.extend(make_transitions(4, rewards=[-9.0, -3.0, -2.0, -0.5]))
+    batch, least = buffer.sample(), -3.625 if level == "mean" else level
+    sampled, stats = batch["next", "reward"].flatten().tolist(), buffer.stats()
+    assert stats["positive_fraction_buffer"] == (0.75 if level == "mean" else 0.25)
+    assert stats["positive_fraction_batch"] == sum(reward > least for reward in sampled) / 2
+
+
 def test_effective_sample_size_age_and_replays_of_the_last_batch(trained):
     buffer, batch = trained
     stats = buffer.stats()

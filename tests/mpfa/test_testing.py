@@ -47,7 +47,7 @@ def test_our_adjustments_pass(adjustment):
     [
         (EntropyFusion(), ["reward", "td_error", "action_gradient"]),
         (EntropyFusion(population="batch", floor=0.1), ["reward", "novelty"]),
-        (EntropyFusion(positive_above="mean"), ["td_error", "action_gradient"]),
+        (EntropyFusion(positive_above=0.5), ["td_error", "action_gradient"]),
         (FixedFusion({"td_error": 1.0}), ["reward", "td_error"]),
         (ScaledFusion(FixedFusion({"reward": 1.0, "td_error": 1.0})), ["reward", "td_error"]),
         (ScheduledFusion({"reward": 1.0}, {"td_error": 1.0}), ["reward", "td_error"]),

@@ -28,7 +28,8 @@ class MPFASampler(SignalSampler):
         positive_above: A transition is positive when its reward is above this: a number (0 in the
             paper), or ``"mean"``, the mean reward of the buffer. It holds for the entropy of Eq.
             (17), the boost and the decay alike. Where all rewards have one sign, 0 makes all of
-            them the same: the TD error and the gradient then get no weight.
+            them the same: the TD error and the gradient then get no weight. With ``"mean"`` the
+            three weights are equal, whatever the data.
         **kwargs: As :class:`SignalSampler`, all of whose arguments are taken. Those that are not
             given are the paper's: its three signals, :class:`~torchrl_mpfa.EntropyFusion`,
             :class:`~torchrl_mpfa.PositiveBoost` and :class:`~torchrl_mpfa.PositiveDecay`, and the
@@ -37,12 +38,15 @@ class MPFASampler(SignalSampler):
     Raises:
         ValueError: If an argument is out of its range.
 
+    Warns:
+        UserWarning: If ``positive_above`` is ``"mean"`` and the fusion not one's own.
+
     Examples:
         >>> sampler = MPFASampler(100_000)
         >>> [type(adjust).__name__ for adjust in sampler.adjustments]
         ['PositiveBoost', 'PositiveDecay']
-        >>> MPFASampler(100_000, positive_above="mean").fusion.positive_above
-        'mean'
+        >>> MPFASampler(100_000, positive_above=-1.0).fusion.positive_above
+        -1.0
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from torchrl_mpfa.adjustment import Adjustment, BatchFacts
 from torchrl_mpfa.checks import bounds, check_counts, check_index, check_range
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion
 from torchrl_mpfa.moving_fusion import Annealed
-from torchrl_mpfa.positive import one_sided
+from torchrl_mpfa.positive import level_of, one_sided
 from torchrl_mpfa.samplers.binding import signal_table_of
 from torchrl_mpfa.samplers.rows import check_signals, write_signals
 from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
@@ -383,7 +383,10 @@ class SignalSampler(TreeSampler):
             effective sample size and age of the last batch, and the factor of the boost.
         """
         table = self.bind(storage)
-        found = batch_statistics(self._names, self.weights, self.fusion, table, self._last_batch)
+        level = level_of((*self.adjustments, self.fusion))
+        found = batch_statistics(
+            self._names, self.weights, self.fusion, table, self._last_batch, level
+        )
         return {**found, **boost_factor(self._weighing, self.adjustments)}
 
     def state_dict(self) -> dict[str, Any]:

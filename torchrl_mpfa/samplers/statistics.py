@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.fusion import Fusion
+from torchrl_mpfa.positive import Level, is_positive
 from torchrl_mpfa.storages.table import SignalTable
 
 
@@ -54,6 +55,7 @@ def batch_statistics(
     fusion: Fusion,
     table: SignalTable,
     last_batch: tuple[Tensor, Tensor] | None,
+    positive_above: Level,
 ) -> dict[str, float]:
     """Statistics of the buffer and of the last batch; see ``docs/metrics.md``.
 
@@ -63,6 +65,7 @@ def batch_statistics(
         fusion: Where the weights come from; its ``entropies`` are given if it has any.
         table: Signals of every slot.
         last_batch: Slots and importance weights last sampled, each of shape ``[B]``.
+        positive_above: What the reward of a positive transition exceeds.
 
     Returns:
         Plain numbers by name.
@@ -70,7 +73,12 @@ def batch_statistics(
     found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
     if table.size == 0:
         return found
-    found["positive_fraction_buffer"] = float((table.rewards > 0).double().mean())
+    mean = float(table.rewards.mean())
+
+    def positive_fraction(rewards: Tensor) -> float:
+        return float(is_positive(rewards, positive_above, mean=mean).double().mean())
+
+    found["positive_fraction_buffer"] = positive_fraction(table.rewards)
     if last_batch is None:
         return found
     index, importance = last_batch
@@ -84,9 +92,8 @@ def batch_statistics(
     if weights and len(known):
         shares = signal_shares(known, known.new_tensor([weights[name] for name in names]))
         found.update({f"share/{n}": s for n, s in zip(names, shares.tolist(), strict=True)})
-    rewards = rows[:, table.reward_column]
     age = table.writes - 1 - rows[:, table.time_column]
-    found["positive_fraction_batch"] = float((rewards > 0).double().mean())
+    found["positive_fraction_batch"] = positive_fraction(rows[:, table.reward_column])
     found["effective_sample_size"] = effective_sample_size(importance)
     found["sampled_age_mean"] = float(age.mean())
     found["sampled_age_max"] = float(age.max())
