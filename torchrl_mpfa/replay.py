@@ -54,9 +54,9 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none.
-        ValueError: If ``batch_size`` is not a positive integer, or capacity or signals of sampler
-            and storage differ; or, where signals are fused, if ``priority_key`` is where one is
-            read, or ``sample_unit`` makes sequences.
+        ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` not 0, or capacity or
+            signals of sampler and storage differ; or, where signals are fused, if ``priority_key``
+            is where one is read, or ``sample_unit`` makes sequences.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -82,6 +82,12 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         self._unreturned, self._warned = 0, False
         if (batch_size := kwargs.get("batch_size")) is not None:
             check_counts(batch_size=batch_size)
+        if prefetch := kwargs.get("prefetch"):
+            raise ValueError(
+                f"prefetch must be 0, got {prefetch}: batches that are sampled ahead know nothing "
+                "of the writes and updates before them, and one seed would not always give the "
+                "same batches"
+            )
         # TorchRL sets it once the parts are made, which have to agree with it.
         self.priority_key = kwargs.get("priority_key", "td_error")
         super().__init__(generator=generator or seeded_generator(), **kwargs)
@@ -99,12 +105,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             self._storage.needs_signals = True
         if self._checks:
             self._storage.strict = True
-        if self._prefetch_cap and isinstance(self._sampler, PrioritizedSampler):
-            raise ValueError(
-                f"prefetch must be 0 with a prioritized sampler, got {self._prefetch_cap}: batches "
-                "that are sampled ahead know nothing of the update before them, and one seed would "
-                "not always give the same batches"
-            )
 
     def _check_priority_key(self, table: SignalTable) -> None:
         if as_path(self.priority_key) in map(as_path, table.read_keys):
@@ -205,15 +205,13 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
 
     def empty(self, empty_write_count: bool = True) -> None:
-        """Forget all transitions, and the batches that were prefetched from them.
+        """Forget all transitions.
 
         Args:
             empty_write_count: As in TorchRL.
         """
-        with self._futures_lock:
-            self._clear_prefetch_queue_locked()
-            with self._replay_lock, self._write_lock:
-                super().empty(empty_write_count)
+        with self._replay_lock, self._write_lock:
+            super().empty(empty_write_count)
 
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
         data, info = super()._sample(batch_size)
@@ -387,8 +385,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def dumps(self, path: str | Path) -> None:
         """Save in a folder, whole or not at all, with a checksum of each file.
-
-        The queue of a buffer that prefetches is not saved.
 
         Raises:
             ValueError: If the data hold anything but tensors and plain values.

@@ -216,23 +216,22 @@ def test_without_a_generator_the_global_seed_rules():
     assert sampled[0].equal(sampled[1])
 
 
-def test_prefetching_is_refused_with_priorities_for_the_reason_that_is_given():
-    for sampler in (MPFASampler(32), TreeSampler(32, 0.6, 0.4), PrioritizedSampler(32, 0.6, 0.4)):
-        with pytest.raises(
-            ValueError, match="prefetch must be 0 with a prioritized sampler, got 2"
-        ):
-            SignalReplayBuffer(
-                storage=SignalTensorStorage(32), sampler=sampler, batch_size=8, prefetch=2
-            )
-
-
-def test_emptying_forgets_what_was_prefetched():
-    buffer = SignalReplayBuffer(storage=SignalTensorStorage(50), batch_size=8, prefetch=2)
-    buffer.extend(make_transitions(50))
-    buffer.sample()
-    buffer.empty()
-    buffer.extend(make_transitions(50, first=1000))
-    assert min(float(buffer.sample()["observation"].min()) for _ in range(4)) >= 1000
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        MPFASampler(32),
+        TreeSampler(32, 0.6, 0.4),
+        PrioritizedSampler(32, 0.6, 0.4),
+        RandomSampler(),
+        None,
+    ],
+    ids=lambda sampler: type(sampler).__name__,
+)
+def test_prefetching_is_rejected_as_one_seed_would_not_give_the_same_batches(sampler):
+    with pytest.raises(ValueError, match=r"prefetch must be 0, got 2: batches .* same batches"):
+        SignalReplayBuffer(
+            storage=SignalTensorStorage(32), sampler=sampler, batch_size=8, prefetch=2
+        )
 
 
 def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):
