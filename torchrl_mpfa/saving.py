@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import pickle
+import secrets
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +23,8 @@ def save_atomically(state: Any, path: str | Path) -> None:
     """Write tensors and plain values to a file in one step.
 
     The file is written beside its place and renamed, so that a crash at any moment leaves the
-    old file or the new one, never half of one. What a killed save left beside it is removed.
+    old file or the new one, never half of one. What a killed save left beside it is removed. Of
+    several saves at once, by threads or processes, the last one counts.
 
     Args:
         state: What ``torch.load(weights_only=True)`` can read again.
@@ -121,10 +123,11 @@ def _checksum(file: IO[bytes], end: int) -> bytes:
 def _replacing(path: Path) -> Iterator[IO[bytes]]:
     """A new file to write, which takes the place of ``path`` once it is whole."""
     _remove_leftovers(path)
-    # Opened as any file is, so that it gets the permissions that any file gets.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(8)}.tmp")
     try:
-        with temporary.open("w+b") as file:
+        # A new file with the permissions that any gets, which mkstemp's would not have; never one,
+        # nor a link, that is there already.
+        with temporary.open("x+b") as file:
             yield file
             file.flush()
             # Without this, a power cut after the rename could leave an empty file.
@@ -138,7 +141,7 @@ def _replacing(path: Path) -> Iterator[IO[bytes]]:
 def _remove_leftovers(path: Path) -> None:
     """Remove the temporary files of saves whose process is gone."""
     for found in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-        process = found.name.removesuffix(".tmp").rpartition(".")[2]
+        process = found.name.removesuffix(".tmp").rpartition(".")[2].partition("-")[0]
         if process.isdigit() and not _lives(int(process)):
             found.unlink(missing_ok=True)
 

@@ -5,6 +5,7 @@ import pickle
 import random
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -53,11 +54,46 @@ def test_a_crash_before_the_rename_leaves_the_old_file(tmp_path, monkeypatch):
 def test_what_a_killed_save_left_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    (tmp_path / f".state.pt.{gone.pid}.tmp").write_bytes(b"half")
+    for name in (f"{gone.pid}", f"{gone.pid}-0123456789abcdef"):
+        (tmp_path / f".state.pt.{name}.tmp").write_bytes(b"half")
     alive = tmp_path / f".state.pt.{os.getppid()}.tmp"
     alive.write_bytes(b"being written")
     save_atomically({"step": 1}, tmp_path / "state.pt")
     assert sorted(os.listdir(tmp_path)) == [alive.name, "state.pt"]
+
+
+def test_of_saves_at_once_the_last_one_counts_and_none_is_damaged(tmp_path):
+    path = tmp_path / "state.pt"
+
+    def save(number):
+        for _ in range(40):
+            save_atomically({"of": torch.full((5000,), number)}, path)
+            assert len(load_safely(path)["of"].unique()) == 1
+
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(save, range(3)))
+    assert os.listdir(tmp_path) == ["state.pt"]
+
+
+def test_a_link_at_the_name_of_the_temporary_file_is_not_followed(tmp_path, monkeypatch):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    monkeypatch.setattr("secrets.token_hex", lambda _: "known")
+    for name in (f"{os.getpid()}", f"{os.getpid()}-known"):
+        (tmp_path / f".table.md.{name}.tmp").symlink_to(victim)
+    with pytest.raises(FileExistsError):
+        write_text_atomically("text", tmp_path / "table.md")
+    assert victim.read_text(encoding="utf-8") == "precious"
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_a_file_gets_the_permissions_that_any_file_gets(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        save_atomically({}, tmp_path / "state.pt")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "state.pt").stat().st_mode & 0o777 == 0o666 & ~mask
 
 
 def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
