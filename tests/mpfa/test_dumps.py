@@ -1,16 +1,22 @@
 """Dumps: whole or absent, damage is noticed, and nothing in them is executed."""
 
+import json
 import os
 import pickle
 import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+import zipfile
+import zlib
 from pathlib import Path
 
 import pytest
 import torch
+from torchrl.data import CompressedListStorage, LazyTensorStorage
+from torchrl.data.replay_buffers import RandomSampler
 
 from tests.mpfa.transitions import make_buffer, make_transitions, same, snapshot, train_rounds
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
@@ -44,6 +50,117 @@ def refused(folder, match):
     return same(before, snapshot(buffer))
 
 
+def sealed_by_hand(path, folder):
+    """What seal_dump writes, of whatever is there, links to folders left out."""
+    found = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != MANIFEST)
+    files = {
+        file.relative_to(folder).as_posix(): [file.stat().st_size, zlib.crc32(file.read_bytes())]
+        for file in found
+    }
+    manifest = {"format": 1, "folder": os.path.relpath(folder, path), "files": files}
+    (path / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
+
+
+def pickled_entry(trap, write):
+    """Files of an entry that TensorDict unpickles."""
+    about = {"_type": "<class 'tensordict.tensorclass.NonTensorData'>", "shape": [16]}
+    about |= {"device": "cpu", "_is_memmap": True, "_is_shared": False, "_non_tensor": {}}
+    write("meta.json", json.dumps(about))
+    write("other.pickle", pickle.dumps(Trap(str(trap))))
+
+
+def entry_behind_a_link(storage, trap):
+    evil = storage.parent.parent / "evil"
+    evil.mkdir()
+    pickled_entry(
+        trap,
+        lambda name, data: (evil / name).write_bytes(
+            data.encode() if isinstance(data, str) else data
+        ),
+    )
+    (storage / "evil").symlink_to("../../evil")
+    about = json.loads((storage / "meta.json").read_text(encoding="utf-8"))
+    (storage / "meta.json").write_text(json.dumps({**about, "evil": {"type": "NonTensorData"}}))
+
+
+def stack_in_an_archive(storage, trap):
+    with zipfile.ZipFile(storage / "0", "w") as archive:
+        pickled_entry(trap, archive.writestr)
+    about = {"_type": "<class 'tensordict._lazy.LazyStackedTensorDict'>", "stack_dim": 0}
+    (storage / "meta.json").write_text(json.dumps(about))
+
+
+@pytest.mark.parametrize("kind", [SignalTensorStorage, LazyTensorStorage])
+@pytest.mark.parametrize(
+    ("hide", "words"),
+    [
+        (entry_behind_a_link, "storage/evil is a link"),
+        (stack_in_an_archive, "storage/0 could execute anything"),
+    ],
+)
+def test_a_pickle_that_is_hidden_is_never_read(dumped, tmp_path, hide, words, kind):
+    trap, storage = tmp_path / "trap", dumped / "dump-1/storage"
+    hide(storage, trap)
+    sealed_by_hand(storage, storage)
+    sealed_by_hand(dumped, dumped / "dump-1")
+    with pytest.raises(ValueError, match=words):
+        make_buffer(16).loads(dumped)
+    sampler = RandomSampler()
+    with pytest.raises(ValueError, match=words):
+        SignalReplayBuffer(storage=kind(16), sampler=sampler, batch_size=4).loads(dumped)
+    with pytest.raises(ValueError, match=words):
+        SignalTensorStorage(16).loads(storage)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("indices", [True, False])
+def test_text_that_torchrl_would_evaluate_is_never_read(tmp_path, indices):
+    trap = tmp_path / "trap"
+
+    def make(kind):
+        return SignalReplayBuffer(storage=kind(max_size=16), sampler=RandomSampler(), batch_size=2)
+
+    buffer = make(LazyTensorStorage)
+    buffer.extend(make_transitions(4))
+    buffer.dumps(tmp_path / "buffer")
+    folder = tmp_path / "buffer/dump-1"
+    code = {"__type__": "torch.dtype", "value": f"__import__('os').mkdir({str(trap)!r})"}
+    (folder / "storage/metadata.json").write_text(json.dumps([code]), encoding="utf-8")
+    if indices:
+        (folder / "storage/data_indices.json").write_text("[0]", encoding="utf-8")
+    sealed_by_hand(tmp_path / "buffer", folder)
+    with pytest.raises((ValueError, FileNotFoundError), match=r"data_indices\.json|Data indices"):
+        make(CompressedListStorage).loads(tmp_path / "buffer")
+    assert not trap.exists()
+
+
+def replace_by_link(path):
+    path.rename(path.with_name("moved"))
+    path.symlink_to("moved")
+
+
+@pytest.mark.parametrize(
+    ("place", "spoil", "words"),
+    [
+        ("dump-1/storage/observation.memmap", replace_by_link, "observation.memmap is a link"),
+        ("dump-1/storage", replace_by_link, "dump-1/storage is a link"),
+        ("dump-1/storage/none", lambda path: path.symlink_to("nothing"), "storage/none is a link"),
+        ("dump-1/storage/pipe", os.mkfifo, "storage/pipe is a link or a device"),
+        ("dump-1", replace_by_link, "it names the folder 'dump-1', which is not the dump's own"),
+        (MANIFEST, replace_by_link, f"it has no {MANIFEST}"),
+    ],
+)
+def test_a_link_or_a_pipe_in_a_dump_is_refused(dumped, place, spoil, words):
+    spoil(dumped / place)
+    assert refused(dumped, words)
+
+
+def test_a_dump_may_be_reached_by_a_link(dumped, tmp_path):
+    (tmp_path / "latest").symlink_to(dumped)
+    make_buffer(16).loads(tmp_path / "latest")
+    make_buffer(16).storage.loads(tmp_path / "latest/dump-1/storage")
+
+
 @pytest.mark.parametrize("place", [".", "dump-1", "dump-1/storage"])
 @pytest.mark.parametrize("name", ["prefetch.pkl", "other.pickle"])
 @pytest.mark.parametrize("sealed", [False, True])
@@ -73,15 +190,13 @@ def test_what_torchrl_wrote_is_refused_and_not_unpickled(tmp_path):
 
 
 def test_our_dumps_hold_no_pickles(dumped):
-    assert {file.suffix for file in dumped.rglob("*") if file.is_file()} == {
-        ".memmap",
-        ".json",
-        ".pt",
-    }
+    files = [file for file in (dumped / "dump-1").rglob("*") if file.is_file()]
+    assert {file.suffix for file in files} == {".memmap", ".json", ".pt"}
 
 
 def files_of(folder):
-    return sorted(file for file in folder.rglob("*") if file.is_file() and file.name != MANIFEST)
+    beside = (MANIFEST, ".lock")
+    return sorted(file for file in folder.rglob("*") if file.is_file() and file.name not in beside)
 
 
 def test_every_bit_that_flips_is_noticed(dumped):
@@ -128,7 +243,7 @@ def test_a_dump_that_fails_leaves_the_old_one_and_no_rest(dumped, monkeypatch):
     monkeypatch.setattr(buffer.writer, "dumps", crash)
     with pytest.raises(KeyboardInterrupt):
         buffer.dumps(dumped)
-    assert sorted(os.listdir(dumped)) == ["dump-1", MANIFEST]
+    assert sorted(os.listdir(dumped)) == [".lock", "dump-1", MANIFEST]
     found = make_buffer(16)
     found.loads(dumped)
     assert len(found) == 12
@@ -140,10 +255,26 @@ def test_the_next_dump_removes_the_old_one_and_what_killed_ones_left(dumped):
     buffer = make_buffer(16)
     buffer.extend(make_transitions(5))
     buffer.dumps(dumped)
-    assert sorted(os.listdir(dumped)) == ["dump-8", MANIFEST, "notes.txt"]
+    assert sorted(os.listdir(dumped)) == [".lock", "dump-8", MANIFEST, "notes.txt"]
     found = make_buffer(16)
     found.loads(dumped)
     assert len(found) == 5
+
+
+def test_of_dumps_at_once_each_waits_for_the_one_before(dumped):
+    later = make_buffer(16)
+    later.extend(make_transitions(3))
+    thread = threading.Thread(target=later.dumps, args=[dumped])
+    with new_dump(dumped) as folder:
+        thread.start()
+        thread.join(0.2)
+        assert thread.is_alive()
+        assert sorted(os.listdir(dumped)) == [".lock", "dump-1", folder.name, MANIFEST]
+    thread.join()
+    assert sorted(os.listdir(dumped)) == [".lock", "dump-3", MANIFEST]
+    found = make_buffer(16)
+    found.loads(dumped)
+    assert len(found) == 3
 
 
 def test_a_storage_notices_damage_by_itself(tmp_path):

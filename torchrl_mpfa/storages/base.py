@@ -325,7 +325,7 @@ class SignalStorageMixin:
         self._check_signals(state)
         length, is_tree = read_metadata(path, self.max_size, state["_signals"]["size"])
         if not is_tree:
-            self._check_data(TensorDict.load_memmap(path), length)
+            self._check_data(TensorDict.load_memmap(path, allow_pickle=False), length)
         return state
 
     def loads(self, path: str | Path) -> None:
