@@ -20,7 +20,7 @@ CAPACITY = 8
 KEY = ("next", "reward")
 
 
-def make_tracked_buffer(count, *, ndim=1, kind=SignalTensorStorage, sampler=None):
+def make_tracked_buffer(count, *, ndim=1, kind=SignalTensorStorage, sampler=None, wide=False):
     """A buffer of ``count`` transitions, of one environment, in the middle of its training."""
     buffer = SignalReplayBuffer(
         storage=kind(CAPACITY, ndim=ndim),
@@ -30,6 +30,9 @@ def make_tracked_buffer(count, *, ndim=1, kind=SignalTensorStorage, sampler=None
         generator=seeded(),
     )
     data = make_transitions(count)
+    if wide:
+        data["action"] = torch.zeros(count, 2)
+        data["next", "observation"] = torch.zeros(count, 1)
     buffer.extend(data if ndim == 1 else data.unsqueeze(0))
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
     return buffer
@@ -120,9 +123,80 @@ def test_a_reward_that_is_not_finite_is_refused_and_taken_back(wrong):
         lambda: buffer.update_({"next": {"reward": all_rewards(buffer, wrong)}}),
         lambda: buffer.__setitem__(KEY, all_rewards(buffer, wrong)),
     ):
-        with pytest.raises(ValueError, match=f"reward at .* must be finite, got {wrong}"):
+        with pytest.raises(ValueError, match=rf"reward.* must be finite, got {wrong}"):
             write()
         assert same(before, snapshot(buffer))
+
+
+ROWS = (CAPACITY, 1)
+BAD_WRITES = [
+    (lambda b: b.set_("observation", torch.full(ROWS, torch.nan)), "'observation' must be finite"),
+    (lambda b: b.set_("action", torch.ones(ROWS)), r"'action' must have the shape \[2\].* \[1\]"),
+    (lambda b: b.set_("action", torch.ones(2)), "batch dimension mismatch"),
+    (
+        lambda b: b.set_("action", torch.ones(CAPACITY, 2).double()),
+        "'action' must be torch.float32",
+    ),
+    (lambda b: b.set_("none", torch.ones(ROWS)), "'none' is not in the storage"),
+    (
+        lambda b: b.__setitem__("observation", torch.full(ROWS, -torch.inf)),
+        "'observation' must be finite, got -inf in row 0",
+    ),
+    (
+        lambda b: b.set_at_(
+            "observation", torch.tensor([[1.0], [torch.nan]]), torch.tensor([1, 2])
+        ),
+        "'observation' must be finite, got nan in row 1",
+    ),
+    (lambda b: b.set_at_("observation", torch.tensor([torch.inf]), 3), "'observation' must be fin"),
+    (lambda b: b.set_at_("action", torch.ones(2), slice(2)), r"must have the shape \[2\]"),
+    (lambda b: b.set_at_("action", torch.ones(2, 2), torch.tensor([0, 99])), "index 99 is out of"),
+    (
+        lambda b: b.update_({"observation": torch.ones(ROWS), "action": torch.ones(3, 2)}),
+        "batch dimension mismatch",
+    ),
+    (
+        lambda b: b.update_({"next": {"observation": torch.full(ROWS, torch.nan)}}),
+        r"\('next', 'observation'\) must be finite, got nan in row 0",
+    ),
+    (
+        lambda b: b.update_if_present(
+            index=torch.arange(2),
+            generation=b.writer.generations_of(torch.arange(2)),
+            patch={"observation": torch.tensor([[1.0], [torch.nan]])},
+        ),
+        "'observation' must be finite, got nan in row 1",
+    ),
+]
+
+
+@pytest.mark.parametrize("case", range(len(BAD_WRITES)))
+def test_what_extend_would_refuse_is_refused_in_place_and_nothing_changes(case):
+    write, message = BAD_WRITES[case]
+    buffer = make_tracked_buffer(CAPACITY, wide=True)
+    before = snapshot(buffer)
+    with pytest.raises((ValueError, KeyError, RuntimeError, IndexError), match=message):
+        write(buffer)
+    assert same(before, snapshot(buffer))
+
+
+def test_some_of_the_entries_are_written_and_others_left_out():
+    buffer = make_tracked_buffer(CAPACITY, wide=True)
+    batch = buffer[:]
+    batch["observation"], batch["extra"] = torch.full(ROWS, 3.0), torch.full(ROWS, torch.nan)
+    buffer.update_(batch, keys_to_update=["observation"])
+    buffer.set_at_("action", torch.full((2, 2), 4.0), torch.arange(CAPACITY) < 2)
+    assert buffer[:]["observation"].flatten().tolist() == [3.0] * CAPACITY
+    assert buffer[:]["action"][:3, 0].tolist() == [4.0, 4.0, 0.0]
+
+
+def test_an_entry_that_may_be_nan_may_be_written_so_in_place():
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(CAPACITY, allow_nonfinite=["observation"]), batch_size=4
+    )
+    buffer.extend(make_transitions(3))
+    buffer.set_at_("observation", torch.tensor([torch.nan]), 1)
+    assert buffer[:]["observation"].isnan().flatten().tolist() == [False, True, False]
 
 
 def test_a_signal_of_ones_own_follows_and_must_not_become_negative():

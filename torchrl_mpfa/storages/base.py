@@ -109,23 +109,38 @@ class SignalStorageMixin:
         table.size = len(self)  # type: ignore[arg-type]
 
     @contextmanager
-    def rewriting(self) -> Iterator[None]:
-        """Read rewards and signals anew, of which entries are written in place inside of it.
+    def rewriting(self, entries: Any, index: Any) -> Iterator[None]:
+        """Read rewards and signals again, of which entries are written in place inside of it.
+
+        Args:
+            entries: What is about to be written, a mapping or tensordict.
+            index: In which of the filled slots; None: TorchRL checks all but whether numbers are
+                finite.
 
         Raises:
-            ValueError: If a reward or a signal is not finite then, or a signal negative; those
-                entries are as they were.
+            IndexError: If a slot is outside.
+            KeyError: If an entry is unknown.
+            RuntimeError: If an entry is not of so many transitions.
+            ValueError: If shape or dtype of an entry are not those in the storage, a number is not
+                finite, or a signal negative then; all entries are as they were.
         """
+        schema = self._known_schema() if self.strict else None
+        if schema is not None and index is None:
+            check_finite_entries(TensorDict(dict(entries)), 1, self._allow_nonfinite)
+        elif schema is not None:
+            filled = self.get(slice(None)).shape[: self.ndim]
+            rows = torch.zeros(()).expand(filled)[index].shape
+            schema.check(TensorDict(dict(entries), rows), len(rows), whole=True, some=True)
         stored = self._storage if self.initialized else None  # type: ignore[attr-defined]
-        entries = []
+        kept = []
         if isinstance(stored, TensorDictBase):
             found = (stored.get(key, None) for key in self.signal_table.read_keys)
-            entries = [(entry, entry.clone()) for entry in found if entry is not None]
+            kept = [(entry, entry.clone()) for entry in found if entry is not None]
         try:
             yield
             rows = rows_of_data(self.signal_table, stored, len(self))  # type: ignore[arg-type]
         except BaseException:
-            for entry, before in entries:
+            for entry, before in kept:
                 entry.copy_(before)
             raise
         self.signal_table.rewrite(rows)

@@ -52,13 +52,14 @@ class Schema:
         """Whether the tensors of a storage are still those that were described."""
         return self._first is not None and stored.get(self._first[0]) is self._first[1].stored
 
-    def check(self, data: TensorDictBase, lead: int, *, whole: bool) -> Pairs:
+    def check(self, data: TensorDictBase, lead: int, *, whole: bool, some: bool = False) -> Pairs:
         """Refuse transitions of another form than those in the storage.
 
         Args:
             data: The transitions.
             lead: How many dimensions of ``data`` count transitions.
             whole: Whether an entry that is missing, unknown or not finite is refused, too.
+            some: Whether entries may be missing all the same.
 
         Returns:
             Each entry of the storage with what is to be written to it.
@@ -68,7 +69,7 @@ class Schema:
             ValueError: If shape or dtype of an entry differ, or a number is not finite.
         """
         pairs: Pairs = []
-        _match(self._tree, data, lead, whole, (), pairs)
+        _match(self._tree, data, lead, whole, (), pairs, some)
         return pairs
 
 
@@ -113,7 +114,13 @@ def _count(tree: _Tree) -> int:
 
 
 def _match(
-    tree: _Tree, data: TensorDictBase, lead: int, whole: bool, path: _Path, pairs: Pairs
+    tree: _Tree,
+    data: TensorDictBase,
+    lead: int,
+    whole: bool,
+    path: _Path,
+    pairs: Pairs,
+    some: bool,
 ) -> None:
     known = 0
     for key, value in data.items():
@@ -126,14 +133,14 @@ def _match(
         elif isinstance(expected, dict):
             if not isinstance(value, TensorDictBase):
                 raise ValueError(f"entry {_name(path, key)} must hold entries, got {_kind(value)}")
-            _match(expected, value, lead, whole, (*path, key), pairs)
+            _match(expected, value, lead, whole, (*path, key), pairs, some)
         elif whole and isinstance(value, Tensor | TensorDictBase) and key != INDEX_KEY:
             raise KeyError(
                 f"entry {_name(path, key)} is not in the storage, whose first transitions did not "
                 "have it: leave it out, or write it from the start"
             )
         known += expected is not None
-    if whole and known != len(tree):
+    if whole and not some and known != len(tree):
         for key in tree:
             if key != INDEX_KEY and data.get(key, None) is None:
                 raise KeyError(f"entry {_name(path, key)} is missing in the transitions")
