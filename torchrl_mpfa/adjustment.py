@@ -8,7 +8,6 @@ https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, check
 from torchrl_mpfa.positive import Level, check_level, is_positive
 
 if TYPE_CHECKING:
@@ -172,11 +172,6 @@ class Counting(Protocol):
         ...
 
 
-def _check_positive(name: str, value: float) -> None:
-    if not 0.0 < value < math.inf:
-        raise ValueError(f"{name} must be positive and finite, got {value}")
-
-
 @dataclass(frozen=True)
 class PositiveBoost:
     r"""Eq. (22) for positive transitions, all others unchanged.
@@ -205,10 +200,9 @@ class PositiveBoost:
     target_share: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_positive("boost", self.boost)
+        check(POSITIVE, boost=self.boost)
         check_level(self.positive_above)
-        if not 0.0 <= self.target_share < 1.0:
-            raise ValueError(f"target_share must be in [0, 1), got {self.target_share}")
+        check(BELOW_ONE, target_share=self.target_share)
         if self.target_share > 0 and self.boost < 1:
             raise ValueError(f"boost must be at least 1 with a target_share, got {self.boost}")
         if self.bound not in ("floor", "cap", "none"):
@@ -264,7 +258,7 @@ class PositiveDecay:
     positive_above: Level = 0.0
 
     def __post_init__(self) -> None:
-        _check_positive("sharpness", self.sharpness)
+        check(POSITIVE, sharpness=self.sharpness)
         check_level(self.positive_above)
         if self.position not in ("batch", "rank", "count"):
             raise ValueError(f"position must be 'batch', 'rank' or 'count', got {self.position!r}")

@@ -3,10 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from numbers import Integral
+from typing import Any
 
 import torch
 from torch import Tensor
+
+Rule = tuple[Callable[[Any], bool], str]
+"""Whether a value can be, and in words what it must be."""
+
+POSITIVE: Rule = (lambda value: 0.0 < value < math.inf, "positive and finite")
+NOT_NEGATIVE: Rule = (lambda value: 0.0 <= value < math.inf, "finite and not negative")
+SHARE: Rule = (lambda value: 0.0 <= value <= 1.0, "in [0, 1]")
+BELOW_ONE: Rule = (lambda value: 0.0 <= value < 1.0, "in [0, 1)")
+ABOVE_ZERO: Rule = (lambda value: 0.0 < value <= 1.0, "in (0, 1]")
+COUNT: Rule = (
+    lambda value: (
+        isinstance(value, Integral) and not isinstance(value, bool) and 1 <= value < 2**31
+    ),
+    "a positive 31-bit integer",
+)
 
 
 def seeded_generator() -> torch.Generator:
@@ -16,28 +33,40 @@ def seeded_generator() -> torch.Generator:
     return generator
 
 
-def check_range(name: str, value: float, *, low: float) -> None:
-    """Refuse what is no number, below ``low`` or not finite."""
-    try:
-        inside = low <= value < math.inf
-    except TypeError:
-        raise TypeError(f"{name} must be a number, got {value!r}") from None
-    if not inside:
-        raise ValueError(f"{name} must be finite and at least {low}, got {value}")
+def check(rule: Rule, **values: Any) -> None:
+    """Refuse, by name, values that a rule does not allow.
+
+    Raises:
+        TypeError: If a value cannot be compared with a number.
+        ValueError: If it is not allowed.
+
+    Examples:
+        >>> check(POSITIVE, lr=0.1, tau=0.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: tau must be positive and finite, got 0.0
+    """
+    allowed, wanted = rule
+    for name, value in values.items():
+        try:
+            inside = bool(allowed(value))
+        except (TypeError, ValueError, RuntimeError):
+            # A text, or a tensor of several numbers.
+            raise TypeError(f"{name} must be a number, got {value!r}") from None
+        if not inside:
+            raise ValueError(f"{name} must be {wanted}, got {value!r}")
 
 
-def check_counts(**counts: object) -> None:
+def check_counts(**counts: Any) -> None:
     """Refuse, by name, what is not a positive integer.
 
     Examples:
         >>> check_counts(width=64, layers=0)
         Traceback (most recent call last):
         ...
-        ValueError: layers must be a positive integer, got 0
+        ValueError: layers must be a positive 31-bit integer, got 0
     """
-    for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+    check(COUNT, **counts)
 
 
 def bounds(values: Tensor) -> tuple[float, float]:

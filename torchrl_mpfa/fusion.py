@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, check
 from torchrl_mpfa.positive import Level, check_level
 
 if TYPE_CHECKING:
@@ -258,8 +259,7 @@ class EntropyFusion:
         check_level(self.positive_above)
         if self.population not in ("buffer", "batch"):
             raise ValueError(f"population must be 'buffer' or 'batch', got {self.population!r}")
-        if not 0.0 <= self.floor < 1.0:
-            raise ValueError(f"floor must be in [0, 1), got {self.floor}")
+        check(BELOW_ONE, floor=self.floor)
         if self.positive_above == "mean":
             warnings.warn(
                 "positive_above='mean' makes the entropies of Eqs. (16) and (17) one and the same: "
@@ -317,8 +317,7 @@ class FixedFusion:
         if not isinstance(self.values, Mapping):
             raise TypeError(f"values must be a weight for each signal, got {self.values!r}")
         for name, value in self.values.items():
-            if not 0.0 <= value < float("inf"):
-                raise ValueError(f"weight of {name!r} must be finite and not negative, got {value}")
+            check(NOT_NEGATIVE, **{f"weight of {name!r}": value})
         if not any(self.values.values()):
             raise ValueError(f"values must have a positive weight, got {self.values}")
 

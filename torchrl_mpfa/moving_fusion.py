@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.fusion import FixedFusion, Fusion
 
 if TYPE_CHECKING:
@@ -61,8 +62,7 @@ class ScheduledFusion:
         Raises:
             ValueError: If ``fraction`` is outside.
         """
-        if not 0.0 <= fraction <= 1.0:
-            raise ValueError(f"fraction must be in [0, 1], got {fraction}")
+        check(SHARE, fraction=fraction)
         self._fraction = fraction
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:

@@ -53,7 +53,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         **kwargs: Passed to :class:`~torchrl.data.TensorDictReplayBuffer`.
 
     Raises:
-        TypeError: If the sampler fuses signals and the storage keeps none.
+        TypeError: If the sampler fuses signals and the storage keeps none, or ``generator`` is no
+            generator.
         ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` not 0, or capacity or
             signals of sampler and storage differ; or, where signals are fused, if ``priority_key``
             is where one is read, or ``sample_unit`` makes sequences.
@@ -88,6 +89,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 "of the writes and updates before them, and one seed would not always give the "
                 "same batches"
             )
+        if not isinstance(generator, torch.Generator | None):
+            raise TypeError(f"generator must be a torch.Generator, got {generator!r}")
         # TorchRL sets it once the parts are made, which have to agree with it.
         self.priority_key = kwargs.get("priority_key", "td_error")
         super().__init__(generator=generator or seeded_generator(), **kwargs)

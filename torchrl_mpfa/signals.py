@@ -73,12 +73,15 @@ def as_signals(signals: Sequence[Signal | str]) -> tuple[Signal, ...]:
         The signals, in the order given.
 
     Raises:
+        TypeError: If they are a text, or anything but signals and names.
         ValueError: If there is none, or a name appears twice.
 
     Examples:
         >>> [signal.name for signal in as_signals(["td_error", "novelty"])]
         ['td_error', 'novelty']
     """
+    if isinstance(signals, str) or not all(isinstance(s, str | Signal) for s in signals):
+        raise TypeError(f"signals must be a list of signals or their names, got {signals!r}")
     known = {signal.name: signal for signal in MPFA_SIGNALS}
     made = tuple(known.get(s, Signal(s)) if isinstance(s, str) else s for s in signals)
     names = [signal.name for signal in made]

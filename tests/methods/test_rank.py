@@ -110,5 +110,5 @@ def test_weights_are_those_of_the_shares():
 
 
 def test_a_negative_refresh_is_refused():
-    with pytest.raises(ValueError, match="rank_refresh must be finite and at least 0, got -1"):
+    with pytest.raises(ValueError, match="rank_refresh must be finite and not negative, got -1"):
         make_sampler(4, rank_refresh=-1)

@@ -129,7 +129,9 @@ def test_priorities_whose_sum_overflows_are_refused(alpha):
 def test_a_batch_of_nothing_is_refused(size):
     buffer = make_buffer(8)
     buffer.extend(make_transitions(8))
-    with pytest.raises(ValueError, match=f"batch_size must be a positive integer, got {size}"):
+    with pytest.raises(
+        ValueError, match=f"batch_size must be a positive 31-bit integer, got {size}"
+    ):
         buffer.sampler.sample(buffer.storage, size)
 
 

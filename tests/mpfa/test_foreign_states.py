@@ -86,7 +86,11 @@ def too_many():
     [
         (no_reward, KeyError, "the transitions lack 'reward'|'next.reward' is missing"),
         (reward_that_is_not_finite, ValueError, "reward' .*must be finite"),
-        (two_rewards, ValueError, r"one number per transition, got shape|has shape \[8, 2\]"),
+        (
+            two_rewards,
+            ValueError,
+            r"one real number per transition, got|has shape \[8, 2\]",
+        ),
         (too_many, ValueError, r"'_len' of the saved storage must be in \[0, 8\], got 9"),
     ],
 )

@@ -85,7 +85,9 @@ def test_the_value_depends_on_observation_and_action(late_action):
 def test_sizes_below_one_are_refused(argument):
     sizes = {"observation_size": 3, "action_size": 2, argument: 0}
     for make in (make_actor, make_critic):
-        with pytest.raises(ValueError, match=f"{argument} must be a positive integer, got 0"):
+        with pytest.raises(
+            ValueError, match=f"{argument} must be a positive 31-bit integer, got 0"
+        ):
             make(**sizes)
 
 

@@ -13,7 +13,19 @@ from tests.mpfa.transitions import (
     train_rounds,
     write_signals,
 )
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import (
+    EntropyFusion,
+    FixedFusion,
+    MPFASampler,
+    PositiveDecay,
+    SignalReplayBuffer,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    make_sac_loss,
+    make_stochastic_actor,
+)
+from torchrl_mpfa.signals import as_signals
 
 
 @pytest.fixture
@@ -67,6 +79,9 @@ def test_a_signal_of_the_wrong_shape_is_named_with_its_shape(buffer, shape):
     with pytest.raises(
         ValueError, match=r"signal 'td_error' must have one .*shape \[4, .* 4 slots"
     ):
+        buffer.update_tensordict_priority(batch)
+    batch["signals", "td_error"] = torch.tensor([1 + 5j, 2, 3, 4])
+    with pytest.raises(ValueError, match=r"must have one real number .* torch.complex64 of shape"):
         buffer.update_tensordict_priority(batch)
     assert same(before, snapshot(buffer))
 
@@ -154,7 +169,9 @@ def test_sequences_are_refused_where_signals_are_fused():
 
 @pytest.mark.parametrize("wrong", [-1, 0, "a", 2.5, True])
 def test_a_batch_size_that_is_no_count_is_refused_before_anything_is_made(wrong):
-    with pytest.raises(ValueError, match=f"batch_size must be a positive integer, got {wrong!r}"):
+    with pytest.raises(
+        ValueError, match=f"batch_size must be a positive 31-bit integer, got {wrong!r}"
+    ):
         SignalReplayBuffer(storage=SignalTensorStorage(8), batch_size=wrong)
 
 
@@ -194,4 +211,65 @@ def test_update_signals_can_be_called_by_hand_with_the_same_refusals(buffer):
         sampler.update_signals(torch.tensor([0]), {"td_error": torch.ones(1)}, storage=storage)
     with pytest.raises(TypeError, match="storage must keep signals"):
         sampler.update_signals(torch.tensor([0, 1]), signals, storage=LazyTensorStorage(16))
+    assert same(before, snapshot(buffer))
+
+
+def decay(value):
+    return PositiveDecay(sharpness=value)
+
+
+def buffer_with_generator(value):
+    return SignalReplayBuffer(storage=SignalTensorStorage(8), generator=value)
+
+
+def sac_loss(value):
+    actor, critic = make_stochastic_actor(3, 2, width=8), make_critic(3, 2, width=8)
+    return make_sac_loss(actor, critic, alpha_init=value)
+
+
+NO_NUMBER = "must be a number, got"
+
+
+@pytest.mark.parametrize(
+    ("make", "value", "message"),
+    [
+        (decay, "much", f"sharpness {NO_NUMBER} 'much'"),
+        (decay, torch.rand(2), rf"sharpness {NO_NUMBER} tensor"),
+        (decay, None, f"sharpness {NO_NUMBER} None"),
+        (lambda value: EntropyFusion(floor=value), [0.1], rf"floor {NO_NUMBER} \[0.1\]"),
+        (lambda value: FixedFusion({"a": value}), "1", f"weight of 'a' {NO_NUMBER} '1'"),
+        (lambda value: make_actor(3, 2, final_init=value), "0", f"final_init {NO_NUMBER} '0'"),
+        (
+            lambda value: make_actor(3, 2, final_init=value),
+            -1.0,
+            "final_init must be finite and no",
+        ),
+        (lambda value: make_actor(3, 2, width=value), 2**31, "width must be a positive 31-bit int"),
+        (SignalTensorStorage, 2**31, "max_size must be a positive 31-bit integer, got 2147483648"),
+        (
+            lambda value: MPFASampler(value),
+            10**30,
+            "max_capacity must be a positive 31-bit integer",
+        ),
+        (sac_loss, torch.nan, "alpha_init must be positive and finite, got nan"),
+        (buffer_with_generator, "seed", "generator must be a torch.Generator, got 'seed'"),
+        (as_signals, "novelty", "signals must be a list of signals or their names, got 'novelty'"),
+        (as_signals, [1], r"signals must be a list of signals or their names, got \[1\]"),
+    ],
+)
+def test_an_argument_that_cannot_be_is_named_with_its_value(make, value, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        make(value)
+
+
+def test_a_complex_reward_is_refused_and_changes_nothing(buffer):
+    before = snapshot(buffer)
+    data = make_transitions(2)
+    data["next", "reward"] = torch.tensor([[1 + 2j], [0.5]])
+    storage = SignalTensorStorage(8)
+    with pytest.raises(ValueError, match=r"one real number .* torch\.complex64"):
+        storage.set(torch.arange(2), data)
+    assert len(storage) == 0
+    with pytest.raises(ValueError, match=r"must be torch\.float32 as in"):
+        buffer.extend(data)
     assert same(before, snapshot(buffer))

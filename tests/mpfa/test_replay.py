@@ -384,5 +384,7 @@ def test_the_paper_signal_of_the_reward_is_its_absolute_value():
 def test_a_batch_size_that_is_no_count_is_refused(wrong):
     buffer = make_buffer()
     buffer.extend(make_transitions(10))
-    with pytest.raises(ValueError, match=f"batch_size must be a positive integer, got {wrong}"):
+    with pytest.raises(
+        ValueError, match=f"batch_size must be a positive 31-bit integer, got {wrong}"
+    ):
         buffer.sample(wrong)

@@ -86,7 +86,7 @@ def test_without_noise_ddpg_draws_no_random_number_and_has_the_same_state():
 def test_noise_without_bounds_is_refused():
     with pytest.raises(ValueError, match="one of action_spec and bounds must be given"):
         make_loss(policy_noise=0.1)
-    with pytest.raises(ValueError, match="policy_noise must be finite and at least"):
+    with pytest.raises(ValueError, match="policy_noise must be finite and not negative"):
         make_loss(policy_noise=-0.1, bounds=BOUNDS)
     with pytest.raises(ValueError, match="low < high"):
         make_loss(policy_noise=0.1, bounds=(1.0, -1.0))
@@ -127,5 +127,5 @@ def test_a_delayed_smoothed_ddpg_is_the_same_compiled():
 
 
 def test_a_delay_that_is_no_count_is_refused():
-    with pytest.raises(ValueError, match="policy_delay must be a positive integer, got 0"):
+    with pytest.raises(ValueError, match="policy_delay must be a positive 31-bit integer, got 0"):
         make_learner(make_loss(), policy_delay=0)

@@ -7,7 +7,6 @@ learner has the same methods and takes its place.
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any, ClassVar, Literal, NoReturn, Protocol, runtime_checkable
 
 import torch
@@ -15,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.learners.states import check_state, refuse_copy, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
@@ -102,11 +101,9 @@ class ActorCriticLearner:
             )
         if loss.reduction == "none":  # type: ignore[attr-defined]
             raise ValueError("reduction of the loss must be 'mean' or 'sum', got 'none'")
-        check_rate("actor_lr", actor_lr)
-        check_rate("critic_lr", critic_lr)
-        check_range("critic_weight_decay", critic_weight_decay, low=0.0)
-        if not 0 < tau <= 1:
-            raise ValueError(f"tau must be in (0, 1], got {tau}")
+        check(POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr)
+        check(NOT_NEGATIVE, critic_weight_decay=critic_weight_decay)
+        check(ABOVE_ZERO, tau=tau)
         groups = [
             {"params": loss.actor_parameters(), "lr": actor_lr},
             {
@@ -212,8 +209,7 @@ class ActorCriticLearner:
         Raises:
             ValueError: If ``factor`` is outside.
         """
-        if not 0.0 <= factor <= 1.0:
-            raise ValueError(f"factor must be in [0, 1], got {factor}")
+        check(SHARE, factor=factor)
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * factor
 
@@ -263,13 +259,3 @@ def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.o
     if name == "radam":
         return torch.optim.RAdam(groups, foreach=True)
     raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
-
-
-def check_rate(name: str, rate: float) -> None:
-    """Refuse a learning rate that is not positive and finite.
-
-    Raises:
-        ValueError: If it is not.
-    """
-    if not 0 < rate < math.inf:
-        raise ValueError(f"{name} must be positive and finite, got {rate}")

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_range
-from torchrl_mpfa.learners.base import OptimizerName, check_rate, make_optimizer
+from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
+from torchrl_mpfa.learners.base import OptimizerName, make_optimizer
 from torchrl_mpfa.learners.states import (
     check_state,
     check_updates,
@@ -20,7 +20,6 @@ from torchrl_mpfa.learners.states import (
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.functional import bootstrap_target
-from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
 from torchrl_mpfa.selection import Draw
@@ -45,11 +44,6 @@ def _whole_batch(draw: Draw | TensorDictBase, name: str) -> TensorDictBase:
             _ONE_NETWORK.format(trains=draw.trains, loss_function=draw.loss_function, name=name)
         )
     return draw.batch
-
-
-def _check_factor(factor: float) -> None:
-    if not 0.0 <= factor <= 1.0:
-        raise ValueError(f"factor must be in [0, 1], got {factor}")
 
 
 class DQNLearner:
@@ -86,10 +80,9 @@ class DQNLearner:
             raise TypeError(
                 f"loss of a DQNLearner must be a SignalDQNLoss, got {type(loss).__name__}"
             )
-        check_rate("lr", lr)
-        check_range("weight_decay", weight_decay, low=0.0)
-        if not 0 < tau <= 1:
-            raise ValueError(f"tau must be in (0, 1], got {tau}")
+        check(POSITIVE, lr=lr)
+        check(NOT_NEGATIVE, weight_decay=weight_decay)
+        check(ABOVE_ZERO, tau=tau)
         self.loss = loss
         network = loss.value_network
         if not isinstance(network, DirectModule):
@@ -147,7 +140,7 @@ class DQNLearner:
         Raises:
             ValueError: If ``factor`` is outside.
         """
-        _check_factor(factor)
+        check(SHARE, factor=factor)
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate * factor
 
@@ -218,9 +211,8 @@ class QLearner:
     ) -> None:
         if not isinstance(getattr(policy, "module", None), ValueTable):
             raise TypeError(f"policy must be one of make_value_table, got {type(policy).__name__}")
-        if not 0 < lr <= 1:
-            raise ValueError(f"lr must be in (0, 1], got {lr}")
-        check_gamma(gamma)
+        check(ABOVE_ZERO, lr=lr)
+        check(SHARE, gamma=gamma)
         self.policy, self.gamma, self.importance = policy, gamma, importance
         self._rate = self._first_rate = lr
         self.updates = 0
@@ -287,7 +279,7 @@ class QLearner:
         Raises:
             ValueError: If ``factor`` is outside.
         """
-        _check_factor(factor)
+        check(SHARE, factor=factor)
         self._rate = self._first_rate * factor
 
     def state_dict(self) -> dict[str, Any]:

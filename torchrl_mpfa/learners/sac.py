@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_mpfa.learners.base import ActorCriticLearner, check_rate
+from torchrl_mpfa.checks import POSITIVE, check
+from torchrl_mpfa.learners.base import ActorCriticLearner
 from torchrl_mpfa.losses import SignalSACLoss
 
 
@@ -37,7 +38,7 @@ class SACLearner(ActorCriticLearner):
     loss_type = SignalSACLoss
 
     def __init__(self, loss: SignalSACLoss, *, alpha_lr: float = 3e-4, **kwargs: Any) -> None:
-        check_rate("alpha_lr", alpha_lr)
+        check(POSITIVE, alpha_lr=alpha_lr)
         super().__init__(loss, **kwargs)
         if not loss.fixed_alpha:
             self._add_parameters([loss.log_alpha], lr=alpha_lr)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -11,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_mpfa.checks import check_counts, check_range
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
 from torchrl_mpfa.losses.averaging import AveragedNetwork, PastCritics
 from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
 from torchrl_mpfa.losses.functional import DISTANCES, action_gradient, critic_loss, saturation
@@ -109,13 +108,10 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             raise ValueError(
                 f"loss_function must be one of {DISTANCES}, got {kwargs['loss_function']!r}"
             )
-        if not gradient_order > 0:  # It may be infinite.
-            raise ValueError(f"gradient_order must be positive, got {gradient_order}")
-        if not 0 < reward_scale < math.inf:
-            raise ValueError(f"reward_scale must be positive and finite, got {reward_scale}")
-        check_range("saturation_penalty", saturation_penalty, low=0.0)
-        check_range("saturation_limit", saturation_limit, low=0.0)
-        check_range("pal_alpha", pal_alpha, low=0.0)
+        check((lambda order: order > 0, "positive"), gradient_order=gradient_order)
+        check(POSITIVE, reward_scale=reward_scale)
+        check(NOT_NEGATIVE, saturation_penalty=saturation_penalty)
+        check(NOT_NEGATIVE, saturation_limit=saturation_limit, pal_alpha=pal_alpha)
         check_counts(target_average=target_average)
         if target_average > 1 and not isinstance(critic_network, DirectModule):
             raise ValueError(

@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
+from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import Parts, bare, bind, call, read_inputs
-from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.losses.smoothing import TargetSmoothing, bounds_of, check_noise
 from torchrl_mpfa.losses.writing import SignalKeys
 
@@ -237,7 +237,7 @@ def make_ddpg_loss(
         >>> make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)).importance
         'critic'
     """
-    check_gamma(gamma)
+    check(SHARE, gamma=gamma)
     loss = SignalDDPGLoss(actor, critic, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

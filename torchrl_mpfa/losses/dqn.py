@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -12,8 +11,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
+from torchrl_mpfa.checks import POSITIVE, SHARE, check
 from torchrl_mpfa.losses.functional import distance
-from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.losses.targets import as_torchrl_needs
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
@@ -70,9 +69,8 @@ class SignalDQNLoss(DQNLoss):
             )
         if loss_function not in _DISTANCES:
             raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
-        if not 0 < reward_scale < math.inf:
-            raise ValueError(f"reward_scale must be positive and finite, got {reward_scale}")
-        check_gamma(gamma)
+        check(POSITIVE, reward_scale=reward_scale)
+        check(SHARE, gamma=gamma)
         super().__init__(
             value_network,
             # Of which the bent distance is made, in the units of the reward.

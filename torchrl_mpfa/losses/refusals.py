@@ -22,18 +22,3 @@ def check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
             f"{critic_name} must read what actor_network writes, {list(actor.out_keys)}, but "
             f"reads {list(first.in_keys)}"
         )
-
-
-def check_gamma(gamma: float) -> float:
-    """Refuse a discount outside [0, 1].
-
-    Raises:
-        ValueError: If it is outside.
-
-    Examples:
-        >>> check_gamma(0.99)
-        0.99
-    """
-    if not 0.0 <= gamma <= 1.0:
-        raise ValueError(f"gamma must be in [0, 1], got {gamma}")
-    return gamma

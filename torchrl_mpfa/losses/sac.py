@@ -12,9 +12,9 @@ from torch import Tensor
 from torchrl.objectives import SACLoss, ValueEstimators
 from torchrl.objectives.sac import compute_rsample_log_prob
 
+from torchrl_mpfa.checks import POSITIVE, SHARE, check
 from torchrl_mpfa.losses.calling import StackedNetworks, bind, read_inputs
 from torchrl_mpfa.losses.functional import least_value, soft_value
-from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.losses.trust import read_trust, trusted_loss
 from torchrl_mpfa.losses.twin import TwinCritics
 from torchrl_mpfa.losses.writing import SignalKeys
@@ -84,6 +84,7 @@ class SignalSACLoss(TwinCritics, SACLoss):
         for name in ("value_network", "skip_done_states"):
             if kwargs.get(name):
                 raise ValueError(f"{name} is not supported, got {kwargs[name]!r}")
+        check(POSITIVE, alpha_init=kwargs.get("alpha_init", 1.0))
         super().__init__(actor_network, qvalue_network, **kwargs)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -212,7 +213,7 @@ def make_sac_loss(
         >>> float(make_sac_loss(actor, critic, target_entropy=-1.0).target_entropy)
         -1.0
     """
-    check_gamma(gamma)
+    check(SHARE, gamma=gamma)
     loss = SignalSACLoss(actor, critic, loss_function=loss_function, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.checks import NOT_NEGATIVE, check
 from torchrl_mpfa.losses.functional import smoothed_action, smoothing_noise
 from torchrl_mpfa.networks import action_bounds
 
@@ -53,5 +53,4 @@ def bounds_of(action_spec: Any, bounds: Any) -> tuple[Tensor, Tensor]:
 
 def check_noise(policy_noise: float, noise_clip: float) -> None:
     """Refuse a deviation or a limit of the noise that is negative or not finite."""
-    check_range("policy_noise", policy_noise, low=0.0)
-    check_range("noise_clip", noise_clip, low=0.0)
+    check(NOT_NEGATIVE, policy_noise=policy_noise, noise_clip=noise_clip)

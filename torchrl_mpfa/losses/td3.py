@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 
+from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bare, bind, call, read_inputs
 from torchrl_mpfa.losses.functional import least_value
-from torchrl_mpfa.losses.refusals import check_gamma
 from torchrl_mpfa.losses.smoothing import TargetSmoothing, bounds_of, check_noise
 from torchrl_mpfa.losses.twin import TwinCritics
 from torchrl_mpfa.losses.writing import SignalKeys
@@ -172,7 +172,7 @@ def make_td3_loss(
         >>> loss.max_action.item()
         2.0
     """
-    check_gamma(gamma)
+    check(SHARE, gamma=gamma)
     loss = SignalTD3Loss(actor, critic, loss_function=loss_function, **kwargs)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
     return loss

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import RandomSampler, Storage
 
 from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
+from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.losses.trust import BEHAVIOR
 from torchrl_mpfa.methods.catalogue import METHODS, Method
@@ -120,8 +121,7 @@ class Replay:
             >>> replay.buffer.sampler.beta
             0.7
         """
-        if not 0.0 <= fraction <= 1.0:
-            raise ValueError(f"fraction must be in [0, 1], got {fraction}")
+        check(SHARE, fraction=fraction)
         start, end = self.method.beta, self.method.beta_end
         self.buffer.anneal(start + (end - start) * fraction, fraction)
 

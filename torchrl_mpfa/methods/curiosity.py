@@ -8,7 +8,6 @@ after it; the bonus is the error of foreseeing the latter from the former and th
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from typing import Any
 
@@ -17,7 +16,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.checks import POSITIVE, SHARE, check, check_counts
 from torchrl_mpfa.learners.states import refuse_unfinished
 
 
@@ -99,12 +98,10 @@ class Curiosity(nn.Module):
         reward_key: NestedKey = "reward",
     ) -> None:
         super().__init__()
+        check_counts(observation_size=observation_size, action_size=action_size)
         check_counts(features=features, width=width)
-        for name, value in (("scale", scale), ("lr", lr)):
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
-        if not 0.0 <= forward_share <= 1.0:
-            raise ValueError(f"forward_share must be in [0, 1], got {forward_share}")
+        check(POSITIVE, scale=scale, lr=lr)
+        check(SHARE, forward_share=forward_share)
         self.scale, self.forward_share, self.reward_key = scale, forward_share, reward_key
         self.encoder = _network(observation_size, width, features)
         self.inverse_model = _network(2 * features, width, action_size)

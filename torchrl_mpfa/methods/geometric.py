@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.checks import BELOW_ONE, check
 from torchrl_mpfa.samplers.newest import NewestSampler
 
 
@@ -79,9 +79,7 @@ class GeometricSampler(NewestSampler):
     """
 
     def __init__(self, *, rate: float = 3e-5) -> None:
-        check_range("rate", rate, low=0)
-        if rate >= 1:
-            raise ValueError(f"rate must be in [0, 1), got {rate}")
+        check(BELOW_ONE, rate=rate)
         super().__init__()
         self.rate = rate
 

@@ -13,13 +13,13 @@ to [0, 1] within a batch, the schedule of the weights and the penalty on replays
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.moving_fusion import ScheduledFusion
 from torchrl_mpfa.signals import Signal
 
@@ -81,8 +81,7 @@ def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
         >>> value_schedule().end
         {'relative_value': 0.5, 'relative_td_error': 0.5}
     """
-    if not 0.0 <= final_share <= 1.0:
-        raise ValueError(f"final_share must be in [0, 1], got {final_share}")
+    check(SHARE, final_share=final_share)
     value, error = RELATIVE_VALUE.name, RELATIVE_ERROR.name
     return ScheduledFusion({value: 0.0, error: 1.0}, {value: final_share, error: 1.0 - final_share})
 
@@ -110,10 +109,8 @@ class ReplayPenalty:
     floor: float = 0.01
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.penalty < math.inf:
-            raise ValueError(f"penalty must be finite and not negative, got {self.penalty}")
-        if not 0.0 < self.floor < math.inf:
-            raise ValueError(f"floor must be positive and finite, got {self.floor}")
+        check(NOT_NEGATIVE, penalty=self.penalty)
+        check(POSITIVE, floor=self.floor)
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Lower priorities by the replays of their transitions, shape ``[B]``."""

@@ -11,7 +11,6 @@ no further from it, are our reading.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
@@ -20,7 +19,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
 from torchrl_mpfa.methods.acting import actions_of
 
 _LEAST_VARIANCE = 1e-3
@@ -58,8 +57,7 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
         >>> bool(near < far)
         True
     """
-    if not 0.0 < variance < math.inf:
-        raise ValueError(f"variance must be positive and finite, got {variance}")
+    check(POSITIVE, variance=variance)
     deviation = deviation.double()
     mean = deviation.mean(-2)
     centered = deviation - mean.unsqueeze(-2)
@@ -105,8 +103,8 @@ class LowestDivergence:
         action_key: NestedKey = "action",
     ) -> None:
         check_counts(batches=batches)
-        if not callable(sigma) and not 0.0 <= sigma < math.inf:
-            raise ValueError(f"sigma must be finite and not negative, got {sigma}")
+        if not callable(sigma):
+            check(NOT_NEGATIVE, sigma=sigma)
         self.policy = policy
         self.batches = batches
         self.sigma = sigma

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
+from torchrl_mpfa.checks import check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.states import refuse
 from torchrl_mpfa.selection import Draw
@@ -48,8 +49,7 @@ class LA3PSampler(SignalSampler):
     KIND = "la3p"
 
     def __init__(self, *args: Any, uniform_fraction: float = 0.5, **kwargs: Any) -> None:
-        if not 0.0 < uniform_fraction < 1.0:
-            raise ValueError(f"uniform_fraction must be in (0, 1), got {uniform_fraction}")
+        check((lambda share: 0.0 < share < 1.0, "in (0, 1)"), uniform_fraction=uniform_fraction)
         self.uniform_fraction = uniform_fraction
         self._part: Part | None = None
         super().__init__(*args, **kwargs)

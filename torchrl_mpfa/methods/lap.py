@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.checks import POSITIVE, SHARE, check
 
 if TYPE_CHECKING:
     from torchrl_mpfa.storages.table import SignalTable
@@ -73,10 +74,8 @@ class PriorityFloor:
     quantile: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.floor < math.inf:
-            raise ValueError(f"floor must be positive and finite, got {self.floor}")
-        if not 0.0 <= self.quantile <= 1.0:
-            raise ValueError(f"quantile must be in [0, 1], got {self.quantile}")
+        check(POSITIVE, floor=self.floor)
+        check(SHARE, quantile=self.quantile)
 
     @property
     def counts(self) -> bool:

@@ -2,24 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from numbers import Integral
-from typing import Any
-
+from torchrl_mpfa.checks import BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
 from torchrl_mpfa.methods.catalogue import Method
 
-Rule = tuple[Callable[[Any], bool], str]
-"""Whether a value can be, and in words what it must be."""
-
-POSITIVE: Rule = (lambda value: 0.0 < value < math.inf, "positive and finite")
-NOT_NEGATIVE: Rule = (lambda value: 0.0 <= value < math.inf, "finite and not negative")
-SHARE: Rule = (lambda value: 0.0 <= value <= 1.0, "in [0, 1]")
-BELOW_ONE: Rule = (lambda value: 0.0 <= value < 1.0, "in [0, 1)")
-COUNT: Rule = (
-    lambda value: isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1,
-    "a positive integer",
-)
 SWITCH: Rule = (lambda value: isinstance(value, bool), "true or false")
 
 RANGES: dict[str, Rule] = {
@@ -69,11 +54,5 @@ def check_ranges(method: Method) -> None:
         ...
         ValueError: priority_floor must be finite and not negative, got -1.0
     """
-    for name, (allowed, wanted) in RANGES.items():
-        value = getattr(method, name)
-        try:
-            inside = allowed(value)
-        except TypeError:
-            raise TypeError(f"{name} must be a number, got {value!r}") from None
-        if not inside:
-            raise ValueError(f"{name} must be {wanted}, got {value!r}")
+    for name, rule in RANGES.items():
+        check(rule, **{name: getattr(method, name)})

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import check_range
+from torchrl_mpfa.checks import NOT_NEGATIVE, check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.states import check_count, check_tensor, refuse
 
@@ -57,7 +57,7 @@ class RankSampler(SignalSampler):
     KIND = "rank"
 
     def __init__(self, *args: Any, rank_refresh: float = 0.25, **kwargs: Any) -> None:
-        check_range("rank_refresh", rank_refresh, low=0)
+        check(NOT_NEGATIVE, rank_refresh=rank_refresh)
         self.rank_refresh = rank_refresh
         super().__init__(*args, **kwargs)
 

@@ -13,7 +13,6 @@ what comes after it: where the later TD errors of its episode are large, its own
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.checks import POSITIVE, check
 from torchrl_mpfa.signals import TD_ERROR, Signal
 
 if TYPE_CHECKING:
@@ -86,9 +86,7 @@ class Reliability:
     alpha: float = 0.6
 
     def __post_init__(self) -> None:
-        for name in ("exponent", "alpha"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        check(POSITIVE, exponent=self.exponent, alpha=self.alpha)
 
     @property
     def counts(self) -> bool:

@@ -15,7 +15,6 @@ policy counts as a Gaussian around its action, as wide as the behavior was.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
 
+from torchrl_mpfa.checks import POSITIVE, SHARE, check
 from torchrl_mpfa.losses.trust import (
     BEHAVIOR_MEAN,
     BEHAVIOR_SIGMA,
@@ -168,10 +168,8 @@ class RememberForget:
     def __init__(
         self, policy: TensorDictModule, *, far_share: float = 0.1, cutoff: float = 4.0
     ) -> None:
-        if not 0.0 <= far_share <= 1.0:
-            raise ValueError(f"far_share must be in [0, 1], got {far_share}")
-        if not 0.0 < cutoff < math.inf:
-            raise ValueError(f"cutoff must be positive and finite, got {cutoff}")
+        check(SHARE, far_share=far_share)
+        check(POSITIVE, cutoff=cutoff)
         self.policy = policy
         self.far_share = far_share
         self.cutoff = cutoff

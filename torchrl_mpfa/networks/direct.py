@@ -10,6 +10,8 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_mpfa.checks import NOT_NEGATIVE, check
+
 
 class DirectModule(TensorDictModule):
     """A :class:`~tensordict.nn.TensorDictModule` that is a plain function of its inputs as well.
@@ -78,6 +80,7 @@ def last_layer(inputs: int, outputs: int, final_init: float | None) -> nn.Linear
     """
     layer = nn.Linear(inputs, outputs)
     if final_init is not None:
+        check(NOT_NEGATIVE, final_init=final_init)
         nn.init.uniform_(layer.weight, -final_init, final_init)
         nn.init.uniform_(layer.bias, -final_init, final_init)
     return layer

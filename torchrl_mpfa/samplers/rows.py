@@ -35,17 +35,17 @@ def write_signals(
 
     Raises:
         KeyError: If a signal is missing.
-        ValueError: If one has not one number per transition.
+        ValueError: If one has not one real number per transition.
     """
     count = len(rows) if live is None else len(live)
     for name, priority_of in learned.items():
         if name not in signals:
             raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
         value = signals[name].detach()
-        if value.numel() != count:
+        if value.numel() != count or value.is_complex():
             raise ValueError(
-                f"signal {name!r} must have one number per transition, got shape "
-                f"{[*value.shape]} for {count} slots"
+                f"signal {name!r} must have one real number per transition, got {value.dtype} of "
+                f"shape {[*value.shape]} for {count} slots"
             )
         value = value.reshape(-1) if live is None else value.reshape(-1)[live]
         column = rows.select(1, table.column[name])

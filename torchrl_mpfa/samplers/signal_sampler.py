@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts
-from torchrl_mpfa.checks import bounds, check_counts, check_index, check_range
+from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_counts, check_index
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import level_of, one_sided
@@ -108,7 +108,7 @@ class SignalSampler(TreeSampler):
         if combination not in COMBINATIONS:
             raise ValueError(unknown("combination", combination, COMBINATIONS))
         self.combination = combination
-        check_range("entropy_refresh", entropy_refresh, low=0)
+        check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self.signals = as_signals(signals)
         self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
         if not isinstance(self.fusion, Fusion):

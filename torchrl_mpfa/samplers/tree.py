@@ -10,11 +10,12 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.checks import (
+    NOT_NEGATIVE,
     bounds,
+    check,
     check_counts,
     check_finite,
     check_index,
-    check_range,
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
@@ -73,8 +74,7 @@ class TreeSampler(SavedTrees):
         stratified: bool = False,
     ) -> None:
         check_counts(max_capacity=max_capacity)
-        for name, value in (("alpha", alpha), ("beta", beta), ("eps", eps)):
-            check_range(name, value, low=0)
+        check(NOT_NEGATIVE, alpha=alpha, beta=beta, eps=eps)
         if dtype not in (torch.float, torch.double):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.stratified = stratified
@@ -115,7 +115,7 @@ class TreeSampler(SavedTrees):
 
     @alpha.setter
     def alpha(self, value: float) -> None:
-        check_range("alpha", value, low=0)
+        check(NOT_NEGATIVE, alpha=value)
         self._check_alpha(value)
         before, self._alpha = self._alpha, value
         if value != before:
@@ -146,7 +146,7 @@ class TreeSampler(SavedTrees):
 
     @beta.setter
     def beta(self, value: float) -> None:
-        check_range("beta", value, low=0)
+        check(NOT_NEGATIVE, beta=value)
         self._beta = value
 
     @property

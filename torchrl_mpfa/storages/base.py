@@ -275,6 +275,12 @@ class SignalStorageMixin:
                 raise KeyError(f"{key!r} is missing in the saved storage")
         rows = None if foreign else state["_signals"]["size"]
         length = check_length(state["_len"], self.max_size, rows)
+        found = state["initialized"]
+        if not isinstance(found, bool) or found < bool(length):
+            raise ValueError(
+                f"'initialized' of the saved storage must be true with rows, got {found!r} with "
+                f"{length}"
+            )
         self._check_data(state["_storage"], length)
         if not foreign:
             signals: dict[str, Any] = state["_signals"]

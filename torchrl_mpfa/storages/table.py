@@ -267,10 +267,10 @@ def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
     value = data.get(key, None)
     if value is None:
         return None
-    if value.numel() != count:
+    if value.numel() != count or value.is_complex():
         raise ValueError(
-            f"{name} at {key!r} must have one number per transition, got shape {[*value.shape]} "
-            f"for {count} transitions"
+            f"{name} at {key!r} must have one real number per transition, got {value.dtype} of "
+            f"shape {[*value.shape]} for {count} transitions"
         )
     flat = value.detach().reshape(count).to("cpu", torch.double)
     low, high = flat.aminmax()

@@ -18,9 +18,10 @@ from navigation.settings.environment import EnvironmentSettings
 from navigation.settings.learners import is_discrete
 from navigation.settings.train import TrainSettings
 from navigation.worlds import is_of_a_test
+from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule
 from torchrl_mpfa.methods import Method, can_be_remote
 from torchrl_mpfa.methods.assembly import WORDS, unused_settings
-from torchrl_mpfa.methods.ranges import NOT_NEGATIVE, POSITIVE, RANGES, SHARE, Rule
+from torchrl_mpfa.methods.ranges import RANGES
 
 
 def at_least(least: float) -> Rule:
@@ -37,7 +38,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-OPEN_SHARE: Rule = (lambda value: 0.0 < value <= 1.0, "in (0, 1]")
 LEVEL: Rule = (
     lambda value: value == "mean" or (_is_number(value) and math.isfinite(value)),
     "a finite number or mean",
@@ -81,7 +81,7 @@ RULES: dict[str, Rule] = {
     "learner.lr_end_factor": SHARE,
     "learner.lr_power": POSITIVE,
     "learner.gamma": SHARE,
-    "learner.tau": OPEN_SHARE,
+    "learner.tau": ABOVE_ZERO,
     "learner.width": at_least(1),
     "learner.layers": at_least(1),
     "learner.final_init": POSITIVE,
@@ -94,7 +94,7 @@ RULES: dict[str, Rule] = {
     "learner.noise_clip": NOT_NEGATIVE,
     "learner.alpha_init": POSITIVE,
     "learner.alpha_lr": POSITIVE,
-    "learner.table_lr": OPEN_SHARE,
+    "learner.table_lr": ABOVE_ZERO,
     "curriculum.name": NAME,
     "exploration.random_steps": at_least(0),
     "exploration.sigma": NOT_NEGATIVE,
