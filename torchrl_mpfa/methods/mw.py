@@ -9,6 +9,7 @@ paper; that both are divided by their means and count the same, and the number, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -87,14 +88,9 @@ class CappedSampler(SignalSampler):
         """Everything that the next batches depend on; tensors and plain values only."""
         return {**super().state_dict(), "_spent": self._spent.clone()}
 
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
-
-        Raises:
-            ValueError: If an entry is missing, of another sampler, or not what it must be.
-        """
-        super().check_state(state_dict)
-        check_tensor(state_dict, "_spent", torch.bool, self._max_capacity)
+    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
+        spent = check_tensor(state, "_spent", torch.bool, self._max_capacity)
+        return super()._saved_leaves(state, written).masked_fill(spent[written], 0.0)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

@@ -5,6 +5,7 @@ Schaul et al. (2016), "Prioritized experience replay", https://arxiv.org/abs/151
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -30,6 +31,15 @@ def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
         [1.0, 0.5]
     """
     return rank.pow(-alpha)
+
+
+def _share_in(order: Tensor, priority: Tensor, *, alpha: float) -> Tensor:
+    """Shares by the ranks that priorities would have in an order, negated and rising, ``[B]``."""
+    negated = -priority
+    above = torch.searchsorted(order, negated)
+    # Equal ones share the mean of their places; one that has no equal stands after those above.
+    until = torch.searchsorted(order, negated, right=True).maximum(above + 1)
+    return rank_share((above + until + 1).double() / 2, alpha=alpha)
 
 
 class RankSampler(SignalSampler):
@@ -68,11 +78,7 @@ class RankSampler(SignalSampler):
         self._written = 0
 
     def _leaf(self, priority: Tensor) -> Tensor:
-        negated = -priority
-        above = torch.searchsorted(self._order, negated)
-        # Equal ones share the mean of their places; one that has no equal stands after those above.
-        until = torch.searchsorted(self._order, negated, right=True).maximum(above + 1)
-        return rank_share((above + until + 1).double() / 2, alpha=self._alpha)
+        return _share_in(self._order, priority, alpha=self._alpha)
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         super()._write(slots, priority, learned=learned)
@@ -105,10 +111,13 @@ class RankSampler(SignalSampler):
             ValueError: If an entry is missing, of another sampler, or not what it must be.
         """
         super().check_state(state_dict)
-        order = check_tensor(state_dict, "_order", torch.double, None)
+        check_count(state_dict, "_written")
+
+    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
+        order = check_tensor(state, "_order", torch.double, None)
         if len(order) > self._max_capacity or not bool((order.diff() >= 0).all()):
             refuse("_order", f"at most {self._max_capacity} rising numbers", f"{len(order)} others")
-        check_count(state_dict, "_written")
+        return _share_in(order, state["_priorities"][written], alpha=state["_alpha"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

@@ -49,6 +49,13 @@ class SavedTrees(PrioritizedSampler):
             ValueError: If an entry is missing, of another sampler, or not what it must be.
         """
         check_tree_state(state_dict, kind=self.KIND, capacity=self._max_capacity)
+        written = ~state_dict["_priorities"].isnan()
+        check_leaves(state_dict, written, self._saved_leaves(state_dict, written))
+
+    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
+        """What written slots of a saved state are sampled in proportion to, shape ``[M]``."""
+        priorities: Tensor = state["_priorities"][written]
+        return priorities.pow(state["_alpha"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -133,12 +140,29 @@ def check_tree_state(state: Mapping[str, Any], *, kind: str, capacity: int) -> N
         refuse("_learned", "false where nothing was written", True)
     for name in ("_sum_tree", "_min_tree"):
         check_tensor(state, name, torch.double, capacity)
-    check_values(state, "_sum_tree", written, high=math.inf)
-    if not bool(state["_sum_tree"].sum() < math.inf):
+
+
+def check_leaves(state: Mapping[str, Any], written: Tensor, leaves: Tensor) -> None:
+    """Refuse trees that do not belong to their priorities.
+
+    Args:
+        state: The saved state.
+        written: Which slots are written, shape ``[N]``.
+        leaves: What follows from the priorities of those, shape ``[M]``; 0 where a slot is left
+            out of the sampling, and has no lowest share either.
+
+    Raises:
+        ValueError: If they do not, or have no finite sum.
+    """
+    for name, counts in (("_sum_tree", leaves >= 0), ("_min_tree", leaves > 0)):
+        found = state[name][written]
+        # The power of a number may differ in its last bits by what stands beside it.
+        wrong = counts & ~found.isclose(leaves, rtol=1e-9, atol=0.0) | ~(found >= 0)
+        if bool(wrong.any()):
+            wanted = f"{leaves[wrong][0].item()}, as follows from '_priorities'"
+            refuse(name, wanted, found[wrong][0].item())
+    if not bool(leaves.sum() < math.inf):
         refuse("_sum_tree", "of finite sum", math.inf)
-    lowest = state["_min_tree"][written]
-    if not bool((lowest >= 0).all()):
-        refuse("_min_tree", "not negative", lowest[~(lowest >= 0)][0].item())
 
 
 def entry(state: Mapping[str, Any], name: str) -> Any:
