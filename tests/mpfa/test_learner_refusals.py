@@ -108,6 +108,34 @@ def test_a_batch_without_an_entry_changes_nothing(name, options):
         assert same(snapshot(learner), before)
 
 
+def test_moments_that_cannot_be_are_refused():
+    learner = make_learner("ddpg")
+    state = deepcopy(learner.state_dict())
+    state["optimizer"]["state"][0]["exp_avg_sq"].view(-1)[0] = -1.0
+    with pytest.raises(ValueError, match=r"\['exp_avg_sq'\] must be finite and not neg.*got -1.0"):
+        learner.load_state_dict(state)
+
+
+@pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)
+@pytest.mark.parametrize("entry", ["observation", "action", ("next", "observation")])
+def test_a_batch_that_does_not_fit_the_networks_is_named_and_changes_nothing(name, options, entry):
+    learner, batch = make_learner(name, **options), make_batch()
+    before = snapshot(learner)
+    for wrong in (torch.cat([batch[entry]] * 2, -1), batch[entry].double()):
+        words = re.escape(f"{entry!r} {[*wrong.shape]} {wrong.dtype}")
+        with pytest.raises(RuntimeError, match=f"batch does not fit the loss, got .*{words}.*:"):
+            learner.update(make_batch().set(entry, wrong))
+        assert same(snapshot(learner), before)
+
+
+def test_a_batch_that_does_not_fit_a_network_of_discrete_actions_is_named():
+    learner = DQNLearner(SignalDQNLoss(make_value_network(9, 4, width=8)))
+    batch = make_batch()
+    batch["action"] = torch.eye(4)[torch.zeros(len(batch), dtype=torch.long)]
+    with pytest.raises(RuntimeError, match=r"batch does not fit the loss, got 'observation' \["):
+        learner.update(batch)
+
+
 def test_rewards_that_overflow_the_loss_are_told_from_rewards_that_are_none():
     learner = make_learner("ddpg")
     before = snapshot(learner)
@@ -152,6 +180,14 @@ def weight_of(state, start="target_"):
             torch.zeros(1),
             r"\['state'\]\[0\]\['exp_avg'\] must have shape \(.*\), got \(1,\)",
         ),
+        (["optimizer", "state"], {}, r"\['state'\] must not be empty after 3 updates"),
+        (
+            ["optimizer", "state", 0, "step"],
+            torch.tensor(-5.0),
+            r"\['state'\]\[0\]\['step'\] must be finite and not negative, got -5.0",
+        ),
+        (["optimizer", "param_groups", 0, "lr"], "1", r"\[0\]\['lr'\] must be a number, got '1'"),
+        (["optimizer", "param_groups", 1, "eps"], torch.nan, r"\[1\]\['eps'\] must be .*got nan"),
         (["optimizer", "state", 99], {}, r"\['state'\] must be of \d+ parameters"),
         (["optimizer", "param_groups"], [], r"\['param_groups'\] must have \d groups, got \[\]"),
         (["optimizer", "param_groups", 0, "lr"], None, r"\['param_groups'\]\[0\] lacks 'lr'"),
@@ -173,7 +209,7 @@ def test_a_foreign_state_changes_nothing_and_is_named(name, path, value, words):
         if value is torch.nan:
             value = torch.full_like(state["loss"][key], torch.nan)
     before = snapshot(learner)
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         learner.load_state_dict(altered(state, path, value))
     assert same(snapshot(learner), before)
     learner.load_state_dict(state)

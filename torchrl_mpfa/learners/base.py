@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.states import check_state, refuse_copy, refuse_unfinished
+from torchrl_mpfa.learners.states import check_state, naming, refuse_copy, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.selection import Draw, Trains
@@ -139,6 +139,7 @@ class ActorCriticLearner:
 
         Raises:
             KeyError: If the batch lacks an entry.
+            RuntimeError: If the batch does not fit the networks.
             ValueError: If a loss is not finite. Nothing of the learner is changed then.
         """
         if not isinstance(draw, Draw):
@@ -149,7 +150,8 @@ class ActorCriticLearner:
         if trains == "both" and not due:
             trains = "critic"
         if trains == "critic" or due:
-            log = self._step(draw.batch, trains, draw.loss_function)
+            with naming(draw.batch):
+                log = self._step(draw.batch, trains, draw.loss_function)
         self.updates = updates
         return {key: value.detach() for key, value in log.items()}
 

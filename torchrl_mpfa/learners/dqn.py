@@ -14,6 +14,7 @@ from torchrl_mpfa.learners.base import OptimizerName, make_optimizer
 from torchrl_mpfa.learners.states import (
     check_state,
     check_updates,
+    naming,
     refuse_copy,
     refuse_unfinished,
 )
@@ -115,7 +116,8 @@ class DQNLearner:
         """
         batch = _whole_batch(draw, type(self).__name__)
         self.optimizer.zero_grad(set_to_none=True)
-        loss, log = self.loss.losses(batch)
+        with naming(batch):
+            loss, log = self.loss.losses(batch)
         log["loss_value"] = loss
         refuse_unfinished(log, batch)
         loss.backward()

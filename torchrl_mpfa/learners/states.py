@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
 
 
 def refuse_unfinished(losses: Mapping[str, Tensor], batch: TensorDictBase) -> None:
@@ -58,6 +61,19 @@ def _first_not_finite(batch: TensorDictBase) -> str | None:
     return None
 
 
+@contextmanager
+def naming(batch: TensorDictBase) -> Iterator[None]:
+    """Say of which batch an error of PyTorch is, such as that two matrices do not fit."""
+    try:
+        yield
+    except torch.OutOfMemoryError:
+        raise
+    except RuntimeError as error:
+        found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
+        forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
+        raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
+
+
 def refuse_copy(learner: object) -> NoReturn:
     """Refuse to copy a learner: the optimizer of a copy would move none of the copy's parameters.
 
@@ -89,6 +105,10 @@ def check_state(given: Any, own: Mapping[str, Any], optimizer: torch.optim.Optim
         _check_entry(f"state_dict['loss'][{name!r}]", given["loss"][name], value)
     check_updates(given["updates"])
     _check_optimizer(given["optimizer"], own["optimizer"], optimizer)
+    if given["updates"] and not given["optimizer"]["state"]:
+        raise ValueError(
+            f"state_dict['optimizer']['state'] must not be empty after {given['updates']} updates"
+        )
 
 
 def check_updates(updates: Any) -> None:
@@ -135,6 +155,8 @@ def _check_optimizer(given: Any, own: Mapping[str, Any], optimizer: torch.optim.
         raise ValueError(f"{name}['param_groups'] must have {len(mine)} groups, got {groups!r}")
     for place, (group, expected) in enumerate(zip(groups, mine, strict=True)):
         _check_keys(f"{name}['param_groups'][{place}]", group, expected)
+        for key in ("lr", "eps", "weight_decay"):
+            check(NOT_NEGATIVE, **{f"{name}['param_groups'][{place}][{key!r}]": group[key]})
         if group["params"] != expected["params"]:
             raise ValueError(
                 f"{name}['param_groups'][{place}]['params'] must be {expected['params']}, got "
@@ -149,6 +171,8 @@ def _check_optimizer(given: Any, own: Mapping[str, Any], optimizer: torch.optim.
         for key, value in values.items():
             like = torch.zeros(()) if key == "step" else parameters[place]
             _check_entry(f"{name}['state'][{place}][{key!r}]", value, like)
+            if key != "exp_avg":
+                check_finite(f"{name}['state'][{place}][{key!r}]", value)
 
 
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
