@@ -171,3 +171,9 @@ def test_unknown_words_are_refused():
 def test_any_callable_is_an_adjustment():
     assert isinstance(PositiveBoost(), Adjustment)
     assert isinstance(lambda priority, batch: priority, Adjustment)
+
+
+def test_of_equal_priorities_the_earlier_place_decays_more():
+    decay = PositiveDecay(sharpness=1e-3, position="rank")
+    found = decay.factors(torch.ones(5000), facts(torch.ones(5000)))
+    assert (found.diff() > 0).all()

@@ -9,7 +9,15 @@ from tensordict import TensorDict
 from tests.methods.replays import assert_shares, seeded, set_signals
 from tests.mpfa.test_updates import make_learner, make_rows
 from tests.mpfa.transitions import same
-from torchrl_mpfa import MixtureSampler, ScaledFusion, SignalSampler, run_updates
+from torchrl_mpfa import (
+    MixtureSampler,
+    PositiveBoost,
+    ScaledFusion,
+    SignalReplayBuffer,
+    SignalSampler,
+    SignalTensorStorage,
+    run_updates,
+)
 from torchrl_mpfa.fusion import FixedFusion, fuse_product
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.testing import check_sampler
@@ -235,3 +243,19 @@ def test_what_cannot_be_combined_is_refused():
         ):
             second.load_state_dict({**first.state_dict(), "_parts": value})
         assert same(before, second.state_dict())
+
+
+def test_a_boost_is_a_factor_of_each_signal_with_its_eps():
+    sampler = MixtureSampler(
+        2, 1.0, 1.0, 0.5, signals=SIGNALS, adjustments=[PositiveBoost(boost=3.0, bound="none")]
+    )
+    buffer = SignalReplayBuffer(
+        storage=SignalTensorStorage(2, signals=SIGNALS), sampler=sampler, batch_size=2
+    )
+    buffer.extend(TensorDict({"next": {"reward": torch.tensor([[1.0], [-2.0]])}}, [2]))
+    set_signals(buffer, td_error=torch.tensor([0.25, 4.0]))
+    leaves = [[(1.0 + 0.5) * 3.0, 2.0 + 0.5], [(0.25 + 0.5) * 3.0, 4.0 + 0.5]]
+    shares = [[leaf / sum(each) for leaf in each] for each in leaves]
+    expected = [(first + second) / 2 for first, second in zip(*shares, strict=True)]
+    weights = sampler.batch_weights(2)
+    assert float(weights[0] / weights[1]) == pytest.approx(expected[1] / expected[0])

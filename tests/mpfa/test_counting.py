@@ -1,5 +1,7 @@
 """Adjustments that count the buffer: when they count, what they are told, and what is saved."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -251,3 +253,35 @@ def test_the_bend_is_that_of_the_method_until_errors_are_known():
     set_signals(replay.buffer, td_error=torch.zeros(10))
     set_signals(replay.buffer, td_error=torch.zeros(10))
     assert 0 < replay.buffer.sample()["bend"][0] < 1e-5
+
+
+class Scale:
+    """A fusion of one signal that says how often it was asked."""
+
+    asked = 0
+
+    def weights(self, names, table, index):
+        self.asked += 1
+        return torch.ones(len(names))
+
+
+def test_a_share_of_the_buffer_may_be_rewritten_before_the_fusion_weighs_again():
+    fusion = Scale()
+    buffer, _ = make_counted(8, entropy_refresh=0.5, fusion=fusion)
+    train(buffer, 1)
+    buffer.extend(make_transitions(4))
+    train(buffer, 1)
+    assert fusion.asked == 1  # A half, and no more.
+    buffer.extend(make_transitions(1))
+    train(buffer, 1)
+    assert fusion.asked == 2
+
+
+def test_what_was_counted_of_later_writes_is_counted_again():
+    buffer, census = make_counted()
+    state = deepcopy(buffer.storage.state_dict())
+    buffer.extend(make_transitions(6))
+    train(buffer, 1)
+    buffer.storage.load_state_dict(state)
+    train(buffer, 1)
+    assert census.asked == 2

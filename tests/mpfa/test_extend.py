@@ -81,6 +81,10 @@ BAD = {
     "nothing next": (removed("next"), r"'next' is missing in the transitions"),
     "no action": (removed("action"), r"'action' is missing in the transitions"),
     "unknown entry": (changed("loc", torch.ones(2, 2)), r"'loc' is not in the storage"),
+    "unknown nested entry": (
+        changed(("next", "info"), TensorDict({"loc": torch.ones(2)}, [2])),
+        r"\('next', 'info'\) is not in the storage",
+    ),
     "entries in place of a tensor": (
         changed("action", TensorDict({"a": torch.ones(2, 2)}, [2])),
         r"'action' must be a tensor, got TensorDict",

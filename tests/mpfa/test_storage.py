@@ -277,3 +277,23 @@ def test_torchrls_own_sampler_may_sample_the_storage():
     buffer = ReplayBuffer(storage=SignalTensorStorage(8), sampler=RandomSampler(), batch_size=4)
     buffer.extend(torch.arange(5.0))
     assert buffer.sample().shape == (4,)
+
+
+def test_a_batch_from_before_two_clearings_is_old(make_storage):
+    storage = make_storage(8)
+    buffer = make_buffer(8, storage=storage)
+    buffer.extend(make_transitions(8))
+    batch = write_signals(buffer.sample())
+    buffer.empty()
+    buffer.empty()
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == len(batch)
+
+
+def test_rows_that_are_written_out_of_order_count_as_in_torchrl():
+    ours, theirs = make_buffer(8).storage, LazyTensorStorage(8)
+    rows = make_transitions(1).set("index", torch.zeros(1, dtype=torch.long))
+    for storage in (ours, theirs):
+        for slot in (0, 5, 5):
+            storage.set(torch.tensor([slot]), rows.clone())
+    assert len(ours) == len(theirs) == 3

@@ -303,3 +303,37 @@ def test_an_exponent_that_cannot_be_is_refused_and_changes_nothing(kind, name, v
     assert same(states_of(sampler), before)
     setattr(sampler, name, 0.9)
     assert getattr(sampler, name) == 0.9
+
+
+def test_the_highest_mass_that_there_is_does_not_leave_the_filled_slots(monkeypatch):
+    # Of these priorities the sum is rounded up, beyond what the search adds up.
+    priority = 10 ** (torch.rand(29, generator=seeded(7), dtype=torch.double) * 5)
+    sampler = TreeSampler(64, 1.0, 0.4, 0.0)
+    storage = filled(sampler, 29, 64)
+    sampler.update_priority(torch.arange(29), priority)
+    highest = torch.full((3,), 1.0 - 2.0**-53, dtype=torch.double)
+    monkeypatch.setattr(sampler, "_mass", lambda count: highest.clone())
+    assert sampler.sample(storage, 3)[0].tolist() == [28] * 3
+
+
+def test_without_an_exponent_the_highest_priority_is_the_highest_ever():
+    sampler = TreeSampler(4, 0.0, 0.4, 0.0, max_priority_within_buffer=True)
+    filled(sampler, 4, 4)
+    sampler.update_priority([0, 1], torch.tensor([5.0, 2.0]))
+    sampler.mark_update(torch.tensor([0]))
+    assert sampler.default_priority == 5.0
+
+
+def test_a_priority_of_zero_that_was_learned_twice_is_still_learned():
+    sampler = TreeSampler(4, 1.0, 0.4, 0.0, max_priority_within_buffer=True)
+    for _ in range(2):
+        sampler.update_priority([0], torch.tensor([0.0]))
+        assert sampler.default_priority == 0.0
+
+
+def test_of_equal_priorities_the_first_is_that_of_the_highest_as_in_torchrl():
+    ours, theirs = TreeSampler(4, 1.0, 0.4), PrioritizedSampler(4, 1.0, 0.4)
+    for sampler in (ours, theirs):
+        for slot, priority in ((2, 3.0), (0, 1.0), (0, 3.0)):
+            sampler.update_priority(torch.tensor([slot]), torch.tensor([priority]))
+    assert int(ours._max_priority[1]) == int(theirs._max_priority[1]) == 2
