@@ -20,7 +20,7 @@ BELOW_ONE: Rule = (lambda value: 0.0 <= value < 1.0, "in [0, 1)")
 ABOVE_ZERO: Rule = (lambda value: 0.0 < value <= 1.0, "in (0, 1]")
 COUNT: Rule = (
     lambda value: (
-        isinstance(value, Integral) and not isinstance(value, bool) and 1 <= value < 2**31
+        isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) < 2**31
     ),
     "a positive 31-bit integer",
 )

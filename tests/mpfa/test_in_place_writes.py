@@ -132,7 +132,10 @@ ROWS = (CAPACITY, 1)
 BAD_WRITES = [
     (lambda b: b.set_("observation", torch.full(ROWS, torch.nan)), "'observation' must be finite"),
     (lambda b: b.set_("action", torch.ones(ROWS)), r"'action' must have the shape \[2\].* \[1\]"),
-    (lambda b: b.set_("action", torch.ones(2)), "batch dimension mismatch"),
+    (
+        lambda b: b.set_("action", torch.ones(2)),
+        "must be of .* transitions: batch dimension mismatch",
+    ),
     (
         lambda b: b.set_("action", torch.ones(CAPACITY, 2).double()),
         "'action' must be torch.float32",
@@ -153,7 +156,7 @@ BAD_WRITES = [
     (lambda b: b.set_at_("action", torch.ones(2, 2), torch.tensor([0, 99])), "index 99 is out of"),
     (
         lambda b: b.update_({"observation": torch.ones(ROWS), "action": torch.ones(3, 2)}),
-        "batch dimension mismatch",
+        "must be of .* transitions: batch dimension mismatch",
     ),
     (
         lambda b: b.update_({"next": {"observation": torch.full(ROWS, torch.nan)}}),

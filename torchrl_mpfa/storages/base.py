@@ -120,7 +120,6 @@ class SignalStorageMixin:
         Raises:
             IndexError: If a slot is outside.
             KeyError: If an entry is unknown.
-            RuntimeError: If an entry is not of so many transitions.
             ValueError: If shape or dtype of an entry are not those in the storage, a number is not
                 finite, or a signal negative then; all entries are as they were.
         """
@@ -129,8 +128,14 @@ class SignalStorageMixin:
             check_finite_entries(TensorDict(dict(entries)), 1, self._allow_nonfinite)
         elif schema is not None:
             filled = self.get(slice(None)).shape[: self.ndim]
-            rows = torch.zeros(()).expand(filled)[index].shape
-            schema.check(TensorDict(dict(entries), rows), len(rows), whole=True, some=True)
+            slots = torch.zeros(()).expand(filled)[index].shape
+            try:
+                given = TensorDict(dict(entries), slots)
+            except RuntimeError as error:
+                raise ValueError(
+                    f"entries {[*dict(entries)]} must be of {[*slots]} transitions: {error}"
+                ) from None
+            schema.check(given, len(slots), whole=True, some=True)
         stored = self._storage if self.initialized else None  # type: ignore[attr-defined]
         kept = []
         if isinstance(stored, TensorDictBase):
