@@ -254,7 +254,8 @@ class EntropyFusion:
     floor: float = 0.0
 
     def __post_init__(self) -> None:
-        if isinstance(self.reward_signals, str):
+        names = self.reward_signals
+        if isinstance(names, str) or not isinstance(names, Sequence | None):
             raise TypeError(f"reward_signals must be names, got {self.reward_signals!r}")
         check_level(self.positive_above)
         if self.population not in ("buffer", "batch"):

@@ -34,6 +34,7 @@ class Signal:
             is known at the write; a learned signal is stored as it comes.
 
     Raises:
+        TypeError: If ``priority`` is no function.
         ValueError: If ``name`` is empty or ``known_at`` unknown.
 
     Examples:
@@ -49,6 +50,8 @@ class Signal:
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError(f"name must not be empty, got {self.name!r}")
+        if not (self.priority is None or callable(self.priority)):
+            raise TypeError(f"priority must be a function, got {self.priority!r}")
         if self.known_at not in ("update", "write"):
             raise ValueError(f"known_at must be 'update' or 'write', got {self.known_at!r}")
         if not self.key:

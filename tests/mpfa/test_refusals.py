@@ -18,6 +18,7 @@ from torchrl_mpfa import (
     FixedFusion,
     MPFASampler,
     PositiveDecay,
+    Signal,
     SignalReplayBuffer,
     SignalTensorStorage,
     make_actor,
@@ -254,6 +255,12 @@ NO_NUMBER = "must be a number, got"
         (sac_loss, torch.nan, "alpha_init must be positive and finite, got nan"),
         (buffer_with_generator, "seed", "generator must be a torch.Generator, got 'seed'"),
         (as_signals, "novelty", "signals must be a list of signals or their names, got 'novelty'"),
+        (lambda value: EntropyFusion(value), 5, "reward_signals must be names, got 5"),
+        (
+            lambda value: Signal("a", priority=value),
+            "abs",
+            "priority must be a function, got 'abs'",
+        ),
         (as_signals, [1], r"signals must be a list of signals or their names, got \[1\]"),
     ],
 )
