@@ -24,6 +24,11 @@ def pytest_collection() -> Generator[None, object, object]:
     return found
 
 
+def pytest_unconfigure() -> None:
+    """Let Python free at its end what was imported, which Triton would else report as leaks."""
+    gc.unfreeze()
+
+
 # PyTorch takes seconds to import, and of the processes of pytest-xdist the first runs no test.
 @pytest.fixture(autouse=True)
 def one_thread():
