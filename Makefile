@@ -50,7 +50,7 @@ HEADERS := import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_
 WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
 NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simulated wheels; demo and train use physics=kinematic
 # Arguments of the scripts on such a Python, evaluated when they are called: there may be no .venv before.
-WHEELS = `$(BIN)/python -c "import sys; print('--physics ' + ('kinematic' if sys.version_info >= (3, 12) else 'wheels'))"`
+EVALUATED = `$(BIN)/python -c "import sys; print('kinematic' if sys.version_info >= (3, 12) else 'wheels')"`
 PHYSICS = `$(BIN)/python -c "import sys; print('environment.physics=kinematic' * (sys.version_info >= (3, 12)))"`
 
 help: ## Print this list
@@ -63,8 +63,8 @@ demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unse
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
 	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true learner.compile=$(COMPILE) 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
 	@echo "== driving through test worlds of every generator"
-	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) $(WHEELS)
-	@cp runs/demo/evaluation-all/evaluation.json runs/demo/evaluation-all/trajectories.png runs/demo/evaluation-all/episode.gif runs/demo/
+	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED)
+	@cd runs/demo/evaluation-all-$(EVALUATED) && cp evaluation.json trajectories.png episode.gif ..
 	@echo "written: runs/demo/evaluation.json, trajectories.png, episode.gif"
 
 train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)

@@ -8,7 +8,7 @@
     python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, not kept
 
 Prints one row per world or generator, and the total. Writes to --output; by default to
-``evaluation-WORLDS`` in the folder of the run, or, for other files and planners, to
+``evaluation-WORLDS-PHYSICS`` in the folder of the run, or, for other files and planners, in
 runs/evaluation-NAME; another seed and noise are part of that name:
 summary.csv (the rows with their intervals), evaluation.json (their numbers), episodes.csv (one row
 per episode), settings.json (the arguments, and a policy's card), trajectories.png (paths in up to
@@ -42,12 +42,19 @@ from mpfa_envs import (
 )
 from navigation import files
 from navigation.environments import check_physics
-from navigation.evaluating import Drivable, Drives, drive, summary_row, tasks_of
+from navigation.evaluating import (
+    Drivable,
+    Drives,
+    drive,
+    evaluation_folder,
+    summary_row,
+    tasks_of,
+)
 from navigation.live import watch
 from navigation.pictures import Values, write_pictures
 from navigation.records import as_table, write_table
 from navigation.training.values import load_learner, values_of
-from navigation.worlds import parse_worlds, world_name, worlds_label
+from navigation.worlds import parse_worlds, world_name
 from torchrl_mpfa.saving import write_text_atomically
 
 EVALUATION = "evaluation.json"
@@ -122,7 +129,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     try:
         options.names = parse_worlds(options.worlds)
         options.loaded = load_driver(options)
-        check_physics(options.physics or options.loaded.env_arguments.get("physics", "wheels"))
+        options.physics = options.physics or options.loaded.env_arguments.get("physics", "wheels")
+        check_physics(options.physics)
         files.check_folder(options.output or output_folder(options))
     except (ValueError, OSError) as error:
         parser.error(str(error))
@@ -157,16 +165,10 @@ def name_of(options: argparse.Namespace) -> str:
 
 
 def output_folder(options: argparse.Namespace) -> Path:
-    """Where results go unless the command line says.
-
-    Each choice of worlds, seed and noise has its own folder; that of the first seed without noise
-    may hold rows of a study.
-    """
-    name = f"evaluation-{worlds_label(options.worlds)}"
-    if options.seed:
-        name += f"-seed{options.seed}"
-    noise = {} if options.noise is None else asdict(options.noise)
-    name += "".join(f"-{what}{value:g}" for what, value in noise.items() if value)
+    """Where results go unless the command line says."""
+    name = evaluation_folder(
+        options.worlds, options.physics, seed=options.seed, noise=options.noise
+    )
     policy = options.path
     if policy is None:
         return Path("runs") / f"evaluation-{name_of(options)}" / name
@@ -199,7 +201,12 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         kept = {name: None if math.isnan(value) else value for name, value in values}
         return {"episodes": int(row["episodes"]), **kept}
 
-    document: dict[str, Any] = {**entries(rows[-1]), "generators": {}, "worlds": {}}
+    document: dict[str, Any] = {
+        "physics": rows[-1]["physics"],
+        **entries(rows[-1]),
+        "generators": {},
+        "worlds": {},
+    }
     for row in rows:
         generator, _, split = str(row["world"]).partition("-")
         if generator in GENERATORS and split in ("test", "validation"):
@@ -256,10 +263,9 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     options = parse(arguments)
     policy: Drivable = options.loaded
     folder = options.output or output_folder(options)
-    asked = {"episodes": options.episodes, "seed": options.seed, "physics": options.physics}
-    how = {"noise": options.noise}
-    if options.physics is not None:
-        how["physics"] = options.physics
+    physics = options.physics
+    asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
+    how = {"noise": options.noise, "physics": physics}
     if options.live:
         return show_live(options, how)
     results: list[EpisodeResult] = []
@@ -272,14 +278,18 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             )
             results += drives.results
             driven.append(drives)
-            rows.append({"world": world_name(world), **summary_row(drives.results)})
+            rows.append(
+                {"world": world_name(world), "physics": physics, **summary_row(drives.results)}
+            )
         if not options.no_pictures:
             write_pictures(policy, driven, folder, values=critic(options), **how)
         if len(rows) > 1:
-            rows.append({"world": "total", **summary_row(results)})
+            rows.append({"world": "total", "physics": physics, **summary_row(results)})
         summary = pd.DataFrame(rows)
         write_table(summary, folder / "summary.csv")
-        write_table(as_table(results, EpisodeResult), folder / files.EPISODES)
+        episodes = as_table(results, EpisodeResult)
+        episodes.insert(0, "physics", physics)
+        write_table(episodes, folder / files.EPISODES)
         write_text_atomically(
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
@@ -292,7 +302,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         else:
             document |= {"policy": options.policy, "memory": options.memory}
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
-    print(f"\n{name_of(options)}\n{printed(summary)}")
+    print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
     print(f"written: {folder}")
     return summary
 

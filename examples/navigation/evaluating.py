@@ -1,9 +1,9 @@
-"""How well a policy drives in the worlds of a command line."""
+"""How well a policy drives in the worlds of a command line, and where that is kept."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from mpfa_envs import (
@@ -18,6 +18,7 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from navigation.worlds import worlds_label
 
 Drivable = Policy | MapPlanner | DynamicWindow
 """What drives, and knows by ``env_arguments`` what it must sense."""
@@ -35,6 +36,34 @@ class Drives:
     def of_world(self, name: str) -> list[int]:
         """Numbers of the episodes in one world."""
         return [n for n, each in enumerate(self.tasks) if each.world.name == name]
+
+
+def evaluation_folder(
+    words: Sequence[str], physics: str, *, seed: int = 0, noise: RobotNoise | None = None
+) -> str:
+    """Name of the folder of an evaluation: each choice has its own.
+
+    Args:
+        words: Worlds, as on the command line.
+        physics: ``wheels`` or ``kinematic``.
+        seed: Seed of the tasks in a world.
+        noise: Errors of the robot; None: none.
+
+    Returns:
+        The name; that of the first seed without noise may hold rows of a study.
+
+    Examples:
+        >>> evaluation_folder(["test", "bars:test"], "wheels", noise=RobotNoise(slip=0.1))
+        'evaluation-test+bars-test-wheels-slip0.1'
+    """
+    errors = {} if noise is None else asdict(noise)
+    return "".join(
+        [
+            f"evaluation-{worlds_label(words)}-{physics}",
+            f"-seed{seed}" if seed else "",
+            *(f"-{what}{value:g}" for what, value in errors.items() if value),
+        ]
+    )
 
 
 def tasks_of(
@@ -65,29 +94,27 @@ def drive(
     *,
     episodes: int | None,
     seed: int,
-    physics: str | None,
+    physics: str,
     noise: RobotNoise | None = None,
     progress: bool,
 ) -> Drives:
     """Drive a policy through fixed tasks, contact being the only collision.
 
-    As :func:`mpfa_envs.evaluate`, and the ways are kept.
+    As :func:`mpfa_envs.evaluate`, and the paths are kept.
 
     Args:
         policy: The policy, or a planner.
         world: What :func:`mpfa_envs.world_tasks` takes.
         episodes: Number of tasks; None: as many as there usually are.
         seed: Seed of the tasks in a world.
-        physics: ``wheels`` or ``kinematic``; None: as trained.
+        physics: ``wheels`` or ``kinematic``.
         noise: Errors of the robot; None: none.
         progress: Whether to show a bar.
 
     Returns:
-        Tasks, results and ways.
+        Tasks, results and paths.
     """
-    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
-    if physics is not None:
-        arguments["physics"] = physics
+    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise, "physics": physics}
     tasks = tasks_of(policy, [world], episodes=episodes, seed=seed)
     trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
 

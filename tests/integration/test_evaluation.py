@@ -39,7 +39,7 @@ def test_the_script_writes_tables_and_pictures(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     evaluate.main([str(run), "--worlds", "B", "--episodes", "3"])
-    folder = run / "evaluation-B"
+    folder = run / "evaluation-B-kinematic"
     summary = read_table(folder / "summary.csv")
     assert list(summary["world"]) == ["B"]
     row = summary.iloc[0]
@@ -53,7 +53,8 @@ def test_the_script_writes_tables_and_pictures(
         assert picture.size[0] == 640
     with Image.open(folder / "episode.gif") as animation:
         assert getattr(animation, "n_frames", 1) > 1
-    assert json.loads((folder / "settings.json").read_text())["card"]["learner"] == "ddpg"
+    said = json.loads((folder / "settings.json").read_text())
+    assert said["card"]["learner"] == "ddpg"
     assert f"written: {folder}" in capsys.readouterr().out
 
 
@@ -77,7 +78,7 @@ def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     # The tasks of this seed are short, and a picture takes longer than a step.
     worlds = ["--worlds", "A", "B", "--episodes", "2", "--seed", "145"]
     summary = evaluate.main(["--policy", *words, *worlds])
-    folder = Path("runs") / f"evaluation-{name}" / "evaluation-A+B-seed145"
+    folder = Path("runs") / f"evaluation-{name}" / "evaluation-A+B-kinematic-seed145"
     assert list(summary["world"]) == ["A", "B", "total"]
     assert list(summary["success"]) == [1.0, 1.0, 1.0]
     found = json.loads((folder / "evaluation.json").read_text())
@@ -90,7 +91,7 @@ def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     assert settings["memory"] == ("none" if name == "astar" else "map")
     assert {path.name for path in folder.iterdir()} >= {*pictures, "summary.csv"}
     shown = capsys.readouterr().out
-    assert f"\n{name}\n" in shown and "plan_ms" in shown
+    assert f"\n{name}, physics: kinematic\n" in shown and "plan_ms" in shown
 
 
 @pytest.mark.parametrize(
@@ -114,60 +115,84 @@ def test_several_worlds_have_a_row_each_and_a_total(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     evaluate.main([str(run), "--worlds", "A", "--episodes", "1", "--no-pictures"])
-    before = (run / "evaluation-A" / "episodes.csv").read_bytes()
+    before = (run / "evaluation-A-kinematic" / "episodes.csv").read_bytes()
     worlds = ["--worlds", "A", "rooms:5-6"]
     summary = evaluate.main([str(run), *worlds, "--episodes", "2", "--no-pictures"])
     assert list(summary["world"]) == ["A", "rooms-5", "rooms-6", "total"]
     assert list(summary["episodes"]) == [2, 2, 2, 6]
     assert summary["spl"].iloc[-1] == pytest.approx(summary["spl"].iloc[:-1].mean())
     # Results of other worlds stay what they were.
-    assert (run / "evaluation-A" / "episodes.csv").read_bytes() == before
-    assert len(read_table(run / "evaluation-A+rooms-5-6" / "episodes.csv")) == 6
+    assert (run / "evaluation-A-kinematic" / "episodes.csv").read_bytes() == before
+    assert len(read_table(run / "evaluation-A+rooms-5-6-kinematic" / "episodes.csv")) == 6
     assert "rooms-6" in capsys.readouterr().out
 
 
 def test_another_seed_and_noise_leave_the_rows_of_a_study_where_they_are(run: Path) -> None:
-    asked = Evaluation(("A",), 1)
+    asked = Evaluation(("A",), 1, "kinematic")
     job = Job("ddpg", "per", 0, run.parent)
     run.rename(job.path)
     (job.path / files.EPISODES).write_text("success,world\n")
     (job.path / files.STATUS).write_text('{"finished": true}')
     how = [str(job.path), "--worlds", "A", "--episodes", "1", "--no-pictures"]
-    study = ["--output", str(job.path / asked.folder)]
+    study = ["--output", str(job.results(asked))]
     others = (["--seed", "3"], ["--noise", "slip=0.1,latency=1"])
     evaluate.main(how)
     assert job.is_evaluated(asked)
     for other in others:
         evaluate.main([*how, *other])
         assert job.is_evaluated(asked)
-    names = {path.name for path in job.path.glob("evaluation-*")}
-    assert names == {"evaluation-A", "evaluation-A-seed3", "evaluation-A-slip0.1-latency1"}
+    names = {path.name.removeprefix("evaluation-A-") for path in job.path.glob("evaluation-*")}
+    assert names == {"kinematic", "kinematic-seed3", "kinematic-slip0.1-latency1"}
     for other in others:
         evaluate.main([*how, *other, *study])
         assert not job.is_evaluated(asked)
     # Written before there were seeds and noise.
     evaluate.main(how)
-    file = job.path / asked.folder / files.SETTINGS
+    file = job.results(asked) / files.SETTINGS
     found = json.loads(file.read_text())
     file.write_text(json.dumps({name: found[name] for name in found if name != "seed"}))
     assert job.is_evaluated(asked)
 
 
+@pytest.mark.parametrize("words", [["run"], ["--policy", "dwa"]], ids=" ".join)
+def test_an_evaluation_names_its_physics_and_another_physics_leaves_its_results(
+    words: list[str], run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(run)
+    source = [str(run)] if words == ["run"] else words
+    found = {}
+    for physics in ("kinematic", "wheels"):  # As trained, which is also a planner's, and asked for.
+        how = [] if physics == "kinematic" else ["--physics", physics]
+        evaluate.main([*source, "--worlds", "A", "--episodes", "1", "--no-pictures", *how])
+        shown = capsys.readouterr().out
+        found[physics] = folder = Path(shown.split("written: ")[1].strip())
+        assert f", physics: {physics}\n" in shown
+        for name in ("settings.json", "evaluation.json"):
+            assert json.loads((folder / name).read_text())["physics"] == physics
+        for name in ("summary.csv", "episodes.csv"):
+            assert list(read_table(folder / name)["physics"]) == [physics]
+    assert [folder.name for folder in found.values()] == [
+        "evaluation-A-kinematic",
+        "evaluation-A-wheels",
+    ]
+
+
 def test_a_folder_in_use_is_refused_in_one_sentence(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with files.lock(run / "evaluation-A"), pytest.raises(SystemExit) as caught:
+    folder = run / "evaluation-A-kinematic"
+    with files.lock(folder), pytest.raises(SystemExit) as caught:
         evaluate.main([str(run), "--worlds", "A", "--episodes", "1", "--no-pictures"])
     assert caught.value.code == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"evaluate.py: another process is using {run / 'evaluation-A'}")
+    assert said.startswith(f"evaluate.py: another process is using {folder}")
 
 
 def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> None:
     words = ["bars:validation", "mazes:validation", "D"]
     summary = evaluate.main([str(run), "--worlds", *words, "--episodes", "20"])
     assert list(summary["world"]) == ["bars-validation", "mazes-validation", "D", "total"]
-    folder = run / f"evaluation-{worlds_label(words)}"
+    folder = run / f"evaluation-{worlds_label(words)}-kinematic"
     found = json.loads((folder / "evaluation.json").read_text())
     assert sorted(found["generators"]) == ["bars:validation", "mazes:validation"]
     assert sorted(found["worlds"]) == ["D"]
@@ -201,7 +226,8 @@ def test_the_table_tells_of_walkers_where_there_are_any(
 
 def test_a_time_that_there_is_not_is_null_in_the_document() -> None:
     lost = EpisodeResult(0, False, False, True, 9.0, 1.0, 2.0, 0.1, 0.0)
-    document = evaluate.as_document([{"world": "A", **summary_row([lost, lost])}])
+    row = {"world": "A", "physics": "wheels", **summary_row([lost, lost])}
+    document = evaluate.as_document([row])
     assert document["time_s"] is None
     assert document["worlds"]["A"]["timeout"] == 1.0
 
@@ -219,7 +245,7 @@ def test_the_policy_that_comes_with_the_project_reaches_its_goals(
     arguments = ["--worlds", "A", "--episodes", "6", "--physics", "kinematic", "--no-pictures"]
     summary = evaluate.main([str(SHIPPED), *arguments])
     assert summary["success"].iloc[0] == 1.0
-    assert (tmp_path / "runs/evaluation-td3-mpfa_per/evaluation-A/episodes.csv").exists()
+    assert (tmp_path / "runs/evaluation-td3-mpfa_per/evaluation-A-kinematic/episodes.csv").exists()
 
 
 @pytest.mark.parametrize(

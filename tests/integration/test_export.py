@@ -23,7 +23,7 @@ def test_the_script_tells_what_it_compared_and_puts_known_results_on_the_card(
     shutil.copy(SHIPPED, tmp_path / "policy.npz")
     evaluate.main([str(tmp_path), *["--worlds", "B", "--episodes", "2", "--no-pictures"]])
     stale = tmp_path / "evaluation-stale"
-    shutil.copytree(tmp_path / "evaluation-B", stale)
+    shutil.copytree(tmp_path / "evaluation-B-wheels", stale)
     settings = json.loads((stale / "settings.json").read_text())
     (stale / "settings.json").write_text(json.dumps(settings | {"sha256": "of another"}))
     file = export.main([str(tmp_path), "--episodes", "3"])

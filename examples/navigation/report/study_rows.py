@@ -13,7 +13,7 @@ import pandas as pd
 from navigation import files
 from navigation.records import read_table
 from navigation.report.tables import area_under
-from navigation.studies.jobs import Job, Study
+from navigation.studies.jobs import Evaluation, Job, Study
 from navigation.studies.protocol import Table, label_of
 from navigation.studies.remaining import parts_left
 from navigation.worlds import family
@@ -48,7 +48,7 @@ def read_runs(table: Table, root: Path) -> Rows:
         The rows, with as many digits as are kept.
     """
     curves: dict[tuple[str, int], pd.DataFrame] = {}
-    tests: dict[tuple[str, int, str], pd.DataFrame] = {}
+    tests: dict[tuple[str, int, Evaluation], pd.DataFrame] = {}
     for study in table.studies:
         for job in study.jobs:
             if not job.is_trained():
@@ -56,8 +56,8 @@ def read_runs(table: Table, root: Path) -> Rows:
             run = label_of(job, root), job.seed
             curves[run] = _rows(run, job.path / files.EVALUATIONS, CURVES)
             if job.is_evaluated(study.evaluation):
-                folder = study.evaluation.folder
-                tests[(*run, folder)] = _rows(run, job.path / folder / files.EPISODES, TESTS)
+                rows = job.results(study.evaluation) / files.EPISODES
+                tests[(*run, study.evaluation)] = _rows(run, rows, TESTS)
     return Rows(together(curves.values(), CURVES), together(tests.values(), TESTS))
 
 

@@ -12,13 +12,14 @@ from typing import Any
 import pandas as pd
 
 from navigation import files
+from navigation.evaluating import evaluation_folder
 from navigation.records import read_table, write_table
 from navigation.settings.checks import settings_by_name
 from navigation.settings.command_line import composed
+from navigation.settings.environment import EnvironmentSettings
 from navigation.settings.resuming import LAWFUL, OF_THE_CALL
 from navigation.settings.train import TrainSettings, as_settings
 from navigation.studies.arms import PLAIN, Arm, with_defaults
-from navigation.worlds import worlds_label
 from torchrl_mpfa.saving import write_text_atomically
 
 SCRIPTS = Path(__file__).resolve().parents[2]
@@ -43,12 +44,6 @@ class Evaluation:
     """Pairs of start and goal in each of them."""
     physics: str | None = None
     """``wheels`` or ``kinematic``; None: as trained."""
-
-    @property
-    def folder(self) -> str:
-        """Folder of the results, in that of a run."""
-        physics = f"-{self.physics}" if self.physics else ""
-        return f"evaluation-{worlds_label(self.words)}{physics}"
 
 
 TESTED = Evaluation(("test",), 200)
@@ -108,12 +103,22 @@ class Job:
 
     def evaluates(self, wanted: Evaluation) -> list[str]:
         """The command that evaluates its policy."""
-        physics = ["--physics", wanted.physics] if wanted.physics else []
         return [
             *(str(SCRIPTS / "evaluate.py"), str(self.path)),
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
-            *(*physics, "--output", str(self.path / wanted.folder)),
+            *(["--physics", wanted.physics] if wanted.physics else []),
         ]
+
+    def physics(self, wanted: Evaluation) -> str:
+        """What it is evaluated with: ``wheels`` or ``kinematic``."""
+        if wanted.physics is not None:
+            return wanted.physics
+        trained = _read_json(self.path / files.SETTINGS).get("environment", {})
+        return str(trained.get("physics", EnvironmentSettings.physics))
+
+    def results(self, wanted: Evaluation) -> Path:
+        """Folder of its evaluation."""
+        return self.path / evaluation_folder(wanted.words, self.physics(wanted))
 
     def status(self) -> Mapping[str, Any]:
         """How far it says that it is; nothing before its first episode."""
@@ -126,13 +131,13 @@ class Job:
 
     def is_evaluated(self, wanted: Evaluation) -> bool:
         """Whether the policy that it has now was evaluated as it is asked for."""
-        found = _read_json(self.path / wanted.folder / files.SETTINGS)
+        found = _read_json(self.results(wanted) / files.SETTINGS)
         policy = self.path / files.POLICY
         return (
             self.is_trained()
             and found.get("episodes") == wanted.episodes
             and found.get("words") == list(wanted.words)
-            and found.get("physics") == wanted.physics
+            and found.get("physics") == self.physics(wanted)
             # A study drives the pairs of the first seed, and robots without errors.
             and found.get("seed", 0) == 0
             and found.get("noise") is None
@@ -250,13 +255,13 @@ def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
     tables, settings = [], {}
     for job in jobs:
         if job.is_evaluated(wanted):
-            table = read_table(job.path / wanted.folder / files.EPISODES)
+            table = read_table(job.results(wanted) / files.EPISODES)
             table.insert(0, "learner", job.learner)
             table.insert(1, "method", job.method)
             table.insert(2, "arm", job.arm.name)
             table.insert(3, "seed", job.seed)
-            settings[job.name] = trained = _read_json(job.path / files.SETTINGS)
-            table.insert(4, "physics", wanted.physics or trained["environment"]["physics"])
+            settings[job.name] = _read_json(job.path / files.SETTINGS)
+            table.insert(4, "physics", table.pop("physics"))
             tables.append(table)
     if tables:
         write_table(pd.concat(tables), folder / files.EPISODES)

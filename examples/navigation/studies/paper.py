@@ -155,7 +155,7 @@ def read_runs(wanted: Sequence[Study], find: Callable[[Job], Path | None]) -> Ru
 
 def evaluation_of(job: Job) -> Path | None:
     """The rows of a run in the unseen world, if its policy was tested there as those of all are."""
-    return job.path / TESTED.folder / files.EPISODES if job.is_evaluated(TESTED) else None
+    return job.results(TESTED) / files.EPISODES if job.is_evaluated(TESTED) else None
 
 
 def _is_whole(job: Job) -> bool:

@@ -10,7 +10,7 @@ from statistics import median
 from navigation import files
 from navigation.records import read_table
 from navigation.studies.arms import Arm
-from navigation.studies.jobs import Job, Study
+from navigation.studies.jobs import Evaluation, Job, Study
 
 
 def jobs_done(study: Study) -> list[Job]:
@@ -69,7 +69,7 @@ def seconds_of(job: Job, study: Study) -> tuple[float, float] | None:
     # begins at once. A second one begins some time later: it takes no longer than a training.
     trained, tested = (
         path.stat().st_mtime
-        for path in (job.path / files.POLICY, job.path / study.evaluation.folder / files.EPISODES)
+        for path in (job.path / files.POLICY, job.results(study.evaluation) / files.EPISODES)
     )
     training = float(found["trained_for"].iloc[-1] + found["seconds"].sum())
     return training, min(tested - trained, training)
@@ -91,12 +91,12 @@ def hours_left(studies: Sequence[Study], *, jobs: int) -> float | None:
         return None
     left = 0.0
     training: set[Path] = set()
-    testing: set[tuple[Path, str]] = set()
+    testing: set[tuple[Path, Evaluation]] = set()
     for study, seconds in zip(studies, typical, strict=True):
         to_train, to_test = seconds or of_all
         done = {job.path for job in jobs_done(study)}
         for job in study.jobs:
-            test = job.path, study.evaluation.folder
+            test = job.path, study.evaluation
             if job.path in done or test in testing:
                 continue
             testing.add(test)

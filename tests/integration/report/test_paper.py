@@ -37,9 +37,11 @@ FIGURES = ["claims", *(f"figure_{n}" for n in (3, 5, 8, 9, 10, 11, 13))]
 
 def say_tested(job: Job, **other: object) -> None:
     """Say of the rows of a run that they are those of its policy, in the unseen world."""
-    said: dict[str, object] = {"words": ["test"], "episodes": 200, "seed": 0, "physics": None}
+    said: dict[str, object] = {"words": ["test"], "episodes": 200, "seed": 0, "physics": "wheels"}
     said["sha256"] = files.digest(job.path / files.POLICY)
-    (job.path / "evaluation-test" / "settings.json").write_text(json.dumps({**said, **other}))
+    (job.path / "evaluation-test-wheels" / "settings.json").write_text(
+        json.dumps({**said, **other})
+    )
 
 
 @pytest.fixture(scope="session")
@@ -59,8 +61,8 @@ def paper_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
             tested = {"world": "test", "episode": range(4), "timeout": False, "time_s": 20.0}
             rows = pd.DataFrame({**tested, "success": [True] * 3 + [False]})
             rows["collision"] = ~rows["success"]
-            (job.path / "evaluation-test").mkdir()
-            write_table(rows, job.path / "evaluation-test" / "episodes.csv")
+            (job.path / "evaluation-test-wheels").mkdir()
+            write_table(rows, job.path / "evaluation-test-wheels" / "episodes.csv")
             say_tested(job)
     return folder
 
@@ -102,8 +104,8 @@ def test_the_commands_that_are_named_make_the_runs_that_are_looked_for(tmp_path:
 def test_a_run_that_is_not_at_its_end_is_missing_and_in_no_table(tmp_path: Path) -> None:
     first, _ = wanted = studies(tmp_path, seeds=1)
     (job,) = first.runs()["per"]
-    (job.path / "evaluation-test").mkdir(parents=True)
-    for name in ("updates.csv", "episodes.csv", "evaluation-test/episodes.csv"):
+    (job.path / "evaluation-test-wheels").mkdir(parents=True)
+    for name in ("updates.csv", "episodes.csv", "evaluation-test-wheels/episodes.csv"):
         write_table(pd.DataFrame({"total_steps": [1]}), job.path / name)
     (job.path / "policy.npz").write_bytes(b"policy")
     say_tested(job)
@@ -111,12 +113,12 @@ def test_a_run_that_is_not_at_its_end_is_missing_and_in_no_table(tmp_path: Path)
         (job.path / "status.json").write_text(json.dumps({"finished": finished}))
         assert (job.name in missing(first)) != finished
         assert ("per" in read_runs(wanted, lambda job: job.path / "episodes.csv")) == finished
-    tested = job.path / "evaluation-test"
+    tested = job.path / "evaluation-test-wheels"
     assert evaluation_of(job) == tested / "episodes.csv"
     # Of other worlds, or by other rules.
-    tested.rename(job.path / "evaluation-test+A")
+    tested.rename(job.path / "evaluation-test+A-wheels")
     assert evaluation_of(job) is None
-    (job.path / "evaluation-test+A").rename(tested)
+    (job.path / "evaluation-test+A-wheels").rename(tested)
     for said in ({"episodes": 20}, {"seed": 1}, {"sha256": "of another policy"}):
         say_tested(job, **said)
         assert evaluation_of(job) is None

@@ -60,7 +60,7 @@ def small_table(root: Path, *, seeds: int = 4) -> Table:
 
 def write_run(job: Job, heights: Sequence[float], outcomes: Sequence[Sequence[bool]]) -> None:
     """A run as training and evaluation leave it behind, as far as the study reads it."""
-    folder = job.path / TEST.folder
+    folder = job.results(TEST)
     folder.mkdir(parents=True)
     (job.path / files.STATUS).write_text(json.dumps({"finished": True}))
     (job.path / files.POLICY).write_bytes(b"policy")
