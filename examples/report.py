@@ -219,7 +219,7 @@ def report(options: argparse.Namespace, output: Path) -> int:
         for where, found in driven.groupby("family", sort=False):
             parts += [
                 f"## {where}{how}",
-                outcome_table(found, with_paper=where == "test"),
+                outcome_table(found),
                 interval_table(found),
                 comparison_table(found),
                 power_lines(found),

@@ -21,10 +21,7 @@ from navigation.report.intervals import (
 )
 from navigation.report.permutation import least_p, permutation_p
 from navigation.report.power import MOST, runs_needed
-from navigation.studies.paper import NAMES, TABLE_2, TESTS
 
-_OF_THE_PAPER = ("mpfa_per", "per")
-"""Methods whose rows of the paper stand under those of any study."""
 GOAL = 0.9
 """Greedy success in validation that the speed of each run is told by."""
 RATES = (0.9, 0.95)
@@ -59,8 +56,8 @@ def scores(rows: pd.DataFrame, column: str) -> Array:
     return matrix.to_numpy()
 
 
-def outcome_table(rows: pd.DataFrame, *, with_paper: bool) -> str:
-    """Success of each run, and means over the runs; beside the paper's if they compare."""
+def outcome_table(rows: pd.DataFrame) -> str:
+    """Success of each run, and means over the runs."""
     lines = []
     width = _width(rows["arm"])
     for arm, found in rows.groupby("arm", sort=False):
@@ -77,11 +74,6 @@ def outcome_table(rows: pd.DataFrame, *, with_paper: bool) -> str:
                 f"{reached.mean():.1f}" if reached.size else "",
             ]
         )
-    for method in _OF_THE_PAPER if with_paper else ():
-        row = TABLE_2[method]
-        cells = _cells(f"paper/{NAMES[method]}", width)
-        of_all = f"{row.collisions / TESTS:.1%}"
-        lines.append([*cells, f"{row.success:.1%}", "", of_all, "", "", f"{row.time:.1f}"])
     head = [*_ARM[:width], "success", "of each run", "collision", "timeout", "SPL"]
     return table([*head, "time [s]"], lines)
 
@@ -261,6 +253,9 @@ def _cells(arm: str, width: int) -> list[str]:
 def _ends(interval: Interval) -> str:
     if math.isnan(interval.low):
         return "one run"
+    if interval.low == interval.high:
+        # Runs that all end alike, at 0 % or 100 % as a rule, do not tell how much others differ.
+        return "none, no spread"
     return f"[{interval.low:.3f}, {interval.high:.3f}]"
 
 
