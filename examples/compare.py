@@ -29,6 +29,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import navigation.extra  # noqa: F401
+
+# isort: split
 from navigation import files
 from navigation.environments import check_physics
 from navigation.settings.train import GROUPS, register

@@ -29,6 +29,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import navigation.extra  # noqa: F401
+
+# isort: split
 import pandas as pd
 
 from mpfa_envs import (

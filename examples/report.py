@@ -30,6 +30,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import navigation.extra  # noqa: F401
+
+# isort: split
 import pandas as pd
 
 from navigation import files

@@ -18,55 +18,23 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+import navigation.extra  # noqa: F401
 
-from navigation.files import check_folder
-from navigation.settings.command_line import composed, parse_overrides
-from navigation.settings.train import as_settings, register
-from navigation.training.running import Refused, resume, start
-
-REFUSED = 2
-_SWEEP = ("-m", "--multirun")
-
-
-def run(config: DictConfig) -> None:
-    """One run, in the folder that Hydra found for it."""
-    try:
-        status = start(as_settings(config), Path(HydraConfig.get().runtime.output_dir))
-    except Refused as error:
-        refuse(error)
-    if status:
-        raise SystemExit(status)
-
-
-def refuse(error: Exception) -> None:
-    """Say in one line what is wrong."""
-    print(f"train.py: {error}", file=sys.stderr)
-    raise SystemExit(REFUSED)
+# isort: split
+from navigation.finished import after_the_end, is_finished
 
 
 def main() -> None:
     """Check the command line, then train."""
-    register()
     arguments = sys.argv[1:]
-    try:
-        overrides = parse_overrides(arguments)
-        folders = [o.value() for o in overrides if o.key_or_group == "resume"]
-        if folders and folders[-1] is not None:
-            raise SystemExit(resume(Path(str(folders[-1])), overrides))
-        named = any(override.key_or_group == "run_dir" for override in overrides)
-        if named and any(option in arguments for option in _SWEEP):
-            raise ValueError(
-                "run_dir is for one run: those of a sweep have their settings as names, in the "
-                "folder hydra.sweep.dir=FOLDER"
-            )
-        for settings in composed(arguments):
-            check_folder(Path(settings.run_dir))
-    except (ValueError, Refused) as error:
-        refuse(error)
-    hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()
+    only, _, folder = "".join(arguments).partition("resume=")
+    if len(arguments) == 1 and not only and is_finished(Path(folder)):
+        print(after_the_end(Path(folder)))
+        raise SystemExit(0)
+    # Imports PyTorch, Hydra and wandb, which takes seconds.
+    from navigation.training.script import train
+
+    train(arguments)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -65,10 +66,13 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (train.main, "resume=checkpoint", "checkpoint.pt is damaged or not a checkpoint"),
         (train.main, "run_dir=file", A_FILE),
         (train.main, "run_dir=file/run", r"file/run cannot be a folder, as .*file is a file"),
-        (train.main, "run_dir=", "run_dir must be no empty word, got ''"),
+        (train.main, "run_dir=", "run_dir must not be empty, got ''"),
         (train.main, f"seed={2**62}", f"seed must be at most 4294967295, got {2**62}"),
-        (train.main, "tracking.project=", "tracking.project must be no empty word, got ''"),
+        (train.main, "tracking.project=", "tracking.project must not be empty, got ''"),
         (train.main, "tracking.group=", "tracking.group must be a word of at most 128 letters"),
+        (train.main, "threads=1000000", "threads must be from 1 to 1024, got 1000000"),
+        (train.main, "learner.width=3000000", "learner.width must be from 1 to 65536, got 3000000"),
+        (train.main, "method.capacity=10000000000", "method.capacity must be from 1 to 1000000000"),
         (train.main, "method.signals=[rewad]", "method.signals must be of .*, got 'rewad'"),
         (train.main, "curriculum.stages=3", "curriculum.stages"),
         (
@@ -157,3 +161,18 @@ def test_without_pybullet_simulated_wheels_are_refused_before_anything_has_begun
     said = capsys.readouterr().err.splitlines()[-1]
     assert "physics='wheels' needs PyBullet" in said, said
     assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("script", ["train", "evaluate", "compare", "report", "study"])
+def test_without_its_extra_a_script_says_so_in_one_sentence(script: str, tmp_path: Path) -> None:
+    file = Path(train.__file__ or "").with_name(f"{script}.py")
+    hidden = (
+        "import runpy, sys; sys.modules['hydra'] = sys.modules['pandas'] = None; "
+        f"sys.path.insert(0, {str(file.parent)!r}); "
+        f"runpy.run_path({str(file)!r}, run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", hidden], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr == "this script needs hydra, pandas: pip install '.[examples]'\n"

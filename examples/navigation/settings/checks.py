@@ -29,6 +29,11 @@ def at_least(least: float) -> Rule:
     return lambda value: least <= value < math.inf, f"at least {least:g}"
 
 
+def up_to(most: int) -> Rule:
+    """A count that this machine may have room for."""
+    return lambda value: 1 <= value <= most, f"from 1 to {most}"
+
+
 def choice(*names: str) -> Rule:
     """One of some words."""
     return lambda value: value in names, f"one of {', '.join(names)}"
@@ -55,7 +60,7 @@ SIGNALS = (
 MOST_ROBOTS = 4096
 """On wheels these take 6.4 GB."""
 
-WORD: Rule = (lambda value: bool(value.strip()), "no empty word")
+WORD: Rule = (lambda value: bool(value.strip()), "not be empty")
 
 LAST_SEED = 2**32 - 1
 """Each stage has a seed of its own, a million times as large, which is to fit in 64 bits."""
@@ -63,7 +68,7 @@ RULES: dict[str, Rule] = {
     "run_dir": WORD,
     "tracking.project": WORD,
     "seed": at_least(0),
-    "threads": at_least(1),
+    "threads": up_to(1024),
     "checkpoint_every": at_least(1),
     "robots": (
         lambda value: 1 <= value <= MOST_ROBOTS,
@@ -74,6 +79,7 @@ RULES: dict[str, Rule] = {
     **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
     **{f"method.{name}": rule for name, rule in RANGES.items()},
     "method.positive_above": LEVEL,
+    "method.capacity": up_to(10**9),
     "learner.name": NAME,
     "learner.algorithm": choice("ddpg", "td3", "sac", "dqn", "q_learning"),
     "learner.actor_lr": POSITIVE,
@@ -82,8 +88,8 @@ RULES: dict[str, Rule] = {
     "learner.lr_power": POSITIVE,
     "learner.gamma": SHARE,
     "learner.tau": ABOVE_ZERO,
-    "learner.width": at_least(1),
-    "learner.layers": at_least(1),
+    "learner.width": up_to(2**16),
+    "learner.layers": up_to(100),
     "learner.final_init": POSITIVE,
     "learner.critic_weight_decay": NOT_NEGATIVE,
     "learner.reward_scale": POSITIVE,
@@ -169,10 +175,8 @@ def check_settings(settings: TrainSettings) -> None:
     if not settings.curriculum.stages:
         raise ValueError("curriculum.stages must name at least one world, got []")
     for name, value in settings_by_name(settings):
-        if name in RULES and value is not None:
-            allowed, wanted = RULES[name]
-            if not allowed(value):
-                raise ValueError(f"{name} must be {wanted}, got {value!r}")
+        if value is not None:
+            _check_value(name, value)
     if settings.seed > LAST_SEED:
         raise ValueError(f"seed must be at most {LAST_SEED}, got {settings.seed}")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
@@ -208,6 +212,13 @@ def check_settings(settings: TrainSettings) -> None:
         raise ValueError(
             "tracking=tensorboard needs TensorBoard: pip install 'torchrl-mpfa[tensorboard]'"
         )
+
+
+def _check_value(name: str, value: Any) -> None:
+    allowed, wanted = rule = RULES.get(name, (lambda _: True, ""))
+    if not allowed(value):
+        must = wanted if rule is WORD else f"be {wanted}"
+        raise ValueError(f"{name} must {must}, got {value!r}")
 
 
 def _check_method(method: Method) -> None:

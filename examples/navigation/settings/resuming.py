@@ -24,7 +24,6 @@ LAWFUL = (
     "curriculum.name",
     "evaluation.every",
     "checkpoint_every",
-    "threads",
     "tracking.mode",
     "tracking.csv",
     "tracking.tensorboard",

@@ -169,7 +169,7 @@ class AssessmentSettings:
     """What is left of the best score at its end, as the worst of more episodes is worse."""
     by: str = "outcome"
     """Score of an episode: ``outcome``, what Eq. (25) pays at its end, or ``return``, all of its
-    rewards, as in TD7. A return is the higher, the longer the way of the task was."""
+    rewards, as in TD7. Returns grow with path length."""
 
 
 @dataclass
@@ -206,6 +206,7 @@ class TrainSettings:
     )
     hydra: Any = field(
         default_factory=lambda: {
+            "job": {"name": "train"},
             "run": {"dir": "${run_dir}"},
             "sweep": {
                 "dir": "runs/sweep-${now:%Y-%m-%d_%H-%M-%S}",
@@ -227,12 +228,13 @@ class TrainSettings:
     device: str = "cpu"
     """Where the networks are; the buffer stays in main memory."""
     threads: int = 1
-    """Threads of PyTorch; with networks this small a second one gains nothing."""
+    """Threads of PyTorch, by which the last bits of a network depend; with networks this small a
+    second one gains nothing."""
     overwrite: bool = False
     """Whether to start again in a folder that holds a run; its files are moved to ``previous/``."""
     resume: str | None = None
-    """Folder of a run to continue, with its own settings. More episodes, tracking, threads and
-    how often to evaluate and to save may be changed; anything else is refused."""
+    """Folder of a run to continue, with its own settings. More episodes, tracking and how
+    often to evaluate and to save may be changed; anything else is rejected."""
     checkpoint_every: int = 10_000
     """Actions between two checkpoints."""
     robots: int = 1

@@ -13,6 +13,7 @@ import pandas as pd
 
 from navigation import files
 from navigation.evaluating import evaluation_folder
+from navigation.finished import is_finished, read_json
 from navigation.records import read_table, write_table
 from navigation.settings.checks import settings_by_name
 from navigation.settings.command_line import composed
@@ -25,7 +26,7 @@ from torchrl_mpfa.saving import write_text_atomically
 SCRIPTS = Path(__file__).resolve().parents[2]
 _OF_THE_RESULT = ("evaluation.every", "ray.workers", "ray.steps", "ray.sync")
 """Settings that a run may change on its way, although it becomes another one by them."""
-_FREE = {*LAWFUL, *OF_THE_CALL, "device"} - {*_OF_THE_RESULT}
+_FREE = {*LAWFUL, *OF_THE_CALL, "device", "threads"} - {*_OF_THE_RESULT}
 """Settings that may be others than those that a study asks for."""
 
 
@@ -113,7 +114,7 @@ class Job:
         """What it is evaluated with: ``wheels`` or ``kinematic``."""
         if wanted.physics is not None:
             return wanted.physics
-        trained = _read_json(self.path / files.SETTINGS).get("environment", {})
+        trained = read_json(self.path / files.SETTINGS).get("environment", {})
         return str(trained.get("physics", EnvironmentSettings.physics))
 
     def results(self, wanted: Evaluation) -> Path:
@@ -122,16 +123,15 @@ class Job:
 
     def status(self) -> Mapping[str, Any]:
         """How far it says that it is; nothing before its first episode."""
-        return _read_json(self.path / files.STATUS)
+        return read_json(self.path / files.STATUS)
 
     def is_trained(self) -> bool:
         """Whether it came to its end, and left behind what a run has there."""
-        there = all((self.path / name).exists() for name in (files.POLICY, files.EPISODES))
-        return there and bool(self.status().get("finished"))
+        return is_finished(self.path)
 
     def is_evaluated(self, wanted: Evaluation) -> bool:
         """Whether the policy that it has now was evaluated as it is asked for."""
-        found = _read_json(self.results(wanted) / files.SETTINGS)
+        found = read_json(self.results(wanted) / files.SETTINGS)
         policy = self.path / files.POLICY
         return (
             self.is_trained()
@@ -147,7 +147,7 @@ class Job:
 
     def differences(self, asked: TrainSettings) -> list[str]:
         """Where the settings that it was trained with are others than those asked for."""
-        found = _read_json(self.path / files.SETTINGS)
+        found = read_json(self.path / files.SETTINGS)
         if not found:
             return []
         had, wanted = (dict(settings_by_name(each)) for each in (as_settings(found), asked))
@@ -260,7 +260,7 @@ def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
             table.insert(1, "method", job.method)
             table.insert(2, "arm", job.arm.name)
             table.insert(3, "seed", job.seed)
-            settings[job.name] = _read_json(job.path / files.SETTINGS)
+            settings[job.name] = read_json(job.path / files.SETTINGS)
             table.insert(4, "physics", table.pop("physics"))
             tables.append(table)
     if tables:
@@ -272,10 +272,3 @@ def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
         "runs": settings,
     }
     write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
-
-
-def _read_json(path: Path) -> Mapping[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: remove it, and the run is made anew") from error

@@ -105,6 +105,7 @@ class TrainingRun:
         sizes = self._observation_size, spec.shape[-1]
         method, device = method_of(settings), settings.device
         self.learner = make_learner(settings.learner, method, *sizes, device=device)
+        self._to_compile = settings.learner.compile
         self.curiosity = make_curiosity(method, *sizes, device=device)
         self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
         replay = self.robots.make_replay(
@@ -262,6 +263,9 @@ class TrainingRun:
         if self.settings.ray.workers:
             # A call to another process costs as much as an update: one for all that are due.
             due, updates = 1, due * updates
+        if self._to_compile:
+            self._to_compile = False
+            tqdm.write("compiling the update, some 20 s, or a few if that was done before")
         for _ in range(due):
             losses, batch = run_updates(
                 self.buffer,

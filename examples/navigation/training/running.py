@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
@@ -13,10 +14,12 @@ from pathlib import Path
 import torch
 import torch._inductor.config as inductor
 from hydra.core.override_parser.types import Override
+from torch._dynamo.exc import BackendCompilerFailed
 
 from mpfa_envs.render import plot_histograms
 from navigation import files
 from navigation.figures import plot_learning_curve
+from navigation.finished import after_the_end, is_finished
 from navigation.records import EpisodeRecord, as_table
 from navigation.settings.checks import check_settings
 from navigation.settings.resuming import changed, check_lawful, check_single
@@ -38,6 +41,32 @@ def refusing() -> Iterator[None]:
         yield
     except (ValueError, OSError, files.FolderInUse) as error:
         raise Refused(" ".join(str(error).split())) from error
+    except (MemoryError, RuntimeError) as error:
+        cause = outside_cause(error)
+        if cause is None:
+            raise
+        raise Refused(cause) from error
+
+
+def outside_cause(error: Exception) -> str | None:
+    """What the machine lacks, in one sentence; None if an error is about something else."""
+    said = str(error).partition("\n")[0].strip()
+    if isinstance(error, BackendCompilerFailed):
+        return (
+            f"the update could not be compiled, {said}: install a C++ compiler and the headers of "
+            "Python, or begin again with learner.compile=false"
+        )
+    if isinstance(error, MemoryError | torch.OutOfMemoryError) or "allocate memory" in said:
+        how_much = said.rpartition("memory: ")[2]
+        return (
+            "not enough memory for method.capacity, learner.width, method.batch_size and robots "
+            f"as they are ({how_much})"
+        )
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    # By name, as Ray is an extra; its RayTaskError is an error in what a worker did.
+    if "RayError" in kinds and "RayTaskError" not in kinds:
+        return f"the Ray cluster has lost what the run needs: {said}"
+    return None
 
 
 def start(settings: TrainSettings, folder: Path) -> int:
@@ -99,7 +128,11 @@ def resume(folder: Path, overrides: list[Override]) -> int:
             state = read_checkpoint(folder)
             settings = changed(state["settings"], overrides)
             check_settings(settings)
-            check_lawful(as_settings(state["settings"]), settings, folder)
+            before = as_settings(state["settings"])
+            check_lawful(before, settings, folder)
+            if is_finished(folder) and settings.curriculum.stages == before.curriculum.stages:
+                print(after_the_end(folder))
+                return 0
             prepare_process(settings)
             training = TrainingRun(settings, folder, state)
             # A run that was finished is not, once it is asked for more.
@@ -122,13 +155,20 @@ def prepare_process(settings: TrainSettings) -> None:
         inductor.cpp.vec_isa_ok = True
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    # The compiler of programs for a CPU warns that a CUDA toolkit is there and no GPU.
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
 
 
 def _train(training: TrainingRun) -> int:
-    folder = training.folder
+    folder, failure = training.folder, None
     try:
         finished = training.train()
     except KeyboardInterrupt:
+        finished = False
+    except Exception as error:
+        failure = outside_cause(error)
+        if failure is None:
+            raise
         finished = False
     finally:
         training.close()
@@ -144,8 +184,10 @@ def _train(training: TrainingRun) -> int:
         return 0
     saved = (folder / files.CHECKPOINT).exists()
     how = f"continue with: train.py resume={folder}" if saved else "nothing of it was saved"
+    if failure is not None:
+        print(f"train.py: {failure}", file=sys.stderr)
     print(f"stopped after {training.actions} actions; {how}")
-    return training.stop.exit_status
+    return training.stop.exit_status if failure is None else 1
 
 
 def write_settings(settings: TrainSettings, path: Path) -> None:

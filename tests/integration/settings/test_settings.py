@@ -177,10 +177,10 @@ def usual() -> TrainSettings:
     ("arguments", "message"),
     [
         ("learner.saturation_penalty=nan", "learner.saturation_penalty must be .*got nan"),
-        ("learner.width=0", "learner.width must be at least 1, got 0"),
+        ("learner.width=0", "learner.width must be from 1 to 65536, got 0"),
         ("learner.tau=0", r"learner.tau must be in \(0, 1\], got 0.0"),
         ("seed=-1", "seed must be at least 0, got -1"),
-        ("threads=0", "threads must be at least 1"),
+        ("threads=0", "threads must be from 1 to 1024, got 0"),
         ("device=warp", "device must be one that PyTorch knows, got 'warp'"),
         ("checkpoint_every=0", "checkpoint_every must be at least 1, got 0"),
         ("tracking.log_every=0", "tracking.log_every must be at least 1, got 0"),

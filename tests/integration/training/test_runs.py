@@ -203,6 +203,8 @@ def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: s
         (STAGES.format(1), r"curriculum.stages may have more .* has \[A: 2\], got \[A: 1\]"),
         ("run_dir=elsewhere", "resume: run_dir is of no use, a run goes on in its folder"),
         ("overwrite=true", "resume: overwrite is of no use"),
+        # Sums over two threads have other last bits.
+        ("threads=2", r"cannot change threads=2 \(it has 1\)"),
         ("tracking=csv,wandb", r"takes one value, got tracking=.*: several are tracking=\[csv,wan"),
         (
             "evaluation.every=100,200",
@@ -249,6 +251,28 @@ def test_one_wandb_run_stays_one_through_resuming(
     assert started[0]["tags"] == ["A1", "mpfa_per", "ddpg", "paper"]
     assert started[0]["job_type"] == "train"
     assert read_checkpoint(tmp_path)["wandb"] == started[0]["id"]
+
+
+def test_resuming_a_finished_run_says_so_and_what_else_there_is_to_do(
+    two_episodes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(two_episodes)
+    more = f"resume={two_episodes} 'curriculum.stages=[{{world: A, episodes: 4}}]'"
+    said = (
+        f"{two_episodes} is finished, after 2 episodes: evaluate it with evaluate.py "
+        f"{two_episodes}, or train on with train.py {more}\n"
+    )
+    # At once: nothing of what takes seconds to import is.
+    code = (
+        "import runpy, sys; sys.modules['torch'] = sys.modules['omegaconf'] = None; "
+        f"sys.argv = ['train.py', 'resume={two_episodes}']; "
+        f"runpy.run_path({train.__file__!r}, run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
+    assert go_on(two_episodes, "tracking=off") == 0
+    assert capsys.readouterr().out == said
+    assert contents(two_episodes) == before
 
 
 def exit_status(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:

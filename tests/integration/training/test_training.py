@@ -20,35 +20,9 @@ from navigation.settings.train import GROUPS, Stage, TrainSettings
 from navigation.training import loop
 from navigation.training.checkpoints import random_state, read_checkpoint, set_random_state
 from navigation.training.loop import TrainingRun
-from navigation.training.running import prepare_process
 from tests.integration.tiny_runs import rows, tiny, train
 from torchrl_mpfa import SignalSampler, save_atomically
 from torchrl_mpfa.methods import ALIASES, Method
-
-
-def test_training_treats_denormal_numbers_as_zero() -> None:
-    threads, least = torch.get_num_threads(), torch.finfo(torch.float32).tiny
-    try:
-        prepare_process(TrainSettings(threads=1))
-        assert (torch.tensor([least]) / 2).item() == 0.0
-    finally:
-        torch.set_flush_denormal(False)
-        torch.set_num_threads(threads)
-    assert (torch.tensor([least]) / 2).item() > 0.0
-
-
-def test_no_program_is_compiled_to_see_which_instructions_the_compiler_knows() -> None:
-    options = torch._inductor.config.cpp
-    before = options.vec_isa_ok
-    try:
-        for given, expected in ((None, True), (False, False)):
-            options.vec_isa_ok = given
-            prepare_process(TrainSettings(threads=1))
-            torch.set_flush_denormal(False)
-            assert options.vec_isa_ok is expected
-    finally:
-        # By hand: monkeypatch would leave PyTorch without this option.
-        options.vec_isa_ok = before
 
 
 def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -> None:

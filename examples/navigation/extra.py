@@ -1,0 +1,9 @@
+"""Imported before all else by the scripts that need it: ends them where the extra is missing."""
+
+from importlib.util import find_spec
+
+_missing = [
+    name for name in ("hydra", "matplotlib", "pandas", "tqdm", "wandb") if not find_spec(name)
+]
+if _missing:
+    raise SystemExit(f"this script needs {', '.join(_missing)}: pip install '.[examples]'")
