@@ -105,7 +105,7 @@ def test_every_public_name_is_in_the_reference_once(package: str, names: list[st
 
 
 SMALL = {
-    "24_000": "1_280",
+    "24_064": "1_280",
     "100_000": "2_000",
     "6_400": "640",
     "width=64": "width=8",
@@ -165,9 +165,14 @@ def run(page: str, changes: dict[str, str]) -> dict[str, Any]:
     return names
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_the_code_of_the_tutorial_runs(folder: Path) -> None:
+def test_the_code_of_the_tutorial_runs_without_a_warning(folder: Path) -> None:
     names = run("tutorial.md", SMALL)
+    # Of other sizes TorchRL warns that it collects more than it is asked for.
+    text = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    actions, at_once = (
+        int(re.findall(rf"{name} ?= ?([\d_]+)", text)[0]) for name in ("ACTIONS", "frames_per_batch")
+    )
+    assert actions % at_once == 0
     assert names["learner"].updates == 256
     assert set(names["paths"]) == {0, 1}
     assert (folder / "policy.npz").exists()
