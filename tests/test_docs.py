@@ -170,7 +170,8 @@ def test_the_code_of_the_tutorial_runs_without_a_warning(folder: Path) -> None:
     # Of other sizes TorchRL warns that it collects more than it is asked for.
     text = (DOCS / "tutorial.md").read_text(encoding="utf-8")
     actions, at_once = (
-        int(re.findall(rf"{name} ?= ?([\d_]+)", text)[0]) for name in ("ACTIONS", "frames_per_batch")
+        int(re.findall(rf"{name} ?= ?([\d_]+)", text)[0])
+        for name in ("ACTIONS", "frames_per_batch")
     )
     assert actions % at_once == 0
     assert names["learner"].updates == 256

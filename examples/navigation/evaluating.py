@@ -94,7 +94,7 @@ def drive(
     *,
     episodes: int | None,
     seed: int,
-    physics: str,
+    physics: str | None,
     noise: RobotNoise | None = None,
     progress: bool,
 ) -> Drives:
@@ -107,14 +107,16 @@ def drive(
         world: What :func:`mpfa_envs.world_tasks` takes.
         episodes: Number of tasks; None: as many as there usually are.
         seed: Seed of the tasks in a world.
-        physics: ``wheels`` or ``kinematic``.
+        physics: ``wheels`` or ``kinematic``; None: as trained.
         noise: Errors of the robot; None: none.
         progress: Whether to show a bar.
 
     Returns:
         Tasks, results and paths.
     """
-    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise, "physics": physics}
+    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
+    if physics is not None:
+        arguments["physics"] = physics
     tasks = tasks_of(policy, [world], episodes=episodes, seed=seed)
     trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo
 
 from mpfa_envs import (
     INFO_TYPES,
@@ -121,6 +123,17 @@ def test_options_that_are_no_episode_are_refused_and_the_last_one_goes_on(
     following, _ = env.reset()
     env.reset(seed=0)
     np.testing.assert_array_equal(env.reset()[0], following)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_gymnasium_records_a_video_of_it(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy", reason="an extra")
+    env = RecordVideo(gymnasium.make("mpfa/Rooms-v1", render_mode="rgb_array"), str(tmp_path))
+    env.reset(seed=0)
+    env.step(ACTIONS[0])
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    assert video.stat().st_size > 1000
 
 
 def test_it_is_rendered_on_demand() -> None:
