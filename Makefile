@@ -5,7 +5,8 @@
 #   PYTHON=/path/to/python3.11     the Python for .venv; by default the first suitable one
 #   TORCH_INSTALL_ARGS='...'       arguments of `pip install` for another build of PyTorch, which
 #                                  is installed before the project: the wheel file of a CPU
-#                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS'
+#                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS';
+#                                  others than the last ones install again
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   COMPILE=false                  demo, train: no compiled updates; default: true if a C++ compiler and Python.h are found
 #   REGIME=paper                   train: the paper's task and numbers; default: rooms
@@ -34,6 +35,7 @@ WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+TORCH := $(VENV)/.torch-args
 PYTEST := $(BIN)/python -m pytest
 DOCTESTS := --doctest-modules torchrl_mpfa envs
 # Together with the tests, as each process of pytest needs seconds to import PyTorch.
@@ -115,6 +117,13 @@ endif
 endif
 endif
 
+# Nor are other arguments for PyTorch than those that it was installed with.
+ifneq ($(strip $(TORCH_INSTALL_ARGS)),)
+ifneq ($(strip $(TORCH_INSTALL_ARGS)),$(strip $(shell cat $(TORCH) 2>/dev/null)))
+.PHONY: $(STAMP)
+endif
+endif
+
 # The stamp is written last, so that an interrupted installation is repeated.
 $(STAMP): pyproject.toml
 	@rm -f $(STAMP); \
@@ -143,6 +152,8 @@ $(STAMP): pyproject.toml
 	  "$$python" -m venv --clear $(VENV) || exit 1; \
 	fi
 	@echo "== installing in $(VENV); the first time this downloads PyTorch, some gigabytes"
+	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(BIN)/python -m pip uninstall -qq -y torch)
 	$(if $(strip $(TORCH_INSTALL_ARGS)),$(BIN)/python -m pip install $(TORCH_INSTALL_ARGS))
+	$(if $(strip $(TORCH_INSTALL_ARGS)),@printf '%s\n' '$(subst ','\'',$(TORCH_INSTALL_ARGS))' > $(TORCH))
 	$(BIN)/python -m pip install -e ".[dev]"
 	@touch $(STAMP)

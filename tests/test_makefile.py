@@ -263,3 +263,20 @@ def test_another_build_of_torch_is_installed_before_the_project(copy: Path) -> N
     add_program(copy / "bin" / "python3.11", PRETENDER)
     assert make(copy, "test", "TORCH_INSTALL_ARGS=./torch-cpu.whl").returncode == 0
     assert pip_calls(copy) == ["-m pip install ./torch-cpu.whl", "-m pip install -e .[dev]"]
+
+
+def test_other_arguments_for_torch_install_again_and_the_same_or_none_do_not(copy: Path) -> None:
+    add_program(copy / "bin" / "python3.11", PRETENDER)
+    other = "torch==2.15.* --index-url 'file:///a b'"
+    for words, calls in (
+        ([], 1),
+        (["TORCH_INSTALL_ARGS=./torch-cpu.whl"], 3),
+        (["TORCH_INSTALL_ARGS=./torch-cpu.whl"], 3),
+        ([], 3),
+        ([f"TORCH_INSTALL_ARGS={other}"], 5),
+        ([f"TORCH_INSTALL_ARGS={other}"], 5),
+    ):
+        done = make(copy, "test", *words)
+        assert done.returncode == 0, done.stderr
+        assert len(pip_calls(copy)) == calls
+    assert pip_calls(copy)[3] == "-m pip install torch==2.15.* --index-url file:///a b"
