@@ -1,6 +1,6 @@
 """TorchRL's own SAC on many robots, in the loop of TorchRL's SAC script.
 
-    python examples/torchrl_sac.py
+    python examples/torchrl_sac.py                          100,000 actions, some five minutes
     python examples/torchrl_sac.py --replay mpfa --world rooms --actions 50000
 
 The policy goes to ``policy.npz`` in --output, runs/torchrl-sac by default, where

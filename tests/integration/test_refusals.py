@@ -168,7 +168,6 @@ def test_without_its_extra_a_script_says_so_in_one_sentence(script: str, tmp_pat
     file = Path(train.__file__ or "").with_name(f"{script}.py")
     hidden = (
         "import runpy, sys; sys.modules['hydra'] = sys.modules['pandas'] = None; "
-        f"sys.path.insert(0, {str(file.parent)!r}); "
         f"runpy.run_path({str(file)!r}, run_name='__main__')"
     )
     done = subprocess.run(
