@@ -84,8 +84,9 @@ def test_far_transitions_have_no_weight_and_near_ones_have_all_of_it():
     (draw,) = replay.select(replay.buffer)
     far = (draw.batch["index"] % 2).bool()
     assert draw.batch["priority_weight"].equal((~far).float())
-    assert draw.batch["policy_weight"].equal((~far).float())  # beta is 1 at first.
-    assert draw.batch["behavior_weight"].abs().max() == 0
+    # beta is 0.0001 at first.
+    torch.testing.assert_close(draw.batch["policy_weight"], 1e-4 * (~far).float())
+    torch.testing.assert_close(draw.batch["behavior_weight"], torch.full((COUNT,), 1 - 1e-4))
 
 
 @pytest.mark.parametrize("batches", [0, 4_000_000])
@@ -116,14 +117,17 @@ def test_how_fast_the_weight_moves_goes_by_the_slots_and_not_by_what_is_in_them(
     learner = make_learner(**loss_options("ref_er"))
     replay = make_replay("ref_er", capacity=10 * COUNT, batch_size=50, policy=learner.policy)
     replay.buffer.extend(rows_near_and_far(learner, 1.0))
+    replay.buffer.sampler.policy_weight = 0.5
     list(replay.select(replay.buffer))
-    assert replay.buffer.sampler.policy_weight == pytest.approx(1 - 0.1 * 50 / (10 * COUNT))
+    rate = 0.1 * 50 / (10 * COUNT)
+    assert replay.buffer.sampler.policy_weight == pytest.approx((1 - rate) * 0.5)
 
 
 def test_what_is_far_teaches_neither_critic_nor_actor():
     """The update is that of the near transitions alone, over the size of the batch."""
     learner = make_learner(**loss_options("ref_er"))
     replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
+    replay.buffer.sampler.policy_weight = 1.0  # Nothing holds the actor.
     (draw,) = replay.select(replay.buffer)
     loss = learner.loss
     losses, _ = loss.losses(draw.batch)
@@ -138,7 +142,8 @@ def test_what_is_far_teaches_neither_critic_nor_actor():
 def test_the_weight_moves_as_its_rule_says_and_the_policy_is_held_once_too_many_are_far():
     learner = make_learner(**loss_options("ref_er"))
     replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
-    sampler, weight = replay.buffer.sampler, 1.0
+    sampler = replay.buffer.sampler
+    sampler.policy_weight = weight = 1.0
     for number in range(5):
         (draw,) = replay.select(replay.buffer)
         assert draw.batch["policy_weight"].max() == pytest.approx(weight)
@@ -153,6 +158,23 @@ def test_the_weight_moves_as_its_rule_says_and_the_policy_is_held_once_too_many_
     list(near.select(near.buffer))
     assert near.buffer.sampler.policy_weight == pytest.approx(0.55)
     assert next_weight(0.5, far=0.1, allowed=0.1, rate=0.2) == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("rate", [0.0003, 0.1])
+def test_the_weight_starts_next_to_zero_and_no_step_is_longer_than_what_is_left(rate):
+    """The authors' rule in plain steps, up from their start and down from the end."""
+    weight = RememberingSampler().policy_weight
+    assert weight == 1e-4
+    for far in [0.0] * 200 + [1.0] * 200:
+        up = far <= 0.1
+        step = min(rate, weight)
+        expected = weight - step * weight + (min(rate, 1 - weight) if up else 0.0)
+        weight = next_weight(weight, far=far, allowed=0.1, rate=rate)
+        assert weight == pytest.approx(expected)
+        assert 0 < weight < 1
+    assert next_weight(1e-4, far=0.0, allowed=0.1, rate=0.1) == pytest.approx(0.1 + 1e-4 - 1e-8)
+    assert next_weight(1e-4, far=1.0, allowed=0.1, rate=0.1) == pytest.approx(1e-4 - 1e-8)
+    assert next_weight(0.999, far=0.0, allowed=0.1, rate=0.1) == pytest.approx(0.9 * 0.999 + 0.001)
 
 
 def test_a_held_policy_returns_to_its_behavior_and_a_free_one_does_not():
@@ -255,11 +277,11 @@ def test_the_weight_is_saved(way, tmp_path):
     assert second.sampler.policy_weight == 0.25
 
 
-def test_a_buffer_that_is_emptied_begins_with_the_whole_weight():
+def test_a_buffer_that_is_emptied_begins_with_the_first_weight():
     buffer = make_buffer(RememberingSampler(), 9, 2)
     buffer.sampler.policy_weight, buffer.sampler.batches = 0.25, 7
     buffer.empty()
-    assert (buffer.sampler.policy_weight, buffer.sampler.batches) == (1.0, 7)
+    assert (buffer.sampler.policy_weight, buffer.sampler.batches) == (1e-4, 7)
 
 
 def test_what_is_missing_or_out_of_range_is_named():

@@ -8,7 +8,8 @@ https://arxiv.org/abs/1807.05827. Of transitions whose importance ratio
     \rho_i = \frac{\pi(a_i | s_i)}{\mu_i(a_i)}
 
 is outside of :math:`(1 / c, c)` neither critic nor actor learn, and the actor is held near the
-behavior :math:`\mu` by a divergence whose weight grows for as long as too many are. A deterministic
+behavior :math:`\mu` by a divergence whose weight, nearly all of it at first, falls for as long as
+few are. A deterministic
 policy counts as a Gaussian around its action, as wide as the behavior was.
 """
 
@@ -39,6 +40,7 @@ LEAST_SIGMA = 0.2
 """Noise below this counts as this, the authors' own: a policy without any has no ratio."""
 _CUTOFF_DECAY = 5e-7
 _RATE = 0.1
+_FIRST_WEIGHT = 1e-4
 _FILE = "trust.json"
 
 
@@ -73,7 +75,8 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
         rate: :math:`\eta`, how fast it moves.
 
     Returns:
-        :math:`(1 - \eta) \beta` where too many are far, :math:`(1 - \eta) \beta + \eta` else.
+        :math:`(1 - \eta') \beta` where too many are far, with :math:`\eta' = \min(\eta, \beta)`;
+        else :math:`(1 - \eta') \beta + \min(\eta, 1 - \beta)`.
 
     Examples:
         >>> next_weight(0.5, far=0.3, allowed=0.1, rate=0.1)
@@ -81,7 +84,8 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
         >>> next_weight(0.5, far=0.0, allowed=0.1, rate=0.1)
         0.55
     """
-    return (1.0 - rate) * weight + (0.0 if far > allowed else rate)
+    kept = (1.0 - min(rate, weight)) * weight
+    return kept if far > allowed else kept + min(rate, 1.0 - weight)
 
 
 class RememberingSampler(RandomSampler):
@@ -89,18 +93,18 @@ class RememberingSampler(RandomSampler):
 
     Examples:
         >>> RememberingSampler().policy_weight
-        1.0
+        0.0001
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.policy_weight = 1.0
+        self.policy_weight = _FIRST_WEIGHT
         self.batches = 0
 
     def _empty(self) -> None:
         super()._empty()
-        # No transition is far in an empty buffer. The batches go on: they are the training's.
-        self.policy_weight = 1.0
+        # The batches go on: they are the training's.
+        self.policy_weight = _FIRST_WEIGHT
 
     def state_dict(self) -> dict[str, Any]:
         """The weight of the policy's gradient, and the batches so far."""
