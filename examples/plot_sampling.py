@@ -40,8 +40,6 @@ ROUNDS = 600
 """Training steps until priorities have settled, and as many again that count."""
 REPLAY_CAP = 60
 """In place of 1,024, which so few training steps do not reach."""
-RECENCY = 1e-3
-"""In place of 3e-5, by which so small a buffer is as good as uniform."""
 EPISODE_LENGTH = 50
 SIGMA = 0.2
 OBSERVATION_SIZE, ACTION_SIZE = 8, 2
@@ -133,7 +131,6 @@ def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[s
         policy=policy,
         sigma=SIGMA,
         replay_cap=REPLAY_CAP,
-        recency=RECENCY,
     )
     buffer = replay.buffer
     buffer.extend(transitions.data)

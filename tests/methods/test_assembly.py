@@ -121,7 +121,7 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"beta_end": NAN}, r"beta_end must be in \[0, 1\], got nan"),
         ({"curiosity_scale": -1}, "curiosity_scale must be positive and finite, got -1"),
         ({"boost_target": -1}, r"boost_target must be in \[0, 1\), got -1"),
-        ({"method": "geometric", "recency": 1}, r"recency must be in \[0, 1\), got 1"),
+        ({"method": "geometric", "recency": -1}, "recency must be finite and not negative, got -1"),
         ({"method": "ref_er", "far_cutoff": 0}, "far_cutoff must be positive and finite, got 0"),
         (
             {"method": "per", "boost_factor": 10.0},

@@ -1,5 +1,7 @@
 """Replay by age: frequencies of ages against the law written out."""
 
+import math
+
 import pytest
 import torch
 
@@ -16,15 +18,16 @@ def law_by_hand(rate, count):
     return [weight / sum(weights) for weight in weights]
 
 
-def shares_of_slots(rate, order):
+def shares_of_slots(recency, order):
     """Probability of each slot, given the slots from the newest to the oldest."""
     shares = torch.zeros(len(order), dtype=torch.double)
+    rate = 1 - math.exp(-recency / len(order))
     for slot, share in zip(order, law_by_hand(rate, len(order)), strict=True):
         shares[slot] = share
     return shares
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.02, 0.4])
+@pytest.mark.parametrize("recency", [0.0, 0.2, 3.0])
 @pytest.mark.parametrize(
     ("capacity", "written", "order"),
     [
@@ -33,11 +36,11 @@ def shares_of_slots(rate, order):
         (7, (5, 5), [2, 1, 0, 6, 5, 4, 3]),
     ],
 )
-def test_frequencies_are_those_of_the_law_across_the_wrap(rate, capacity, written, order):
-    buffer = make_buffer(GeometricSampler(rate=rate), capacity, SAMPLES, filled=0)
+def test_frequencies_are_those_of_the_law_across_the_wrap(recency, capacity, written, order):
+    buffer = make_buffer(GeometricSampler(recency=recency), capacity, SAMPLES, filled=0)
     for count in written:
         buffer.extend(make_transitions(count))
-    assert_shares(buffer.sample()["index"], shares_of_slots(rate, order), samples=SAMPLES)
+    assert_shares(buffer.sample()["index"], shares_of_slots(recency, order), samples=SAMPLES)
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 3e-5, 0.3, 0.999])
@@ -62,36 +65,37 @@ def test_no_share_leads_beyond_the_oldest_transition():
 def test_in_two_dimensions_age_goes_along_time_and_the_robots_are_alike():
     buffer = SignalReplayBuffer(
         storage=SignalTensorStorage(12, signals=["td_error"], ndim=2),
-        sampler=GeometricSampler(rate=0.5),
+        sampler=GeometricSampler(recency=3.0),
         batch_size=SAMPLES,
         generator=seeded(0),
     )
     for number in range(5):  # Six rows of two robots, the next to be written is the last.
         buffer.extend(make_transitions(2, seed=number).reshape(2, 1))
     time, robot = buffer.sample()["index"].unbind(-1)
-    assert_shares(time, shares_of_slots(0.5, [4, 3, 2, 1, 0]), samples=SAMPLES)
+    assert_shares(time, shares_of_slots(3.0, [4, 3, 2, 1, 0]), samples=SAMPLES)
     assert (robot.double().mean() - 0.5).abs() < 0.02
 
 
-def test_what_is_learned_from_is_younger_than_by_uniform_replay():
-    """Of a buffer of 1,000, the mean age is that of the law, not 500."""
-    replay = make_replay("geometric", capacity=1000, batch_size=SAMPLES, recency=0.01)
-    replay.buffer.extend(make_transitions(1500))  # Slot 499 is the newest.
-    (draw,) = replay.select(replay.buffer)
-    age = (499 - draw.batch["index"]) % 1000
-    expected = sum(age * share for age, share in enumerate(law_by_hand(0.01, 1000)))
-    assert age.double().mean() == pytest.approx(expected, rel=0.03)
-    assert expected < 100
+def test_the_law_has_one_shape_however_many_transitions_a_run_has():
+    """The oldest tenth against the newest, and the mean age, in a buffer that is hardly filled."""
+    for written in (1_000, 24_000):
+        replay = make_replay("geometric", capacity=100_000, batch_size=SAMPLES)
+        replay.buffer.extend(make_transitions(written))
+        (draw,) = replay.select(replay.buffer)
+        age = (written - 1 - draw.batch["index"]).double() / written
+        newest, oldest = (age < 0.1).double().mean(), (age > 0.9).double().mean()
+        assert newest / oldest == pytest.approx(math.exp(0.9 * 3.0), rel=0.1)
+        assert age.mean() == pytest.approx(1 / 3 - 1 / math.expm1(3), rel=0.03)
 
 
-@pytest.mark.parametrize("rate", [-0.1, 1.0, float("nan")])
-def test_a_rate_that_is_no_share_is_refused(rate):
-    with pytest.raises(ValueError, match="rate must be"):
-        GeometricSampler(rate=rate)
+@pytest.mark.parametrize("recency", [-0.1, float("inf"), float("nan")])
+def test_a_recency_that_cannot_be_is_refused(recency):
+    with pytest.raises(ValueError, match="recency must be"):
+        GeometricSampler(recency=recency)
 
 
 def test_what_was_not_stored_is_not_the_newest():
-    sampler = GeometricSampler(rate=0.5)
+    sampler = GeometricSampler(recency=0.5)
     sampler.extend(torch.tensor([3, 4, -1]))  # TorchRL's writers mark it so.
     sampler.add(torch.tensor(-1))
     assert sampler.newest == [4]

@@ -58,7 +58,7 @@ _UNIFORM: dict[str, Callable[[Method], RandomSampler]] = {
     "halves": lambda method: RandomSampler(),
     "newest": lambda method: CombinedSampler(),
     "near_policy": lambda method: RememberingSampler(),
-    "geometric": lambda method: GeometricSampler(rate=method.recency),
+    "geometric": lambda method: GeometricSampler(recency=method.recency),
 }
 _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "prioritized": SignalSampler,

@@ -52,8 +52,8 @@ class Method:
     """Share of transitions that may be far from the policy before ``near_policy`` holds it."""
     far_cutoff: float = 4.0
     """C of ``near_policy``: a ratio of densities of 1 + C or its inverse is far."""
-    recency: float = 3e-5
-    """rho of ``geometric``: by how much less often each older transition is sampled."""
+    recency: float = 3.0
+    """c of ``geometric``: the newest transition is sampled e^c times as often as the oldest."""
     candidates: int = 1
     """Batches of which the most on-policy one is trained on (KLPER)."""
     replay_cap: int = 1024

@@ -6,9 +6,12 @@ prefers what is recent is said by its abstract; the form of the law and its rate
 
 .. math::
 
-    P(k) = \frac{\rho (1 - \rho)^k}{1 - (1 - \rho)^N}, \qquad k = 0, \dots, N - 1
+    P(k) = \frac{\rho (1 - \rho)^k}{1 - (1 - \rho)^N}, \qquad k = 0, \dots, N - 1, \qquad
+    \rho = 1 - e^{-c / N}
 
-where the age :math:`k` of a transition counts those that were written after it.
+where the age :math:`k` of a transition counts those that were written after it. The rate
+:math:`\rho` follows the number :math:`N` of transitions in the buffer: whatever it is, the newest
+is sampled :math:`e^c` times as often as the oldest.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import BELOW_ONE, check
+from torchrl_mpfa.checks import NOT_NEGATIVE, check
 from torchrl_mpfa.samplers.newest import NewestSampler
 
 
@@ -55,33 +58,34 @@ def geometric_age(share: Tensor, *, rate: float, count: int) -> Tensor:
 
 
 class GeometricSampler(NewestSampler):
-    r"""Samples the newest transition most often, each older one :math:`1 - \rho` times as often.
+    r"""Samples the newest transition :math:`e^c` times as often as the oldest in the buffer.
 
-    Ages are those of the ring buffer. In a storage of several dimensions age goes along the first,
-    time, and the other places are uniform.
+    In between, each is sampled :math:`e^{-c / N}` times as often as the one after it, where the
+    buffer holds ``N``. Ages are those of the ring buffer. In a storage of several dimensions age
+    goes along the first, time, and the other places are uniform.
 
     Args:
-        rate: :math:`\rho`; the age at which a transition is sampled half as often as the newest is
-            about :math:`0.69 / \rho`. With 0 sampling is uniform.
+        recency: :math:`c`; the age at which a transition is sampled half as often as the newest is
+            :math:`0.69 N / c`. With 0 sampling is uniform.
 
     Raises:
-        ValueError: If ``rate`` is not in [0, 1).
+        ValueError: If ``recency`` is negative or not finite.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
         >>> buffer = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(1000), sampler=GeometricSampler(rate=0.1), batch_size=64
+        ...     storage=LazyTensorStorage(1000), sampler=GeometricSampler(recency=99), batch_size=64
         ... )
         >>> index = buffer.extend(TensorDict({"reward": torch.rand(1000)}, [1000]))
         >>> bool(buffer.sample()["index"].min() > 800)
         True
     """
 
-    def __init__(self, *, rate: float = 3e-5) -> None:
-        check(BELOW_ONE, rate=rate)
+    def __init__(self, *, recency: float = 3.0) -> None:
+        check(NOT_NEGATIVE, recency=recency)
         super().__init__()
-        self.rate = rate
+        self.recency = recency
 
     @property
     def divisible(self) -> bool:
@@ -108,6 +112,7 @@ class GeometricSampler(NewestSampler):
         along = index if isinstance(index, tuple) else (index,)
         around = len(storage) if len(along) == 1 else storage._len_along_dim0
         share = torch.rand(batch_size, generator=storage._rng, dtype=torch.double)
-        age = geometric_age(share, rate=self.rate, count=around)
+        rate = -math.expm1(-self.recency / around)
+        age = geometric_age(share, rate=rate, count=around)
         along[0].copy_((self.newest[0] - age) % around)
         return index, info

@@ -16,7 +16,7 @@ RANGES: dict[str, Rule] = {
     "reliability": NOT_NEGATIVE,
     "far_share": SHARE,
     "far_cutoff": POSITIVE,
-    "recency": BELOW_ONE,
+    "recency": NOT_NEGATIVE,
     "candidates": COUNT,
     "replay_cap": COUNT,
     "capacity": COUNT,
