@@ -94,7 +94,10 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
             "behavior_mean": action - SIGMA * (1.0 + age) * noise,
             "behavior_sigma": SIGMA * (1.0 + age),
             "episode": torch.arange(count).unsqueeze(1) // EPISODE_LENGTH,
-            "next": {"reward": torch.as_tensor(reward, dtype=torch.float).unsqueeze(1)},
+            "next": {
+                "reward": torch.as_tensor(reward, dtype=torch.float).unsqueeze(1),
+                "done": (torch.arange(count).unsqueeze(1) + 1) % EPISODE_LENGTH == 0,
+            },
         },
         [count],
     )

@@ -125,8 +125,6 @@ def test_what_has_no_figure_samples_every_transition_as_often(name: str) -> None
         assert abs(np.corrcoef(often, np.arange(len(often)))[0, 1]) < 0.15
 
 
-@pytest.mark.parametrize(
-    "name", ["klper", "averaged_ddpg", "geometric", "hvper", "mw", "reaper", "rud"]
-)
+@pytest.mark.parametrize("name", ["klper", "averaged_ddpg", "geometric", "hvper", "mw", "rud"])
 def test_a_reconstruction_is_called_one(name: str) -> None:
     assert "reconstruction" in (DOCS / f"{name}.md").read_text(encoding="utf-8").lower()

@@ -1,38 +1,43 @@
-"""ReaPER: reliabilities against plain loops, and what they do to the frequencies."""
+"""ReaPER: reliabilities against plain loops, and the authors' rules in the leaves of the tree."""
+
+import random
 
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.methods.replays import assert_shares, seeded, set_signals
-from torchrl_mpfa import SignalTensorStorage
-from torchrl_mpfa.methods import Reliability, make_replay, reliability
-from torchrl_mpfa.testing import check_adjustment
+from torchrl_mpfa import SignalSampler, SignalTensorStorage
+from torchrl_mpfa.methods import ReaPERSampler, make_replay, reliability
 
-OMEGA, ALPHA, EPS = 0.3, 0.8, 0.05
+OMEGA, ALPHA, EPS = 0.4, 0.8, 0.05
 
 
-def by_hand(errors, episodes, times):
-    """One transition after the other, with every later one of its episode looked for."""
+def by_hand(errors, episodes, times, totals=None):
+    """One transition after the other, with every earlier one of its episode looked for."""
     found = []
-    for time, episode in zip(times, episodes, strict=True):
+    for row, (time, episode) in enumerate(zip(times, episodes, strict=True)):
         mine = [
-            (0.0 if error != error else error, when)
+            (error, when)
             for error, other, when in zip(errors, episodes, times, strict=True)
             if other == episode
         ]
-        total = sum(error for error, _ in mine)
-        later = sum(error for error, when in mine if when > time)
-        found.append(1.0 if total == 0 else 1 - later / total)
+        total = sum(error for error, _ in mine) if totals is None else totals[row]
+        until = sum(error for error, when in mine if when <= time)
+        found.append(1.0 if total == 0 else min(until / total, 1.0))
     return found
 
 
-def make_rows(episodes, seed=0):
+def make_rows(episodes, done=None, seed=0):
     count = len(episodes)
+    ended = torch.zeros(count, 1, dtype=torch.bool) if done is None else torch.tensor(done)
     return TensorDict(
         {
             "episode": torch.as_tensor(episodes).reshape(-1, 1),
-            "next": {"reward": torch.randn(count, 1, generator=seeded(seed))},
+            "next": {
+                "reward": torch.randn(count, 1, generator=seeded(seed)),
+                "done": ended.reshape(-1, 1),
+            },
         },
         [count],
     )
@@ -43,11 +48,13 @@ def test_reliabilities_are_those_of_the_loops_however_episodes_lie_in_the_buffer
     episodes = torch.randint(6, (60,), generator=seeded(seed))
     times = torch.randperm(60, generator=seeded(seed + 10)).double()
     errors = torch.rand(60, generator=seeded(seed + 20)) * 3
-    errors[::7] = torch.nan
     errors[episodes == 2] = 0.0
-    found = reliability(errors, episodes.double(), times)
-    expected = by_hand(errors.tolist(), episodes.tolist(), times.tolist())
-    assert found.tolist() == pytest.approx(expected, abs=1e-6)
+    totals = torch.rand(60, generator=seeded(seed + 30)) * 20
+    for total in (None, totals):
+        found = reliability(errors, episodes.double(), times, total=total)
+        listed = None if total is None else total.tolist()
+        expected = by_hand(errors.tolist(), episodes.tolist(), times.tolist(), listed)
+        assert found.tolist() == pytest.approx(expected, abs=1e-6)
 
 
 def test_large_errors_of_one_episode_do_not_round_those_of_another_away():
@@ -56,32 +63,105 @@ def test_large_errors_of_one_episode_do_not_round_those_of_another_away():
     assert found.tolist() == pytest.approx([0.5, 1.0, 0.25, 1.0], rel=1e-3)
 
 
-def make_reaper(episodes, *, capacity=None, samples=60_000, **settings):
+class Rules:
+    """What the authors' buffer does, row by row; rows are dictionaries in the order of writing."""
+
+    def __init__(self):
+        self.rows, self.highest = [], 1.0
+
+    def write(self, slot, episode, done):
+        self.rows = [row for row in self.rows if row["slot"] != slot]
+        # As long as nothing else of its episode changes it is sampled by its error alone.
+        fresh = {"slot": slot, "episode": episode, "error": self.highest, "done": done}
+        self.rows.append({**fresh, "leaf": (self.highest + EPS) ** ALPHA})
+        if done:
+            self.rely({episode})
+
+    def learn(self, slots, errors):
+        for row in self.rows:
+            if row["slot"] in slots:
+                row["error"] = errors[slots.index(row["slot"])]
+                self.highest = max(self.highest, row["error"])
+        self.rely({row["episode"] for row in self.rows if row["slot"] in slots})
+
+    def rely(self, episodes):
+        sums, ended = {}, {row["episode"] for row in self.rows if row["done"]}
+        for row in self.rows:
+            sums[row["episode"]] = sums.get(row["episode"], 0.0) + row["error"]
+        largest = max((sums[one] for one in ended), default=0.0)
+        until = {}
+        for row in self.rows:
+            one = row["episode"]
+            until[one] = until.get(one, 0.0) + row["error"]
+            total = sums[one] if one in ended else largest
+            if one in episodes:
+                share = min(until[one] / total, 1.0) if total > 0 else 1.0
+                row["leaf"] = max(share, 1e-3) ** OMEGA * (row["error"] + EPS) ** ALPHA
+
+
+@pytest.mark.parametrize(("seed", "number"), [(0, 1), (1, 1), (2, 0.5), (3, 10**9)])
+def test_leaves_are_those_of_the_authors_rules_through_writes_and_updates(seed, number):
+    """Three robots, a buffer of thirty that wraps, one or two batches an update, duplicates."""
+    choose, capacity = random.Random(seed), 30
+    buffer = make_reaper([], capacity=capacity, samples=8)
+    rules, episodes, latest, slot = Rules(), [0, 1, 2], 2, 0
+    for _ in range(60):
+        done = [choose.random() < 0.2 for _ in episodes]
+        buffer.extend(make_rows([number * one for one in episodes], done))
+        for robot, ends in enumerate(done):
+            rules.write(slot % capacity, episodes[robot], ends)
+            slot += 1
+        for robot, ends in enumerate(done):
+            if ends:
+                latest += 1
+                episodes[robot] = latest
+        count = choose.choice([1, 5])
+        filled = min(slot, capacity)
+        slots = choose.sample(range(filled), min(count, filled))
+        errors = [choose.choice([0.0, choose.random() * 3]) for _ in slots]
+        table = buffer.storage.signal_table
+        index = torch.tensor(slots)
+        batch = TensorDict({"index": index, "written_at": table.written_at(index)}, [len(slots)])
+        batch["signals", "td_error"] = torch.tensor(errors)
+        buffer.update_tensordict_priority(batch)
+        rules.learn(slots, errors)
+        places = torch.tensor([row["slot"] for row in rules.rows])
+        leaves = buffer.sampler._sum_tree[places].tolist()
+        assert leaves == pytest.approx([row["leaf"] for row in rules.rows], rel=1e-5)
+
+
+def make_reaper(episodes, done=None, *, capacity=None, samples=60_000, **settings):
     replay = make_replay(
         "reaper",
         capacity=capacity or len(episodes),
         batch_size=samples,
         generator=seeded(0),
-        alpha=ALPHA,
-        reliability=OMEGA,
-        eps=EPS,
-        **settings,
+        **{"alpha": ALPHA, "reliability": OMEGA, "eps": EPS, **settings},
     )
-    replay.buffer.extend(make_rows(episodes))
+    if len(episodes):
+        replay.buffer.extend(make_rows(episodes, done))
     return replay.buffer
 
 
-def test_frequencies_are_those_of_the_product():
-    episodes = [0, 1, 0, 1, 0, 1, 2, 2, 0, 1]  # Two robots, step by step.
+def test_the_exponents_are_the_authors_and_zero_is_per():
+    sampler = make_replay("reaper").buffer.sampler
+    assert (sampler.exponent, sampler.alpha) == (0.3, 0.3)
+    assert type(make_replay("reaper", reliability=0.0).buffer.sampler) is SignalSampler
+
+
+@pytest.mark.parametrize("combined", [{}, {"signals": ["td_error", "reward"], "boost": True}])
+def test_frequencies_are_those_of_the_product(combined):
+    episodes = [0, 1, 0, 1, 0, 1, 2, 2, 0, 1]  # Two robots, step by step; the last is under way.
+    done = [False] * 5 + [False, False, False, True, True]
     errors = torch.rand(10, generator=seeded(3)) * 2
-    buffer = make_reaper(episodes)
-    for _ in range(2):  # At the first update no error was known.
-        set_signals(buffer, td_error=errors)
-    reliable = by_hand(errors.tolist(), episodes, list(range(10)))
-    leaves = [
-        r**OMEGA * (error + EPS) ** ALPHA
-        for r, error in zip(reliable, errors.tolist(), strict=True)
-    ]
+    buffer = make_reaper(episodes, done, **combined)
+    set_signals(buffer, td_error=errors)
+    listed = errors.tolist()
+    sums = [sum(e for e, o in zip(listed, episodes, strict=True) if o == one) for one in range(3)]
+    sums[2] = max(sums[:2])
+    reliable = by_hand(listed, episodes, list(range(10)), [sums[one] for one in episodes])
+    priority = buffer.sampler.priorities().tolist()
+    leaves = [r**OMEGA * p**ALPHA for r, p in zip(reliable, priority, strict=True)]
     shares = torch.tensor([leaf / sum(leaves) for leaf in leaves], dtype=torch.double)
     assert_shares(buffer.sample()["index"], shares, samples=60_000)
 
@@ -89,10 +169,10 @@ def test_frequencies_are_those_of_the_product():
 def test_an_error_early_in_an_episode_of_errors_counts_less_than_the_same_error_at_its_end():
     """What bootstraps from badly known values, against what a reward alone makes."""
     buffer = make_reaper([0] * 50)
-    for _ in range(2):
-        set_signals(buffer, td_error=torch.ones(50))
+    set_signals(buffer, td_error=torch.ones(50))
+    buffer.extend(make_rows([0], [True]))  # It has ended: the sum is its own.
     counts = torch.bincount(buffer.sample()["index"], minlength=50).double()
-    assert counts[40:].mean() > 1.5 * counts[:10].mean()
+    assert counts[40:].mean() > 1.5 * counts[1:11].mean()
     per = make_replay("per", capacity=50, batch_size=60_000, generator=seeded(0)).buffer
     per.extend(make_rows([0] * 50))
     set_signals(per, td_error=torch.ones(50))
@@ -100,27 +180,21 @@ def test_an_error_early_in_an_episode_of_errors_counts_less_than_the_same_error_
     assert alike[40:].mean() < 1.1 * alike[:10].mean()
 
 
-def test_a_transition_in_the_place_of_an_old_one_does_not_have_its_reliability():
-    buffer = make_reaper([0] * 400, samples=8)
-    for _ in range(2):
-        set_signals(buffer, td_error=torch.ones(400))
-    table, slots = buffer._storage.signal_table, torch.arange(2)
-
-    def learn():
-        batch = TensorDict({"index": slots, "written_at": table.written_at(slots)}, [2])
-        batch["signals", "td_error"] = torch.ones(2)
-        buffer.update_tensordict_priority(batch)
-        return buffer.sampler.priorities(slots).tolist()
-
-    assert max(learn()) < 0.2  # The least reliable ones; all is counted anew here.
-    buffer.extend(make_rows([1, 1]))  # In their places, and too few to count anew.
-    assert learn() == pytest.approx([1 + EPS] * 2)
+def test_another_alpha_keeps_the_reliabilities():
+    done = [False, True, False, False, True]
+    errors = torch.rand(5, generator=seeded(3))
+    buffer = make_reaper([0, 0, 1, 1, 1], done)
+    set_signals(buffer, td_error=errors)
+    buffer.sampler.alpha = 0.5
+    again = make_reaper([0, 0, 1, 1, 1], done, alpha=0.5)
+    set_signals(again, td_error=errors)
+    slots = torch.arange(5)
+    assert buffer.sampler._sum_tree[slots].equal(again.sampler._sum_tree[slots])
 
 
 def test_it_goes_on_where_it_was_saved():
     first, second = (make_reaper([0, 0, 1, 1, 1, 2], samples=3) for _ in range(2))
-    for _ in range(2):
-        set_signals(first, td_error=torch.arange(6.0))
+    set_signals(first, td_error=torch.arange(6.0))
     second.load_state_dict(first.state_dict())
     for number in range(10):
         found = []
@@ -137,10 +211,16 @@ def test_what_is_missing_is_named():
     assert replay.entries == ("episode",)
     assert make_replay("per", capacity=10).entries == ()
     with pytest.raises(KeyError, match="the transitions lack 'episode'"):
-        replay.buffer.extend(TensorDict({"next": {"reward": torch.ones(2, 1)}}, [2]))
-    with pytest.raises(ValueError, match=r"signals \['episode'\] of the sampler are not in the st"):
+        replay.buffer.extend(make_rows([0, 0]).exclude("episode"))
+    with pytest.raises(KeyError, match="the transitions lack 'ended'"):
+        replay.buffer.extend(make_rows([0, 0]).exclude(("next", "done")))
+    with pytest.raises(ValueError, match=r"signals \['episode', 'ended'\] of the sampler are not"):
         make_replay("reaper", storage=SignalTensorStorage(10, signals=["td_error"]))
     with pytest.raises(ValueError, match="exponent must be positive and finite, got 0"):
-        Reliability(0.0)
-    with pytest.raises(ValueError, match=r"must keep the signals \['episode'\]"):
-        check_adjustment(Reliability())
+        ReaPERSampler(10, 0.3, 0.4, exponent=0.0)
+    sampler, storage = ReaPERSampler(10, 0.3, 0.4), SignalTensorStorage(10, signals=["td_error"])
+    with pytest.raises(ValueError, match=r"must keep the signals \['episode', 'ended'\], got"):
+        sampler.bind(storage)
+    for settings in ({"selection": "rank"}, {"combination": "mixture"}):
+        with pytest.raises(ValueError, match=r"reliability must be 0.0 with .* got 0.3"):
+            make_replay("reaper", **settings)

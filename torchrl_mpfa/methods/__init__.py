@@ -22,7 +22,7 @@ from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
 from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.rank import RankSampler, rank_share
-from torchrl_mpfa.methods.reaper import EPISODE, Reliability, reliability
+from torchrl_mpfa.methods.reaper import ENDED, EPISODE, ReaPERSampler, reliability
 from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler, importance_ratio
 from torchrl_mpfa.methods.remote import (
     MethodReplayBuffer,
@@ -33,6 +33,7 @@ from torchrl_mpfa.methods.remote import (
 
 __all__ = [
     "ALIASES",
+    "ENDED",
     "EPISODE",
     "METHODS",
     "RELATIVE_ERROR",
@@ -48,7 +49,7 @@ __all__ = [
     "PriorityFloor",
     "RankSampler",
     "RaySignalReplayBuffer",
-    "Reliability",
+    "ReaPERSampler",
     "RememberForget",
     "RememberingSampler",
     "Replay",

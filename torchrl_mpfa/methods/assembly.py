@@ -30,7 +30,7 @@ from torchrl_mpfa.methods.lap import PriorityFloor
 from torchrl_mpfa.methods.mw import CappedSampler
 from torchrl_mpfa.methods.ranges import check_ranges
 from torchrl_mpfa.methods.rank import RankSampler
-from torchrl_mpfa.methods.reaper import EPISODE, Reliability
+from torchrl_mpfa.methods.reaper import ENDED, EPISODE, ReaPERSampler
 from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.positive import check_level
@@ -71,7 +71,6 @@ _OF_PRIORITIES = (
     "combination",
     "floor_quantile",
     "priority_floor",
-    "reliability",
     "replay_penalty",
 )
 WORDS: dict[str, set[str]] = {
@@ -197,7 +196,7 @@ def buffer_parts(
     Returns:
         ``storage``, ``sampler`` and ``batch_size``.
     """
-    kept = [*signals_of(method), *([EPISODE] if method.reliability > 0 else [])]
+    kept = [*signals_of(method), *([EPISODE, ENDED] if method.reliability > 0 else [])]
     if storage is None:
         storage = SignalTensorStorage(method.capacity, signals=kept or MPFA_SIGNALS, device=device)
     if method.reliability > 0:
@@ -248,6 +247,8 @@ def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
     named = METHODS.get(method.name, method)
     for base, cause, wrong, names in (
         (default, "selection", uniform, _OF_PRIORITIES),
+        (default, "selection", method.selection != "prioritized", ("reliability",)),
+        (default, "combination", method.combination == "mixture", ("reliability",)),
         (default, "priority_floor", method.priority_floor == 0, ("floor_quantile",)),
         (named, "selection", uniform, ("boost", "decay")),
         (named, "boost", not method.boost, ("boost_factor", "boost_target", "boost_bound")),
@@ -298,6 +299,8 @@ def make_sampler(method: Method) -> SignalSampler | RandomSampler:
         more["combination"] = "product"
     elif method.combination == "mixture":
         kind = MixtureSampler
+    if method.reliability > 0:
+        kind, more["exponent"] = ReaPERSampler, method.reliability
     if method.combination != "sum" and isinstance(fusion, ScaledFusion):
         fusion = _equal(method)
     return kind(
@@ -334,8 +337,6 @@ def make_adjustments(method: Method) -> list[Adjustment]:
         made.append(decay)
     if method.priority_floor > 0:
         made.append(PriorityFloor(method.priority_floor, method.floor_quantile))
-    if method.reliability > 0:
-        made.append(Reliability(method.reliability, alpha=method.alpha))
     if method.replay_penalty > 0:
         made.append(ReplayPenalty(penalty=method.replay_penalty, floor=method.eps))
     return made

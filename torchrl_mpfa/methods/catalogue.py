@@ -42,8 +42,8 @@ class Method:
     replay_penalty: float = 0.0
     """Penalty on replays (HVPER); 0: none."""
     reliability: float = 0.0
-    """omega of ReaPER: power of how reliable a TD error is; 0: none. Transitions must have
-    ``"episode"``."""
+    """omega of ReaPER: power of how reliable a TD error is; 0: none. It needs ``prioritized`` and
+    no ``mixture``, and transitions must have ``"episode"``."""
     selection: str = "prioritized"
     """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
     ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P),
@@ -166,7 +166,9 @@ METHODS: dict[str, Method] = {
     ),
     # What else there is today.
     "rank_per": Method("rank_per", **_PER, selection="rank", alpha=0.7, beta=0.5),
-    "reaper": Method("reaper", **_PER, reliability=0.2),
+    "reaper": Method(
+        "reaper", **_PER, reliability=0.3, alpha=0.3, max_priority_within_buffer=False
+    ),
     "lap": Method("lap", **_LAP),
     "pal": Method("pal", **_UNIFORM, loss_function="pal", alpha=0.4),
     "la3p": Method("la3p", **_LAP, selection="split"),
