@@ -168,6 +168,12 @@ class ReaPERSampler(SignalSampler):
         leaf = self._leaf(priority[mine]) * share.clamp_min(_LEAST).pow(self.exponent)
         self._write_leaves(mine, leaf)
 
+    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
+        # Reliabilities follow from the signals of the storage, and are at most 1.
+        highest = super()._saved_leaves(state, written)
+        found = state["_sum_tree"][written]
+        return torch.where((found > 0) & (found <= highest * (1 + 1e-9)), found, highest)
+
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
         super()._retransform_priority_trees(old_alpha, new_alpha)
         if self._table is not None and self._table.size:

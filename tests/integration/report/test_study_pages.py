@@ -226,7 +226,8 @@ def test_the_pages_of_the_runs_and_of_what_is_kept_of_them_are_the_same(
     assert figures == {"C_curves.png", "C_profiles.png", "C_arms.png"}
     for name in figures:
         with Image.open(tmp_path / "one" / name) as a, Image.open(tmp_path / "two" / name) as b:
-            assert a.tobytes() == b.tobytes()
+            # Kept rows are rounded, by which the edge of a line may be a shade lighter.
+            assert np.abs(np.asarray(a, int) - np.asarray(b, int)).max() <= 2
             assert len(a.convert("RGB").getcolors(1 << 24)) > 20
 
 
