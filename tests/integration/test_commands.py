@@ -22,6 +22,7 @@ import play
 import plot_sampling
 import report
 import stable_baselines
+import strength
 import study
 import torchrl_sac
 import torchrl_trainer
@@ -55,6 +56,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "plot_sampling": plot_sampling.main,
     "report": report.main,
     "stable_baselines": stable_baselines.main,
+    "strength": strength.main,
     "study": study.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
