@@ -96,8 +96,9 @@ def _stepper(env: NavigationEnv) -> Callable[[int], None]:
 def _physics_share(env: NavigationEnv, steps: int) -> float:
     """Part of the CPU time of driving that moving the robot takes, resets included in the whole."""
     run = _stepper(env)
-    clock = _Clock(env._drive.move)
-    env._drive.move = clock  # type: ignore[method-assign, assignment]
+    drives = env.robots._batch.drives
+    clock = _Clock(drives.move)
+    drives.move = clock  # type: ignore[method-assign]
     start = time.process_time()
     run(steps)
     return clock.spent / (time.process_time() - start)
@@ -216,7 +217,7 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
         How the episode ended and the way of the robot.
     """
     start, goal = options["start"][:2], options["goal"]
-    for radius in (PAPER_TASK["collision_distance"], env.robot.radius):
+    for radius in (PAPER_TASK["collision_distance"], env.config.robot.radius):
         path = PathPlanner(env.world, radius=radius).find(start, goal)
         if path is not None:
             return _follow(env, options, path[1:])

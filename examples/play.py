@@ -124,10 +124,10 @@ def picture_of(you: Racer, rival: Racer) -> NDArray[np.uint8]:
     assert env.task is not None
     return render_scene(
         env.world,
-        robot=env.robot,
+        robot=env.config.robot,
         pose=you.pose,
         goal=env.task.goal,
-        goal_radius=env.goal_radius,
+        goal_radius=env.config.goal_radius,
         trail=env.trail,
         rays=(env.lidar.angles, ranges),
         walkers=walkers,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from mpfa_envs.later import after_import
 
 if TYPE_CHECKING:
-    from mpfa_envs.arguments import PAPER_TASK
     from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
     from mpfa_envs.binning import Binning
     from mpfa_envs.builtin_worlds import WORLDS
+    from mpfa_envs.config import PAPER_TASK, TaskConfig
     from mpfa_envs.discrete import WHEEL_PAIRS, DiscreteWheels
     from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
     from mpfa_envs.evaluation import Driver, evaluate, run_tasks
@@ -36,12 +37,11 @@ if TYPE_CHECKING:
     from mpfa_envs.path import PathPlanner
     from mpfa_envs.planners import PLANNERS, DynamicWindow, MapPlanner, make_planner
     from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
-    from mpfa_envs.registration import ENV_IDS, ROOMS_TASK, VECTOR_ENV_IDS
+    from mpfa_envs.registration import ENV_IDS, ROOMS_TASK
     from mpfa_envs.render import render_trajectories
     from mpfa_envs.results import EpisodeResult, Interval, spl, summarize
     from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
     from mpfa_envs.robot import ROBOTS, RobotModel
-    from mpfa_envs.rooms import RoomsEnv
     from mpfa_envs.shapes import Box, Cylinder, Polygon
     from mpfa_envs.task_sets import WorldTask, world_tasks
     from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
@@ -66,7 +66,6 @@ __all__ = [
     "PLANNERS",
     "ROBOTS",
     "ROOMS_TASK",
-    "VECTOR_ENV_IDS",
     "WHEEL_PAIRS",
     "WORLDS",
     "Binning",
@@ -94,9 +93,9 @@ __all__ = [
     "RewardTerms",
     "RobotModel",
     "RobotNoise",
-    "RoomsEnv",
     "StepOutcome",
     "Task",
+    "TaskConfig",
     "VectorNavigationEnv",
     "Walker",
     "World",
@@ -137,11 +136,10 @@ _MODULES = {
     "GENERATORS": "generators",
     "INFO_TYPES": "observation",
     "OBSERVATION": "observation",
-    "PAPER_TASK": "arguments",
+    "PAPER_TASK": "config",
     "PLANNERS": "planners",
     "ROBOTS": "robot",
     "ROOMS_TASK": "registration",
-    "VECTOR_ENV_IDS": "registration",
     "WHEEL_PAIRS": "discrete",
     "WORLDS": "builtin_worlds",
     "Binning": "binning",
@@ -169,9 +167,9 @@ _MODULES = {
     "RewardTerms": "reward",
     "RobotModel": "robot",
     "RobotNoise": "noise",
-    "RoomsEnv": "rooms",
     "StepOutcome": "reward",
     "Task": "tasks",
+    "TaskConfig": "config",
     "VectorNavigationEnv": "vector",
     "Walker": "walkers",
     "World": "worlds",
@@ -207,11 +205,17 @@ _MODULES = {
 }
 """Where each name is. A module is imported when a name of it is first asked for: a robot that runs
 :mod:`mpfa_envs.deploy` has neither gymnasium nor torch, and Numba takes half a second."""
+_RENAMED = {"RoomsEnv": "NavigationEnv", "VECTOR_ENV_IDS": "ENV_IDS"}
+"""Old names, which stay for one version."""
 _OF_THE_EXTRA = ("gymnasium", "networkx", "numba", "PIL", "yaml", "scipy")
 
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first asked for."""
+    if name in _RENAMED:
+        message = f"mpfa_envs.{name} is now mpfa_envs.{_RENAMED[name]}"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        name = _RENAMED[name]
     if name in _MODULES:
         try:
             return getattr(import_module(f"mpfa_envs.{_MODULES[name]}"), name)

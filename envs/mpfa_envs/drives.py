@@ -1,164 +1,273 @@
-"""Two ways to move a robot by its wheel speeds: exact kinematics, or PyBullet's physics."""
+"""Two ways to move many robots: exact kinematics, or PyBullet's physics."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+
+from mpfa_envs.kernels.motion import drive_arcs
+from mpfa_envs.vector_state import read_array
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.config import Physics
     from mpfa_envs.robot import RobotModel
     from mpfa_envs.simulation import Simulation
-    from mpfa_envs.worlds import World
-
 
 SUBSTEP: Final = 1 / 30
 """Duration of a step of the physics engine [s].
 
 The wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do not.
 """
+_SERVERS: Final = 32
+"""Physics servers at most."""
 
 
-class Motion(NamedTuple):
-    """Where the robot is and how it moves."""
+class Drives(Protocol):
+    """What :class:`~mpfa_envs.VectorNavigationEnv` needs of a way to move."""
 
-    x: float
-    """Position [m]."""
-    y: float
-    """Position [m]."""
-    heading: float
-    """Direction of the front, from the x axis to the left, in [-π, π] [rad]."""
-    linear_speed: float
-    """Forward speed [m/s]."""
-    angular_speed: float
-    """Turning speed, to the left [rad/s]."""
-
-
-class Drive(Protocol):
-    """What :class:`~mpfa_envs.NavigationEnv` needs of a way to move."""
-
-    def place(self, x: float, y: float, heading: float) -> Motion:
-        """Put the robot at rest at a pose [m, m, rad]."""
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Put a robot at rest at a pose [m, m, rad]."""
         ...
 
-    def move(self, left: float, right: float) -> Motion:
-        """Hold the wheel speeds [m/s] for one time step."""
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What brings the robots where they are in their episodes."""
+        ...
+
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Raises:
+            ValueError: If something is missing or of another shape.
+        """
+        ...
+
+    def load(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Bring them there from their starts ``[N, 3]``."""
         ...
 
     def close(self) -> None:
-        """Release what the drive holds."""
+        """Release what the drives hold."""
         ...
 
 
-class KinematicDrive:
-    """Moves on exact arcs: the wheels have their speed at once and never slip.
+class KinematicDrives:
+    """Moves robots on exact arcs: the wheels have their speed at once and never slip.
 
     Args:
         robot: The robot.
         time_step: Duration of a step [s].
 
     Examples:
+        >>> import numpy as np
         >>> from mpfa_envs import ROBOTS
-        >>> from mpfa_envs.drives import KinematicDrive
-        >>> drive = KinematicDrive(ROBOTS["turtlebot2"], time_step=0.1)
-        >>> _ = drive.place(0.0, 0.0, 0.0)
-        >>> drive.move(0.5, 0.5).x
-        0.05
+        >>> from mpfa_envs.drives import KinematicDrives
+        >>> drives = KinematicDrives(ROBOTS["turtlebot2"], time_step=0.1)
+        >>> motions = np.zeros((2, 5))
+        >>> drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
+        >>> motions[:, 0]
+        array([0.05, 0.  ])
     """
 
     def __init__(self, robot: RobotModel, *, time_step: float) -> None:
         self._wheel_base = robot.wheel_base
         self._time_step = time_step
-        self._pose = (0.0, 0.0, 0.0)
 
-    def place(self, x: float, y: float, heading: float) -> Motion:
-        """Put the robot at rest at a pose [m, m, rad]."""
-        heading = math.remainder(heading, math.tau)
-        self._pose = x, y, heading
-        return Motion(x, y, heading, 0.0, 0.0)
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Nothing is held: the motions say where the robots are."""
 
-    def move(self, left: float, right: float) -> Motion:
-        """Hold the wheel speeds [m/s] for one time step."""
-        x, y, heading = self._pose
-        speed = 0.5 * (left + right)
-        turn = (right - left) / self._wheel_base
-        # Along a chord of the arc: its direction is halfway between the two headings, and
-        # sin(half) / half is its length over the arc's.
-        half = 0.5 * turn * self._time_step
-        chord = speed * self._time_step * (math.sin(half) / half if half else 1.0)
-        x += chord * math.cos(heading + half)
-        y += chord * math.sin(heading + half)
-        heading = math.remainder(heading + 2 * half, math.tau)
-        self._pose = x, y, heading
-        return Motion(x, y, heading, speed, turn)
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        drive_arcs(motions, running, speeds, self._wheel_base, self._time_step)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing is held."""
+        return {}
+
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Nothing is held."""
+        return {}
+
+    def load(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Nothing is held."""
 
     def close(self) -> None:
         """Nothing is held."""
 
 
-class WheelDrive:
-    """Moves by PyBullet: motors turn the wheels, friction moves the robot.
+class WheelDrives:
+    """Moves robots by PyBullet: motors turn the wheels, friction moves the robot.
+
+    Up to 32 robots have a physics server each and drive the same bits as alone. A server takes
+    35 MB; more robots therefore share 32 of them, where they pass through each other. There
+    PyBullet's solver stops at other last digits, and trajectories part slowly.
 
     Args:
         robot: The robot.
-        world: The room it drives in.
+        robots: Number of robots.
         time_step: Duration of a step [s].
-        substep: Duration of a step of the physics engine [s], rounded to divide the time step.
 
     Examples:
-        >>> from mpfa_envs import ROBOTS, WORLDS
-        >>> from mpfa_envs.drives import WheelDrive
-        >>> drive = WheelDrive(ROBOTS["turtlebot2"], WORLDS["A"], time_step=0.1)
-        >>> _ = drive.place(0.0, 0.0, 0.0)
+        >>> import numpy as np
+        >>> from mpfa_envs import ROBOTS
+        >>> from mpfa_envs.drives import WheelDrives
+        >>> drives = WheelDrives(ROBOTS["turtlebot2"], 2, time_step=0.1)
+        >>> motions = np.zeros((2, 5))
         >>> for _ in range(20):
-        ...     motion = drive.move(0.5, 0.5)
-        >>> round(motion.linear_speed, 2)
-        0.5
-        >>> drive.close()
+        ...     drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
+        >>> motions[:, 3].round(2)
+        array([0.5, 0. ])
+        >>> drives.close()
     """
 
-    def __init__(
-        self, robot: RobotModel, world: World, *, time_step: float, substep: float = SUBSTEP
-    ) -> None:
-        # Imported here so that kinematic environments run without PyBullet, which also greets
-        # the terminal whenever it is imported.
+    def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
+        # Imported here so that kinematic environments run without PyBullet.
         from mpfa_envs.simulation import Simulation
 
         self._wheel_radius = robot.wheel_radius
-        self.simulation = Simulation(time_step=time_step, substeps=substeps(time_step, substep))
-        self.simulation.add_world(world)
-        self.simulation.add_robot(robot)
+        self._simulations = [
+            Simulation(time_step=time_step, substeps=max(1, round(time_step / SUBSTEP)))
+            for _ in range(min(robots, _SERVERS))
+        ]
+        self._names = [f"robot_{index}" for index in range(robots)]
+        # Speeds of each robot in its episode so far, and their number.
+        self._driven = np.zeros((robots, 64, 2))
+        self._counts = np.zeros(robots, dtype=np.int64)
+        for index, name in enumerate(self._names):
+            self._simulation_of(index).add_robot(robot, name=name)
+        for index in range(robots):
+            self.place(index, 0.0, 0.0, 0.0)
 
-    def place(self, x: float, y: float, heading: float) -> Motion:
-        """Put the robot at rest at a pose [m, m, rad]."""
-        self.simulation.place_robot(x, y, heading)
-        return Motion(x, y, math.remainder(heading, math.tau), 0.0, 0.0)
+    def _simulation_of(self, index: int) -> Simulation:
+        """The server of a robot."""
+        return self._simulations[index % len(self._simulations)]
 
-    def move(self, left: float, right: float) -> Motion:
-        """Hold the wheel speeds [m/s] for one time step."""
-        self.simulation.set_wheel_speeds(left / self._wheel_radius, right / self._wheel_radius)
-        self.simulation.step()
-        return read_motion(self.simulation)
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Put a robot at rest at a pose [m, m, rad]."""
+        self._simulation_of(index).place_robot(x, y, heading, name=self._names[index])
+        self._counts[index] = 0
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        self._remember(running, speeds)
+        turning = np.where(running[:, None], speeds / self._wheel_radius, 0.0).tolist()
+        moving = np.flatnonzero(running).tolist()
+        # In a server of its own, a robot that does not run is not simulated; in a shared one it
+        # stops.
+        shared = len(self._names) > len(self._simulations)
+        for index in range(len(self._names)) if shared else moving:
+            left, right = turning[index]
+            simulation = self._simulation_of(index)
+            simulation.set_wheel_speeds(left, right, name=self._names[index])
+        for number in {index % len(self._simulations) for index in moving}:
+            self._simulations[number].step()
+        for index in moving:
+            motions[index] = _motion(self._simulation_of(index), self._names[index])
+
+    def _remember(self, running: NDArray[np.bool_], speeds: NDArray[np.float64]) -> None:
+        """Keep what the robots have driven since the start of their episodes."""
+        if self._counts.max() == self._driven.shape[1]:
+            self._driven = np.concatenate((self._driven, np.zeros_like(self._driven)), axis=1)
+        self._driven[running, self._counts[running]] = speeds[running]
+        self._counts[running] += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """The wheel speeds of the episodes so far: the engine cannot save all that it knows."""
+        counts = self._counts.copy()
+        return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
+
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Args:
+            state: What it gave.
+
+        Returns:
+            Its arrays.
+
+        Raises:
+            ValueError: If something is missing or of another shape.
+        """
+        counts = read_array(state, "counts", self._counts)
+        if counts.min() < 0:
+            raise ValueError(f"counts of the state must not be negative, got {counts.tolist()}")
+        speeds = read_array(state, "speeds", np.zeros((len(counts), counts.max(), 2)))
+        return {"counts": counts, "speeds": speeds}
+
+    def load(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Drive the episodes again from their starts.
+
+        Args:
+            arrays: What :meth:`read` gave.
+            starts: Poses at the start (x, y, heading) [m, m, rad], ``[N, 3]``.
+            motions: Poses and speeds, ``[N, 5]``, changed on the way.
+        """
+        counts, speeds = arrays["counts"], arrays["speeds"]
+        last = int(counts.max())
+        # All end at once; who has driven for a shorter time is placed later.
+        for step in range(last + 1):
+            for index in np.flatnonzero(counts == last - step).tolist():
+                self.place(index, *starts[index].tolist())
+            if step == last:
+                return
+            running = step >= last - counts
+            now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
+            self.move(motions, running, now)
 
     def close(self) -> None:
-        """Shut the physics server down; a second call does nothing."""
-        self.simulation.close()
+        """Shut the physics servers down; a second call does nothing."""
+        for simulation in self._simulations:
+            simulation.close()
 
 
-def substeps(time_step: float, substep: float = SUBSTEP) -> int:
-    """Count the steps of the physics engine in a time step [s]."""
-    return max(1, round(time_step / substep))
+def _motion(simulation: Simulation, name: str) -> tuple[float, ...]:
+    """Pose and speeds (x, y, heading, forward, turning) of a simulated robot."""
+    x, y, heading, speed_x, speed_y, turn = simulation.robot_motion(name)
+    return x, y, heading, speed_x * math.cos(heading) + speed_y * math.sin(heading), turn
 
 
-def read_motion(simulation: Simulation, name: str = "robot") -> Motion:
-    """Read the motion of a simulated robot.
+def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:
+    """Make the way to move that a name stands for.
 
     Args:
-        simulation: The physics server.
-        name: Name of the body.
+        physics: How the robots move.
+        robot: What they are.
+        robots: Number of robots.
+        time_step: Duration of a step [s].
 
     Returns:
-        Its motion.
+        The drives.
     """
-    x, y, heading, speed_x, speed_y, turn = simulation.robot_motion(name)
-    speed = speed_x * math.cos(heading) + speed_y * math.sin(heading)
-    return Motion(x, y, heading, speed, turn)
+    if physics == "kinematic":
+        return KinematicDrives(robot, time_step=time_step)
+    return WheelDrives(robot, robots, time_step=time_step)

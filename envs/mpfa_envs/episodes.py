@@ -21,7 +21,7 @@ from mpfa_envs.walker_starts import start_walkers
 from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
-    from mpfa_envs.arguments import TaskArguments
+    from mpfa_envs.config import TaskConfig
     from mpfa_envs.distance import DistanceField, FreeGrid
     from mpfa_envs.local_field import LocalField
     from mpfa_envs.walker_starts import WalkerStarts
@@ -107,12 +107,12 @@ def keeping(rngs: Iterable[np.random.Generator]) -> Iterator[None]:
 
 
 def draw_episode(
-    rules: TaskArguments, world: World, rng: np.random.Generator, task: Task | None = None
+    config: TaskConfig, world: World, rng: np.random.Generator, task: Task | None = None
 ) -> Episode:
     """Draw an episode in a fixed world.
 
     Args:
-        rules: The arguments of the task.
+        config: The arguments of the task.
         world: The room.
         rng: Source of randomness.
         task: Start and goal; None: any.
@@ -123,17 +123,17 @@ def draw_episode(
     Raises:
         ValueError: If the world has no task, or a walker fits nowhere.
     """
-    distance = rules.collision_distance
+    distance = config.collision_distance
     if task is None:
         task = sample_task(
             world,
             rng,
             collision_distance=distance,
-            min_goal_distance=rules.min_goal_distance,
-            detour_chance=rules.detour_chance,
+            min_goal_distance=config.min_goal_distance,
+            detour_chance=config.detour_chance,
         )
-    length = shortest_length(world, rules.robot.radius, task.start[:2], task.goal)
-    along = rules.progress == "shortest_path"
+    length = shortest_length(world, config.robot.radius, task.start[:2], task.goal)
+    along = config.progress == "shortest_path"
     field = distance_field(world, distance, task.goal) if along else None
     return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
 
@@ -145,7 +145,7 @@ class EpisodeSource:
         world: What :class:`~mpfa_envs.NavigationEnv` takes, a sequence of it, of which robot i has
             number ``i % len``, or the name of a generator.
         robots: Number of robots.
-        rules: The arguments of the task.
+        config: The arguments of the task.
         split: Which worlds of a generator are drawn.
         difficulty: Difficulty of a generator's worlds; None: each world's own.
         episodes_per_world: Episodes of a robot in a world of a generator before the next one.
@@ -159,7 +159,7 @@ class EpisodeSource:
         self,
         world: WorldChoice | Sequence[WorldChoice],
         robots: int,
-        rules: TaskArguments,
+        config: TaskConfig,
         *,
         split: Literal["train", "validation"],
         difficulty: float | None,
@@ -168,8 +168,8 @@ class EpisodeSource:
     ) -> None:
         self.refused = 0
         """Worlds of the generator that were drawn anew, as they had no task."""
-        self._rules = rules
-        self._max_goal_distance = check_goal_distance(rules.min_goal_distance, max_goal_distance)
+        self._config = config
+        self._max_goal_distance = check_goal_distance(config.min_goal_distance, max_goal_distance)
         self._episodes_per_world = check_count("episodes_per_world", episodes_per_world)
         if split not in ("train", "validation"):
             raise ValueError(f"split must be 'train' or 'validation', got {split!r}")
@@ -320,13 +320,13 @@ class EpisodeSource:
         return self._read_task(world, start, goal)
 
     def _read_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
-        rules = self._rules
+        config = self._config
         return check_task(
             world,
             {"start": start, "goal": goal},
-            collision_distance=rules.collision_distance,
-            goal_radius=rules.goal_radius,
-            radius=rules.robot.radius,
+            collision_distance=config.collision_distance,
+            goal_radius=config.goal_radius,
+            radius=config.robot.radius,
         )
 
     def _draw(self, world: World | None, rng: np.random.Generator) -> Episode:
@@ -358,22 +358,22 @@ class EpisodeSource:
         """Draw an episode in a fixed world, as :class:`~mpfa_envs.NavigationEnv` does."""
         if task is None and math.isfinite(self._max_goal_distance):
             return self._draw_on_grid(world, rng)
-        return draw_episode(self._rules, world, rng, task)
+        return draw_episode(self._config, world, rng, task)
 
     def _draw_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
         """Draw an episode over the cells of a grid, in milliseconds however full the world is."""
         from mpfa_envs.distance import sample_task_on_grid
 
-        rules = self._rules
+        config = self._config
         task, field = sample_task_on_grid(
-            (_grid_of if self._generator else _kept_grid_of)(world, rules.collision_distance),
+            (_grid_of if self._generator else _kept_grid_of)(world, config.collision_distance),
             rng,
-            min_goal_distance=rules.min_goal_distance,
+            min_goal_distance=config.min_goal_distance,
             max_goal_distance=self._max_goal_distance,
-            detour_chance=rules.detour_chance,
+            detour_chance=config.detour_chance,
         )
         length = field.at(*task.start[:2])
-        kept = field if rules.progress == "shortest_path" else None
+        kept = field if config.progress == "shortest_path" else None
         return Episode(world, task, length, kept, start_walkers(world, task.start[:2], rng))
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from mpfa_envs.arguments import Physics
 from mpfa_envs.checks import check_count
+from mpfa_envs.config import Physics
 from mpfa_envs.planners.dynamic_window import DynamicWindow
 from mpfa_envs.policy import Policy
 from mpfa_envs.results import ENCOUNTERS, EpisodeResult, spl

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import logging
 import tempfile
@@ -14,14 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from mpfa_envs.config import TaskConfig
 from mpfa_envs.deploy.card import FORMAT, SCALES, Card, CardError, card_file
 from mpfa_envs.files import write_atomically
 from mpfa_envs.layers import Choice, LayerNorm, Linear, ReLU, Scale, Tanh
-from mpfa_envs.lidar import Lidar
-from mpfa_envs.navigation import NavigationEnv
-from mpfa_envs.observation import observation_slices
-from mpfa_envs.robot import resolve_robot
-from mpfa_envs.worlds import World
 
 if TYPE_CHECKING:
     import os
@@ -114,12 +109,9 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
     Raises:
         CardError: If the policy does not sense what its ``env_arguments`` say.
     """
-    parameters = inspect.signature(NavigationEnv).parameters.values()
-    given = {each.name: each.default for each in parameters} | policy.env_arguments
-    robot = resolve_robot(given["robot"])
-    lidar = Lidar(World(name="empty"), **(given["lidar"] or {}))
-    slices = observation_slices(lidar.sectors, memory=given["memory"], history=given["history"])
-    near = given["closeness_distance"]
+    config = TaskConfig(**policy.env_arguments)
+    lidar = config.make_lidar()
+    robot = config.robot
     document = {
         "format": FORMAT,
         "observation": {
@@ -131,7 +123,7 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
                     "size": part.stop - part.start,
                     "meaning": _MEANINGS[name],
                 }
-                for name, part in slices.items()
+                for name, part in config.observation_slices.items()
             ],
         },
         "lidar": {
@@ -142,10 +134,10 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
             "noise": lidar.noise,
             "field_of_view": lidar.field_of_view,
         },
-        "memory": given["memory"],
-        "history": given["history"],
+        "memory": config.memory,
+        "history": config.history,
         "scales": {
-            "closeness_distance": robot.collision_distance if near is None else near,
+            "closeness_distance": config.closeness_distance,
             "linear_speed": robot.max_wheel_speed,
             "angular_speed": robot.max_angular_speed,
             **SCALES,
@@ -158,9 +150,9 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
             "meaning": "left and right wheel, from min_wheel_speed at -1 to max_wheel_speed at 1",
         },
         "limits": {
-            "period": given["time_step"] * given["action_repeat"],
-            "goal_radius": given["goal_radius"],
-            "time_limit": given["time_step"] * given["max_steps"],
+            "period": config.time_step * config.action_repeat,
+            "goal_radius": config.goal_radius,
+            "time_limit": config.time_step * config.max_steps,
             "linear_speed": [robot.min_wheel_speed, robot.max_wheel_speed],
             "angular_speed": [-robot.max_angular_speed, robot.max_angular_speed],
         },

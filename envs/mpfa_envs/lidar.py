@@ -1,23 +1,26 @@
 """A planar lidar that is computed exactly from the shapes of the world.
 
-The rays are intersected with boxes, circles and segments in closed form, vectorized over rays and
-shapes. It replaces PyBullet's ray test in both kinds of physics: for 54 rays it is several times
-faster (``benchmarks/environment.py``), and a test holds the two to the same answers.
+The rays are intersected with boxes, circles and segments in closed form. It replaces PyBullet's ray
+test in both kinds of physics: for 54 rays it is many times faster (``benchmarks/environment.py``),
+and a test holds the two to the same answers.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.kernels.lidar import cast_rays
+from mpfa_envs.world_batch import WorldBatch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.occupancy import OccupancyGrid
+    from mpfa_envs.world_batch import BatchArrays
     from mpfa_envs.worlds import World
 
 Reduction = Literal["min", "median", "single"]
@@ -80,33 +83,8 @@ class Lidar:
         rays = check_count("sectors * rays_per_sector", self.sectors * self.rays_per_sector)
         self.angles = math.radians(self.field_of_view) * (0.5 - (np.arange(rays) + 0.5) / rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
-        room = world.room
-        shapes = [*world.boxes, room]
-        # [side, axis, shape, ray]; the room is the last shape.
-        self._bounds = np.array(
-            [
-                [[shape.x_min for shape in shapes], [shape.y_min for shape in shapes]],
-                [[shape.x_max for shape in shapes], [shape.y_max for shape in shapes]],
-            ]
-        )[..., None]
-        self._circles: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        if world.cylinders:
-            centers = np.array([(c.x, c.y) for c in world.cylinders]).T[..., None]
-            self._circles = centers, np.array([c.radius for c in world.cylinders])[:, None] ** 2
-        self._polygons = world if world.polygons else None
-        self._occupancy = world.occupancy
-        count = len(shapes)
-        # Buffers: allocating them anew would cost as much as the arithmetic.
-        self._origin = np.empty((2, 1, 1))
-        self._directions = np.empty((2, 1, rays))
-        self._inverse = np.empty((2, 1, rays))
-        self._offsets = np.empty_like(self._bounds)
-        self._slabs = np.empty((2, 2, count, rays))
-        self._near = np.empty((2, count, rays))
-        self._far = np.empty((2, count, rays))
-        self._enter = np.empty((count, rays))
-        self._leave = np.empty((count, rays))
-        self._missed = np.empty((count, rays), dtype=np.bool_)
+        self._directions = np.stack((np.cos(self.angles), np.sin(self.angles)))
+        self._rooms = WorldBatch([replace(world, walkers=())])
 
     def cast(
         self,
@@ -127,76 +105,34 @@ class Lidar:
         Returns:
             Range of each ray [m], shape ``[rays]``; zero in an obstacle.
         """
-        directions, enter, leave = self._directions, self._enter, self._leave
-        origin = self._origin
-        origin[0], origin[1] = x, y
-        angles = self.angles + heading
-        np.cos(angles, out=directions[0, 0])
-        np.sin(angles, out=directions[1, 0])
-        # A ray parallel to a wall: the tiny number turns 0 / 0 into 0 and changes no other value.
-        directions += 1e-300
-        np.divide(1.0, directions, out=self._inverse)
-        np.subtract(self._bounds, origin, out=self._offsets)
-        slabs = np.multiply(self._offsets, self._inverse, out=self._slabs)
-        near = np.minimum(slabs[0], slabs[1], out=self._near)
-        far = np.maximum(slabs[0], slabs[1], out=self._far)
-        np.maximum(near[0], near[1], out=enter)
-        np.minimum(far[0], far[1], out=leave)
-        np.maximum(enter, 0.0, out=enter)
-        np.greater(enter, leave, out=self._missed)
-        np.copyto(enter, self.max_range, where=self._missed)
-        # One is inside the room: its walls are met where the ray leaves it.
-        enter[-1] = leave[-1]
-        ranges: NDArray[np.float64] = enter.min(axis=0)
-        if self._circles is not None:
-            np.minimum(ranges, self._cast_at_circles(*self._circles), out=ranges)
+        rooms = self._rooms.arrays
         if moving is not None and len(moving):
-            centers, squares = moving[:, :2].T[..., None], moving[:, 2:] ** 2
-            np.minimum(ranges, self._cast_at_circles(centers, squares), out=ranges)
-        if self._polygons is not None:
-            np.minimum(ranges, self._cast_at_polygons(self._polygons), out=ranges)
-        if self._occupancy is not None:
-            self._cast_at_cells(self._occupancy, ranges)
-        np.maximum(ranges, 0.0, out=ranges)
-        return np.minimum(ranges, self.max_range, out=ranges)
+            standing = rooms.circles[:, : rooms.counts[0, 1]]
+            rooms = rooms._replace(
+                circles=np.concatenate((standing, moving[None]), axis=1),
+                counts=np.add(rooms.counts, (0, len(moving), 0, 0)),
+            )
+        ranges = np.empty((1, self.angles.size))
+        self.cast_all(np.array([[x, y, heading]]), np.ones(1, dtype=np.bool_), rooms, ranges)
+        return ranges[0]
 
-    def _cast_at_circles(
-        self, centers: NDArray[np.float64], squares: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Range of each ray to the nearest circle [m], shape ``[rays]``; infinite without one."""
-        offsets = centers - self._origin
-        along = (offsets * self._directions).sum(axis=0)
-        half = along**2 + squares - (offsets * offsets).sum(axis=0)
-        root = np.sqrt(np.maximum(half, 0.0))
-        ranges = np.maximum(along - root, 0.0)
-        ranges[(half < 0.0) | (along + root < 0.0)] = math.inf
-        return np.asarray(ranges.min(axis=0))
+    def cast_all(
+        self,
+        motions: NDArray[np.float64],
+        chosen: NDArray[np.bool_],
+        rooms: BatchArrays,
+        ranges: NDArray[np.float64],
+    ) -> None:
+        """Measure every ray of many robots, without noise.
 
-    def _cast_at_polygons(self, world: World) -> NDArray[np.float64]:
-        """Range of each ray to the nearest polygon [m], shape ``[rays]``; infinite without one."""
-        if world.inside_polygons(self._origin.reshape(1, 2)).any():
-            return np.zeros(len(self.angles))
-        x0, y0, x1, y1 = world.arrays.segments.T[..., None]
-        (x, y), (ray_x, ray_y) = self._origin, self._directions
-        edge_x, edge_y, off_x, off_y = x1 - x0, y1 - y0, x0 - x, y0 - y
-        # origin + t * ray = start + s * edge, solved by Cramer's rule; [edge, ray].
-        turn = ray_x * edge_y - ray_y * edge_x
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ranges = (off_x * edge_y - off_y * edge_x) / turn
-            share = (off_x * ray_y - off_y * ray_x) / turn
-        # A ray along an edge has no solution; the edges that it meets at the ends have one.
-        ranges[~((share >= 0.0) & (share <= 1.0) & (ranges >= 0.0))] = math.inf
-        return np.asarray(ranges.min(axis=0))
-
-    def _cast_at_cells(self, grid: OccupancyGrid, ranges: NDArray[np.float64]) -> None:
-        """Lower the range of each ray ``[rays]`` to that of the nearest occupied cell [m]."""
-        # Imported here because it needs Numba, which takes half a second.
-        from mpfa_envs.kernels.cells import cast_at_cells
-
-        x, y = self._origin[:, 0, 0].tolist()
-        beams = np.concatenate((self._directions[:, 0], self._inverse[:, 0]))
-        if cast_at_cells(x, y, beams, grid.arrays.gaps, grid.resolution, self.max_range, ranges):
-            ranges[:] = 0.0
+        Args:
+            motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
+            chosen: Which robots look around, ``[N]``; the others' ranges stay.
+            rooms: The room of each robot.
+            ranges: Where the ranges go [m], ``[N, rays]``; zero in an obstacle.
+        """
+        view = math.radians(self.field_of_view)
+        cast_rays(motions, chosen, rooms, self._directions, view, self.max_range, ranges)
 
     def scan(
         self, x: float, y: float, heading: float, *, rng: np.random.Generator | None = None

@@ -21,17 +21,13 @@ class LiveView:
     render_mode: str | None
     _window: Window | None = None
 
-    def _set_view(
-        self, render_mode: RenderMode | None, time_step: float, action_repeat: int
-    ) -> None:
-        """Check the render mode, and say how many pictures a second of it are in real time."""
+    def _set_view(self, render_mode: RenderMode | None, shown_for: float) -> None:
+        """Check the render mode; a picture stands for so long in real time [s]."""
         modes = self.metadata["render_modes"]
         if render_mode not in (None, *modes):
             names = " or ".join(map(repr, modes))
             raise ValueError(f"render_mode must be None or {names}, got {render_mode!r}")
         self.render_mode = render_mode
-        # A window shows every time step, what records episodes has a picture for each action.
-        shown_for = time_step * (1 if render_mode == "human" else action_repeat)
         self.metadata = {**self.metadata, "render_fps": max(round(1 / shown_for), 1)}
 
     def _show(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8] | None:

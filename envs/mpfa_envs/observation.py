@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 import numpy as np
@@ -12,8 +11,6 @@ from mpfa_envs.checks import check_count
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.drives import Motion
-    from mpfa_envs.robot import RobotModel
 
 Memory = Literal["none", "map"]
 """What a robot remembers of its episode."""
@@ -123,71 +120,3 @@ def observation_bounds(
     low += [0.0] * sectors * history
     high += [1.0] * sectors * history
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)
-
-
-def observe(
-    ranges: NDArray[np.float64],
-    motion: Motion,
-    goal: tuple[float, float],
-    distance: float,
-    robot: RobotModel,
-    closeness_distance: float,
-    way: NDArray[np.float64] | None = None,
-) -> NDArray[np.float32]:
-    """Build an observation.
-
-    Args:
-        ranges: Range of each sector [m], shape ``[sectors]``.
-        motion: Where the robot is and how it moves.
-        goal: Where it should go (x, y) [m].
-        distance: Distance between the two [m].
-        robot: Whose greatest speeds scale the speeds.
-        closeness_distance: A range of this or less has closeness one [m].
-        way: Direction (x, y) and length [m] of the way that the robot's map leaves; None: it has
-            no map.
-
-    Returns:
-        The observation, shape ``[sectors + 6]``, with a map ``[sectors + 9]``;
-        :func:`observation_slices` names its parts.
-    """
-    x, y, heading, linear_speed, angular_speed = motion
-    sectors = ranges.size
-    observation = np.empty(sectors + (6 if way is None else 9), dtype=np.float32)
-    near = closeness_distance
-    np.divide(near, np.maximum(ranges, near), out=observation[:sectors])
-    # A robot on the goal sees it ahead.
-    bearing = math.atan2(goal[1] - y, goal[0] - x) - heading if distance else 0.0
-    bound = SPEED_BOUND
-    observation[sectors : sectors + 6] = (
-        math.cos(bearing),
-        math.sin(bearing),
-        min(GOAL_CLOSENESS_DISTANCE / distance, 1.0) if distance else 1.0,
-        distance / DISTANCE_SCALE,
-        min(max(linear_speed / robot.max_wheel_speed, -bound), bound),
-        min(max(angular_speed / robot.max_angular_speed, -bound), bound),
-    )
-    if way is not None:
-        length = min(way[2] / DISTANCE_SCALE, WAY_BOUND)
-        observation[sectors + 6 :] = way[0], way[1], length
-    return observation
-
-
-def add_history(
-    observation: NDArray[np.float32], last: NDArray[np.float32] | None, sectors: int, history: int
-) -> NDArray[np.float32]:
-    """Append the scans of earlier decisions to an observation, the newest first.
-
-    Args:
-        observation: What the robot senses now.
-        last: The observation before it, with its own earlier scans; None at the start of an
-            episode, where the robot has always seen what it sees.
-        sectors: Number of sectors of the lidar.
-        history: Number of earlier scans.
-
-    Returns:
-        The observation with ``history * sectors`` numbers more.
-    """
-    if last is None:
-        return np.concatenate((observation, np.tile(observation[:sectors], history)))
-    older = last[len(observation) :][: sectors * (history - 1)]
-    return np.concatenate((observation, last[:sectors], older))

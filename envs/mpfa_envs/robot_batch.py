@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mpfa_envs.drives import make_drives
 from mpfa_envs.episodes import distance_field
 from mpfa_envs.field_batch import FieldBatch
-from mpfa_envs.kernels.lidar import cast_rays
 from mpfa_envs.kernels.motion import scale_actions
 from mpfa_envs.kernels.observation import observe_all
 from mpfa_envs.kernels.step import (
@@ -29,7 +29,6 @@ from mpfa_envs.observation import INFO_TYPES
 from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
 from mpfa_envs.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.tasks import read_task
-from mpfa_envs.vector_drives import make_drives
 from mpfa_envs.vector_state import read_array, read_list
 from mpfa_envs.walker_batch import WalkerBatch
 from mpfa_envs.walkers import no_encounters
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.arguments import TaskArguments
+    from mpfa_envs.config import TaskConfig
     from mpfa_envs.episodes import Episode
     from mpfa_envs.lidar import Lidar
     from mpfa_envs.tasks import Task
@@ -59,24 +58,24 @@ class RobotBatch:
     """What is known of each of many robots, and what happens to them.
 
     Args:
-        rules: The arguments of the task.
+        config: The arguments of the task.
         lidar: What the robots see by.
         worlds: The world of each robot before its first episode.
     """
 
-    def __init__(self, rules: TaskArguments, lidar: Lidar, worlds: Sequence[World]) -> None:
+    def __init__(self, config: TaskConfig, lidar: Lidar, worlds: Sequence[World]) -> None:
         count = len(worlds)
-        self._rules = rules
+        self._config = config
         self._lidar = lidar
         self.tasks: list[Task | None] = [None] * count
         """Start and goal of each robot's episode; None before the first."""
         self.worlds = WorldBatch(worlds)
         """The world that each robot is in."""
         self.walkers = WalkerBatch(
-            self.worlds, radius=rules.robot.radius, time_step=rules.time_step
+            self.worlds, radius=config.robot.radius, time_step=config.time_step
         )
         """What moves around each robot."""
-        self._fields = FieldBatch(count) if rules.progress == "shortest_path" else None
+        self._fields = FieldBatch(count) if config.progress == "shortest_path" else None
         self.episodes = EpisodeArrays(
             motions=np.zeros((count, 5)),
             goals=np.zeros((count, 2)),
@@ -89,25 +88,29 @@ class RobotBatch:
         """Their episodes so far."""
         self.running = np.zeros(count, dtype=np.bool_)
         """Whose episode has begun and not ended, ``[N]``."""
-        self.trails = np.zeros((count, min(rules.max_steps, _TRAIL) + 1, 2))
+        self.trails = np.zeros((count, min(config.max_steps, _TRAIL) + 1, 2))
         """Positions since the start of the episode [m], ``[N, steps, 2]``."""
         self.ranges = np.zeros((count, lidar.angles.size))
         """Range of each ray [m], ``[N, rays]``."""
-        self.memory = MapMemory(count, rules.robot, lidar) if rules.memory == "map" else None
+        self.memory = MapMemory(count, config.robot, lidar) if config.memory == "map" else None
         """The maps that they make, if they make any."""
-        width = max(part.stop for part in rules.observation_slices.values())
+        width = max(part.stop for part in config.observation_slices.values())
         self.observations = np.zeros((count, width), dtype=np.float32)
         """What they sense, ``[N, O]``."""
-        self.drives = make_drives(rules.physics, rules.robot, count, time_step=rules.time_step)
+        self.drives = make_drives(config.physics, config.robot, count, time_step=config.time_step)
         """How they move."""
-        self.noise = rules._make_noise(count)
+        self.noise = config.make_noise(count)
         """What disturbs their motion, if anything does."""
         self._held = np.zeros((len(NUMBERS), count))
-        self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
-        robot = rules.robot
-        self._lengths = robot.radius, rules.collision_distance, rules.goal_radius, rules.time_step
-        self._scales = rules.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed
-        self._payments = payments_of(rules.reward)
+        robot = config.robot
+        self._lengths = (
+            robot.radius,
+            config.collision_distance,
+            config.goal_radius,
+            config.time_step,
+        )
+        self._scales = config.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed
+        self._payments = payments_of(config.reward_function)
 
     def begin(self, index: int, episode: Episode, rng: np.random.Generator) -> None:
         """Start an episode of a robot.
@@ -129,7 +132,7 @@ class RobotBatch:
             way = episode.field.at(x, y)
         self.walkers.begin(index, episode.walkers)
         clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
-        clearance -= self._rules.robot.radius
+        clearance -= self._config.robot.radius
         self.drives.place(index, x, y, heading)
         self.tasks[index] = task
         episodes.motions[index] = x, y, heading, 0.0, 0.0
@@ -140,7 +143,7 @@ class RobotBatch:
         episodes.ways[:, index] = way
         numbers = episodes.numbers[:, index]
         numbers[:] = 0.0
-        numbers[SHORTEST_PATH] = max(episode.shortest_path - self._rules.goal_radius, 0.0)
+        numbers[SHORTEST_PATH] = max(episode.shortest_path - self._config.goal_radius, 0.0)
         numbers[MIN_CLEARANCE] = clearance
         numbers[DISTANCE] = distance
         numbers[POSE : POSE + 3] = x, y, heading
@@ -168,7 +171,7 @@ class RobotBatch:
         if values.shape != (len(self.tasks), 2):
             raise ValueError(f"actions must have shape ({len(self.tasks)}, 2), got {values.shape}")
         speeds = np.empty_like(values)
-        robot = self._rules.robot
+        robot = self._config.robot
         if not scale_actions(values, robot.min_wheel_speed, robot.max_wheel_speed, speeds):
             rows = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
             raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
@@ -189,15 +192,15 @@ class RobotBatch:
         """
         episodes, worlds, running = self.episodes, self.worlds.arrays, moving.copy()
         episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
-        self._lengthen_trails(int(episodes.steps.max()) + self._rules.action_repeat)
-        for _ in range(self._rules.action_repeat):
+        self._lengthen_trails(int(episodes.steps.max()) + self._config.action_repeat)
+        for _ in range(self._config.action_repeat):
             self.walkers.move(running, episodes.motions)
             driven = speeds if self.noise is None else self.noise.drive(speeds, running, rngs)
             self.drives.move(episodes.motions, running, driven)
             if self.noise is not None:
                 self.noise.measure(episodes.motions, running)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
-            judge(episodes, worlds, running, self.trails, self._lengths, self._rules.max_steps)
+            judge(episodes, worlds, running, self.trails, self._lengths, self._config.max_steps)
             if self._fields is not None:
                 measure_ways(episodes, running, self._fields.arrays)
             if self._payments is None:
@@ -242,11 +245,11 @@ class RobotBatch:
                     f"tasks, motions and goals of the state must lie in {world.room}, got {places}"
                 )
             if task is not None and fields is not None:
-                fields[index] = distance_field(world, self._rules.collision_distance, task.goal)
+                fields[index] = distance_field(world, self._config.collision_distance, task.goal)
         walkers = self.walkers.read(state.get("walkers", {}), worlds)
         drives = self.drives.read(state.get("drives", {}))
         # The compiled loops write a trail at the number of its steps.
-        steps, most = values["steps"], self._rules.max_steps
+        steps, most = values["steps"], self._config.max_steps
         if steps.min() < 0 or steps.max() > most:
             raise ValueError(f"steps of the state must be in [0, {most}], got {steps.tolist()}")
         last = int(steps.max())
@@ -289,7 +292,9 @@ class RobotBatch:
                 float(episodes.clearances[index]),
                 *episodes.motions[index, 3:].tolist(),
             )
-            episodes.numbers[REWARD : REWARD + 4, index] += read_terms(self._rules.reward(outcome))
+            episodes.numbers[REWARD : REWARD + 4, index] += read_terms(
+                self._config.reward_function(outcome)
+            )
 
     def sense(self, chosen: NDArray[np.bool_], rngs: Sequence[np.random.Generator]) -> None:
         """Sense the worlds and build the observations.
@@ -299,15 +304,7 @@ class RobotBatch:
             rngs: Source of each robot's noise.
         """
         lidar, ranges = self._lidar, self.ranges
-        cast_rays(
-            self.episodes.motions,
-            chosen,
-            self.worlds.arrays,
-            self._directions,
-            math.radians(lidar.field_of_view),
-            lidar.max_range,
-            ranges,
-        )
+        lidar.cast_all(self.episodes.motions, chosen, self.worlds.arrays, ranges)
         if lidar.is_noisy:
             for index in np.flatnonzero(chosen).tolist():
                 lidar.disturb(ranges[index], rngs[index])
@@ -318,14 +315,17 @@ class RobotBatch:
             ways = self.memory.remember(held.motions, held.goals, seen, chosen)
         median = lidar.reduction == "median"
         observe_all(
-            held,
+            held.motions,
+            held.goals,
+            held.numbers[DISTANCE],
+            held.steps == 0,
             chosen,
             ranges,
             median,
             self._scales,
             ways,
             lidar.sectors,
-            self._rules.history,
+            self._config.history,
             self.observations,
         )
 
@@ -350,10 +350,10 @@ class RobotBatch:
         return tuple(
             render_scene(
                 self.worlds[index],
-                robot=self._rules.robot,
+                robot=self._config.robot,
                 pose=(x, y, heading),
                 goal=tuple(self.episodes.goals[index].tolist()),
-                goal_radius=self._rules.goal_radius,
+                goal_radius=self._config.goal_radius,
                 trail=self.trail(index),
                 rays=(self._lidar.angles, self.ranges[index]),
                 sketch=None if self.memory is None else self.memory.sketch(index, x, y),

@@ -12,15 +12,12 @@ from gymnasium.spaces import Box as BoxSpace
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mpfa_envs.arguments import Physics, Progress, TaskArguments
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
+from mpfa_envs.config import TaskConfig
 from mpfa_envs.episodes import Episode, EpisodeSource, WorldChoice
 from mpfa_envs.kernels.step import outcomes
-from mpfa_envs.noise import RobotNoise
-from mpfa_envs.observation import Memory
-from mpfa_envs.reward import PROGRESS_SCALE, RewardFunction
-from mpfa_envs.robot import RobotModel
+from mpfa_envs.live_view import LiveView
 from mpfa_envs.robot_batch import RobotBatch
 from mpfa_envs.tasks import Task
 from mpfa_envs.vector_infos import final_infos, gather_infos
@@ -41,7 +38,7 @@ _EMPTY = World(name="empty")
 
 
 class VectorNavigationEnv(
-    TaskArguments, VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]
+    LiveView, VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]
 ):
     """Many robots drive to goals by lidar, each in a world of its own and without the others.
 
@@ -61,33 +58,17 @@ class VectorNavigationEnv(
         world: What :class:`~mpfa_envs.NavigationEnv` takes; a sequence of it, robot i driving in
             number ``i % len``; or the name of a generator, ``"rooms"``, ``"bars"`` and so on
             (:data:`~mpfa_envs.GENERATORS`), whose worlds follow one another.
-        robot: As there, and so on for the next ones.
-        physics: ``"wheels"`` has no bodies of the obstacles, as the shapes say what collides.
-        max_steps: Time limit of an episode in time steps.
-        time_step: Duration of a time step [s].
-        action_repeat: Time steps for which an action is held.
-        goal_radius: Distance of the robot's center from the goal that reaches it, walls or not [m].
-        collision_distance: Distance of the center from an obstacle that is a collision [m].
-        progress_scale: ε_p of Eq. (25) [1/m].
-        progress: What an approach is measured by.
-        reward: Computes the reward in place of Eq. (25), robot by robot and hence slowly, unless it
-            is a ``functools.partial`` of :func:`~mpfa_envs.navigation_reward`.
-        lidar: Arguments of :class:`~mpfa_envs.Lidar` other than its defaults.
-        memory: What a robot remembers of its episode.
-        history: How many earlier scans it senses beside the last one.
-        noise: Errors of the lidar, the wheels, the time and the odometry.
-        closeness_distance: A range of this or less has closeness one [m].
-        min_goal_distance: Least distance between a sampled start and goal [m].
-        max_goal_distance: Longest way between them [m].
-        detour_chance: Chance that a sampled task must have an obstacle in its way.
         difficulty: Difficulty of a generator's worlds, from 0 to 1; None: each world's own.
         episodes_per_world: Episodes of a robot in a generator's world before it gets another.
         split: Which worlds of a generator: ``"train"`` or ``"validation"``.
+        max_goal_distance: Longest path between a sampled start and goal [m].
         autoreset_mode: When a new episode begins: ``NEXT_STEP`` with the step after the last one,
             whose action is ignored; ``SAME_STEP`` with the last one, whose observation and info go
             to ``infos["final_obs"]`` and ``infos["final_info"]``; ``DISABLED`` when
             ``reset(options={"reset_mask": ...})`` asks for it.
         render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
+        **task: Fields of :class:`~mpfa_envs.TaskConfig`. On wheels there are no bodies of the
+            obstacles, as the shapes say what collides.
 
     Raises:
         ImportError: If there is no PyBullet and physics is ``"wheels"``.
@@ -116,74 +97,42 @@ class VectorNavigationEnv(
         num_envs: int,
         *,
         world: WorldChoice | Sequence[WorldChoice] = "A",
-        robot: str | RobotModel = "turtlebot2",
-        physics: Physics = "wheels",
-        max_steps: int = 500,
-        time_step: float = 0.1,
-        action_repeat: int = 2,
-        goal_radius: float = 0.5,
-        collision_distance: float | Literal["contact"] | None = None,
-        progress_scale: float = PROGRESS_SCALE,
-        progress: Progress = "straight_line",
-        reward: RewardFunction | None = None,
-        lidar: Mapping[str, Any] | None = None,
-        memory: Memory = "none",
-        history: int = 0,
-        noise: RobotNoise | Mapping[str, Any] | None = None,
-        closeness_distance: float | None = None,
-        min_goal_distance: float = 2.0,
         max_goal_distance: float = math.inf,
-        detour_chance: float = 0.8,
         difficulty: float | None = None,
         episodes_per_world: int = 1,
         split: Literal["train", "validation"] = "train",
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: Literal["rgb_array"] | None = None,
+        **task: Any,
     ) -> None:
         self.num_envs = check_count("num_envs", num_envs)
-        self._set_arguments(
-            robot=robot,
-            physics=physics,
-            max_steps=max_steps,
-            time_step=time_step,
-            action_repeat=action_repeat,
-            goal_radius=goal_radius,
-            collision_distance=collision_distance,
-            progress_scale=progress_scale,
-            progress=progress,
-            reward=reward,
-            lidar=lidar,
-            memory=memory,
-            history=history,
-            noise=noise,
-            closeness_distance=closeness_distance,
-            min_goal_distance=min_goal_distance,
-            detour_chance=detour_chance,
-            render_mode=render_mode,
-        )
+        self.config = TaskConfig(**task)
+        """The settings of the task."""
+        self._set_view(render_mode, self.config.time_step * self.config.action_repeat)
         if autoreset_mode not in tuple(AutoresetMode):
             raise ValueError(
                 f"autoreset_mode must be a gymnasium.vector.AutoresetMode, got {autoreset_mode!r}"
             )
         self.autoreset_mode = autoreset_mode
-        self.lidar = self._make_lidar(_EMPTY)
+        self.lidar = self.config.make_lidar()
+        """What the robots see by, in an empty world."""
         self._source = EpisodeSource(
             world,
             self.num_envs,
-            self,
+            self.config,
             split=split,
             difficulty=difficulty,
             episodes_per_world=episodes_per_world,
             max_goal_distance=max_goal_distance,
         )
         self.metadata["autoreset_mode"] = self.autoreset_mode
-        self.single_observation_space, self.single_action_space = self._make_spaces(
-            self.lidar.sectors, self._source.diagonal
+        self.single_observation_space, self.single_action_space = self.config.make_spaces(
+            self._source.diagonal
         )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._batch = RobotBatch(
-            self, self.lidar, [self._source.fixed(i) or _EMPTY for i in range(self.num_envs)]
+            self.config, self.lidar, [self._source.fixed(i) or _EMPTY for i in range(self.num_envs)]
         )
         self._rngs: list[np.random.Generator] = []
         self._begun = False
@@ -202,6 +151,11 @@ class VectorNavigationEnv(
     def tasks(self) -> list[Task | None]:
         """Start and goal of each robot's episode; None before the first."""
         return list(self._batch.tasks)
+
+    @property
+    def motions(self) -> NDArray[np.float64]:
+        """Poses (x, y, heading) and speeds (forward, turning), ``[N, 5]``."""
+        return self._batch.episodes.motions.copy()
 
     @property
     def poses(self) -> NDArray[np.float64]:

@@ -33,29 +33,29 @@ def describe(env: VectorNavigationEnv, source: EpisodeSource) -> dict[str, Any]:
     Returns:
         Plain values by name: whatever decides what happens next.
     """
-    lidar = env.lidar
+    lidar, task = env.lidar, env.config
     return {
         "num_envs": env.num_envs,
-        "robot": env.robot.name,
-        **{f"robot.{name}": float(getattr(env.robot, name)) for name in _OF_THE_ROBOT},
-        "physics": env.physics,
-        "max_steps": env.max_steps,
-        "time_step": env.time_step,
-        "action_repeat": env.action_repeat,
-        "goal_radius": env.goal_radius,
-        "collision_distance": env.collision_distance,
-        "closeness_distance": env.closeness_distance,
-        "progress": env.progress,
-        **_describe_reward(env.reward),
-        "memory": env.memory,
-        "history": env.history,
+        "robot": task.robot.name,
+        **{f"robot.{name}": float(getattr(task.robot, name)) for name in _OF_THE_ROBOT},
+        "physics": task.physics,
+        "max_steps": task.max_steps,
+        "time_step": task.time_step,
+        "action_repeat": task.action_repeat,
+        "goal_radius": task.goal_radius,
+        "collision_distance": task.collision_distance,
+        "closeness_distance": task.closeness_distance,
+        "progress": task.progress,
+        **_describe_reward(task.reward_function),
+        "memory": task.memory,
+        "history": task.history,
         # None without, as states had it before there was any.
-        "noise": None if env.noise == RobotNoise() else asdict(env.noise),
+        "noise": None if task.noise == RobotNoise() else asdict(task.noise),
         "rays": lidar.angles.size,
         "sectors": lidar.sectors,
         **{f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR},
-        "min_goal_distance": env.min_goal_distance,
-        "detour_chance": env.detour_chance,
+        "min_goal_distance": task.min_goal_distance,
+        "detour_chance": task.detour_chance,
         **source.describe(),
         "autoreset_mode": env.autoreset_mode.value,
     }

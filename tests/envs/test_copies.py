@@ -9,14 +9,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mpfa_envs import NavigationEnv, RoomsEnv, VectorNavigationEnv
+from mpfa_envs import NavigationEnv, VectorNavigationEnv
 
 WAYS = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
-MAKERS = [NavigationEnv, RoomsEnv, lambda **arguments: VectorNavigationEnv(2, **arguments)]
+MAKERS = [NavigationEnv, lambda **arguments: VectorNavigationEnv(2, **arguments)]
 
 
 @pytest.mark.parametrize("way", WAYS, ids=["copy", "pickle"])
-@pytest.mark.parametrize("make", MAKERS, ids=["one", "rooms", "many"])
+@pytest.mark.parametrize("make", MAKERS, ids=["one", "many"])
 def test_a_copy_without_wheels_drives_the_same_episode_on_its_own(
     make: Callable, way: Callable
 ) -> None:

@@ -25,7 +25,7 @@ Recorded = tuple[Scan, tuple[float, float, float], tuple[float, float]]
 
 def sense(env: NavigationEnv) -> Recorded:
     """What a robot in the place of the environment's would measure, right to left."""
-    motion, angles = env._motion, env.lidar.angles
+    motion, angles = env.motion, env.lidar.angles
     ranges = env.lidar.cast(*motion[:3])
     scan = Scan(angles[-1], angles[0] - angles[1], ranges[::-1].copy())
     return scan, motion[:3], motion[3:]
@@ -75,7 +75,7 @@ def test_its_command_is_the_action_as_wheel_speeds_and_as_a_twist(tmp_path: Path
     assert env.task is not None
     pilot.begin(env.task.goal)
     command = pilot.decide(*sense(env))
-    left, right = env.robot.wheel_speeds(policy(seen))
+    left, right = env.config.robot.wheel_speeds(policy(seen))
     assert command[:2] == pytest.approx((left, right))
     assert command[2:] == pytest.approx(((left + right) / 2, (right - left) / 0.23))
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mpfa_envs import (
     EpisodeResult,
     Policy,
+    TaskConfig,
     VectorNavigationEnv,
     evaluate,
     load_policy,
@@ -167,9 +168,11 @@ def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
     evaluate(policy, "A", episodes=1)
     evaluate(policy, "A", episodes=1, action_repeat=3, collision_distance=0.3)
     first, second = made
-    assert (first.robot.name, first.max_steps, first.closeness_distance) == ("burger", 7, 0.2)
-    assert (first.action_repeat, second.action_repeat) == (2, 3)
-    assert (first.collision_distance, second.collision_distance) == (first.robot.radius, 0.3)
+    expected = {**learned, "collision_distance": "contact", "physics": "kinematic"}
+    assert first.config == TaskConfig(**{**expected, "max_steps": first.config.max_steps})
+    assert (first.config.max_steps, first.config.action_repeat) == (7, 2)
+    assert second.config.action_repeat == 3
+    assert [each.config.collision_distance for each in (first, second)] == [0.105, 0.3]
 
 
 def test_a_trajectory_starts_at_the_start_and_ends_at_the_goal() -> None:

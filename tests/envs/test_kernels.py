@@ -1,4 +1,4 @@
-"""The compiled loops against the plain parts for one robot."""
+"""The compiled loops against plain geometry."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 import mpfa_envs
-from mpfa_envs import ROBOTS, WORLDS, Box, Lidar, World
-from mpfa_envs.drives import KinematicDrive
+from mpfa_envs import ROBOTS, WORLDS, Box, Lidar, TaskConfig, World
+from mpfa_envs.drives import KinematicDrives
 from mpfa_envs.kernels import njit
 from mpfa_envs.kernels.clearance import clearance_at
-from mpfa_envs.kernels.lidar import cast_rays
-from mpfa_envs.vector_drives import KinematicDrives
 from mpfa_envs.world_batch import WorldBatch
+from tests.envs.plain_robot import drive_arc, scan
 from tests.envs.shapes import random_shapes
 
 MIXES = [
@@ -40,25 +39,28 @@ def somewhere(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def cast_all(worlds: list[World], motions: np.ndarray, lidar: Lidar) -> np.ndarray:
     ranges = np.full((len(worlds), lidar.angles.size), np.nan)
-    directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
     chosen = np.ones(len(worlds), dtype=np.bool_)
-    view = math.radians(lidar.field_of_view)
-    cast_rays(motions, chosen, WorldBatch(worlds).arrays, directions, view, lidar.max_range, ranges)
+    lidar.cast_all(motions, chosen, WorldBatch(worlds).arrays, ranges)
     return ranges
 
 
 @pytest.mark.parametrize("mix", MIXES, ids=str)
 @pytest.mark.parametrize("max_range", [10.0, 1.5])
 @pytest.mark.parametrize("view", [180.0, 90.0, 270.0, 360.0])
-def test_the_rays_are_those_of_the_lidar(
+def test_rays_meet_what_plain_geometry_says(
     mix: dict[str, int], max_range: float, view: float
 ) -> None:
     rng = np.random.default_rng(1)
     worlds = [random_shapes(rng, **mix) for _ in range(60)]
     motions = somewhere(rng, 60)
-    lidars = [Lidar(world, max_range=max_range, field_of_view=view) for world in worlds]
-    expected = [each.cast(*pose) for each, pose in zip(lidars, motions[:, :3], strict=True)]
-    np.testing.assert_allclose(cast_all(worlds, motions, lidars[0]), expected, atol=1e-9)
+    lidar = Lidar(worlds[0], max_range=max_range, field_of_view=view)
+    expected = [
+        scan(lidar, world, *pose) for world, pose in zip(worlds, motions[:, :3], strict=True)
+    ]
+    np.testing.assert_allclose(cast_all(worlds, motions, lidar), expected, atol=1e-9)
+    np.testing.assert_array_equal(
+        lidar.cast(*motions[0, :3]), cast_all(worlds[:1], motions[:1], lidar)[0]
+    )
 
 
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi, 0.7])
@@ -75,7 +77,7 @@ def test_any_number_of_rays_sees_boxes_all_around(
     lidar = Lidar(world, sectors=sectors, rays_per_sector=rays, field_of_view=view)
     motions = np.array([[0.01, 0.02, heading, 0.0, 0.0]])
     np.testing.assert_allclose(
-        cast_all([world], motions, lidar)[0], lidar.cast(0.01, 0.02, heading), atol=1e-9
+        cast_all([world], motions, lidar)[0], scan(lidar, world, 0.01, 0.02, heading), atol=1e-9
     )
 
 
@@ -90,18 +92,18 @@ def test_the_clearance_is_that_of_the_world(mix: dict[str, int]) -> None:
     np.testing.assert_allclose(measured, expected, atol=1e-12)
 
 
-def test_arcs_are_those_of_the_drive_of_one_robot() -> None:
+def test_arcs_are_those_of_plain_geometry() -> None:
     robot, rng = ROBOTS["turtlebot2"], np.random.default_rng(3)
     motions = somewhere(rng, 8)
-    singles = [KinematicDrive(robot, time_step=0.1) for _ in range(8)]
-    for single, pose in zip(singles, motions[:, :3], strict=True):
-        single.place(*pose)
+    config = TaskConfig(robot=robot)
     drives = KinematicDrives(robot, time_step=0.1)
     for step in range(200):
         speeds = rng.uniform(0.05, 0.5, (8, 2))
         speeds[step % 8, 1] = speeds[step % 8, 0]  # One of them goes straight.
+        expected = [
+            drive_arc(tuple(m), *pair, config) for m, pair in zip(motions, speeds, strict=True)
+        ]
         drives.move(motions, np.ones(8, dtype=np.bool_), speeds)
-        expected = [single.move(*pair) for single, pair in zip(singles, speeds, strict=True)]
         np.testing.assert_allclose(motions, expected, atol=1e-12)
 
 
@@ -109,15 +111,12 @@ def test_a_world_replaces_another_whatever_their_sizes() -> None:
     rng = np.random.default_rng(4)
     batch = WorldBatch([WORLDS["A"], WORLDS["D"]])
     lidar = Lidar(WORLDS["A"])
-    directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
     for mix in (MIXES[4], MIXES[0], MIXES[2], MIXES[3]):
         world = random_shapes(rng, **mix)
         batch[0] = world
         motions = somewhere(rng, 2)
         ranges = np.empty((2, lidar.angles.size))
-        cast_rays(
-            motions, np.ones(2, dtype=np.bool_), batch.arrays, directions, math.pi, 10.0, ranges
-        )
+        lidar.cast_all(motions, np.ones(2, dtype=np.bool_), batch.arrays, ranges)
         for row, each, motion in zip(ranges, (world, WORLDS["D"]), motions, strict=True):
             np.testing.assert_allclose(row, Lidar(each).cast(*motion[:3]), atol=1e-9)
     assert batch[0] is world and len(batch) == 2

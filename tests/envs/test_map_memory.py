@@ -188,7 +188,7 @@ def test_a_picture_shows_what_was_met_and_the_way_to_the_goal() -> None:
         world=POCKET, physics="kinematic", memory="map", render_mode="rgb_array", max_steps=20
     )
     env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
-    memory = env.unwrapped._senses._map
+    memory = env.robots._batch.memory
     sketch = memory.sketch(0, 0.0, 0.0)
     assert math.dist(sketch.way[0], (0.0, 0.0)) < 0.25
     assert math.dist(sketch.way[-1], (3.0, 0.0)) < 0.1

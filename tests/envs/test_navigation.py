@@ -14,14 +14,15 @@ from gymnasium.utils.env_checker import check_env
 
 import mpfa_envs
 from mpfa_envs import (
-    ENV_IDS,
     INFO_TYPES,
     OBSERVATION,
     PAPER_TASK,
     ROBOTS,
+    WORLDS,
     Box,
     NavigationEnv,
     RewardTerms,
+    TaskConfig,
     World,
 )
 from tests.envs.paper import paper_env
@@ -51,7 +52,7 @@ def rolled(physics: str, *, world: str = "D", episodes_before: int = 0) -> str:
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", [f"mpfa/Navigation-{name}-v1" for name in WORLDS])
 def test_every_id_passes_the_checker_without_a_warning(env_id: str, physics: str) -> None:
     env = gymnasium.make(env_id, physics=physics)
     with warnings.catch_warnings():
@@ -142,7 +143,7 @@ def test_close_twice_is_fine_and_the_server_is_gone() -> None:
     import pybullet
 
     env = paper_env(physics="wheels")
-    client = env._drive.simulation.client
+    client = env.robots._batch.drives._simulations[0].client
     assert pybullet.isConnected(physicsClientId=client)
     env.close()
     env.close()
@@ -257,7 +258,7 @@ def test_actions_beyond_the_box_are_clipped() -> None:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        ([math.nan, 0.0], "action must not hold NaN, got .*nan"),
+        ([math.nan, 0.0], "actions must not hold NaN"),
         ([0.0], r"action must have shape \(2,\), got \(1,\)"),
     ],
 )
@@ -284,7 +285,7 @@ def test_a_step_outside_an_episode_asks_for_a_reset() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": (0, 0, 0)}, r"options must have the keys 'start' and 'goal', got \['start'\]"),
+        ({"start": (0, 0, 0)}, "options must have start and goal, or neither"),
         ({"start": (0, 0), "goal": (3, 0)}, r"start must be 3 finite numbers, got \(0, 0\)"),
         ({"start": (0, 0, 0), "goal": (math.inf, 0)}, "goal must be 2 finite numbers"),
         ({"start": (4.8, 0, 0), "goal": (3, 0)}, r"start must be farther .*\(4.8, 0.0\)"),
@@ -385,20 +386,13 @@ def test_wheels_and_kinematics_agree_once_the_robot_is_up_to_speed(robot: str) -
 
 
 def test_the_ids_are_the_class_with_its_defaults() -> None:
-    for env_id in ENV_IDS:
-        env = gymnasium.make(env_id, physics="kinematic").unwrapped
-        plain = NavigationEnv(world=env.world, physics="kinematic")
-        values = [
-            {name: value for name, value in vars(each).items() if isinstance(value, (int, float))}
-            for each in (env, plain)
-        ]
-        assert values[0] == values[1]
-        assert env.collision_distance == env.closeness_distance == pytest.approx(0.25)
-        assert (env.action_repeat, env.detour_chance) == (2, 0.8)
-    assert (
-        gymnasium.make(ENV_IDS[0], physics="kinematic", action_repeat=3).unwrapped.action_repeat
-        == 3
-    )
+    for name in WORLDS:
+        env = gymnasium.make(f"mpfa/Navigation-{name}-v1", physics="kinematic").unwrapped
+        assert env.config == TaskConfig(physics="kinematic")
+        assert env.config.collision_distance == env.config.closeness_distance == 0.25
+        assert (env.config.action_repeat, env.config.detour_chance) == (2, 0.8)
+    repeated = gymnasium.make("mpfa/Navigation-A-v1", physics="kinematic", action_repeat=3)
+    assert repeated.unwrapped.config.action_repeat == 3
 
 
 def test_the_papers_task_counts_collisions_farther_away_and_pays_more_for_an_approach() -> None:
@@ -406,7 +400,7 @@ def test_the_papers_task_counts_collisions_farther_away_and_pays_more_for_an_app
         NavigationEnv(physics="kinematic", **task)
         for task in ({}, {**PAPER_TASK, "action_repeat": 2})
     )
-    assert (study.collision_distance, paper.collision_distance) == (0.25, 0.35)
+    assert [each.config.collision_distance for each in (study, paper)] == [0.25, 0.35]
     for env in (study, paper):
         env.reset(seed=0, options=STRAIGHT)
     rewards = [env.step([1.0, 1.0])[1] for env in (study, paper)]

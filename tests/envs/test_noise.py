@@ -43,7 +43,7 @@ def places(infos):
 @pytest.mark.parametrize("noise", [None, RobotNoise(), {}])
 def test_without_noise_nothing_is_added(noise):
     env = VectorNavigationEnv(2, noise=noise, **KINEMATIC)
-    assert env.noise == RobotNoise()
+    assert env.config.noise == RobotNoise()
     assert env._batch.noise is None
     assert not env.lidar.is_noisy
 
@@ -204,7 +204,7 @@ def test_a_seed_has_its_noise():
 
 def test_torchrl_takes_noise_by_name():
     env = NavigationTorchEnv(num_envs=2, noise={"latency": 1, "slip": 0.1}, **KINEMATIC)
-    assert env.env.noise == RobotNoise(latency=1, slip=0.1)
+    assert env.env.config.noise == RobotNoise(latency=1, slip=0.1)
     env.set_seed(0)
     assert env.rollout(4)["next", "observation"].isfinite().all()
     env.close()

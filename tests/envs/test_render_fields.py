@@ -34,7 +34,7 @@ def test_what_is_sensed_in_a_room_is_what_an_episode_begins_with() -> None:
         np.testing.assert_array_equal(env.reset(options=options)[0], observations[number])
     to_goal = np.hypot(*(poses[:, :2] - GOAL).T)
     assert to_goal.min() > 0.5
-    assert env.world.clearances(poses[:, :2]).min() > env.robot.radius
+    assert env.world.clearances(poses[:, :2]).min() > env.config.robot.radius
 
 
 def test_robots_that_face_the_goal_see_it_ahead() -> None:

@@ -7,9 +7,25 @@ import numpy as np
 import pybullet
 import pytest
 
-from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, World
-from mpfa_envs.drives import WheelDrive
+from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, RobotModel, World
+from mpfa_envs.drives import WheelDrives
 from mpfa_envs.simulation import Simulation
+
+
+class Wheels:
+    """One robot on simulated wheels."""
+
+    def __init__(self, robot: RobotModel) -> None:
+        self.drives = WheelDrives(robot, 1, time_step=0.1)
+        self.motion = np.zeros((1, 5))
+
+    def place(self, *pose: float) -> None:
+        self.drives.place(0, *pose)
+        self.motion[0] = *pose, 0.0, 0.0
+
+    def move(self, left: float, right: float) -> np.ndarray:
+        self.drives.move(self.motion, np.ones(1, dtype=np.bool_), np.array([[left, right]]))
+        return self.motion[0].copy()
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -23,37 +39,39 @@ def test_the_simulated_robot_drives_and_turns_as_commanded(name: str, wheels: st
         "left": (slow, fast),
         "right": (fast, slow),
     }[wheels]
-    drive = WheelDrive(robot, WORLDS["A"], time_step=0.1)
+    drive = Wheels(robot)
     drive.place(0.0, 0.0, 0.5)
     for _ in range(8):
         before = drive.move(left, right)
     driven = turned = 0.0
     for _ in range(20):
         after = drive.move(left, right)
-        driven += math.hypot(after.x - before.x, after.y - before.y)
-        turned += math.remainder(after.heading - before.heading, math.tau)
+        driven += math.dist(after[:2], before[:2])
+        turned += math.remainder(after[2] - before[2], math.tau)
         before = after
-    drive.close()
+    drive.drives.close()
     assert driven / 2.0 == pytest.approx((left + right) / 2, rel=0.03)
     assert turned / 2.0 == pytest.approx((right - left) / robot.wheel_base, rel=0.03, abs=0.01)
 
 
 def test_a_wall_stops_the_simulated_robot() -> None:
-    drive = WheelDrive(ROBOTS["turtlebot2"], WORLDS["A"], time_step=0.1)
-    drive.place(4.5, 0.0, 0.0)
-    for _ in range(30):
-        motion = drive.move(0.5, 0.5)
-    drive.close()
-    assert motion.x == pytest.approx(5.0 - 0.18, abs=0.02)
+    simulation = Simulation(time_step=0.1, substeps=3)
+    simulation.add_world(WORLDS["A"])
+    simulation.add_robot(robot := ROBOTS["turtlebot2"])
+    simulation.place_robot(4.5, 0.0, 0.0)
+    simulation.set_wheel_speeds(0.5 / robot.wheel_radius, 0.5 / robot.wheel_radius)
+    simulation.step(30)
+    assert simulation.robot_motion()[0] == pytest.approx(5.0 - 0.18, abs=0.02)
+    simulation.close()
 
 
 def test_a_drive_does_not_depend_on_earlier_ones_however_short() -> None:
-    def driven(drive: WheelDrive) -> list[tuple[float, ...]]:
+    def driven(drive: Wheels) -> list[list[float]]:
         rng = np.random.default_rng(0)
         drive.place(0.3, 0.2, 0.7)
-        return [drive.move(*rng.uniform(0.05, 0.5, 2)) for _ in range(30)]
+        return [drive.move(*rng.uniform(0.05, 0.5, 2)).tolist() for _ in range(30)]
 
-    drives = [WheelDrive(ROBOTS["turtlebot2"], WORLDS["D"], time_step=0.1) for _ in range(2)]
+    drives = [Wheels(ROBOTS["turtlebot2"]) for _ in range(2)]
     expected = driven(drives[0])
     for steps, pose in ((20, (4.6, 0.0, 0.1)), (1, (0.3, 0.2, 0.7)), (0, (0.3, 0.2, 0.7))):
         drives[1].place(*pose)
@@ -61,7 +79,7 @@ def test_a_drive_does_not_depend_on_earlier_ones_however_short() -> None:
             drives[1].move(0.5, 0.4)
         assert driven(drives[1]) == expected
     for drive in drives:
-        drive.close()
+        drive.drives.close()
 
 
 def test_bodies_have_names_and_a_name_is_used_once() -> None:

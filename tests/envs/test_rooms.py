@@ -12,11 +12,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
 
+import mpfa_envs
 from mpfa_envs import (
     INFO_TYPES,
     ROOMS_TASK,
     NavigationEnv,
-    RoomsEnv,
     VectorNavigationEnv,
     World,
     generate_world,
@@ -41,13 +41,13 @@ def test_the_id_passes_the_checker_without_a_warning() -> None:
     env.close()
 
 
-def test_the_id_makes_one_robot_or_many_of_one_task(env: RoomsEnv) -> None:
+def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
     many = gymnasium.make_vec("mpfa/Rooms-v1", num_envs=3)
-    assert isinstance(env, RoomsEnv)
+    assert isinstance(env, NavigationEnv)
     assert isinstance(many, VectorNavigationEnv)
     for name, value in ROOMS_TASK.items():
         if name not in ("world", "max_goal_distance"):
-            assert getattr(env.robots, name) == getattr(many, name) == value
+            assert getattr(env.config, name) == getattr(many.config, name) == value
     assert env.observation_space == many.single_observation_space
     # The same worlds, if each robot has the seed itself.
     many.reset(seed=[5, 6, 7])
@@ -58,7 +58,7 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: RoomsEnv) -> None:
     many.close()
 
 
-def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: RoomsEnv) -> None:
+def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: NavigationEnv) -> None:
     seen = []
     for seed in (3, None, None, None, np.int64(3), None):
         observation, info = env.reset(seed=seed)
@@ -69,27 +69,23 @@ def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: RoomsE
     assert seen[4:] == seen[:2]
 
 
-def test_in_one_world_it_is_the_environment_of_that_world() -> None:
-    arguments = {"world": "D", "physics": "kinematic", "max_steps": 60}
-    ours, plain = RoomsEnv(**arguments), NavigationEnv(**arguments)
-    first, second = ours.reset(seed=4), plain.reset(seed=4)
-    np.testing.assert_array_equal(first[0], second[0])
-    for action in ACTIONS:
-        first, second = ours.step(action), plain.step(action)
-        np.testing.assert_allclose(first[0], second[0], atol=1e-6)
-        assert first[1] == pytest.approx(second[1], abs=1e-6)
-        assert first[2:4] == second[2:4]
-        assert first[4] == pytest.approx(second[4], abs=1e-6)
-        assert [type(each) for each in first[4].values()] == list(INFO_TYPES.values())
-        if first[2] or first[3]:
+def test_a_step_after_the_end_of_an_episode_asks_for_a_reset(env: NavigationEnv) -> None:
+    env.reset(seed=4)
+    for action in np.tile(ACTIONS, (20, 1)):
+        *_, terminated, truncated, info = env.step(action)
+        assert [type(each) for each in info.values()] == list(INFO_TYPES.values())
+        if terminated or truncated:
             break
     with pytest.raises(ResetNeeded, match=r"call reset\(\) before step\(\)"):
-        ours.step(ACTIONS[0])
-    ours.close()
-    plain.close()
+        env.step(ACTIONS[0])
 
 
-def test_an_episode_can_be_fixed(env: RoomsEnv) -> None:
+def test_the_old_name_of_the_environment_warns() -> None:
+    with pytest.warns(DeprecationWarning, match="RoomsEnv is now mpfa_envs.NavigationEnv"):
+        assert mpfa_envs.RoomsEnv is NavigationEnv
+
+
+def test_an_episode_can_be_fixed(env: NavigationEnv) -> None:
     env.reset(seed=0, options={"world": "bars-7"})
     assert env.world == generate_world("bars", 7)
     ((world, task),) = generator_tasks("clutter", "validation", worlds=1, tasks=1)
@@ -111,7 +107,7 @@ def test_an_episode_can_be_fixed(env: RoomsEnv) -> None:
     ],
 )
 def test_options_that_are_no_episode_are_refused_and_the_last_one_goes_on(
-    env: RoomsEnv, options: dict[str, object], message: str
+    env: NavigationEnv, options: dict[str, object], message: str
 ) -> None:
     env.reset(seed=0)
     before = env.world, env.task
@@ -141,7 +137,7 @@ def test_it_is_rendered_on_demand() -> None:
     env.reset(seed=0)
     assert max(env.render().shape) == 480
     env.close()
-    plain = RoomsEnv(**ROOMS_TASK)
+    plain = NavigationEnv(**ROOMS_TASK)
     plain.reset(seed=0)
     assert plain.render() is None
     plain.close()

@@ -26,10 +26,10 @@ def test_sixty_environments_that_are_dropped_leave_no_server() -> None:
 
 def test_a_closed_server_is_not_closed_again_when_its_number_is_another_ones() -> None:
     first = NavigationEnv(world="A")
-    number = first._drive.simulation.client
+    number = first.robots._batch.drives._simulations[0].client
     first.close()
     second = NavigationEnv(world="A")
-    assert second._drive.simulation.client == number
+    assert second.robots._batch.drives._simulations[0].client == number
     del first
     gc.collect()
     second.reset(seed=0)

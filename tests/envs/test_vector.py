@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import mpfa_envs
 from mpfa_envs import (
-    ENV_IDS,
     INFO_TYPES,
+    PAPER_TASK,
     WORLDS,
     Box,
     NavigationEnv,
@@ -28,6 +28,7 @@ from mpfa_envs import (
     World,
     navigation_reward,
 )
+from tests.envs.plain_robot import PlainRobot
 from tests.envs.shapes import random_shapes
 
 NAMES = ["A", "B", "D", "test"]
@@ -139,29 +140,33 @@ def test_robots_that_share_a_server_part_slowly() -> None:
     theirs.close()
 
 
-def test_a_robot_drives_among_any_shapes_as_alone() -> None:
+@pytest.mark.parametrize("arguments", [{}, {"action_repeat": 3, "robot": "burger"}, PAPER_TASK])
+def test_a_robot_drives_among_any_shapes_as_in_plain_python(arguments: dict) -> None:
     rng, worlds = np.random.default_rng(7), []
     while len(worlds) < 6:
         world = random_shapes(rng, boxes=3, cylinders=4, polygons=3)
         if world.clearance(0.0, 0.0) > 0.5 and world.clearance(3.0, 2.0) > 0.5:
             worlds.append(world)
-    env = make(6, world=worlds, detour_chance=0.0)
-    env.reset(seed=0)
-    single = [NavigationEnv(world=world, physics="kinematic") for world in worlds]
-    for each, task in zip(single, env.tasks, strict=True):
-        each.reset(options=task._asdict())
-    running = np.ones(6, dtype=np.bool_)
+    env = make(6, world=worlds, **{**arguments, "detour_chance": 0.0, "max_steps": 90})
+    seen, _ = env.reset(seed=0)
+    plain = [
+        PlainRobot(world, task, env.config) for world, task in zip(worlds, env.tasks, strict=True)
+    ]
+    np.testing.assert_allclose(seen, [each.observe() for each in plain], atol=1e-6)
+    running, ends = np.ones(6, dtype=np.bool_), set()
     for _ in range(60):
         actions = drive(rng, 6)
-        observations, rewards, terminated, *_ = env.step(actions, only=running)
+        observations, rewards, terminated, truncated, infos = env.step(actions, only=running)
         for index in np.flatnonzero(running):
-            seen, reward, over, *_ = single[index].step(actions[index])
-            np.testing.assert_allclose(observations[index], seen, atol=1e-9)
-            assert rewards[index] == pytest.approx(reward, abs=1e-9)
-            assert terminated[index] == over
-        running &= ~terminated
-    for index, each in enumerate(single):
-        np.testing.assert_allclose(env.trail(index), each.trail, atol=1e-9)
+            expected = plain[index].step(actions[index])
+            np.testing.assert_allclose(observations[index], expected[0], atol=1e-6)
+            assert rewards[index] == pytest.approx(expected[1], abs=1e-9)
+            assert (terminated[index], truncated[index]) == expected[2:]
+            for name in ("success", "collision", "path_length", "min_clearance", "distance"):
+                assert infos[name][index] == pytest.approx(getattr(plain[index], name), abs=1e-9)
+            ends |= {name for name in ("collision", "timeout") if infos[name][index]}
+        running &= ~(terminated | truncated)
+    assert ends
 
 
 def test_a_robot_has_the_same_episodes_whatever_their_number() -> None:
@@ -348,8 +353,8 @@ def test_what_was_given_does_not_change_with_the_next_step() -> None:
     assert set(INFO_TYPES) <= set(infos)
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
-def test_every_id_makes_a_vector_environment(env_id: str) -> None:
+@pytest.mark.parametrize("env_id", [f"mpfa/Navigation-{name}-v1" for name in WORLDS])
+def test_every_world_has_an_id_of_a_vector_environment(env_id: str) -> None:
     env = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")
     assert isinstance(env.unwrapped, VectorNavigationEnv)
     assert env.worlds[0] in WORLDS.values()

@@ -380,7 +380,7 @@ def test_encounters_are_counted_over_an_episode() -> None:
             _, _, terminated, truncated, info = env.step(np.array([0.8, 0.75], np.float32))
             ended = terminated or truncated
             x, y, heading = (info[name] for name in ("x", "y", "heading"))
-            speed = env._motion.linear_speed
+            speed = env.motion[3]
             gaps = [math.hypot(w[0] - x, w[1] - y) - w[4] - 0.18 for w in env.walkers]
             nearest, near = min(nearest, *gaps), near + (min(gaps) < 0.5)
             least = min(

@@ -14,7 +14,7 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils.play import PlayableGame
 
-from mpfa_envs import NavigationEnv, RoomsEnv, VectorNavigationEnv
+from mpfa_envs import NavigationEnv, VectorNavigationEnv
 from mpfa_envs.render.window import Window
 
 pygame = pytest.importorskip("pygame")
@@ -51,7 +51,7 @@ def test_the_window_shows_what_a_recorder_would_see() -> None:
 
 
 def test_a_room_of_a_generator_is_shown_as_well() -> None:
-    env = RoomsEnv(world="rooms", physics="kinematic", render_mode="human")
+    env = NavigationEnv(world="rooms", physics="kinematic", render_mode="human")
     env.metadata["render_fps"] = 1000
     env.reset(seed=0)
     first = on_screen().copy()
@@ -61,7 +61,7 @@ def test_a_room_of_a_generator_is_shown_as_well() -> None:
 
 
 def test_pictures_a_second_are_those_of_real_time() -> None:
-    for mode, fps in (("human", 10), ("rgb_array", 5)):
+    for mode, fps in (("human", 5), ("rgb_array", 5)):
         env = NavigationEnv(physics="kinematic", render_mode=mode)
         assert env.metadata["render_fps"] == fps
         assert NavigationEnv.metadata["render_modes"] == ["human", "rgb_array"]

@@ -11,7 +11,7 @@ from mpfa_envs.checks import check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
-from mpfa_envs.observation import add_history, observe
+from mpfa_envs.kernels.observation import observe_all
 from mpfa_envs.robot import RobotModel, resolve_robot
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Pilot:
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
-        self._observation: NDArray[np.float32] | None = None
+        self._observation = np.zeros((1, self.card.observation_size), dtype=np.float32)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **options: Any) -> Pilot:
@@ -225,15 +225,23 @@ class Pilot:
             if taken is not None and taken != (x, y, heading):
                 points = points.seen_from((x, y, heading), taken, card.max_range)
             way = self._way.sense((x, y, heading), self._goal, points)
-        motion: Any = (x, y, heading, linear / self.pace, angular / self.pace)
-        distance = math.dist((x, y), self._goal)
-        near = card.closeness_distance
-        seen = observe(ranges, motion, self._goal, distance, card.robot, near, way)
-        if card.history:
-            last = None if self._fresh else self._observation
-            seen = add_history(seen, last, card.sectors, card.history)
-        self._observation, self._fresh = seen, False
-        return seen
+        robot = card.robot
+        observe_all(
+            np.array([[x, y, heading, linear / self.pace, angular / self.pace]]),
+            np.array([self._goal]),
+            np.array([math.dist((x, y), self._goal)]),
+            np.array([self._fresh]),
+            np.ones(1, dtype=np.bool_),
+            ranges[None],
+            False,
+            (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
+            np.zeros((0, 3)) if way is None else way[None],
+            card.sectors,
+            card.history,
+            self._observation,
+        )
+        self._fresh = False
+        return self._observation[0].copy()
 
     def decide(
         self,

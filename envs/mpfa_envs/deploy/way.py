@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +44,8 @@ class Way:
     """
 
     def __init__(self, card: Card, *, size: float) -> None:
+        # Without it the loops over the map would run, a thousand times too slowly.
+        import_module("numba")
         lidar = _Rays(card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
         self._square = _Square(size)

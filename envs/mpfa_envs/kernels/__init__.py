@@ -6,7 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
-import numba
+numba: Any
+try:
+    import numba
+except ImportError:  # A robot that runs a policy without a map needs none of it.
+    numba = None
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -14,7 +18,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def njit(function: _Function) -> _Function:
     """Compile a function of numbers and arrays, and keep the code on disk where that can be.
 
-    Arithmetic is not reordered, and a division by zero gives infinity or NaN as in NumPy.
+    Arithmetic is not reordered, and a division by zero gives infinity or NaN as in NumPy. Where
+    there is no Numba the loop stays as it is, with the same results.
 
     Args:
         function: A plain loop.
@@ -22,6 +27,8 @@ def njit(function: _Function) -> _Function:
     Returns:
         The compiled function; it releases the interpreter's lock.
     """
+    if numba is None:
+        return function
     decorate = partial(numba.njit, nogil=True, error_model="numpy")
     compiled: Any
     try:

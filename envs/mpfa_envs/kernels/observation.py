@@ -1,4 +1,4 @@
-"""What many robots sense, as :func:`mpfa_envs.observation.observe` puts it for one."""
+"""Observations of many robots, from what they have measured."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.kernels import njit
-from mpfa_envs.kernels.step import DISTANCE
 from mpfa_envs.observation import DISTANCE_SCALE, GOAL_CLOSENESS_DISTANCE, SPEED_BOUND, WAY_BOUND
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.kernels.step import EpisodeArrays
-
 
 @njit
 def observe_all(
-    episodes: EpisodeArrays,
+    motions: NDArray[np.float64],
+    goals: NDArray[np.float64],
+    distances: NDArray[np.float64],
+    fresh: NDArray[np.bool_],
     chosen: NDArray[np.bool_],
     ranges: NDArray[np.float64],
     median: bool,
@@ -32,7 +32,11 @@ def observe_all(
     """Build the observations of the chosen robots.
 
     Args:
-        episodes: The episodes.
+        motions: Poses and speeds (x, y, heading, forward, turning) that the robots hold to be
+            theirs [m, m, rad, m/s, rad/s], ``[N, 5]``.
+        goals: Where they should go (x, y) [m], ``[N, 2]``.
+        distances: Distances of the two [m], ``[N]``.
+        fresh: Whose episode begins: they have always seen what they see, ``[N]``.
         chosen: Which robots sense, ``[N]``; the others' observations stay.
         ranges: Range of each ray [m], ``[N, rays]``.
         median: Whether a sector reports the median of its rays and not the nearest.
@@ -62,16 +66,16 @@ def observe_all(
                 for ray in range(first + 1, first + count):
                     nearest = min(nearest, ranges[robot, ray])
             seen[sector] = near / max(nearest, near)
-        if episodes.steps[robot] == 0:
+        if fresh[robot]:
             for index in range(start, seen.shape[0]):
                 seen[index] = seen[(index - start) % sectors]
-        motion = episodes.motions[robot]
+        motion = motions[robot]
         speed, turn = motion[3] / fastest, motion[4] / fastest_turn
-        distance = episodes.numbers[DISTANCE, robot]
+        distance = distances[robot]
         # A robot on the goal sees it ahead.
         bearing, closeness = 0.0, 1.0
         if distance > 0.0:
-            goal = episodes.goals[robot]
+            goal = goals[robot]
             bearing = math.atan2(goal[1] - motion[1], goal[0] - motion[0]) - motion[2]
             closeness = min(GOAL_CLOSENESS_DISTANCE / distance, 1.0)
         seen[sectors], seen[sectors + 1] = math.cos(bearing), math.sin(bearing)

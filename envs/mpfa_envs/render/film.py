@@ -78,7 +78,7 @@ def film_episode(
     worth: list[float] = []
     for moment in drive_episode(policy, episode, seed=seed, **env_arguments):
         env, step, ended = moment.env, moment.step, moment.wheels is None
-        step_time = env.time_step * env.action_repeat
+        step_time = env.config.time_step * env.config.action_repeat
         if step % stride == 0 or ended:
             (pictures[step],) = env.render() or ()
         if len(pictures) > most and not ended:
@@ -146,7 +146,7 @@ def drive_episode(
         step, ended = 0, False
         while not ended:
             actions = driver.drive(env, np.arange(1), observations)
-            wheels = env.robot.wheel_speeds(actions[0])
+            wheels = env.config.robot.wheel_speeds(actions[0])
             yield Moment(env, step, observations, wheels, info)
             observations, _, terminated, truncated, info = env.step(actions)
             step, ended = step + 1, bool(terminated[0] or truncated[0])

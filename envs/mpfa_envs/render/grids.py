@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
 from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_number, check_positive
-from mpfa_envs.drives import Motion
 from mpfa_envs.render.canvas import Canvas
 from mpfa_envs.render.colors import viridis
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+_ROBOTS: Final = 64
+"""Places that are looked at together; each may need a map."""
 Heading = float | Literal["goal"]
 """Where robots face [rad], or that each of them faces the goal."""
 
@@ -57,15 +59,15 @@ def observe_room(
     spacing: float = 0.2,
     **env_arguments: Any,
 ) -> tuple[Array, NDArray[np.float32]]:
-    """What a robot senses that stands here and there in a room.
+    """Observations of a robot that stands here and there in a room.
 
     Args:
         world: A name, the path of a YAML file or a world.
         goal: Where it should go (x, y) [m].
         heading: Where it faces [rad]; ``"goal"``: the goal, from everywhere.
         spacing: Distance between two places [m].
-        **env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv`, those that the policy was
-            trained with: ``policy.env_arguments``.
+        **env_arguments: Fields of :class:`~mpfa_envs.TaskConfig`, those that the policy was trained
+            with: ``policy.env_arguments``.
 
     Returns:
         Poses (x, y, heading), ``[N, 3]``, where the robot fits and has not reached the goal, and
@@ -81,29 +83,36 @@ def observe_room(
         ((100, 3), (100, 24))
     """
     # Imported here because gymnasium takes a moment, and other pictures do without it.
-    from mpfa_envs.navigation import NavigationEnv
-    from mpfa_envs.senses import Senses
+    from mpfa_envs.config import TaskConfig
+    from mpfa_envs.episodes import Episode
+    from mpfa_envs.robot_batch import RobotBatch
+    from mpfa_envs.tasks import Task
+    from mpfa_envs.walker_starts import start_walkers
 
     if heading != "goal":
         check_number("heading", heading)
-    world = resolve_world(world)
-    env = NavigationEnv(**{**env_arguments, "world": world, "physics": "kinematic"})
-    senses = Senses(env, env.lidar)
+    world = replace(resolve_world(world), walkers=())
+    config = TaskConfig(**{**env_arguments, "physics": "kinematic", "progress": "straight_line"})
     places = cell_centers(world, spacing)
     offset = np.asarray(goal, dtype=np.float64) - places
-    chosen = (world.clearances(places) > env.robot.radius) & (np.hypot(*offset.T) > env.goal_radius)
+    free = world.clearances(places) > config.robot.radius
+    chosen = free & (np.hypot(*offset.T) > config.goal_radius)
     places, offset = places[chosen], offset[chosen]
     facing = np.arctan2(offset[:, 1], offset[:, 0])
     if heading != "goal":
         facing = np.full(len(places), float(heading))
     poses = np.column_stack((places, facing))
-    found = np.zeros((len(poses), *(env.observation_space.shape or ())), dtype=np.float32)
-    for row, pose in zip(found, poses.tolist(), strict=True):
-        senses.begin(world)
-        motion = Motion(pose[0], pose[1], pose[2], 0.0, 0.0)
-        row[:] = senses.observe(motion, motion, goal, walkers=None, rng=env.np_random)
-    env.close()
-    return poses, found
+    robots = RobotBatch(config, config.make_lidar(), [world] * _ROBOTS)
+    rng = np.random.default_rng(0)
+    walkers = start_walkers(world, (0.0, 0.0), rng)
+    found = []
+    for part in np.array_split(poses, range(_ROBOTS, len(poses), _ROBOTS)):
+        for index, (x, y, turn) in enumerate(part.tolist()):
+            task = Task((x, y, turn), goal)
+            robots.begin(index, Episode(world, task, 0.0, None, walkers), rng)
+        robots.sense(np.arange(_ROBOTS) < len(part), [rng] * _ROBOTS)
+        found.append(robots.observations[: len(part)].copy())
+    return poses, np.concatenate(found)
 
 
 def fill_cells(canvas: Canvas, centers: Array, spacing: float, shares: Array) -> None:

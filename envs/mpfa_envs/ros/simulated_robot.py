@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,15 +11,30 @@ from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count, check_positive, check_seed
 from mpfa_envs.deploy.card import check_finite
 from mpfa_envs.deploy.sectors import Scan
-from mpfa_envs.drives import Drive, KinematicDrive, Motion, WheelDrive
+from mpfa_envs.drives import make_drives
 from mpfa_envs.lidar import Lidar
 from mpfa_envs.robot import RobotModel, resolve_robot
 
 if TYPE_CHECKING:
     import os
 
-    from mpfa_envs.arguments import Physics
+    from mpfa_envs.config import Physics
     from mpfa_envs.worlds import World
+
+
+class Motion(NamedTuple):
+    """Where a robot is and how it moves."""
+
+    x: float
+    """Position [m]."""
+    y: float
+    """Position [m]."""
+    heading: float
+    """Direction of the front, from the x axis to the left, in [-π, π] [rad]."""
+    linear_speed: float
+    """Forward speed [m/s]."""
+    angular_speed: float
+    """Turning speed, to the left [rad/s]."""
 
 
 class SimulatedRobot:
@@ -73,17 +88,20 @@ class SimulatedRobot:
             raise ValueError(f"field must rise, got {field}")
         if physics not in ("wheels", "kinematic"):
             raise ValueError(f"physics must be 'wheels' or 'kinematic', got {physics!r}")
+        self._field = first, last
+        # Its rays go from left to right around its middle, those of a scan from right to left.
+        view = math.degrees(last - first) * rays / (rays - 1)
         self._lidar = Lidar(
-            self.world, sectors=rays, reduction="single", max_range=max_range, noise=noise
+            self.world,
+            sectors=rays,
+            reduction="single",
+            max_range=max_range,
+            noise=noise,
+            field_of_view=min(view, 360.0),
         )
-        self._lidar.angles = np.linspace(first, last, rays)
         self._timeout = check_positive("command_timeout", command_timeout)
         self._rng = np.random.default_rng(check_seed(seed))
-        self._drive: Drive = (
-            KinematicDrive(self.robot, time_step=self.time_step)
-            if physics == "kinematic"
-            else WheelDrive(self.robot, self.world, time_step=self.time_step)
-        )
+        self._drives = make_drives(physics, self.robot, 1, time_step=self.time_step)
         self.time = 0.0
         """Since the robot was made [s]."""
         self.place((0.0, 0.0, 0.0))
@@ -98,11 +116,18 @@ class SimulatedRobot:
             ValueError: If it is not finite.
         """
         x, y, heading = check_finite("start", start, 3)
-        self.motion: Motion = self._drive.place(x, y, heading)
+        heading = math.remainder(heading, math.tau)
+        self._drives.place(0, x, y, heading)
+        self._motions = np.array([[x, y, heading, 0.0, 0.0]])
         self.touched = False
         """Whether its rim has met an obstacle since it was placed."""
         self._told = (0.0, 0.0)
         self._told_at = -math.inf
+
+    @property
+    def motion(self) -> Motion:
+        """Where it is and how it moves."""
+        return Motion(*self._motions[0].tolist())
 
     def obey(self, linear: float, angular: float) -> None:
         """Take speeds of the body, which hold until others come, or none for a while.
@@ -125,18 +150,20 @@ class SimulatedRobot:
         left, right = (
             min(max(speed, -fastest), fastest) for speed in (linear - turn, linear + turn)
         )
-        self.motion = self._drive.move(left, right)
+        self._drives.move(self._motions, np.ones(1, dtype=np.bool_), np.array([[left, right]]))
         self.time += self.time_step
-        clearance = self.world.clearance(self.motion.x, self.motion.y)
+        clearance = self.world.clearance(*self.motion[:2])
         self.touched = self.touched or clearance <= self.robot.radius
 
     def scan(self) -> Scan:
         """What the lidar, at the robot's center, measures."""
-        ranges = self._lidar.measure(*self.motion[:3], rng=self._rng)
-        angles, far = self._lidar.angles, self._lidar.max_range
-        ranges = np.where(ranges >= far, math.inf, ranges)
-        return Scan(float(angles[0]), float(angles[1] - angles[0]), ranges, 0.0, far)
+        x, y, heading, *_ = self.motion
+        (first, last), far = self._field, self._lidar.max_range
+        heading += 0.5 * (first + last)
+        ranges = self._lidar.measure(x, y, heading, rng=self._rng)[::-1]
+        step = (last - first) / (len(ranges) - 1)
+        return Scan(first, step, np.where(ranges >= far, math.inf, ranges), 0.0, far)
 
     def close(self) -> None:
         """Release the physics server."""
-        self._drive.close()
+        self._drives.close()

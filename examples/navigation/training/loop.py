@@ -76,8 +76,8 @@ class TrainingRun:
         robots = vector_of(env)
         self._remembered: dict[str, Any] = {
             "sectors": robots.lidar.sectors,
-            "memory": robots.memory,
-            "history": robots.history,
+            "memory": robots.config.memory,
+            "history": robots.config.history,
         }
         capacity, scale = settings.method.capacity, settings.learner.reward_scale
         self.log = UpdateLog(capacity, reward_scale=scale)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 from argparse import ArgumentTypeError
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import gymnasium
@@ -12,8 +11,14 @@ import pytest
 import torch
 
 from evaluate import read_noise
-from mpfa_envs import Mirror, NavigationEnv, RandomMirror, RobotNoise, load_policy
-from mpfa_envs.reward import PROGRESS_SCALE
+from mpfa_envs import (
+    Mirror,
+    NavigationEnv,
+    RandomMirror,
+    RobotNoise,
+    TaskConfig,
+    load_policy,
+)
 from navigation.environments import env_arguments, make_training_env, vector_of
 from navigation.settings.environment import EnvironmentSettings, NoiseSettings
 from navigation.settings.train import REGIMES
@@ -26,7 +31,7 @@ def test_a_robot_learns_with_a_clearance(robot: str, radius: float) -> None:
         robot=robot, physics="kinematic", clearance=0.1, progress_scale=3.0
     )
     training = make_training_env("C", settings)
-    assert training.env.collision_distance == pytest.approx(radius + 0.1)
+    assert training.env.config.collision_distance == pytest.approx(radius + 0.1)
     assert env_arguments(settings)["closeness_distance"] == pytest.approx(radius + 0.1)
     training.close()
 
@@ -42,8 +47,8 @@ def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
     task = training.env.tasks[0]
     assert judging.reset(options=task._asdict())[0] == pytest.approx(seen)
     for name in ("max_steps", "action_repeat", "closeness_distance", "physics"):
-        assert getattr(judging, name) == getattr(training.env, name)
-    assert judging.closeness_distance == pytest.approx(0.28)
+        assert getattr(judging.config, name) == getattr(training.env.config, name)
+    assert judging.config.closeness_distance == pytest.approx(0.28)
     training.close()
     judging.close()
 
@@ -62,37 +67,15 @@ def test_a_lidar_that_sees_a_whole_turn_is_asked_for_and_mirrored(tmp_path: Path
     assert torch.equal(transform.mirror.observation(batch), mirror.observation(batch))
 
 
-def test_the_defaults_are_those_of_the_environment_itself() -> None:
-    training = make_training_env("B", EnvironmentSettings(physics="kinematic"))
-    plain = NavigationEnv(world="B", physics="kinematic", render_mode=None)
-    ours = vars(training.env)
-    values = (bool, int, float, str, type(None))
-    same = {
-        name: each
-        for name, each in vars(plain).items()
-        if isinstance(each, values) and not name.startswith("_")
-    }
-    assert {"max_steps", "action_repeat", "collision_distance"} <= set(same)
-    assert {name: ours[name] for name in same} == same
-    assert ours["robot"] == plain.robot
-    assert ours["reward"].keywords == plain.reward.keywords
-    defaults = inspect.signature(NavigationEnv).parameters
-    for name in ("robot", "physics", "max_steps", "action_repeat", "detour_chance"):
-        assert getattr(EnvironmentSettings(), name) == defaults[name].default
-    training.close()
-    plain.close()
-
-
 def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> None:
-    settings = EnvironmentSettings(physics="kinematic")
-    trained, plain = make_training_env("D", settings).env, NavigationEnv(physics="kinematic")
-    for name in (
-        "max_steps", "time_step", "action_repeat", "goal_radius", "collision_distance",
-        "closeness_distance", "min_goal_distance", "detour_chance", "robot",
-    ):  # fmt: skip
-        assert getattr(trained, name) == getattr(plain, name), name
-    assert settings.progress_scale == PROGRESS_SCALE
-    assert EnvironmentSettings().physics == "wheels"
+    training = make_training_env("B", EnvironmentSettings(physics="kinematic"))
+    expected = TaskConfig(physics="kinematic")
+    collision = pytest.approx(expected.collision_distance)
+    assert training.env.config.collision_distance == collision
+    same = {"collision_distance": 0.25, "closeness_distance": 0.25}
+    assert replace(training.env.config, **same) == replace(expected, **same)
+    assert EnvironmentSettings().physics == TaskConfig().physics == "wheels"
+    training.close()
 
 
 @pytest.mark.parametrize(
@@ -116,9 +99,6 @@ def test_the_ids_are_the_tasks_that_the_regimes_learn(
     for arguments in (mine, theirs):
         del arguments["autoreset_mode"]
     assert mine == pytest.approx(theirs)
-    assert made.reward.keywords == trained.reward.keywords
-    for name in ("detour_chance", "min_goal_distance"):
-        assert getattr(made, name) == getattr(trained, name)
     assert made._source._max_goal_distance == trained._source._max_goal_distance
     trained.close()
     made.close()
@@ -128,7 +108,7 @@ def test_the_settings_of_noise_are_those_of_the_environment() -> None:
     assert asdict(NoiseSettings()) == asdict(RobotNoise())
     settings = EnvironmentSettings(physics="kinematic", noise=NoiseSettings(slip=0.1, latency=2))
     env = make_training_env("A", settings, robots=2)
-    assert vector_of(env).noise == RobotNoise(slip=0.1, latency=2)
+    assert vector_of(env).config.noise == RobotNoise(slip=0.1, latency=2)
     env.close()
 
 
