@@ -102,7 +102,7 @@ def errors_of_fields(name: str, *, worlds: int = 20) -> Iterator[float]:
         for x, y in (rng.uniform(-0.5, 0.5, (20, 2)) * world.size).tolist():
             i, j = grid.index(x, y)
             near = math.dist((x, y), field.goal) < 1.0
-            if near or grid.clearance[i, j] < DISTANCE + 0.1 or math.isinf(field.values[i, j]):
+            if near or grid.clearance[i, j] < DISTANCE + 0.1 or math.isinf(field.lengths[i, j]):
                 continue
             exact = planner.length((x, y), field.goal)
             if math.isfinite(exact):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mpfa_envs.builtin_worlds import WORLDS
     from mpfa_envs.config import PAPER_TASK, TaskConfig
     from mpfa_envs.discrete import WHEEL_PAIRS, DiscreteWheels
-    from mpfa_envs.distance import DistanceField, FreeGrid, sample_task_on_grid
+    from mpfa_envs.distance import DistanceField, FreeGrid
     from mpfa_envs.evaluation import Driver, evaluate, run_tasks
     from mpfa_envs.export import export_policy
     from mpfa_envs.gazebo import load_gazebo_world
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         split_worlds,
         world_seed,
     )
+    from mpfa_envs.grid_tasks import sample_task_on_grid
     from mpfa_envs.lidar import Lidar
     from mpfa_envs.map_memory import MapMemory
     from mpfa_envs.mirror import Mirror, RandomMirror
@@ -194,7 +195,7 @@ _MODULES = {
     "render_trajectories": "render",
     "run_tasks": "evaluation",
     "sample_task": "tasks",
-    "sample_task_on_grid": "distance",
+    "sample_task_on_grid": "grid_tasks",
     "save_policy": "policy",
     "save_world": "world_file",
     "spl": "results",

@@ -1,12 +1,11 @@
-"""The shortest way from everywhere in a world to a goal, on a grid.
+"""The shortest path from everywhere in a world to a goal, on a grid.
 
 Where :mod:`~mpfa_envs.path` answers one question exactly, a field answers it for all cells at once,
-and in milliseconds however many obstacles there are: the moves between free cells and their 16
-neighbors make a graph, and SciPy's Dijkstra starts from the goal. Moves have 16 directions, hence
-a way in the open is up to 1.4 % too long or too short. Around corners and in narrow passages the
-size of the cells adds to it: ``docs/worlds.md`` has what was measured.
+and in milliseconds however many obstacles there are. Moves lead from a free cell to its 16
+neighbors, hence a path in the open is up to 1.4 % too long or too short. Around corners and in
+narrow passages the size of the cells adds to it: ``docs/worlds.md`` has what was measured.
 
-Centers of free cells keep the distance d. Between two that are a step L apart a way keeps
+Centers of free cells keep the distance d. Between two that are a step L apart a path keeps
 √(d² - L²/4) at least: whatever is nearest to its middle is d away from both ends.
 """
 
@@ -17,11 +16,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.ndimage import find_objects, label
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
-from mpfa_envs.checks import check_number, check_positive, check_share
+from mpfa_envs.checks import check_number, check_positive
 from mpfa_envs.kernels.cells import lower_clearances
 from mpfa_envs.kernels.grid import (
     MOVES,
@@ -33,29 +30,20 @@ from mpfa_envs.kernels.grid import (
     number_cells,
     shortest_way,
 )
-from mpfa_envs.local_field import (
-    LocalField,
-    length_in_map,
-    sample_task_in_map,
-    usual_clearance,
-    within_cell,
-)
-from mpfa_envs.tasks import Task
+from mpfa_envs.kernels.ways import ways_from
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds import Box, World
+    from mpfa_envs.worlds import World
 
-__all__ = ["DistanceField", "FreeGrid", "sample_task_on_grid", "shortest_way"]
+__all__ = ["DistanceField", "FreeGrid", "shortest_way"]
 
 RESOLUTION: Final = 0.1
 """Side of a cell unless another is asked for [m]."""
 _MOST_CELLS: Final = 4_000_000
-_GOALS: Final = 30
-"""Goals that are tried before a world is said to have no task."""
-_DETOURS: Final = 5
-"""Goals that are tried for a detour before a straight way will do."""
+_MARGIN: Final = 3
+"""Cells by which a window is wider than the longest path."""
 
 
 class FreeGrid:
@@ -176,37 +164,26 @@ class FreeGrid:
         return [(int(at), math.dist(self.center(*self.cells[at]), place)) for at in around]
 
     def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
-        """Measure the way between two positions.
+        """Measure the path between two positions.
 
         Args:
             start: Position (x, y) [m].
             goal: Position (x, y) [m].
 
         Returns:
-            Length [m]; infinite if there is no way.
+            Length [m]; infinite if there is no path.
         """
         if not self.free.any():
             return math.inf
-        if self.world.occupancy is not None:
-            return length_in_map(self, start, goal)
-        ways = self.distances(goal)
-        return min(float(ways[cell]) + gap for cell, gap in self.cells_around(start))
-
-    def distances(self, goal: tuple[float, float]) -> NDArray[np.float64]:
-        """Measure the way from every free cell to a goal.
-
-        Args:
-            goal: Position (x, y) [m]. If its cell is not free, the nearest free one counts.
-
-        Returns:
-            Lengths [m], infinite where there is no way, one for each of :attr:`cells`.
-
-        Raises:
-            ValueError: If no cell is free.
-        """
-        graph = self.graph_to(goal)
-        count = graph.shape[0] - 1
-        return np.asarray(dijkstra(graph, indices=[count]))[0, :count]
+        direct = math.dist(start, goal)
+        # In a map, which may be large, a window is looked through first.
+        windows = (1.2 * direct + 1.0, 2.0 * direct + 4.0) if self.world.occupancy else ()
+        for longest in windows:
+            found = DistanceField(self, goal, longest).length_from(start)
+            # A cell with a longer path was not found, but might have been the best one.
+            if found <= longest:
+                return found
+        return DistanceField(self, goal).length_from(start)
 
     def graph_to(self, goal: tuple[float, float]) -> csr_array:
         """Write the moves, and those from a goal to the cells around it, as a sparse matrix.
@@ -242,33 +219,52 @@ def _centers(count: int, resolution: float) -> NDArray[np.float64]:
 
 
 class DistanceField:
-    """The shortest way from every cell of a grid to one goal.
+    """The shortest path to one goal from every cell of a grid, or of a window around the goal.
 
     Args:
         grid: The grid.
-        goal: Position (x, y) [m]. If its cell is not free, the way ends at the nearest free one.
+        goal: Position (x, y) [m]. If its cell is not free, the path ends at the nearest free one.
+        longest: Longest path that is measured [m]; the field is a window that has room for it.
 
     Raises:
         ValueError: If the goal is not two finite numbers, or no cell is free.
 
     Examples:
         >>> from mpfa_envs import WORLDS, DistanceField, FreeGrid
-        >>> field = DistanceField(FreeGrid(WORLDS["B"], distance=0.18), (4.0, 0.0))
+        >>> grid = FreeGrid(WORLDS["B"], distance=0.18)
+        >>> field = DistanceField(grid, (4.0, 0.0))
         >>> round(field.at(3.9, 0.0), 1), round(field.at(0.0, 0.0), 1)  # [m]; a box is between
         (0.1, 6.4)
+        >>> DistanceField(grid, (4.0, 0.0), longest=3.0).lengths.shape
+        (45, 69)
     """
 
-    def __init__(self, grid: FreeGrid, goal: tuple[float, float]) -> None:
+    def __init__(
+        self, grid: FreeGrid, goal: tuple[float, float], longest: float = math.inf
+    ) -> None:
         self.grid = grid
         self.goal = (check_number("goal", goal[0]), check_number("goal", goal[1]))
-        self.values: NDArray[np.float32] = np.full(grid.free.shape, math.inf, dtype=np.float32)
-        """Length of the shortest way [m], infinite where there is none, ``[nx, ny]``."""
-        self.values[grid.free] = grid.distances(self.goal)
+        if not grid.free.any():
+            raise ValueError(f"grid must have a free cell, and {grid.world.name!r} has none")
+        i, j = grid.index(*self.goal)
+        # Moves are measured a little short.
+        reach = min(longest / STEP_SCALE / grid.resolution, max(grid.free.shape))
+        wide = math.ceil(reach) + _MARGIN
+        self.first = max(i - wide, 0), max(j - wide, 0)
+        """Column and row of the grid that the window begins with."""
+        self.window = tuple(
+            slice(first, at + wide + 1) for first, at in zip(self.first, (i, j), strict=True)
+        )
+        free = grid.free[self.window]
+        seeds, gaps = self._around(free, i - self.first[0], j - self.first[1], self.goal)
+        step = grid.resolution * STEP_SCALE
+        self.lengths = ways_from(free, seeds, gaps, MOVES, step, float(longest))
+        """Lengths of the shortest paths [m], infinite where there is none, ``[columns, rows]``."""
 
     @property
     def origin(self) -> tuple[float, float]:
-        """Center of the first cell (x, y) [m]."""
-        return self.grid.origin
+        """Center of the window's first cell (x, y) [m]."""
+        return self.grid.center(*self.first)
 
     @property
     def resolution(self) -> float:
@@ -277,11 +273,11 @@ class DistanceField:
 
     @cached_property
     def filled(self) -> NDArray[np.float32]:
-        """As :attr:`values`; cells without a way have what the nearest cell with one has."""
-        return fill_from_nearest(self.values)
+        """The same in single precision; cells without a path have what the nearest other has."""
+        return fill_from_nearest(self.lengths.astype(np.float32))
 
     def at(self, x: float, y: float) -> float:
-        """Read the length of the way from a position.
+        """Read the length of the path from a position, at the window's edge from outside of it.
 
         Args:
             x: Position [m].
@@ -290,158 +286,59 @@ class DistanceField:
         Returns:
             Length [m], interpolated between the centers of the cells.
         """
-        return interpolate(self.filled, *self.grid.origin, self.grid.resolution, x, y)
+        return interpolate(self.filled, *self.origin, self.resolution, x, y)
 
+    def length_from(self, start: tuple[float, float]) -> float:
+        """Measure the path from a position.
 
-def sample_task_on_grid(
-    place: FreeGrid | World,
-    rng: np.random.Generator,
-    *,
-    distance: float | None = None,
-    min_goal_distance: float = 2.0,
-    max_goal_distance: float = math.inf,
-    detour_chance: float = 0.0,
-    start_clearance: float | None = None,
-    goal_clearance: float | None = None,
-) -> tuple[Task, DistanceField | LocalField]:
-    """Sample a goal, and a start from which there is a way to it, over the cells of a grid.
+        Args:
+            start: Position (x, y) [m].
 
-    It takes milliseconds however many obstacles there are and however rare tasks are, where
-    :func:`~mpfa_envs.sample_task` tries points one by one.
+        Returns:
+            Length [m]; infinite if there is no path in the window.
+        """
+        i, j = (at - first for at, first in zip(self.grid.index(*start), self.first, strict=True))
+        columns, rows = self.lengths.shape
+        if not (0 <= i < columns and 0 <= j < rows):
+            return math.inf
+        cells, gaps = self._around(self.grid.free[self.window], i, j, start)
+        return float((self.lengths[cells[:, 0], cells[:, 1]] + gaps).min(initial=math.inf))
 
-    In the world of a map no way is longer than 20 m, start and goal have the usual clearance, and
-    the field is that of a window around the goal.
+    def _around(
+        self,
+        free: NDArray[np.bool_],
+        i: int,
+        j: int,
+        place: tuple[float, float],
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Cells of the window around a place in cell (i, j), ``[cells, 2]``, and how far they are.
 
-    Args:
-        place: A grid, or a world, of which one is made.
-        rng: Source of randomness.
-        distance: What the way keeps from obstacles [m]; for a world only.
-        min_goal_distance: Least distance between start and goal [m].
-        max_goal_distance: Longest way between them [m].
-        detour_chance: Chance that the task must be a detour, if the world has any: its way is more
-            than 1.08 times the straight line and 0.3 m.
-        start_clearance: What the start keeps from obstacles [m]. None: 0.15 m more than the way,
-            or no more than it where fewer than a tenth of the free cells have that.
-        goal_clearance: The same of the goal.
-
-    Returns:
-        The task, its heading uniform; and the field of its goal.
-
-    Raises:
-        ValueError: If an argument is out of its range, or the world has no such task.
-
-    Examples:
-        >>> import numpy as np
-        >>> from mpfa_envs import WORLDS, sample_task_on_grid
-        >>> rng = np.random.default_rng(0)
-        >>> task, field = sample_task_on_grid(WORLDS["D"], rng, distance=0.25)
-        >>> WORLDS["D"].clearance(*task.goal) >= 0.4, field.at(*task.start[:2]) < 20.0
-        (True, True)
-    """
-    check_positive("min_goal_distance", min_goal_distance)
-    if not max_goal_distance > min_goal_distance:
-        raise ValueError(
-            f"max_goal_distance must be above min_goal_distance = {min_goal_distance}, got "
-            f"{max_goal_distance}"
+        They are those of :meth:`~mpfa_envs.FreeGrid.cells_around`.
+        """
+        x, y = place
+        if free[i, j]:
+            cells = np.concatenate(([[i, j]], _neighbors(free, i, j)))
+        else:
+            cells = np.argwhere(free)
+        gaps = np.hypot(
+            self.grid.xs[cells[:, 0] + self.first[0]] - x,
+            self.grid.ys[cells[:, 1] + self.first[1]] - y,
         )
-    check_share("detour_chance", detour_chance)
-    grid = _as_grid(place, distance)
-    world = grid.world
-    if world.occupancy is not None:
-        return sample_task_in_map(
-            grid,
-            rng,
-            min_goal_distance=min_goal_distance,
-            max_goal_distance=max_goal_distance,
-            detour_chance=detour_chance,
-        )
-    goal_room = _clearance(grid, goal_clearance)
-    start_room = _clearance(grid, start_clearance)
-    columns, rows = grid.cells.T
-    x, y = grid.xs[columns], grid.ys[rows]
-    room = grid.clearance[columns, rows]
-    may_start = (room >= np.float32(start_room)) & _in_regions(world.start_regions, x, y)
-    goals = np.flatnonzero((room >= np.float32(goal_room)) & _in_regions(world.goal_regions, x, y))
-    detour = detour_chance > 0.0 and rng.random() < detour_chance
-    straight: tuple[Task, DistanceField] | None = None
-    for attempt in range(_GOALS if len(goals) and may_start.any() else 0):
-        if straight is not None and attempt >= _DETOURS:
-            break
-        goal_cell = goals[rng.integers(len(goals))]
-        goal = within_cell(grid, rng, x[goal_cell], y[goal_cell], goal_room)
-        direct = np.hypot(x - goal[0], y - goal[1])
-        # Start and goal leave the middle of their cells: by this much they may come nearer.
-        fits = may_start & (direct >= min_goal_distance + grid.resolution)
-        if not fits.any():  # The ways to this goal, which take the time, need not be known.
-            continue
-        field = DistanceField(grid, goal)
-        way = field.values[columns, rows]
-        fits &= np.isfinite(way) & (way <= max_goal_distance - grid.resolution)
-        around = fits & (way > 1.08 * direct + 0.3)
-        wanted = detour and bool(around.any())
-        starts = np.flatnonzero(around if wanted else fits)
-        if not len(starts) or (detour and not wanted and straight is not None):
-            continue
-        cell = starts[rng.integers(len(starts))]
-        start = within_cell(grid, rng, x[cell], y[cell], start_room)
-        task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
-        if wanted or not detour:
-            return task, field
-        straight = task, field
-    if straight is not None:  # Nothing in this world stands in anyone's way.
-        return straight
-    raise ValueError(
-        f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a path of at most {max_goal_distance} m between them "
-        f"that keeps {grid.distance} m"
+        if not free[i, j] and len(cells):
+            nearest = int(gaps.argmin())
+            cells, gaps = cells[nearest : nearest + 1], gaps[nearest : nearest + 1]
+        # A gap of zero would be no edge of a graph.
+        return cells.astype(np.int64), np.maximum(gaps, 1e-12)
+
+
+def _neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:
+    """Cells to which a move leads from a cell, ``[cells, 2]``."""
+    columns, rows = free.shape
+    to = MOVES[:, :2] + (i, j)
+    inside = ((to >= 0) & (to < (columns, rows))).all(axis=1)
+    to, moves = to[inside], MOVES[inside]
+    over, under = moves[:, 2:4] + (i, j), moves[:, 4:6] + (i, j)
+    is_open = (
+        free[to[:, 0], to[:, 1]] & free[over[:, 0], over[:, 1]] & free[under[:, 0], under[:, 1]]
     )
-
-
-def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
-    """Tell whether there is a start and a goal with a path between them.
-
-    It looks for a part of the free cells that hangs together and is wide enough in x or in y.
-
-    Args:
-        grid: The grid.
-        min_goal_distance: Least distance between start and goal [m].
-
-    Returns:
-        Whether :func:`sample_task_on_grid` finds one.
-    """
-    parts, _ = label(grid.free)
-    parts = np.where(grid.clearance >= np.float32(_clearance(grid, None)), parts, 0)
-    steps = min_goal_distance / grid.resolution + 1.0
-    return any(
-        place is not None and max(span.stop - span.start - 1 for span in place) > steps
-        for place in find_objects(parts)
-    )
-
-
-def _as_grid(place: FreeGrid | World, distance: float | None) -> FreeGrid:
-    """The grid that is meant."""
-    if isinstance(place, FreeGrid):
-        if distance is not None:
-            raise ValueError(f"distance must be None for a grid, which has one, got {distance}")
-        return place
-    if distance is None:
-        raise ValueError("distance must be given for a world, got None")
-    return FreeGrid(place, distance=distance)
-
-
-def _clearance(grid: FreeGrid, wanted: float | None) -> float:
-    """The clearance that starts or goals keep [m]."""
-    if wanted is not None:
-        return max(check_positive("clearance", wanted), grid.distance)
-    return usual_clearance(grid)
-
-
-def _in_regions(
-    regions: tuple[Box, ...], x: NDArray[np.float64], y: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Tell which points lie in one of the regions; all do if there are none."""
-    inside = np.full(len(x), not regions)
-    for region in regions:
-        x_min, y_min, x_max, y_max = region.bounds
-        inside |= (x_min <= x) & (x <= x_max) & (y_min <= y) & (y <= y_max)
-    return inside
+    return to[is_open]

@@ -13,6 +13,7 @@ import numpy as np
 
 from mpfa_envs.builtin_worlds import WORLDS, resolve_world
 from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.grid_tasks import LONGEST_PATH
 from mpfa_envs.path import shortest_length
 from mpfa_envs.plain_worlds import fingerprint, world_from_plain, world_to_plain
 from mpfa_envs.tasks import Task, check_task, sample_task
@@ -23,7 +24,6 @@ from mpfa_envs.worlds import World
 if TYPE_CHECKING:
     from mpfa_envs.config import TaskConfig
     from mpfa_envs.distance import DistanceField, FreeGrid
-    from mpfa_envs.local_field import LocalField
     from mpfa_envs.walker_starts import WalkerStarts
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     """Start and goal."""
     shortest_path: float
     """The shortest path to the goal's center [m]."""
-    field: DistanceField | LocalField | None
+    field: DistanceField | None
     """Lengths of the ways to the goal, if the progress is along the shortest path."""
     walkers: WalkerStarts
     """Where the walkers start."""
@@ -72,9 +72,7 @@ _kept_grid_of = lru_cache(maxsize=4)(_grid_of)
 """The same for worlds that stay; a grid takes some megabytes."""
 
 
-def distance_field(
-    world: World, distance: float, goal: tuple[float, float]
-) -> DistanceField | LocalField:
+def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
     """Measure the ways to a goal from everywhere in a world.
 
     Args:
@@ -87,11 +85,8 @@ def distance_field(
     """
     from mpfa_envs.distance import DistanceField
 
-    if world.occupancy is not None:
-        from mpfa_envs.local_field import LocalField
-
-        return LocalField(_kept_grid_of(world, distance), goal)
-    return DistanceField(_kept_grid_of(world, distance), goal)
+    longest = math.inf if world.occupancy is None else LONGEST_PATH
+    return DistanceField(_kept_grid_of(world, distance), goal, longest)
 
 
 @contextmanager
@@ -362,7 +357,7 @@ class EpisodeSource:
 
     def _draw_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
         """Draw an episode over the cells of a grid, in milliseconds however full the world is."""
-        from mpfa_envs.distance import sample_task_on_grid
+        from mpfa_envs.grid_tasks import sample_task_on_grid
 
         config = self._config
         task, field = sample_task_on_grid(

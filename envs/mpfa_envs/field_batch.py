@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.distance import DistanceField
-    from mpfa_envs.local_field import LocalField
 
 
 class FieldArrays(NamedTuple):
@@ -54,7 +53,7 @@ class FieldBatch:
         """What the compiled loops read; setting a larger field may replace the arrays."""
         return self._fields
 
-    def __setitem__(self, robot: int, field: DistanceField | LocalField) -> None:
+    def __setitem__(self, robot: int, field: DistanceField) -> None:
         nx, ny = field.filled.shape
         values = self._fields.values
         if nx > values.shape[1] or ny > values.shape[2]:

@@ -116,7 +116,7 @@ def _sample_cells(
 ) -> Task:
     """Sample a task on a grid, which is quick in any world, and finds the rarest."""
     # Imported here because it needs Numba, which takes half a second, and many worlds do not.
-    from mpfa_envs.distance import sample_task_on_grid
+    from mpfa_envs.grid_tasks import sample_task_on_grid
 
     grid = grid_for(world, collision_distance)
     return sample_task_on_grid(

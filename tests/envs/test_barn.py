@@ -29,7 +29,7 @@ def test_the_task_can_be_solved_with_something_to_spare(index: int) -> None:
     assert math.dist(task.start[:2], task.goal) == 10.0
     assert 9.8 < field.at(*task.start[:2]) < 15.0
     i, j = field.grid.index(*task.start[:2])
-    assert math.isfinite(field.values[i, j])
+    assert math.isfinite(field.lengths[i, j])
 
 
 def test_a_world_is_asked_for_by_its_name_and_driven_in() -> None:

@@ -18,7 +18,8 @@ from mpfa_envs import (
     generate_world,
     sample_task_on_grid,
 )
-from mpfa_envs.distance import has_task, shortest_way
+from mpfa_envs.distance import shortest_way
+from mpfa_envs.grid_tasks import has_task
 
 MIXED = World(
     name="mixed",
@@ -83,7 +84,7 @@ def oracle(grid: FreeGrid, goal: tuple[int, int]) -> dict[tuple[int, int], float
 def test_values_are_the_lengths_of_the_shortest_chains_of_moves(world: World) -> None:
     grid = FreeGrid(world, distance=0.2, resolution=0.15)
     cell = tuple(grid.cells[len(grid.cells) // 3].tolist())
-    values = DistanceField(grid, grid.center(*cell)).values
+    values = DistanceField(grid, grid.center(*cell)).lengths
     found = oracle(grid, cell)
     assert len(found) > 100
     for index in np.ndindex(values.shape):
@@ -115,20 +116,20 @@ def test_a_wall_is_walked_around_and_a_closed_one_is_not() -> None:
     assert field.at(-3.0, 3.0) == pytest.approx(exact, rel=0.03)
     cut = DistanceField(FreeGrid(CUT, distance=0.3), goal)
     i, j = cut.grid.index(-3.0, 3.0)
-    assert cut.values[i, j] == math.inf and math.isfinite(cut.at(-3.0, 3.0))
+    assert cut.lengths[i, j] == math.inf and math.isfinite(cut.at(-3.0, 3.0))
 
 
 def test_cells_without_a_way_take_what_is_nearest() -> None:
     grid = FreeGrid(MIXED, distance=0.2)
     field = DistanceField(grid, (-0.5, 2.0))
-    known = np.argwhere(np.isfinite(field.values))
-    for i, j in np.argwhere(np.isinf(field.values))[::7].tolist():
+    known = np.argwhere(np.isfinite(field.lengths))
+    for i, j in np.argwhere(np.isinf(field.lengths))[::7].tolist():
         gaps = np.hypot(*(known - (i, j)).T)
         # Of several that are nearly as near, it may take any.
         near = known[gaps < gaps.min() + 0.5]
-        assert np.isclose(field.values[near[:, 0], near[:, 1]], field.filled[i, j]).any()
-    finite = np.isfinite(field.values)
-    np.testing.assert_array_equal(field.filled[finite], field.values[finite])
+        assert np.isclose(field.lengths[near[:, 0], near[:, 1]], field.filled[i, j]).any()
+    finite = np.isfinite(field.lengths)
+    np.testing.assert_allclose(field.filled[finite], field.lengths[finite], rtol=1e-6)
 
 
 def test_positions_are_read_bilinearly_one_by_one_or_many_at_once() -> None:
@@ -148,7 +149,7 @@ def test_positions_are_read_bilinearly_one_by_one_or_many_at_once() -> None:
 def test_a_goal_off_the_free_cells_is_reached_from_the_nearest_one() -> None:
     field = DistanceField(FreeGrid(WORLDS["B"], distance=0.25), (0.0, 3.75))
     i, j = field.grid.index(0.0, 3.2)
-    assert field.values[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
+    assert field.lengths[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
     closet = World(name="closet", size=(0.3, 0.3))
     with pytest.raises(ValueError, match="grid must have a free cell, and 'closet' has none"):
         DistanceField(FreeGrid(closet, distance=0.2), (0.0, 0.0))

@@ -65,7 +65,7 @@ def test_a_task_is_found_in_each_of_hundreds_of_worlds(name: str) -> None:
             task, field = sample_task_on_grid(grid, rng, detour_chance=0.8)
             assert math.dist(task.start[:2], task.goal) >= 2.0
             # A way over free cells, and 0.07 m to spare for a robot of 0.18 m.
-            assert math.isfinite(field.values[grid.index(*task.start[:2])]), world.name
+            assert math.isfinite(field.lengths[grid.index(*task.start[:2])]), world.name
             assert min(world.clearance(*task.start[:2]), world.clearance(*task.goal)) > 0.2499
 
 

@@ -6,11 +6,13 @@ import warnings
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.sparse.csgraph import dijkstra
 
 from mpfa_envs import (
     ROBOTS,
     WORLDS,
     Box,
+    DistanceField,
     FreeGrid,
     Lidar,
     NavigationEnv,
@@ -23,7 +25,6 @@ from mpfa_envs import (
 )
 from mpfa_envs.kernels.grid import MOVES, STEP_SCALE
 from mpfa_envs.kernels.ways import ways_from
-from mpfa_envs.local_field import LocalField
 from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
 
 GOOD = {
@@ -332,7 +333,8 @@ def test_cells_in_buckets_find_the_ways_of_dijkstra_to_the_bit():
     around = grid.cells_around((0.3, 0.2))
     seeds = np.array([grid.cells[cell] for cell, _ in around])
     gaps = np.array([gap for _, gap in around])
-    expected = grid.distances((0.3, 0.2))
+    graph = grid.graph_to((0.3, 0.2))
+    expected = dijkstra(graph, indices=[graph.shape[0] - 1])[0, :-1]
     step = grid.resolution * STEP_SCALE
     found = ways_from(grid.free, seeds, gaps, MOVES, step, math.inf)[grid.free]
     np.testing.assert_array_equal(found, expected)
@@ -348,8 +350,8 @@ def test_ways_in_a_map_are_those_among_boxes_in_their_place(scattered):
         start, goal = (grids[0].center(*free[rng.integers(len(free))]) for _ in range(2))
         lengths = [grid.length(start, goal) for grid in grids]
         assert lengths[0] == pytest.approx(lengths[1], abs=1e-9)
-    field = LocalField(grids[0], goal, 2.0)
-    assert field.ways[np.isfinite(field.ways)].max() <= 2.0
+    field = DistanceField(grids[0], goal, 2.0)
+    assert field.lengths[np.isfinite(field.lengths)].max() <= 2.0
     assert field.at(*goal) < 0.1
 
 

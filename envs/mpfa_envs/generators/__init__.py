@@ -17,7 +17,7 @@ import numpy as np
 
 from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.checks import check_count, check_share, did_you_mean
-from mpfa_envs.distance import FreeGrid, has_task, sample_task_on_grid
+from mpfa_envs.distance import FreeGrid
 from mpfa_envs.generators.bars import bars
 from mpfa_envs.generators.clutter import clutter
 from mpfa_envs.generators.crowd import crowd
@@ -26,6 +26,7 @@ from mpfa_envs.generators.halls import halls
 from mpfa_envs.generators.mazes import mazes
 from mpfa_envs.generators.mixed import mixed
 from mpfa_envs.generators.rooms import rooms
+from mpfa_envs.grid_tasks import has_task, sample_task_on_grid
 from mpfa_envs.tasks import Task
 from mpfa_envs.worlds import World
 
