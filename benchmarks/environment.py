@@ -98,7 +98,7 @@ def _physics_share(env: NavigationEnv, steps: int) -> float:
     run = _stepper(env)
     drives = env.robots._batch.drives
     clock = _Clock(drives.move)
-    drives.move = clock  # type: ignore[method-assign]
+    drives.move = clock  # type: ignore[method-assign, assignment]
     start = time.process_time()
     run(steps)
     return clock.spent / (time.process_time() - start)
