@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from mpfa_envs.occupancy import OccupancyGrid
     from mpfa_envs.path import PathPlanner
     from mpfa_envs.planners import PLANNERS, DynamicWindow, MapPlanner, make_planner
-    from mpfa_envs.policy import Policy, PolicyFileError, load_policy, save_policy
+    from mpfa_envs.policy import Policy, PolicyFileError
+    from mpfa_envs.policy_file import load_policy, save_policy
     from mpfa_envs.registration import ENV_IDS, ROOMS_TASK
     from mpfa_envs.render import render_trajectories
     from mpfa_envs.results import EpisodeResult, Interval, spl, summarize
@@ -185,7 +186,7 @@ _MODULES = {
     "generate_world": "generators",
     "generator_tasks": "generators",
     "load_gazebo_world": "gazebo",
-    "load_policy": "policy",
+    "load_policy": "policy_file",
     "load_world": "world_file",
     "make_navigation_env": "torchrl_env",
     "make_planner": "planners",
@@ -196,7 +197,7 @@ _MODULES = {
     "run_tasks": "evaluation",
     "sample_task": "tasks",
     "sample_task_on_grid": "grid_tasks",
-    "save_policy": "policy",
+    "save_policy": "policy_file",
     "save_world": "world_file",
     "spl": "results",
     "split_worlds": "generators",

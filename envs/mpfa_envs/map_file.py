@@ -25,13 +25,15 @@ from PIL import Image
 from mpfa_envs.checks import check_positive
 from mpfa_envs.files import read_file
 from mpfa_envs.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
-from mpfa_envs.worlds import LARGEST_SIDE, World
+from mpfa_envs.shapes import LARGEST_SIDE
 from mpfa_envs.yaml_nodes import NodeReader, WorldFileError, read_nodes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+
+    from mpfa_envs.worlds import World
 
 Mode = Literal["trinary", "scale", "raw"]
 """What shades between the thresholds mean."""
@@ -59,30 +61,28 @@ class _Rule(NamedTuple):
     free: float
 
 
-def load_map(path: str | os.PathLike[str], *, unknown: Unknown = "occupied") -> World:
-    """Read a map of ROS as a world, whose room is what the map knows of.
+def read_map(
+    path: Path, root: yaml.Node | None = None, *, unknown: Unknown = "occupied"
+) -> OccupancyGrid:
+    """Read the cells of a map of ROS, a room of what the map knows of.
 
     What lies around the outermost free cells, and the cells that touch them, is cut off.
 
     Args:
         path: The YAML file; the image's path in it is relative to its folder.
+        root: The nodes of the file, if they have been read already.
         unknown: What cells are of which the map knows nothing.
 
     Returns:
-        The world, called as the file. ``world.occupancy.center`` is where its (0, 0) is on the map.
+        The cells; ``center`` is where the (0, 0) of their world is on the map.
 
     Raises:
         WorldFileError: If a file cannot be read or is no map; the message names the line.
         ValueError: If unknown is neither.
     """
-    path = Path(path)
-    return read_map(path, read_nodes(path), unknown=unknown)
-
-
-def read_map(path: Path, root: yaml.Node | None, *, unknown: Unknown = "occupied") -> World:
-    """Read a map of the nodes of its YAML file; arguments and errors are :func:`load_map`'s."""
     if unknown not in get_args(Unknown):
         raise ValueError(f"unknown must be one of {get_args(Unknown)}, got {unknown!r}")
+    root = read_nodes(path) if root is None else root
     reader = _Reader(path)
     entries = reader.mapping(root, "the file", _KEYS)
     for key in _KEYS[:-1]:
@@ -115,8 +115,7 @@ def read_map(path: Path, root: yaml.Node | None, *, unknown: Unknown = "occupied
     left, right = max(columns[0] - 1, 0), min(columns[-1] + 2, free.shape[1])
     kept = ~free[top:bottom, left:right]
     corner = x + float(left) * resolution, y + float(len(free) - bottom) * resolution
-    grid = OccupancyGrid(np.ascontiguousarray(kept[::-1].T), resolution, corner)
-    return World(name=path.stem, size=grid.size, occupancy=grid)
+    return OccupancyGrid(np.ascontiguousarray(kept[::-1].T), resolution, corner)
 
 
 def _classify(shades: NDArray[np.uint8], rule: _Rule) -> tuple[NDArray[np.bool_], ...]:
@@ -233,9 +232,9 @@ def save_map(
 ) -> None:
     """Write the obstacles of a world as a map for ROS's map_server.
 
-    The cells of a map are written as they are, and :func:`load_map` reads an equal world. Of shapes
-    a cell is occupied if its middle is within half a cell of an obstacle, and walls are one cell
-    thick, so that nothing thin is lost. Walkers and regions are not in a map.
+    The cells of a map are written as they are, and :meth:`~mpfa_envs.World.from_map` reads an equal
+    world. Of shapes a cell is occupied if its middle is within half a cell of an obstacle, and
+    walls are one cell thick, so that nothing thin is lost. Walkers and regions are not in a map.
 
     Args:
         world: The world.

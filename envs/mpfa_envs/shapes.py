@@ -12,6 +12,8 @@ from mpfa_envs.checks import all_finite
 Point = tuple[float, float]
 """A position (x, y) [m]."""
 
+LARGEST_SIDE: Final = 1000.0
+"""No room is wider or deeper than this [m]."""
 MOST_VERTICES: Final = 100
 """No polygon has more vertices: each pair of its edges is looked at."""
 

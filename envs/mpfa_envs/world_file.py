@@ -64,7 +64,8 @@ def load_world(path: str | os.PathLike[str]) -> World:
         # Imported here because most worlds are no maps.
         from mpfa_envs.map_file import read_map
 
-        return read_map(path, root)
+        grid = read_map(path, root)
+        return World(name=path.stem, size=grid.size, occupancy=grid)
     return _Reader(path).world(root)
 
 

@@ -7,13 +7,14 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
 from mpfa_envs.checks import all_finite
 from mpfa_envs.occupancy import OccupancyGrid
-from mpfa_envs.shapes import Box, Cylinder, Polygon, Shape
+from mpfa_envs.shapes import LARGEST_SIDE, Box, Cylinder, Polygon, Shape
 from mpfa_envs.walkers import MOST_WALKERS, Walker
 
 if TYPE_CHECKING:
@@ -24,10 +25,8 @@ if TYPE_CHECKING:
 
     from mpfa_envs.shapes import Point
 
-__all__ = ["LARGEST_SIDE", "MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
+__all__ = ["MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
 
-LARGEST_SIDE: Final = 1000.0
-"""No room is wider or deeper than this [m]."""
 MOST_OBSTACLES: Final = 1000
 """No room has more obstacles."""
 _APART: Final = 0.05
@@ -157,21 +156,28 @@ class World:
     def from_map(
         path: str | os.PathLike[str], *, unknown: Literal["occupied", "free"] = "occupied"
     ) -> World:
-        """Read a map of ROS, as :func:`~mpfa_envs.map_file.load_map` does.
+        """Read a map of ROS as a world, whose room is what the map knows of.
+
+        What lies around the outermost free cells, and the cells that touch them, is cut off.
 
         Args:
-            path: The YAML file; it names the image.
+            path: The YAML file; the image's path in it is relative to its folder.
             unknown: What cells are of which the map knows nothing.
 
         Returns:
-            The world, called as the file.
+            The world, called as the file. ``world.occupancy.center`` is where its (0, 0) is on the
+            map.
 
         Raises:
-            WorldFileError: If a file cannot be read or is no map.
+            WorldFileError: If a file cannot be read or is no map; the message names the line.
+            ValueError: If unknown is neither.
         """
-        from mpfa_envs.map_file import load_map
+        # Imported here because it needs Pillow and PyYAML, and most worlds come from elsewhere.
+        from mpfa_envs.map_file import read_map
 
-        return load_map(path, unknown=unknown)
+        path = Path(path)
+        grid = read_map(path, unknown=unknown)
+        return World(name=path.stem, size=grid.size, occupancy=grid)
 
     def to_map(self, path: str | os.PathLike[str], *, resolution: float | None = None) -> None:
         """Write a map for ROS, as :func:`~mpfa_envs.map_file.save_map` does.
