@@ -30,7 +30,7 @@ from mpfa_envs import (
     render_trajectories,
 )
 from mpfa_envs.render import tiled
-from mpfa_envs.simulation import Simulation
+from mpfa_envs.robots.simulation import Simulation
 
 ROUNDS = 5
 PAIRS = 200

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs import FreeGrid, Lidar, OccupancyGrid, Task, World, sample_task_on_grid
-from mpfa_envs.kernels.clearance import clearance_at
-from mpfa_envs.kernels.lidar import cast_rays
-from mpfa_envs.path import shortest_length
-from mpfa_envs.world_batch import BatchArrays, WorldBatch
+from mpfa_envs.paths.planner import shortest_length
+from mpfa_envs.sensing.lidar_loops import cast_rays
+from mpfa_envs.worlds.batch import BatchArrays, WorldBatch
+from mpfa_envs.worlds.clearance_loops import clearance_at
 
 SIDE, ROOM, CELL = 2000, 160, 0.05
 ROBOTS = 4

@@ -24,8 +24,8 @@ from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 from mpfa_envs import NavigationEnv, Policy, WorldTask, load_policy
-from mpfa_envs.render import render_scene
-from mpfa_envs.render.window import Window
+from mpfa_envs.scene.scene import render_scene
+from mpfa_envs.scene.window import Window
 from navigation.evaluating import tasks_of
 from navigation.worlds import parse_worlds
 

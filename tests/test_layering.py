@@ -67,7 +67,7 @@ def test_the_navigation_task_does_not_know_the_replay_parts():
 def test_only_the_simulation_imports_pybullet():
     users = importers(EVERYTHING, {"pybullet", "pybullet_utils"})
     assert {user for user in users if not user.startswith("tests/")} == {
-        "envs/mpfa_envs/simulation.py"
+        "envs/mpfa_envs/robots/simulation.py"
     }
 
 

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 from mpfa_envs.later import after_import
 
 if TYPE_CHECKING:
-    from mpfa_envs.barn import BARN_WORLDS, barn_task, barn_world
-    from mpfa_envs.binning import Binning
-    from mpfa_envs.builtin_worlds import WORLDS
-    from mpfa_envs.config import PAPER_TASK, TaskConfig
-    from mpfa_envs.discrete import WHEEL_PAIRS, DiscreteWheels
-    from mpfa_envs.distance import DistanceField, FreeGrid
-    from mpfa_envs.evaluation import Driver, evaluate, run_tasks
-    from mpfa_envs.export import export_policy
-    from mpfa_envs.gazebo import load_gazebo_world
+    from mpfa_envs.env.config import PAPER_TASK, TaskConfig
+    from mpfa_envs.env.navigation import NavigationEnv
+    from mpfa_envs.env.registration import ENV_IDS, ROOMS_TASK
+    from mpfa_envs.env.torchrl_env import NavigationTorchEnv, make_navigation_env
+    from mpfa_envs.env.vector import VectorNavigationEnv
+    from mpfa_envs.evaluation.results import EpisodeResult, Interval, spl, summarize
+    from mpfa_envs.evaluation.runs import Driver, evaluate, run_tasks
     from mpfa_envs.generators import (
         GENERATORS,
         generate_world,
@@ -27,32 +25,35 @@ if TYPE_CHECKING:
         split_worlds,
         world_seed,
     )
-    from mpfa_envs.grid_tasks import sample_task_on_grid
-    from mpfa_envs.lidar import Lidar
-    from mpfa_envs.map_memory import MapMemory
-    from mpfa_envs.mirror import Mirror, RandomMirror
-    from mpfa_envs.navigation import NavigationEnv
-    from mpfa_envs.noise import RobotNoise
-    from mpfa_envs.observation import INFO_TYPES, OBSERVATION, observation_slices
-    from mpfa_envs.occupancy import OccupancyGrid
-    from mpfa_envs.path import PathPlanner
+    from mpfa_envs.paths.distance import DistanceField, FreeGrid
+    from mpfa_envs.paths.planner import PathPlanner
+    from mpfa_envs.paths.tasks import sample_task_on_grid
     from mpfa_envs.planners import PLANNERS, DynamicWindow, MapPlanner, make_planner
-    from mpfa_envs.policy import Policy, PolicyFileError
-    from mpfa_envs.policy_file import load_policy, save_policy
-    from mpfa_envs.registration import ENV_IDS, ROOMS_TASK
+    from mpfa_envs.policies.export import export_policy
+    from mpfa_envs.policies.files import load_policy, save_policy
+    from mpfa_envs.policies.policy import Policy, PolicyFileError
     from mpfa_envs.render import render_trajectories
-    from mpfa_envs.results import EpisodeResult, Interval, spl, summarize
-    from mpfa_envs.reward import RewardTerms, StepOutcome, navigation_reward
-    from mpfa_envs.robot import ROBOTS, RobotModel
-    from mpfa_envs.shapes import Box, Cylinder, Polygon
-    from mpfa_envs.task_sets import WorldTask, world_tasks
-    from mpfa_envs.tasks import Task, evaluation_pairs, sample_task
-    from mpfa_envs.torchrl_env import NavigationTorchEnv, make_navigation_env
-    from mpfa_envs.vector import VectorNavigationEnv
-    from mpfa_envs.walkers import Walker
-    from mpfa_envs.world_file import load_world, save_world
-    from mpfa_envs.worlds import World, WorldArrays
-    from mpfa_envs.yaml_nodes import WorldFileError
+    from mpfa_envs.robots.discrete import WHEEL_PAIRS, DiscreteWheels
+    from mpfa_envs.robots.model import ROBOTS, RobotModel
+    from mpfa_envs.robots.noise import RobotNoise
+    from mpfa_envs.sensing.binning import Binning
+    from mpfa_envs.sensing.lidar import Lidar
+    from mpfa_envs.sensing.map_memory import MapMemory
+    from mpfa_envs.sensing.mirror import Mirror, RandomMirror
+    from mpfa_envs.sensing.observation import INFO_TYPES, OBSERVATION, observation_slices
+    from mpfa_envs.tasks.reward import RewardTerms, StepOutcome, navigation_reward
+    from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
+    from mpfa_envs.tasks.sets import WorldTask, world_tasks
+    from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world
+    from mpfa_envs.worlds.builtin import WORLDS
+    from mpfa_envs.worlds.gazebo import load_gazebo_world
+    from mpfa_envs.worlds.occupancy import OccupancyGrid
+    from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
+    from mpfa_envs.worlds.task import Task
+    from mpfa_envs.worlds.walker import Walker
+    from mpfa_envs.worlds.world import World, WorldArrays
+    from mpfa_envs.worlds.world_file import load_world, save_world
+    from mpfa_envs.worlds.yaml_nodes import WorldFileError
 
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start your own from."""
@@ -133,77 +134,77 @@ __all__ = [
 ]
 
 _MODULES = {
-    "BARN_WORLDS": "barn",
-    "ENV_IDS": "registration",
+    "BARN_WORLDS": "worlds.barn",
+    "ENV_IDS": "env.registration",
     "GENERATORS": "generators",
-    "INFO_TYPES": "observation",
-    "OBSERVATION": "observation",
-    "PAPER_TASK": "config",
+    "INFO_TYPES": "sensing.observation",
+    "OBSERVATION": "sensing.observation",
+    "PAPER_TASK": "env.config",
     "PLANNERS": "planners",
-    "ROBOTS": "robot",
-    "ROOMS_TASK": "registration",
-    "WHEEL_PAIRS": "discrete",
-    "WORLDS": "builtin_worlds",
-    "Binning": "binning",
-    "Box": "shapes",
-    "Cylinder": "shapes",
-    "DiscreteWheels": "discrete",
-    "DistanceField": "distance",
-    "Driver": "evaluation",
+    "ROBOTS": "robots.model",
+    "ROOMS_TASK": "env.registration",
+    "WHEEL_PAIRS": "robots.discrete",
+    "WORLDS": "worlds.builtin",
+    "Binning": "sensing.binning",
+    "Box": "worlds.shapes",
+    "Cylinder": "worlds.shapes",
+    "DiscreteWheels": "robots.discrete",
+    "DistanceField": "paths.distance",
+    "Driver": "evaluation.runs",
     "DynamicWindow": "planners",
-    "EpisodeResult": "results",
-    "FreeGrid": "distance",
-    "Interval": "results",
-    "Lidar": "lidar",
-    "MapMemory": "map_memory",
+    "EpisodeResult": "evaluation.results",
+    "FreeGrid": "paths.distance",
+    "Interval": "evaluation.results",
+    "Lidar": "sensing.lidar",
+    "MapMemory": "sensing.map_memory",
     "MapPlanner": "planners",
-    "Mirror": "mirror",
-    "NavigationEnv": "navigation",
-    "NavigationTorchEnv": "torchrl_env",
-    "OccupancyGrid": "occupancy",
-    "PathPlanner": "path",
-    "Policy": "policy",
-    "PolicyFileError": "policy",
-    "Polygon": "shapes",
-    "RandomMirror": "mirror",
-    "RewardTerms": "reward",
-    "RobotModel": "robot",
-    "RobotNoise": "noise",
-    "StepOutcome": "reward",
-    "Task": "tasks",
-    "TaskConfig": "config",
-    "VectorNavigationEnv": "vector",
-    "Walker": "walkers",
-    "World": "worlds",
-    "WorldArrays": "worlds",
-    "WorldFileError": "yaml_nodes",
-    "WorldTask": "task_sets",
-    "barn_task": "barn",
-    "barn_world": "barn",
-    "evaluate": "evaluation",
-    "evaluation_pairs": "tasks",
-    "export_policy": "export",
+    "Mirror": "sensing.mirror",
+    "NavigationEnv": "env.navigation",
+    "NavigationTorchEnv": "env.torchrl_env",
+    "OccupancyGrid": "worlds.occupancy",
+    "PathPlanner": "paths.planner",
+    "Policy": "policies.policy",
+    "PolicyFileError": "policies.policy",
+    "Polygon": "worlds.shapes",
+    "RandomMirror": "sensing.mirror",
+    "RewardTerms": "tasks.reward",
+    "RobotModel": "robots.model",
+    "RobotNoise": "robots.noise",
+    "StepOutcome": "tasks.reward",
+    "Task": "worlds.task",
+    "TaskConfig": "env.config",
+    "VectorNavigationEnv": "env.vector",
+    "Walker": "worlds.walker",
+    "World": "worlds.world",
+    "WorldArrays": "worlds.world",
+    "WorldFileError": "worlds.yaml_nodes",
+    "WorldTask": "tasks.sets",
+    "barn_task": "worlds.barn",
+    "barn_world": "worlds.barn",
+    "evaluate": "evaluation.runs",
+    "evaluation_pairs": "tasks.sampling",
+    "export_policy": "policies.export",
     "generate_world": "generators",
     "generator_tasks": "generators",
-    "load_gazebo_world": "gazebo",
-    "load_policy": "policy_file",
-    "load_world": "world_file",
-    "make_navigation_env": "torchrl_env",
+    "load_gazebo_world": "worlds.gazebo",
+    "load_policy": "policies.files",
+    "load_world": "worlds.world_file",
+    "make_navigation_env": "env.torchrl_env",
     "make_planner": "planners",
-    "navigation_reward": "reward",
-    "observation_slices": "observation",
+    "navigation_reward": "tasks.reward",
+    "observation_slices": "sensing.observation",
     "register_generator": "generators",
     "render_trajectories": "render",
-    "run_tasks": "evaluation",
-    "sample_task": "tasks",
-    "sample_task_on_grid": "grid_tasks",
-    "save_policy": "policy_file",
-    "save_world": "world_file",
-    "spl": "results",
+    "run_tasks": "evaluation.runs",
+    "sample_task": "tasks.sampling",
+    "sample_task_on_grid": "paths.tasks",
+    "save_policy": "policies.files",
+    "save_world": "worlds.world_file",
+    "spl": "evaluation.results",
     "split_worlds": "generators",
-    "summarize": "results",
+    "summarize": "evaluation.results",
     "world_seed": "generators",
-    "world_tasks": "task_sets",
+    "world_tasks": "tasks.sets",
 }
 """Where each name is. A module is imported when a name of it is first asked for: a robot that runs
 :mod:`mpfa_envs.deploy` has neither gymnasium nor torch, and Numba takes half a second."""
@@ -230,4 +231,4 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-after_import("gymnasium", "mpfa_envs.registration")
+after_import("gymnasium", "mpfa_envs.env.registration")

@@ -10,7 +10,7 @@ from typing import Any
 from torchrl.envs import EnvBase, TransformedEnv
 
 from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
-from mpfa_envs.robot import resolve_robot
+from mpfa_envs.robots.model import resolve_robot
 from navigation.settings.environment import EnvironmentSettings
 
 _AHEAD, _SECTOR = 180.0, 10.0
@@ -29,7 +29,7 @@ def check_physics(physics: str) -> None:
     """
     if physics == "wheels":
         try:
-            import_module("mpfa_envs.simulation")
+            import_module("mpfa_envs.robots.simulation")
         except ImportError as error:
             raise ValueError(str(error)) from error
 

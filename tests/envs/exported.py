@@ -9,8 +9,8 @@ import numpy as np
 
 from mpfa_envs import Policy, export_policy
 from mpfa_envs.deploy import Card
-from mpfa_envs.layers import LayerNorm, Linear, ReLU, Tanh
-from mpfa_envs.robot import ROBOTS
+from mpfa_envs.policies.layers import LayerNorm, Linear, ReLU, Tanh
+from mpfa_envs.robots.model import ROBOTS
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "td3-mpfa_per.npz"
 ENV_ARGUMENTS = {"robot": "turtlebot2", "physics": "kinematic", "closeness_distance": 0.23}

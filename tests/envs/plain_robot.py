@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mpfa_envs import Lidar, Polygon, Task, World
-from mpfa_envs.config import TaskConfig
+from mpfa_envs.env.config import TaskConfig
 
 
 class PlainRobot:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import BARN_WORLDS, DistanceField, FreeGrid, NavigationEnv, barn_task, barn_world
-from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.generators.resolve import resolve_world
 
 
 def test_there_are_twenty_worlds_from_open_to_narrow() -> None:

@@ -23,7 +23,7 @@ from mpfa_envs import (
     split_worlds,
     world_tasks,
 )
-from mpfa_envs.layers import Linear
+from mpfa_envs.policies.layers import Linear
 
 MANY = 2**31
 

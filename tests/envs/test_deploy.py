@@ -17,7 +17,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 import mpfa_envs
 from mpfa_envs import NavigationEnv, RobotModel
 from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
-from mpfa_envs.observation import observation_slices
+from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.exported import card, exported
 
 Recorded = tuple[Scan, tuple[float, float, float], tuple[float, float]]

@@ -24,8 +24,8 @@ from mpfa_envs import (
     observation_slices,
     save_policy,
 )
-from mpfa_envs.discrete import mirrored_places
-from mpfa_envs.layers import Choice, Linear, Table
+from mpfa_envs.policies.layers import Choice, Linear, Table
+from mpfa_envs.robots.discrete import mirrored_places
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])

@@ -18,8 +18,8 @@ from mpfa_envs import (
     generate_world,
     sample_task_on_grid,
 )
-from mpfa_envs.distance import shortest_way
-from mpfa_envs.grid_tasks import has_task
+from mpfa_envs.paths.distance import shortest_way
+from mpfa_envs.paths.tasks import has_task
 
 MIXED = World(
     name="mixed",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Box, NavigationEnv, Task, VectorNavigationEnv, World
-from mpfa_envs.plain_worlds import world_to_plain
+from mpfa_envs.worlds.plain import world_to_plain
 
 
 def test_the_seed_of_a_reset_is_that_of_the_robots_that_it_starts() -> None:

@@ -23,9 +23,9 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
-from mpfa_envs.layers import Linear, Tanh
-from mpfa_envs.results import bootstrap, wilson
-from mpfa_envs.robot import resolve_robot
+from mpfa_envs.evaluation.results import bootstrap, wilson
+from mpfa_envs.policies.layers import Linear, Tanh
+from mpfa_envs.robots.model import resolve_robot
 
 POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.npz"))
 

@@ -21,9 +21,9 @@ from mpfa_envs import (
     load_policy,
     save_policy,
 )
-from mpfa_envs.binning import Binning
 from mpfa_envs.deploy import CardError, Pilot
-from mpfa_envs.layers import Choice, Linear, ReLU, Scale, Table, Tanh
+from mpfa_envs.policies.layers import Choice, Linear, ReLU, Scale, Table, Tanh
+from mpfa_envs.sensing.binning import Binning
 from tests.envs.exported import ENV_ARGUMENTS, SHIPPED, exported, make_policy
 
 

@@ -23,7 +23,7 @@ from mpfa_envs import (
     save_world,
 )
 from mpfa_envs.deploy.card import CardError, read_exported
-from mpfa_envs.layers import Linear
+from mpfa_envs.policies.layers import Linear
 
 POLICY = Policy([Linear(np.ones((2, 24), np.float32), np.zeros(2, np.float32))])
 TEXT = "root:x:0:0:root:/root:/bin/bash\n"

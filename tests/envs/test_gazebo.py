@@ -14,7 +14,7 @@ from mpfa_envs import (
     barn_world,
     load_gazebo_world,
 )
-from mpfa_envs.builtin_worlds import resolve_world
+from mpfa_envs.generators.resolve import resolve_world
 
 BARN_CENTER = (-2.25, 7.0)
 SPECK = "<box><size>1e-200 1e-200 1</size></box>"

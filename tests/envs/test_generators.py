@@ -30,8 +30,8 @@ from mpfa_envs import (
     split_worlds,
     world_seed,
 )
-from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.plain_worlds import walker_to_plain
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.worlds.plain import walker_to_plain
 
 NAMES = list(GENERATORS)
 PINNED = {

@@ -13,10 +13,10 @@ import pytest
 
 import mpfa_envs
 from mpfa_envs import ROBOTS, WORLDS, Box, Lidar, TaskConfig, World
-from mpfa_envs.drives import KinematicDrives
-from mpfa_envs.kernels import njit
-from mpfa_envs.kernels.clearance import clearance_at
-from mpfa_envs.world_batch import WorldBatch
+from mpfa_envs.compiled import njit
+from mpfa_envs.robots.drives import KinematicDrives
+from mpfa_envs.worlds.batch import WorldBatch
+from mpfa_envs.worlds.clearance_loops import clearance_at
 from tests.envs.plain_robot import drive_arc, scan
 from tests.envs.shapes import random_shapes
 
@@ -132,7 +132,7 @@ def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
         "        raise RuntimeError('cannot cache function: no locator available')\n"
         "    return real(*args, **kwargs)\n"
         "numba.njit = refuse\n"
-        "from mpfa_envs.kernels import njit\n"
+        "from mpfa_envs.compiled import njit\n"
         "print(njit(lambda x: 2.0 * x)(3.0))\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(root)}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import EXAMPLE_WORLD, WORLDS, Box, Cylinder, Lidar, World, generate_world, load_world
-from mpfa_envs.simulation import Simulation
+from mpfa_envs.robots.simulation import Simulation
 
 
 def test_the_rays_go_from_left_to_right_over_the_front() -> None:

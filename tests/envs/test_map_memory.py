@@ -19,9 +19,9 @@ from mpfa_envs import (
     generate_world,
     observation_slices,
 )
-from mpfa_envs.map_memory import RESOLUTION
-from mpfa_envs.render.colors import WAY
-from mpfa_envs.robot import ROBOTS
+from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.scene.colors import WAY
+from mpfa_envs.sensing.map_memory import RESOLUTION
 from tests.envs.shapes import random_shapes
 
 ROBOT = ROBOTS["turtlebot2"]

@@ -23,9 +23,9 @@ from mpfa_envs import (
     load_world,
     save_world,
 )
-from mpfa_envs.kernels.grid import MOVES, STEP_SCALE
-from mpfa_envs.kernels.ways import ways_from
-from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs.paths.field_loops import ways_from
+from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
+from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 
 GOOD = {
     "image": "map.pgm",

@@ -428,7 +428,7 @@ def test_an_episode_goes_on_where_the_next_one_has_no_place_for_a_walker(
         raise ValueError(f"world {world.name!r} has no place")
 
     with monkeypatch.context() as patch, pytest.raises(ValueError, match="'A' has no place"):
-        patch.setattr("mpfa_envs.episodes.start_walkers", refuse)
+        patch.setattr("mpfa_envs.env.episodes.start_walkers", refuse)
         env.reset(seed=seed)
     assert (env.task, env.np_random_seed) == (twin.task, 0)
     np.testing.assert_array_equal(env.step([1.0, 0.5])[0], twin.step([1.0, 0.5])[0])

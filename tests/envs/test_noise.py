@@ -15,7 +15,7 @@ from mpfa_envs import (
     Task,
     VectorNavigationEnv,
 )
-from mpfa_envs.noise import NoisyMotion
+from mpfa_envs.robots.noise import NoisyMotion
 
 ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
 AHEAD = Task((-4.0, 0.0, 0.0), (4.0, 0.0))

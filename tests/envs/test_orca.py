@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Box, Cylinder, Polygon, Walker, World
-from mpfa_envs.orca import OrcaRoom, _outlines
-from mpfa_envs.walker_batch import WalkerBatch
-from mpfa_envs.walker_starts import start_walkers
-from mpfa_envs.world_batch import WorldBatch
+from mpfa_envs.walkers.batch import WalkerBatch
+from mpfa_envs.walkers.orca import OrcaRoom, _outlines
+from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.worlds.batch import WorldBatch
 
 pytest.importorskip("pyrvo", reason="an extra")
 AVOIDER = Walker(behavior="orca", waypoints=((-3.0, 1.5), (3.0, 1.5)), speed=1.0)

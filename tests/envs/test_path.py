@@ -20,8 +20,8 @@ from mpfa_envs import (
     evaluation_pairs,
     generate_world,
 )
-from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.path import is_small, shortest_length
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.planner import is_small, shortest_length
 
 BLOCK = World(name="block", boxes=(Box(-1.0, -2.0, 1.0, 2.0),))
 
@@ -145,7 +145,7 @@ def test_a_grid_measures_what_the_planner_finds(name: str, monkeypatch: pytest.M
     ends = [(task.start[:2], task.goal) for task in tasks]
     exact = [shortest_length(world, 0.18, *pair) for pair in ends]
     assert exact == [PathPlanner(world, radius=0.18).length(*pair) for pair in ends]
-    monkeypatch.setattr("mpfa_envs.path.is_small", lambda world: False)
+    monkeypatch.setattr("mpfa_envs.paths.planner.is_small", lambda world: False)
     on_grid = [shortest_length(world, 0.18, *pair) for pair in ends]
     assert on_grid == pytest.approx(exact, rel=0.025)
     assert on_grid != exact

@@ -23,8 +23,8 @@ from mpfa_envs import (
     run_tasks,
     world_tasks,
 )
-from mpfa_envs.builtin_worlds import resolve_world
-from mpfa_envs.evaluation import as_driver
+from mpfa_envs.evaluation.runs import as_driver
+from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.planners import (
     AntColony,
     PurePursuit,
@@ -33,7 +33,7 @@ from mpfa_envs.planners import (
     dijkstra_path,
     path_length,
 )
-from mpfa_envs.robot import ROBOTS
+from mpfa_envs.robots.model import ROBOTS
 
 SEARCHES = {"astar": astar_path, "dijkstra": dijkstra_path}
 # A wall from side to side: nothing gets through.
@@ -260,7 +260,9 @@ def test_a_planner_plans_in_the_world_that_it_is_in() -> None:
 
 def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = itertools.count()
-    monkeypatch.setattr("mpfa_envs.evaluation.time", SimpleNamespace(perf_counter=ticks.__next__))
+    monkeypatch.setattr(
+        "mpfa_envs.evaluation.runs.time", SimpleNamespace(perf_counter=ticks.__next__)
+    )
     results = run_tasks(
         as_driver(lambda seen: np.ones((len(seen), 2))),
         world_tasks("A", episodes=4),

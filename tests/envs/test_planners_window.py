@@ -18,7 +18,7 @@ from mpfa_envs import (
     observation_slices,
 )
 from mpfa_envs.planners import WindowScore
-from mpfa_envs.robot import ROBOTS
+from mpfa_envs.robots.model import ROBOTS
 
 TURTLEBOT = ROBOTS["turtlebot2"]
 PARTS = observation_slices()

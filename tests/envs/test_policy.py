@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from mpfa_envs import Policy, PolicyFileError, load_policy, save_policy
-from mpfa_envs.layers import Linear
+from mpfa_envs.policies.layers import Linear
 
 ENV_ARGUMENTS = {"robot": "turtlebot2", "physics": "kinematic", "action_repeat": 2}
 
@@ -190,7 +190,7 @@ def test_a_foreign_file_is_refused_with_the_reason(
 def test_a_file_that_unpacks_to_much_is_refused_unread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mpfa_envs.policy_file._LARGEST", 1000)
+    monkeypatch.setattr("mpfa_envs.policies.files._LARGEST", 1000)
     file = tmp_path / "large.npz"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("about.npy", b"\0" * 1001)

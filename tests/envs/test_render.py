@@ -16,13 +16,13 @@ from mpfa_envs.render import (
     TRAIL,
     WALL,
     render_methods,
-    render_scene,
     shown_episodes,
     tiled,
     viridis,
     write_animation,
 )
-from mpfa_envs.robot import ROBOTS
+from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.scene.scene import render_scene
 from tests.envs.paper import paper_env
 
 

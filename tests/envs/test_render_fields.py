@@ -16,9 +16,9 @@ from mpfa_envs.render import (
     samples,
     viridis,
 )
-from mpfa_envs.render.colors import LINES
 from mpfa_envs.render.values import way_of
-from mpfa_envs.robot import ROBOTS
+from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.scene.colors import LINES
 from tests.envs.test_render import pixel
 
 GOAL = (3.0, 3.0)

@@ -8,8 +8,8 @@ import pybullet
 import pytest
 
 from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, RobotModel, World
-from mpfa_envs.drives import WheelDrives
-from mpfa_envs.simulation import Simulation
+from mpfa_envs.robots.drives import WheelDrives
+from mpfa_envs.robots.simulation import Simulation
 
 
 class Wheels:

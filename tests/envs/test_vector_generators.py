@@ -19,8 +19,8 @@ from mpfa_envs import (
     VectorNavigationEnv,
     World,
 )
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.generators import generate_world
+from mpfa_envs.generators.resolve import resolve_world
 
 GENERATOR_IDS = [each for each in ENV_IDS if each.split("-")[1] not in WORLDS]
 

@@ -22,7 +22,7 @@ from mpfa_envs import (
     World,
     navigation_reward,
 )
-from mpfa_envs.plain_worlds import fingerprint, world_from_plain, world_to_plain
+from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
 from tests.envs.shapes import random_shapes
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mpfa_envs import Walker, World, load_world, save_world
-from mpfa_envs.plain_worlds import world_from_plain, world_to_plain
+from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 from tests.envs.test_walkers import BUSY, ROUND, STANDING
 
 

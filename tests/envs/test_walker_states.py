@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mpfa_envs import Lidar, Walker, World
-from mpfa_envs.walker_batch import WalkerBatch
-from mpfa_envs.walker_starts import start_walkers
-from mpfa_envs.world_batch import WorldBatch
+from mpfa_envs.walkers.batch import WalkerBatch
+from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.worlds.batch import WorldBatch
 
 HALL = World(name="hall", size=(40.0, 40.0), walkers=(Walker(speed=1.0),))
 

@@ -24,12 +24,12 @@ from mpfa_envs import (
     evaluate,
     summarize,
 )
-from mpfa_envs.kernels.walkers import time_to_collision
-from mpfa_envs.render.colors import WALKER
-from mpfa_envs.robot import ROBOTS
-from mpfa_envs.walker_batch import WalkerBatch
-from mpfa_envs.walker_starts import start_walkers
-from mpfa_envs.world_batch import WorldBatch
+from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.scene.colors import WALKER
+from mpfa_envs.walkers.batch import WalkerBatch
+from mpfa_envs.walkers.loops import time_to_collision
+from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.worlds.batch import WorldBatch
 
 ROUND = ((-3.0, 0.5), (3.0, 0.5), (3.0, -3.0))
 BUSY = World(

@@ -15,7 +15,7 @@ from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils.play import PlayableGame
 
 from mpfa_envs import NavigationEnv, VectorNavigationEnv
-from mpfa_envs.render.window import Window
+from mpfa_envs.scene.window import Window
 
 pygame = pytest.importorskip("pygame")
 
@@ -136,7 +136,7 @@ def test_gymnasium_can_play_it_by_keyboard() -> None:
 def test_triton_can_be_imported_after_a_window_was_opened() -> None:
     pytest.importorskip("triton")
     code = (
-        "import numpy as np; from mpfa_envs.render.window import Window\n"
+        "import numpy as np; from mpfa_envs.scene.window import Window\n"
         "window = Window('test', fps=30); window.show(np.zeros((9, 9, 3), np.uint8)); import triton"
     )
     # Where there is neither screen nor setting, SDL picks a driver that renders in software.

@@ -20,7 +20,7 @@ from mpfa_envs import (
     evaluation_pairs,
     sample_task,
 )
-from mpfa_envs.path import planner_for
+from mpfa_envs.paths.planner import planner_for
 
 
 def test_clearance_is_the_distance_to_the_nearest_face() -> None:

@@ -12,8 +12,8 @@ import pytest
 import evaluate
 import play
 from mpfa_envs import Policy, world_tasks
-from mpfa_envs.layers import Linear
-from mpfa_envs.render.colors import RIVAL, ROBOT
+from mpfa_envs.policies.layers import Linear
+from mpfa_envs.scene.colors import RIVAL, ROBOT
 from navigation.live import watch
 
 pygame = pytest.importorskip("pygame")

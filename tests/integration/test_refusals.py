@@ -154,7 +154,7 @@ def test_without_pybullet_simulated_wheels_are_refused_before_anything_has_begun
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)  # As where it is not installed.
-    monkeypatch.delitem(sys.modules, "mpfa_envs.simulation", raising=False)
+    monkeypatch.delitem(sys.modules, "mpfa_envs.robots.simulation", raising=False)
     monkeypatch.setattr(sys, "argv", [f"{main.__module__}.py", *line.split()])
     before = sorted(folder.rglob("*"))
     assert status_of(main, line.split()) == 2

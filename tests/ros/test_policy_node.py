@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import Policy, export_policy
-from mpfa_envs.layers import Linear
+from mpfa_envs.policies.layers import Linear
 from tests.envs.exported import ENV_ARGUMENTS
 from tests.ros.fake_rclpy import World, install
 

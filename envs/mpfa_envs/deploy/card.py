@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mpfa_envs.checks import check_count, check_number, check_positive
 from mpfa_envs.files import read_file
-from mpfa_envs.observation import (
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.sensing.observation import (
     DISTANCE_SCALE,
     GOAL_CLOSENESS_DISTANCE,
     SPEED_BOUND,
     WAY_BOUND,
     observation_slices,
 )
-from mpfa_envs.robot import RobotModel
 
 if TYPE_CHECKING:
     import os

@@ -11,8 +11,8 @@ from mpfa_envs.checks import check_positive, check_share
 from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
-from mpfa_envs.kernels.observation import observe_all
-from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.sensing.observation_loops import observe_all
 
 if TYPE_CHECKING:
     import os

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.deploy.sectors import Points
-from mpfa_envs.kernels.route import UNKNOWN
-from mpfa_envs.map_memory import MapMemory
+from mpfa_envs.sensing.map_loops import UNKNOWN
+from mpfa_envs.sensing.map_memory import MapMemory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,9 +15,7 @@ from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from mpfa_envs.builtin_worlds import WORLDS
 from mpfa_envs.checks import check_count, check_share, did_you_mean
-from mpfa_envs.distance import FreeGrid
 from mpfa_envs.generators.bars import bars
 from mpfa_envs.generators.clutter import clutter
 from mpfa_envs.generators.crowd import crowd
@@ -26,9 +24,11 @@ from mpfa_envs.generators.halls import halls
 from mpfa_envs.generators.mazes import mazes
 from mpfa_envs.generators.mixed import mixed
 from mpfa_envs.generators.rooms import rooms
-from mpfa_envs.grid_tasks import has_task, sample_task_on_grid
-from mpfa_envs.tasks import Task
-from mpfa_envs.worlds import World
+from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.paths.tasks import has_task, sample_task_on_grid
+from mpfa_envs.worlds.builtin import WORLDS
+from mpfa_envs.worlds.task import Task
+from mpfa_envs.worlds.world import World
 
 Generator: TypeAlias = Callable[[random.Random, float], World]
 """Samples a world of a difficulty in [0, 1]."""
@@ -128,7 +128,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
     Returns:
         The world, in which there is a task for a TurtleBot2 with 0.07 m to spare. It is called
         ``"bars-7"``, ``"bars-test-7"`` or, with a difficulty, ``"bars-7@0.5"``, which
-        :func:`~mpfa_envs.builtin_worlds.resolve_world` understands.
+        :func:`~mpfa_envs.worlds.builtin.resolve_world` understands.
 
     Raises:
         TypeError: If a generator of your own gives something else.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from mpfa_envs.generators.placing import between, cut_box, sample_size
-from mpfa_envs.worlds import Box, World
+from mpfa_envs.worlds.world import Box, World
 
 
 def bars(rng: random.Random, difficulty: float) -> World:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from mpfa_envs.generators.placing import between, cut_box, fit_cylinder, sample_size
-from mpfa_envs.worlds import Box, Cylinder, World
+from mpfa_envs.worlds.world import Box, Cylinder, World
 
 
 def clutter(rng: random.Random, difficulty: float) -> World:

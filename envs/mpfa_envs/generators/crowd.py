@@ -7,11 +7,11 @@ import random
 from typing import TYPE_CHECKING, Final
 
 from mpfa_envs.generators.placing import between, cut_box, fit_cylinder, sample_size
-from mpfa_envs.walkers import Walker
-from mpfa_envs.worlds import Box, Cylinder, World
+from mpfa_envs.worlds.walker import Walker
+from mpfa_envs.worlds.world import Box, Cylinder, World
 
 if TYPE_CHECKING:
-    from mpfa_envs.shapes import Point
+    from mpfa_envs.worlds.shapes import Point
 
 _CORNERS: Final = 3
 """Waypoints of a round."""

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 
 from mpfa_envs.generators.placing import between
-from mpfa_envs.worlds import Cylinder, World
+from mpfa_envs.worlds.world import Cylinder, World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

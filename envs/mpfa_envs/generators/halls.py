@@ -6,7 +6,7 @@ import math
 import random
 
 from mpfa_envs.generators.placing import between, fit_cylinder, fit_polygon, sample_size
-from mpfa_envs.worlds import Cylinder, Polygon, World
+from mpfa_envs.worlds.world import Cylinder, Polygon, World
 
 Outline = list[tuple[float, float]]
 """Corners around the origin (x, y) [m]."""

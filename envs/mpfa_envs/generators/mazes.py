@@ -6,7 +6,7 @@ import random
 from typing import Final
 
 from mpfa_envs.generators.placing import between, cut_box
-from mpfa_envs.worlds import Box, World
+from mpfa_envs.worlds.world import Box, World
 
 _SIDES: Final = (8.0, 14.0)
 """Shortest and longest side [m]."""

@@ -10,7 +10,7 @@ from mpfa_envs.generators.fields import fields
 from mpfa_envs.generators.halls import halls
 from mpfa_envs.generators.mazes import mazes
 from mpfa_envs.generators.rooms import rooms
-from mpfa_envs.worlds import World
+from mpfa_envs.worlds.world import World
 
 _KINDS = (rooms, clutter, bars, fields, halls, mazes)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from mpfa_envs.worlds import Box, Cylinder, Polygon
+from mpfa_envs.worlds.world import Box, Cylinder, Polygon
 
 _LEAST_SIDE = 0.05
 """What is left of a box at a wall is left out if it is thinner than this [m]."""

@@ -6,7 +6,7 @@ import math
 import random
 from typing import Final
 
-from mpfa_envs.worlds import Box, World
+from mpfa_envs.worlds.world import Box, World
 
 _HALF: Final = 5.0
 """Half of a room's side [m]."""

@@ -7,13 +7,13 @@ from types import MappingProxyType
 from typing import Final
 
 from mpfa_envs.checks import did_you_mean
-from mpfa_envs.observation import Memory
 from mpfa_envs.planners.ant_colony import AntColony
 from mpfa_envs.planners.dynamic_window import DynamicWindow, WindowScore
 from mpfa_envs.planners.map_planner import MapPlanner
 from mpfa_envs.planners.pure_pursuit import PurePursuit
 from mpfa_envs.planners.search import Search, astar_path, dijkstra_path, path_length
-from mpfa_envs.robot import RobotModel
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.sensing.observation import Memory
 
 __all__ = [
     "PLANNERS",

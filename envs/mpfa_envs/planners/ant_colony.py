@@ -14,8 +14,8 @@ from mpfa_envs.planners.search import centers
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.distance import FreeGrid
-    from mpfa_envs.shapes import Point
+    from mpfa_envs.paths.distance import FreeGrid
+    from mpfa_envs.worlds.shapes import Point
 
 _MOST_MOVES: Final = 16
 """Of a cell: straight, diagonal and a knight's."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_positive
-from mpfa_envs.observation import DISTANCE_SCALE, Memory, observation_slices
-from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.sensing.observation import DISTANCE_SCALE, Memory, observation_slices
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

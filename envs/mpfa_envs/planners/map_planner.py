@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.checks import check_positive
-from mpfa_envs.distance import FreeGrid
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners.pure_pursuit import PurePursuit
-from mpfa_envs.robot import TRAINING_CLEARANCE, RobotModel, resolve_robot
+from mpfa_envs.robots.model import TRAINING_CLEARANCE, RobotModel, resolve_robot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.env.vector import VectorNavigationEnv
     from mpfa_envs.planners.search import Search
-    from mpfa_envs.shapes import Point
-    from mpfa_envs.vector import VectorNavigationEnv
-    from mpfa_envs.worlds import World
+    from mpfa_envs.worlds.shapes import Point
+    from mpfa_envs.worlds.world import World
 
 _LEAST_CLEARANCE: Final = 0.02
 """What a path keeps where there is none with the wanted clearance [m]."""

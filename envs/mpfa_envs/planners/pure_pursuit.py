@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.distance import FreeGrid
-    from mpfa_envs.robot import RobotModel
-    from mpfa_envs.shapes import Point
+    from mpfa_envs.paths.distance import FreeGrid
+    from mpfa_envs.robots.model import RobotModel
+    from mpfa_envs.worlds.shapes import Point
 
 _SPACING: Final = 0.05
 """Distance of the points that a path is made of [m]."""

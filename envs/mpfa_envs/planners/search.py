@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from mpfa_envs.distance import FreeGrid
-from mpfa_envs.kernels.grid import STEP_SCALE
+from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.paths.grid_loops import STEP_SCALE
 
 if TYPE_CHECKING:
     import networkx
 
-    from mpfa_envs.shapes import Point
+    from mpfa_envs.worlds.shapes import Point
 
 _START: Final = -1
 _GOAL: Final = -2

@@ -7,7 +7,18 @@ matplotlib, which the extra ``pictures`` brings.
 
 from mpfa_envs.render.animation import write_animation
 from mpfa_envs.render.charts import draw_seeds, plot_histograms, plot_seeds
-from mpfa_envs.render.colors import (
+from mpfa_envs.render.film import Film, drive_episode, film_episode
+from mpfa_envs.render.grids import observe_room
+from mpfa_envs.render.samples import render_samples
+from mpfa_envs.render.traces import Panel, render_traces
+from mpfa_envs.render.trajectories import (
+    Outcome,
+    render_methods,
+    render_trajectories,
+    shown_episodes,
+)
+from mpfa_envs.render.values import render_values
+from mpfa_envs.scene.colors import (
     FLOOR,
     GOAL,
     LINES,
@@ -18,19 +29,8 @@ from mpfa_envs.render.colors import (
     WALL,
     viridis,
 )
-from mpfa_envs.render.film import Film, drive_episode, film_episode
-from mpfa_envs.render.grids import observe_room
-from mpfa_envs.render.samples import render_samples
-from mpfa_envs.render.scene import render_scene
-from mpfa_envs.render.tiles import tiled
-from mpfa_envs.render.traces import Panel, render_traces
-from mpfa_envs.render.trajectories import (
-    Outcome,
-    render_methods,
-    render_trajectories,
-    shown_episodes,
-)
-from mpfa_envs.render.values import render_values
+from mpfa_envs.scene.scene import render_scene
+from mpfa_envs.scene.tiles import tiled
 
 __all__ = [
     "FLOOR",

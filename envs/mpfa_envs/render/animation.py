@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from mpfa_envs.checks import check_count, check_positive
-from mpfa_envs.render import colors
+from mpfa_envs.scene import colors
 
 if TYPE_CHECKING:
     import os
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _LEAST_DELAY: Final = 20
 """Below this players of GIFs take a delay of their own [ms]."""
 _KIT: Final = 64
-"""Colors of a palette that are of :mod:`mpfa_envs.render.colors` at most."""
+"""Colors of a palette that are of :mod:`mpfa_envs.scene.colors` at most."""
 
 
 def write_animation(

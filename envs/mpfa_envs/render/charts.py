@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.render.colors import LINES, VIRIDIS
+from mpfa_envs.scene.colors import LINES, VIRIDIS
 
 if TYPE_CHECKING:
     import os

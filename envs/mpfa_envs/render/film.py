@@ -14,9 +14,9 @@ from mpfa_envs.render.traces import Panel, render_traces
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.evaluation import Action, Driver
-    from mpfa_envs.task_sets import WorldTask
-    from mpfa_envs.vector import VectorNavigationEnv
+    from mpfa_envs.env.vector import VectorNavigationEnv
+    from mpfa_envs.evaluation.runs import Action, Driver
+    from mpfa_envs.tasks.sets import WorldTask
 
 _RECENT = 10.0
 """Time for which speeds are seen [s]."""
@@ -132,8 +132,8 @@ def drive_episode(
     # Imported here because gymnasium takes a moment, and other pictures do without it.
     from gymnasium.vector import AutoresetMode
 
-    from mpfa_envs.evaluation import as_driver
-    from mpfa_envs.vector import VectorNavigationEnv
+    from mpfa_envs.env.vector import VectorNavigationEnv
+    from mpfa_envs.evaluation.runs import as_driver
 
     arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
     arguments |= episode.limit({**arguments, **env_arguments})

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_number, check_positive
-from mpfa_envs.render.canvas import Canvas
-from mpfa_envs.render.colors import viridis
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.scene.canvas import Canvas
+from mpfa_envs.scene.colors import viridis
 
 if TYPE_CHECKING:
     import os
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds import World
+    from mpfa_envs.worlds.world import World
 
     Array = NDArray[np.float64]
 
@@ -83,11 +83,11 @@ def observe_room(
         ((100, 3), (100, 24))
     """
     # Imported here because gymnasium takes a moment, and other pictures do without it.
-    from mpfa_envs.config import TaskConfig
-    from mpfa_envs.episodes import Episode
-    from mpfa_envs.robot_batch import RobotBatch
-    from mpfa_envs.tasks import Task
-    from mpfa_envs.walker_starts import start_walkers
+    from mpfa_envs.env.config import TaskConfig
+    from mpfa_envs.env.episodes import Episode
+    from mpfa_envs.env.robots import RobotBatch
+    from mpfa_envs.walkers.starts import start_walkers
+    from mpfa_envs.worlds.task import Task
 
     if heading != "goal":
         check_number("heading", heading)

@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_positive
-from mpfa_envs.render.canvas import Canvas
-from mpfa_envs.render.colors import shares_of
+from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.render.grids import fill_cells
-from mpfa_envs.render.strip import HEIGHT, Scale, strip_width, titled, write_strip
-from mpfa_envs.render.tiles import tiled
+from mpfa_envs.scene.canvas import Canvas
+from mpfa_envs.scene.colors import shares_of
+from mpfa_envs.scene.strip import HEIGHT, Scale, strip_width, titled, write_strip
+from mpfa_envs.scene.tiles import tiled
 
 if TYPE_CHECKING:
     import os
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds import World
+    from mpfa_envs.worlds.world import World
 
     Array = NDArray[np.float64]
 

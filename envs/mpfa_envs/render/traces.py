@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mpfa_envs.render.canvas import FINE, font
-from mpfa_envs.render.colors import GRID, LINES, PAPER, TEXT
+from mpfa_envs.scene.canvas import FINE, font
+from mpfa_envs.scene.colors import GRID, LINES, PAPER, TEXT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count
-from mpfa_envs.render.canvas import Canvas, Point
-from mpfa_envs.render.colors import GOAL, GOAL_AREA, GOAL_EDGE, OUTCOMES, ROBOT_FRONT, TRAIL
-from mpfa_envs.render.strip import HEIGHT, Entry, Key, Mark, Title, strip_width, titled, write_strip
-from mpfa_envs.render.tiles import tiled
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.scene.canvas import Canvas, Point
+from mpfa_envs.scene.colors import GOAL, GOAL_AREA, GOAL_EDGE, OUTCOMES, ROBOT_FRONT, TRAIL
+from mpfa_envs.scene.strip import HEIGHT, Entry, Key, Mark, Title, strip_width, titled, write_strip
+from mpfa_envs.scene.tiles import tiled
 
 if TYPE_CHECKING:
     import os
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds import World
+    from mpfa_envs.worlds.world import World
 
 Outcome = Literal["success", "collision", "timeout"]
 """How an episode ended."""

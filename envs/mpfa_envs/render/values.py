@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_positive
-from mpfa_envs.render.canvas import FINE, Canvas, Point
-from mpfa_envs.render.colors import ROBOT_FRONT, TEXT, shares_of
+from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.render.grids import Heading, fill_cells, observe_room
-from mpfa_envs.render.strip import HEIGHT, Entry, Facing, Scale, strip_width, titled, write_strip
-from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.scene.canvas import FINE, Canvas, Point
+from mpfa_envs.scene.colors import ROBOT_FRONT, TEXT, shares_of
+from mpfa_envs.scene.strip import HEIGHT, Entry, Facing, Scale, strip_width, titled, write_strip
 
 if TYPE_CHECKING:
     import os
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds import World
+    from mpfa_envs.worlds.world import World
 
     Observations = NDArray[np.float32]
 

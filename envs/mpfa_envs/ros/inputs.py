@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from mpfa_envs.deploy.pilot import Pilot
     from mpfa_envs.deploy.sectors import Points, Scan
-    from mpfa_envs.robot import RobotModel
+    from mpfa_envs.robots.model import RobotModel
 
 Pose = tuple[float, float, float]
 _AHEAD: Final = 0.15

@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.builtin_worlds import resolve_world
 from mpfa_envs.checks import check_count, check_positive, check_seed
 from mpfa_envs.deploy.card import check_finite
 from mpfa_envs.deploy.sectors import Scan
-from mpfa_envs.drives import make_drives
-from mpfa_envs.lidar import Lidar
-from mpfa_envs.robot import RobotModel, resolve_robot
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.robots.drives import make_drives
+from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.sensing.lidar import Lidar
 
 if TYPE_CHECKING:
     import os
 
-    from mpfa_envs.config import Physics
-    from mpfa_envs.worlds import World
+    from mpfa_envs.robots.drives import Physics
+    from mpfa_envs.worlds.world import World
 
 
 class Motion(NamedTuple):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mpfa_envs import Interval
-from mpfa_envs.results import wilson
+from mpfa_envs.evaluation.results import wilson
 
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]

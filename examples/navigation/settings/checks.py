@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from mpfa_envs import world_tasks
-from mpfa_envs.robot import resolve_robot
+from mpfa_envs.robots.model import resolve_robot
 from navigation.environments import check_physics, make_training_env
 from navigation.settings.environment import EnvironmentSettings
 from navigation.settings.learners import is_discrete

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from mpfa_envs import WHEEL_PAIRS, Binning
-from mpfa_envs.layers import Choice, Layer, Table, from_torch
+from mpfa_envs.policies.layers import Choice, Layer, Table, from_torch
 from navigation.settings.learners import LearnerSettings, is_discrete
 from navigation.settings.train import TrainSettings
 from torchrl_mpfa import (

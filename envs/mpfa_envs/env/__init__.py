@@ -1,0 +1,1 @@
+"""The navigation task as environments: many robots, one robot, TorchRL."""

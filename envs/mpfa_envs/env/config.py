@@ -1,0 +1,208 @@
+"""The settings of the navigation task, which all its environments share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from gymnasium.spaces import Box as BoxSpace
+
+from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.robots.drives import Physics
+from mpfa_envs.robots.model import ROBOTS, RobotModel, resolve_collision_distance, resolve_robot
+from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
+from mpfa_envs.sensing.lidar import Lidar
+from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
+from mpfa_envs.tasks.reward import PROGRESS_SCALE, RewardFunction, resolve_reward
+from mpfa_envs.worlds.world import World
+
+Progress = Literal["straight_line", "shortest_path", "none"]
+"""What the reward's progress is measured along."""
+
+PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "action_repeat": 1,
+        "progress_scale": 15.0,
+        "collision_distance": 0.35,
+        "closeness_distance": 0.35,
+        "detour_chance": 0.0,
+    }
+)
+"""Settings of the paper's task, for its TurtleBot2, where they are not the defaults.
+
+The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
+"""
+_MOST_STEPS: Final = 1_000_000
+"""No episode has more time steps: a policy that never arrives must come to an end."""
+_EMPTY: Final = World(name="empty")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """The navigation task: robot, senses, reward, and when an episode ends.
+
+    :class:`~mpfa_envs.NavigationEnv`, :class:`~mpfa_envs.VectorNavigationEnv` and
+    :func:`~mpfa_envs.make_navigation_env` take its fields as keyword arguments and keep it as
+    ``env.config``. The defaults are the task that the study trains on; :data:`PAPER_TASK` holds
+    what the paper says or suggests where that differs.
+
+    A field has the type that it has afterwards: names, None and mappings may be given where their
+    meaning says so.
+
+    Raises:
+        ValueError: If a field is out of its range.
+
+    Examples:
+        >>> from mpfa_envs import TaskConfig
+        >>> TaskConfig(robot="burger", max_steps=200).robot.radius
+        0.105
+    """
+
+    robot: RobotModel = ROBOTS["turtlebot2"]
+    """A :class:`~mpfa_envs.RobotModel`, or a name in :data:`~mpfa_envs.ROBOTS`."""
+    physics: Physics = "wheels"
+    """``"wheels"`` simulates motors and friction in PyBullet; ``"kinematic"`` moves on exact arcs,
+    several times faster, and needs no PyBullet. Lidar, clearance and collisions are computed from
+    the same shapes in both."""
+    max_steps: int = 500
+    """Time limit of an episode in time steps."""
+    time_step: float = 0.1
+    """Duration of a time step [s]; the robot must not drive collision_distance in less."""
+    action_repeat: int = 2
+    """Time steps for which an action is held. Their rewards add up, and the episode may end after
+    any of them. The default is half as many decisions as time steps."""
+    goal_radius: float = 0.5
+    """Distance of the robot's center from the goal that reaches it, walls or not [m]."""
+    collision_distance: float = None  # type: ignore[assignment]
+    """Distance of the robot's center from an obstacle or wall that is a collision [m]. None: the
+    robot's radius and 0.07 m, 0.25 m for the TurtleBot2. ``"contact"``: the robot's radius."""
+    progress_scale: float = PROGRESS_SCALE
+    """The paper's ε_p in Eq. (25), reward per meter of approach [1/m]."""
+    progress: Progress = "straight_line"
+    """What an approach is measured by: ``"straight_line"``, the distance to the goal as in Eq.
+    (25); ``"shortest_path"``, the path to it that keeps the collision distance
+    (:class:`~mpfa_envs.DistanceField`); or ``"none"``, only goal and collision count."""
+    reward: RewardFunction | None = None
+    """Computes the reward in place of Eq. (25), robot by robot and hence slowly, and without
+    progress_scale; ``functools.partial(navigation_reward, goal_reward=20.0)``, say, which is as
+    fast. Another function pays as it likes; with ``progress="none"`` it is told the straight
+    distances."""
+    lidar: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``."""
+    memory: Memory = "none"
+    """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
+    the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it senses what is
+    before it and nothing else."""
+    history: int = 0
+    """How many earlier scans it senses beside the last one, sector by sector: those of the
+    decisions before, the newest first, by which it may tell what moves."""
+    noise: RobotNoise = field(default_factory=RobotNoise)
+    """Errors of the lidar, the wheels, the time and the odometry, none by default: a
+    :class:`~mpfa_envs.RobotNoise` or its numbers by name."""
+    closeness_distance: float = None  # type: ignore[assignment]
+    """A range of this or less has closeness one [m]. None: the default of collision_distance,
+    whatever that is."""
+    min_goal_distance: float = 2.0
+    """Least distance between a sampled start and goal [m]."""
+    detour_chance: float = 0.8
+    """Chance that a sampled task must have an obstacle in its path; 0: no condition."""
+
+    def __post_init__(self) -> None:
+        """Check all fields; the first that is out of its range is named."""
+        for name, kinds in (("physics", Physics), ("progress", Progress)):
+            if getattr(self, name) not in get_args(kinds):
+                raise ValueError(
+                    f"{name} must be one of {get_args(kinds)}, got {getattr(self, name)!r}"
+                )
+        robot = resolve_robot(self.robot)
+        scale = check_number("progress_scale", self.progress_scale)
+        resolved: dict[str, Any] = {
+            "robot": robot,
+            "progress_scale": scale,
+            "max_steps": check_count("max_steps", self.max_steps, most=_MOST_STEPS),
+            "time_step": check_positive("time_step", self.time_step),
+            "action_repeat": check_count("action_repeat", self.action_repeat),
+            "goal_radius": check_positive("goal_radius", self.goal_radius),
+            "min_goal_distance": check_positive("min_goal_distance", self.min_goal_distance),
+            "detour_chance": check_share("detour_chance", self.detour_chance),
+            "collision_distance": resolve_collision_distance(self.collision_distance, robot),
+            "closeness_distance": (
+                robot.collision_distance
+                if self.closeness_distance is None
+                else check_positive("closeness_distance", self.closeness_distance)
+            ),
+            "noise": resolve_noise(self.noise),
+        }
+        for name, value in resolved.items():
+            object.__setattr__(self, name, value)
+        if not self.min_goal_distance > self.goal_radius:
+            raise ValueError(
+                f"min_goal_distance must be above goal_radius = {self.goal_radius}, "
+                f"got {self.min_goal_distance}"
+            )
+        # Collisions are looked for at the ends of time steps. Of a robot that does not drive
+        # farther than the collision distance in one, the center cannot get into an obstacle before.
+        fastest = max(abs(robot.min_wheel_speed), abs(robot.max_wheel_speed))
+        if self.time_step * fastest > self.collision_distance:
+            raise ValueError(
+                f"time_step must be at most {self.collision_distance / fastest:.4g} s, in which "
+                f"{robot.name!r} drives no farther than collision_distance = "
+                f"{self.collision_distance} m at its fastest, got {self.time_step}"
+            )
+        object.__setattr__(self, "lidar", self._read_lidar())
+        # They check what was given.
+        _ = self.reward_function, self.observation_slices
+
+    def _read_lidar(self) -> dict[str, Any]:
+        """The arguments of the lidar, with its noise."""
+        if not isinstance(self.lidar, Mapping | None):
+            raise ValueError(f"lidar must hold arguments of Lidar, got {self.lidar!r}")
+        arguments = dict(self.lidar or {})
+        for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
+            if value > 0.0:
+                if name in arguments:
+                    raise ValueError(f"lidar must not hold {name!r} beside noise={self.noise}")
+                arguments[name] = value
+        return arguments
+
+    def make_lidar(self, world: World = _EMPTY) -> Lidar:
+        """Make the lidar, in a world."""
+        try:
+            return Lidar(world, **self.lidar)
+        except TypeError as error:
+            raise ValueError(
+                f"lidar must hold arguments of Lidar, got {self.lidar!r}: {error}"
+            ) from error
+
+    def make_noise(self, robots: int) -> NoisyMotion | None:
+        """Make what disturbs the motion of some robots, if anything does."""
+        if not self.noise.is_in_motion:
+            return None
+        base, step = self.robot.wheel_base, self.time_step
+        return NoisyMotion(self.noise, robots, wheel_base=base, time_step=step)
+
+    @cached_property
+    def reward_function(self) -> RewardFunction:
+        """The reward of a time step: the user's, or Eq. (25)."""
+        progress, scale = self.progress, self.progress_scale
+        return resolve_reward(self.reward, progress=progress, progress_scale=scale)
+
+    @cached_property
+    def observation_slices(self) -> Mapping[str, slice]:
+        """The parts of an observation by name."""
+        sectors = self.make_lidar().sectors
+        return observation_slices(sectors, memory=self.memory, history=self.history)
+
+    def make_spaces(self, diagonal: float) -> tuple[BoxSpace[np.float32], BoxSpace[np.float32]]:
+        """Make the spaces of one robot's observations and actions.
+
+        Args:
+            diagonal: Longest distance in a room [m].
+        """
+        sectors = self.make_lidar().sectors
+        low, high = observation_bounds(sectors, diagonal, memory=self.memory, history=self.history)
+        return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)

@@ -1,0 +1,418 @@
+"""Where the episodes of many robots come from: fixed worlds, or new ones of a generator."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.planner import shortest_length
+from mpfa_envs.paths.tasks import LONGEST_PATH
+from mpfa_envs.saved import read_list
+from mpfa_envs.tasks.sampling import check_task, sample_task
+from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.worlds.builtin import WORLDS
+from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
+from mpfa_envs.worlds.task import Task
+from mpfa_envs.worlds.world import World
+
+if TYPE_CHECKING:
+    from mpfa_envs.env.config import TaskConfig
+    from mpfa_envs.paths.distance import DistanceField, FreeGrid
+    from mpfa_envs.walkers.starts import WalkerStarts
+
+WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
+"""What stands for one world."""
+GENERATED_DIAGONAL: Final = 50.0
+"""No room of a generator is longer than this from corner to corner [m]."""
+_WORLDS: Final = 50
+"""Worlds of a generator that are drawn before it is said to have no task."""
+
+
+class Episode(NamedTuple):
+    """A task in its world, and what its robot's progress is measured by."""
+
+    world: World
+    """The room."""
+    task: Task
+    """Start and goal."""
+    shortest_path: float
+    """The shortest path to the goal's center [m]."""
+    field: DistanceField | None
+    """Lengths of the ways to the goal, if the progress is along the shortest path."""
+    walkers: WalkerStarts
+    """Where the walkers start."""
+
+
+class Whereabouts(NamedTuple):
+    """How far the robots are among the worlds of a generator."""
+
+    refused: int
+    """Worlds that had no task."""
+    left: list[int]
+    """Episodes that each robot still has in its world."""
+    worlds: list[World | None]
+    """That world, where there are any left."""
+
+
+def _grid_of(world: World, distance: float) -> FreeGrid:
+    """Make the grid of a world."""
+    # Imported here because it needs Numba, which takes half a second.
+    from mpfa_envs.paths.distance import FreeGrid
+
+    return FreeGrid(world, distance=distance)
+
+
+_kept_grid_of = lru_cache(maxsize=4)(_grid_of)
+"""The same for worlds that stay; a grid takes some megabytes."""
+
+
+def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
+    """Measure the ways to a goal from everywhere in a world.
+
+    Args:
+        world: The room and its obstacles.
+        distance: What the ways keep from obstacles and walls [m].
+        goal: Where they lead (x, y) [m].
+
+    Returns:
+        The field; in the world of a map, that of a window around the goal.
+    """
+    from mpfa_envs.paths.distance import DistanceField
+
+    longest = math.inf if world.occupancy is None else LONGEST_PATH
+    return DistanceField(_kept_grid_of(world, distance), goal, longest)
+
+
+@contextmanager
+def keeping(rngs: Iterable[np.random.Generator]) -> Iterator[None]:
+    """Let sources of randomness be as they were if what they are needed for is refused."""
+    before = [(rng, rng.bit_generator.state) for rng in rngs]
+    try:
+        yield
+    except BaseException:
+        for rng, state in before:
+            rng.bit_generator.state = state
+        raise
+
+
+def draw_episode(
+    config: TaskConfig, world: World, rng: np.random.Generator, task: Task | None = None
+) -> Episode:
+    """Draw an episode in a fixed world.
+
+    Args:
+        config: The arguments of the task.
+        world: The room.
+        rng: Source of randomness.
+        task: Start and goal; None: any.
+
+    Returns:
+        The episode.
+
+    Raises:
+        ValueError: If the world has no task, or a walker fits nowhere.
+    """
+    distance = config.collision_distance
+    if task is None:
+        task = sample_task(
+            world,
+            rng,
+            collision_distance=distance,
+            min_goal_distance=config.min_goal_distance,
+            detour_chance=config.detour_chance,
+        )
+    length = shortest_length(world, config.robot.radius, task.start[:2], task.goal)
+    along = config.progress == "shortest_path"
+    field = distance_field(world, distance, task.goal) if along else None
+    return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
+
+
+class EpisodeSource:
+    """Draws the episodes of each robot: a task in its world, or in a new world.
+
+    Args:
+        world: What :class:`~mpfa_envs.NavigationEnv` takes, a sequence of it, of which robot i has
+            number ``i % len``, or the name of a generator.
+        robots: Number of robots.
+        config: The arguments of the task.
+        split: Which worlds of a generator are drawn.
+        difficulty: Difficulty of a generator's worlds; None: each world's own.
+        episodes_per_world: Episodes of a robot in a world of a generator before the next one.
+        max_goal_distance: Longest way between a sampled start and goal [m].
+
+    Raises:
+        ValueError: If an argument is out of its range, or a world has no task.
+    """
+
+    def __init__(
+        self,
+        world: WorldChoice | Sequence[WorldChoice],
+        robots: int,
+        config: TaskConfig,
+        *,
+        split: Literal["train", "validation"],
+        difficulty: float | None,
+        episodes_per_world: int,
+        max_goal_distance: float,
+    ) -> None:
+        self.refused = 0
+        """Worlds of the generator that were drawn anew, as they had no task."""
+        self._config = config
+        self._max_goal_distance = check_goal_distance(config.min_goal_distance, max_goal_distance)
+        self._episodes_per_world = check_count("episodes_per_world", episodes_per_world)
+        if split not in ("train", "validation"):
+            raise ValueError(f"split must be 'train' or 'validation', got {split!r}")
+        self._split = split
+        self._generator = resolve_generator(world)
+        if difficulty is not None:
+            check_share("difficulty", difficulty)
+            if self._generator is None:
+                raise ValueError(
+                    "difficulty must be None unless world is the name of a generator, got "
+                    f"{difficulty!r}"
+                )
+        self._difficulty = difficulty
+        fixed = [] if self._generator else _resolve_worlds(world)
+        self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
+        self._left = [0] * robots
+        # A task of each world, or the lack of one, shows before anything runs.
+        rng = np.random.default_rng(0)
+        probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
+        self.diagonal = GENERATED_DIAGONAL
+        """Longest distance in the rooms [m]."""
+        diagonals = [self._draw(probe, rng).world.diagonal for probe in probes]
+        if self._generator:
+            self.refused = 0
+        else:
+            self.diagonal = max(diagonals)
+
+    def draw(
+        self,
+        robots: Sequence[int],
+        rngs: Sequence[np.random.Generator],
+        given: Sequence[tuple[World, Task | None] | None] | None = None,
+        renewed: Iterable[int] = (),
+    ) -> list[Episode]:
+        """Draw the next episodes of some robots, or none if one of them has none.
+
+        Args:
+            robots: Their numbers.
+            rngs: The sources of randomness of all robots.
+            given: For each robot, a world for this episode alone, with a task or None for any of
+                that world; or None.
+            renewed: Robots whose episode is in a new world, as after a seed.
+
+        Returns:
+            The episodes.
+
+        Raises:
+            ValueError: If no world with a task is found; nothing is drawn then.
+        """
+        before = Whereabouts(self.refused, list(self._left), list(self._worlds))
+        try:
+            with keeping(rngs[robot] for robot in robots):
+                for robot in renewed:
+                    self.forget(robot)
+                return [
+                    self._draw_next(each, rngs[each], None if given is None else given[each])
+                    for each in robots
+                ]
+        except BaseException:
+            self.load(before)
+            raise
+
+    def _draw_next(
+        self, robot: int, rng: np.random.Generator, given: tuple[World, Task | None] | None
+    ) -> Episode:
+        """Draw the next episode of a robot."""
+        if given is not None:
+            return self._draw_in(given[0], rng, given[1])
+        kept = self._worlds[robot] if self._generator is None or self._left[robot] else None
+        episode = self._draw(kept, rng)
+        if self._generator:
+            new = episode.world is not kept
+            self._left[robot] = (self._episodes_per_world if new else self._left[robot]) - 1
+            self._worlds[robot] = episode.world
+        return episode
+
+    def forget(self, robot: int) -> None:
+        """Let the next episode of a robot be in a new world, as after a seed."""
+        self._left[robot] = 0
+
+    def fixed(self, robot: int) -> World | None:
+        """The world that a robot always drives in; None with a generator."""
+        return None if self._generator else self._worlds[robot]
+
+    def describe(self) -> dict[str, Any]:
+        """What decides which episodes come, as plain values by name."""
+        world: str | list[str] | None = self._generator
+        if world is None:
+            names = {id(each): fingerprint(each) for each in self._worlds if each is not None}
+            world = [names[id(each)] for each in self._worlds]
+            world = world[0] if len(names) == 1 else world
+        return {
+            "world": world,
+            "max_goal_distance": self._max_goal_distance,
+            "difficulty": self._difficulty,
+            "episodes_per_world": self._episodes_per_world,
+            "split": self._split,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where each robot is among the worlds of a generator."""
+        kept = zip(self._worlds, self._left, strict=True)
+        return {
+            "refused": self.refused,
+            "left": list(self._left),
+            "worlds": [world_to_plain(world) if left and world else None for world, left in kept],
+        }
+
+    def read(self, state: Mapping[str, Any]) -> Whereabouts:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Args:
+            state: What it gave.
+
+        Returns:
+            Where it says that the robots are.
+
+        Raises:
+            ValueError: If something is missing, or not there for each robot.
+        """
+        counts, values = (read_list(state, name, len(self._left)) for name in ("left", "worlds"))
+        left = [check_count("left", count, least=0) for count in counts]
+        worlds = [None if each is None else world_from_plain(each) for each in values]
+        if any(count and world is None for count, world in zip(left, worlds, strict=True)):
+            raise ValueError("worlds of the state must hold a world wherever left is not 0")
+        return Whereabouts(
+            check_count("refused", state.get("refused"), least=0, most=math.inf), left, worlds
+        )
+
+    def load(self, found: Whereabouts) -> None:
+        """Go on from what :meth:`read` gave."""
+        self.refused, self._left = found.refused, found.left
+        if self._generator:
+            self._worlds = found.worlds
+
+    def check(self, world: World, task: Task | None) -> Task | None:
+        """Refuse a world that is too large, or a task that cannot be driven."""
+        if world.diagonal > self.diagonal:
+            raise ValueError(
+                f"world {world.name!r} must be at most {self.diagonal:.4g} m from corner to "
+                f"corner, as the observations are bounded, got {world.diagonal:.4g} m"
+            )
+        return None if task is None else self._read_task(world, *task)
+
+    def check_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
+        """Read a task in a world, and refuse it likewise."""
+        self.check(world, None)
+        return self._read_task(world, start, goal)
+
+    def _read_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
+        config = self._config
+        return check_task(
+            world,
+            {"start": start, "goal": goal},
+            collision_distance=config.collision_distance,
+            goal_radius=config.goal_radius,
+            radius=config.robot.radius,
+        )
+
+    def _draw(self, world: World | None, rng: np.random.Generator) -> Episode:
+        """Draw an episode in a world, in a new one where it is None or has no task."""
+        if self._generator is None and world is not None:
+            return self._draw_in(world, rng)
+        reason: ValueError | None = None
+        for _ in range(_WORLDS):
+            try:
+                return self._draw_on_grid(world or self._new_world(rng), rng)
+            except ValueError as error:
+                self.refused += 1
+                world, reason = None, error
+        raise ValueError(
+            f"world = {self._generator!r} cannot be driven: {_WORLDS} of its worlds in a row have "
+            f"no task; the last one: {reason}"
+        ) from reason
+
+    def _new_world(self, rng: np.random.Generator) -> World:
+        """The next world of the generator."""
+        from mpfa_envs.generators import generate_world, world_seed
+
+        seed = world_seed(self._split, int(rng.integers(10**9)))
+        world = generate_world(str(self._generator), seed, difficulty=self._difficulty)
+        self.check(world, None)
+        return world
+
+    def _draw_in(self, world: World, rng: np.random.Generator, task: Task | None = None) -> Episode:
+        """Draw an episode in a fixed world, as :class:`~mpfa_envs.NavigationEnv` does."""
+        if task is None and math.isfinite(self._max_goal_distance):
+            return self._draw_on_grid(world, rng)
+        return draw_episode(self._config, world, rng, task)
+
+    def _draw_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
+        """Draw an episode over the cells of a grid, in milliseconds however full the world is."""
+        from mpfa_envs.paths.tasks import sample_task_on_grid
+
+        config = self._config
+        task, field = sample_task_on_grid(
+            (_grid_of if self._generator else _kept_grid_of)(world, config.collision_distance),
+            rng,
+            min_goal_distance=config.min_goal_distance,
+            max_goal_distance=self._max_goal_distance,
+            detour_chance=config.detour_chance,
+        )
+        length = field.at(*task.start[:2])
+        kept = field if config.progress == "shortest_path" else None
+        return Episode(world, task, length, kept, start_walkers(world, task.start[:2], rng))
+
+
+def resolve_generator(world: object) -> str | None:
+    """The name of a generator, or None for what stands for fixed worlds.
+
+    Raises:
+        ValueError: If it is a word that is neither a generator nor a world.
+    """
+    from mpfa_envs.generators import GENERATORS
+
+    if not isinstance(world, str):
+        return None
+    if world in GENERATORS:
+        return world
+    if world.isidentifier() and world not in WORLDS:
+        known = [*GENERATORS, *WORLDS]
+        hint = f" ({question})" if (question := did_you_mean(world, known)) else ""
+        raise ValueError(
+            "world must be a World, the path of a .yaml file, a sequence of these, or one of "
+            f"{known}, got {world!r}{hint}"
+        )
+    return None
+
+
+def _resolve_worlds(world: WorldChoice | Sequence[WorldChoice]) -> list[World]:
+    """The fixed worlds that are meant."""
+    if isinstance(world, Sequence) and not isinstance(world, str):
+        if not world:
+            raise ValueError("world must hold at least one world, got an empty sequence")
+        return [resolve_world(each) for each in world]
+    return [resolve_world(world)]
+
+
+def check_goal_distance(least: float, most: float) -> float:
+    """A longest way that is above the least distance between start and goal [m].
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
+        raise ValueError(
+            f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"
+        )
+    return float(most)

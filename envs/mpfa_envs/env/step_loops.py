@@ -1,0 +1,180 @@
+"""What a time step leads to, for many robots: where they are, what ended, and Eq. (25)."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.compiled import njit
+from mpfa_envs.paths.grid_loops import interpolate
+from mpfa_envs.worlds.clearance_loops import clearance_at
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.paths.batch import FieldArrays
+    from mpfa_envs.worlds.batch import BatchArrays
+
+# Rows of the tables of a batch: the keys of the info dictionary in their order.
+SUCCESS: Final = 0
+COLLISION: Final = 1
+TIMEOUT: Final = 2
+REWARD: Final = 0
+"""First of the four terms of the reward."""
+SIM_TIME: Final = 4
+PATH_LENGTH: Final = 5
+SHORTEST_PATH: Final = 6
+MIN_CLEARANCE: Final = 7
+DISTANCE: Final = 8
+POSE: Final = 9
+"""First of x, y and the heading."""
+ENCOUNTERS: Final = 12
+"""First of what is counted of walkers: distance, time in personal space, time to collision."""
+
+
+class EpisodeArrays(NamedTuple):
+    """The episodes of a batch of robots, changed in place."""
+
+    motions: NDArray[np.float64]
+    """Poses and speeds (x, y, heading, forward, turning), ``[N, 5]``."""
+    goals: NDArray[np.float64]
+    """Positions (x, y) [m], ``[N, 2]``."""
+    numbers: NDArray[np.float64]
+    """The numbers of the info dictionary, ``[15, N]``."""
+    flags: NDArray[np.bool_]
+    """Its flags, ``[3, N]``."""
+    steps: NDArray[np.int64]
+    """Time steps so far, ``[N]``."""
+    clearances: NDArray[np.float64]
+    """Distance of the robots' rims from the nearest obstacle or wall [m], ``[N]``."""
+    ways: NDArray[np.float64]
+    """What is left of the way to the goal, as the progress is measured, now and before the last
+    time step [m], ``[2, N]``."""
+
+
+@njit
+def judge(
+    episodes: EpisodeArrays,
+    worlds: BatchArrays,
+    running: NDArray[np.bool_],
+    trails: NDArray[np.float64],
+    rules: tuple[float, float, float, float],
+    max_steps: int,
+) -> None:
+    """Take in where robots have moved: lengths, distances, and whether an episode ended.
+
+    Args:
+        episodes: The episodes.
+        worlds: The room of each robot.
+        running: Which robots have moved, ``[N]``.
+        trails: Where the positions of the episode go [m], ``[N, steps, 2]``.
+        rules: Radius of the robot, collision distance, radius of the goal [m]; time step [s].
+        max_steps: Time limit in time steps.
+    """
+    radius, collision_distance, goal_radius, time_step = rules
+    motions, numbers, flags = episodes.motions, episodes.numbers, episodes.flags
+    for robot in range(motions.shape[0]):
+        if not running[robot]:
+            continue
+        x, y = motions[robot, 0], motions[robot, 1]
+        episodes.steps[robot] += 1
+        steps = episodes.steps[robot]
+        trails[robot, steps, 0], trails[robot, steps, 1] = x, y
+        moved = math.hypot(x - numbers[POSE, robot], y - numbers[POSE + 1, robot])
+        distance = math.hypot(episodes.goals[robot, 0] - x, episodes.goals[robot, 1] - y)
+        to_obstacle = clearance_at(worlds, robot, x, y)
+        success = distance <= goal_radius
+        collision = not success and to_obstacle <= collision_distance
+        flags[SUCCESS, robot], flags[COLLISION, robot] = success, collision
+        flags[TIMEOUT, robot] = not (success or collision) and steps >= max_steps
+        clearance = to_obstacle - radius
+        episodes.clearances[robot] = clearance
+        episodes.ways[1, robot], episodes.ways[0, robot] = episodes.ways[0, robot], distance
+        numbers[SIM_TIME, robot] = steps * time_step
+        numbers[PATH_LENGTH, robot] += moved
+        numbers[MIN_CLEARANCE, robot] = min(numbers[MIN_CLEARANCE, robot], clearance)
+        numbers[DISTANCE, robot] = distance
+        numbers[POSE, robot], numbers[POSE + 1, robot] = x, y
+        numbers[POSE + 2, robot] = motions[robot, 2]
+
+
+@njit
+def settle(
+    episodes: EpisodeArrays, running: NDArray[np.bool_], payments: tuple[float, float, float]
+) -> bool:
+    """Add the terms of Eq. (25), as :func:`mpfa_envs.navigation_reward` gives them, and stop.
+
+    Args:
+        episodes: The episodes; the first rows of their numbers are added to.
+        running: Which robots have moved, ``[N]``; those whose episode has ended are taken out.
+        payments: Rewards for the goal, for a collision, and per meter of approach.
+
+    Returns:
+        Whether any robot still runs.
+    """
+    numbers, flags = episodes.numbers, episodes.flags
+    left = False
+    for robot in range(running.shape[0]):
+        if not running[robot]:
+            continue
+        if flags[SUCCESS, robot]:
+            numbers[REWARD, robot] += payments[0]
+        elif flags[COLLISION, robot]:
+            numbers[REWARD + 1, robot] += payments[1]
+        else:
+            approach = episodes.ways[1, robot] - episodes.ways[0, robot]
+            numbers[REWARD + 2, robot] += payments[2] * approach
+        ended = flags[SUCCESS, robot] or flags[COLLISION, robot] or flags[TIMEOUT, robot]
+        running[robot] = not ended
+        left |= not ended
+    return left
+
+
+@njit
+def outcomes(
+    episodes: EpisodeArrays, moving: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Read what a step has given.
+
+    Args:
+        episodes: The episodes.
+        moving: Which robots took part, ``[N]``.
+
+    Returns:
+        Rewards, terminations and truncations, ``[N]``; zero and false for the others.
+    """
+    robots = moving.shape[0]
+    rewards = np.zeros(robots)
+    terminated, truncated = np.zeros(robots, np.bool_), np.zeros(robots, np.bool_)
+    for robot in range(robots):
+        if moving[robot]:
+            for term in range(REWARD, REWARD + 4):
+                rewards[robot] += episodes.numbers[term, robot]
+            flags = episodes.flags
+            terminated[robot] = flags[SUCCESS, robot] or flags[COLLISION, robot]
+            truncated[robot] = flags[TIMEOUT, robot]
+    return rewards, terminated, truncated
+
+
+@njit
+def measure_ways(episodes: EpisodeArrays, running: NDArray[np.bool_], fields: FieldArrays) -> None:
+    """Measure what is left of the way to the goal along the shortest path.
+
+    Args:
+        episodes: The episodes; their ways are changed.
+        running: Which robots have moved, ``[N]``.
+        fields: Ways to each robot's goal.
+    """
+    for robot in range(running.shape[0]):
+        if running[robot]:
+            nx, ny = fields.shapes[robot, 0], fields.shapes[robot, 1]
+            episodes.ways[0, robot] = interpolate(
+                fields.values[robot, :nx, :ny],
+                fields.origins[robot, 0],
+                fields.origins[robot, 1],
+                fields.resolutions[robot],
+                episodes.motions[robot, 0],
+                episodes.motions[robot, 1],
+            )

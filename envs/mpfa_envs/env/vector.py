@@ -1,0 +1,397 @@
+"""The navigation task for many robots at once, each in a world of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box as BoxSpace
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from mpfa_envs.checks import check_count
+from mpfa_envs.env.config import TaskConfig
+from mpfa_envs.env.episodes import Episode, EpisodeSource, WorldChoice
+from mpfa_envs.env.infos import final_infos, gather_infos
+from mpfa_envs.env.live_view import LiveView
+from mpfa_envs.env.options import (
+    read_mask,
+    read_reset_mask,
+    read_seed,
+    read_tasks,
+    spawn_generators,
+)
+from mpfa_envs.env.robots import RobotBatch
+from mpfa_envs.env.state import check_alike, describe, read_generators
+from mpfa_envs.env.step_loops import outcomes
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.worlds.task import Task
+from mpfa_envs.worlds.world import World
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_EMPTY = World(name="empty")
+
+
+class VectorNavigationEnv(
+    LiveView, VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]
+):
+    """Many robots drive to goals by lidar, each in a world of its own and without the others.
+
+    It is :class:`~mpfa_envs.NavigationEnv` N times, with the same observations, actions, rewards,
+    ends and infos, and a robot drives the same trajectory in it; but all are moved, sensed and
+    rewarded together by compiled loops, some thirty times as fast.
+
+    It follows gymnasium's conventions for vector environments: arrays have the robots as their
+    first axis, ``infos`` holds an array for each key and a mask ``_key`` beside it, and
+    ``autoreset_mode`` says when an episode that has ended gives way to the next.
+
+    Robot i draws from a source of randomness of its own, made of the seed and i alone: its episodes
+    are the same for any number of robots and in any process.
+
+    Args:
+        num_envs: Number of robots N.
+        world: What :class:`~mpfa_envs.NavigationEnv` takes; a sequence of it, robot i driving in
+            number ``i % len``; or the name of a generator, ``"rooms"``, ``"bars"`` and so on
+            (:data:`~mpfa_envs.GENERATORS`), whose worlds follow one another.
+        difficulty: Difficulty of a generator's worlds, from 0 to 1; None: each world's own.
+        episodes_per_world: Episodes of a robot in a generator's world before it gets another.
+        split: Which worlds of a generator: ``"train"`` or ``"validation"``.
+        max_goal_distance: Longest path between a sampled start and goal [m].
+        autoreset_mode: When a new episode begins: ``NEXT_STEP`` with the step after the last one,
+            whose action is ignored; ``SAME_STEP`` with the last one, whose observation and info go
+            to ``infos["final_obs"]`` and ``infos["final_info"]``; ``DISABLED`` when
+            ``reset(options={"reset_mask": ...})`` asks for it.
+        render_mode: ``"rgb_array"`` to get pictures from :meth:`render`.
+        **task: Fields of :class:`~mpfa_envs.TaskConfig`. On wheels there are no bodies of the
+            obstacles, as the shapes say what collides.
+
+    Raises:
+        ImportError: If there is no PyBullet and physics is ``"wheels"``.
+        ValueError: If an argument is out of its range, or a world has no task; nothing is built
+            then.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import VectorNavigationEnv
+        >>> env = VectorNavigationEnv(4, world=["A", "D"], physics="kinematic")
+        >>> observations, infos = env.reset(seed=0)
+        >>> observations, rewards, ended, timeout, infos = env.step(np.ones((4, 2)))
+        >>> observations.shape, infos["sim_time"]
+        ((4, 24), array([0.2, 0.2, 0.2, 0.2]))
+        >>> [world.name for world in env.worlds]
+        ['A', 'D', 'A', 'D']
+        >>> env.close()
+    """
+
+    # Gymnasium declares it as an instance variable.
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    single_observation_space: BoxSpace[np.float32]
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        world: WorldChoice | Sequence[WorldChoice] = "A",
+        max_goal_distance: float = math.inf,
+        difficulty: float | None = None,
+        episodes_per_world: int = 1,
+        split: Literal["train", "validation"] = "train",
+        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: Literal["rgb_array"] | None = None,
+        **task: Any,
+    ) -> None:
+        self.num_envs = check_count("num_envs", num_envs)
+        self.config = TaskConfig(**task)
+        """The settings of the task."""
+        self._set_view(render_mode, self.config.time_step * self.config.action_repeat)
+        if autoreset_mode not in tuple(AutoresetMode):
+            raise ValueError(
+                f"autoreset_mode must be a gymnasium.vector.AutoresetMode, got {autoreset_mode!r}"
+            )
+        self.autoreset_mode = autoreset_mode
+        self.lidar = self.config.make_lidar()
+        """What the robots see by, in an empty world."""
+        self._source = EpisodeSource(
+            world,
+            self.num_envs,
+            self.config,
+            split=split,
+            difficulty=difficulty,
+            episodes_per_world=episodes_per_world,
+            max_goal_distance=max_goal_distance,
+        )
+        self.metadata["autoreset_mode"] = self.autoreset_mode
+        self.single_observation_space, self.single_action_space = self.config.make_spaces(
+            self._source.diagonal
+        )
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._batch = RobotBatch(
+            self.config, self.lidar, [self._source.fixed(i) or _EMPTY for i in range(self.num_envs)]
+        )
+        self._rngs: list[np.random.Generator] = []
+        self._begun = False
+
+    @property
+    def worlds(self) -> list[World]:
+        """The world that each robot is in."""
+        return list(self._batch.worlds)
+
+    @property
+    def worlds_refused(self) -> int:
+        """Worlds of the generator that had no task and were drawn anew."""
+        return self._source.refused
+
+    @property
+    def tasks(self) -> list[Task | None]:
+        """Start and goal of each robot's episode; None before the first."""
+        return list(self._batch.tasks)
+
+    @property
+    def motions(self) -> NDArray[np.float64]:
+        """Poses (x, y, heading) and speeds (forward, turning), ``[N, 5]``."""
+        return self._batch.episodes.motions.copy()
+
+    @property
+    def poses(self) -> NDArray[np.float64]:
+        """Poses (x, y, heading) [m, m, rad], ``[N, 3]``."""
+        return self._batch.episodes.motions[:, :3].copy()
+
+    @property
+    def observations(self) -> NDArray[np.float32]:
+        """The last observations, ``[N, O]``."""
+        return self._batch.observations.copy()
+
+    @property
+    def info_tables(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """The infos as two tables, ``[3, N]`` and ``[15, N]``: the rows are flags and numbers."""
+        return self._batch.episodes.flags.copy(), self._batch.episodes.numbers.copy()
+
+    def check_task(
+        self,
+        index: int,
+        start: Sequence[float],
+        goal: Sequence[float],
+        world: WorldChoice | None = None,
+    ) -> tuple[World, Task]:
+        """Read a task of a robot.
+
+        Args:
+            index: Number of the robot.
+            start: Pose (x, y, heading) [m, m, rad].
+            goal: Position (x, y) [m].
+            world: The room; None: the one that the robot always drives in.
+
+        Returns:
+            The room and the task.
+
+        Raises:
+            ValueError: If it cannot be driven.
+        """
+        room = self._source.fixed(index) if world is None else resolve_world(world)
+        if room is None:
+            raise ValueError("world must be given where the worlds are a generator's, got None")
+        return room, self._source.check_task(room, start, goal)
+
+    def trail(self, index: int) -> list[tuple[float, float]]:
+        """Positions (x, y) of a robot's episode so far [m].
+
+        Args:
+            index: Number of the robot.
+        """
+        return self._batch.trail(index)
+
+    def walkers(self, index: int) -> NDArray[np.float64]:
+        """The walkers around a robot: (x, y), their speeds in both directions, and their radii.
+
+        Args:
+            index: Number of the robot.
+
+        Returns:
+            Shape ``[K, 5]`` [m, m/s, m].
+        """
+        return self._batch.walkers.of(index)
+
+    def set_seed(self, seed: int | Sequence[int | None]) -> None:
+        """Seed the episodes that begin from now on, without beginning any.
+
+        Args:
+            seed: As in :meth:`reset`.
+
+        Raises:
+            ValueError: If a seed is negative, or there are not as many as robots.
+        """
+        seeded = read_seed(seed, self.num_envs)
+        self._rngs = self._generators(seeded)
+        for index, rng in enumerate(seeded):
+            if rng is not None:
+                self._source.forget(index)
+
+    def _generators(
+        self, seeded: Sequence[np.random.Generator | None]
+    ) -> list[np.random.Generator]:
+        """The robots' sources of randomness, new ones where they are given."""
+        kept = self._rngs or spawn_generators(np.random.SeedSequence(), self.num_envs)
+        return [new or old for new, old in zip(seeded, kept, strict=True)]
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode of every robot, or of some.
+
+        Args:
+            seed: Seed of these and all following episodes. A sequence has a seed for each robot,
+                with which it has the episodes of a :class:`~mpfa_envs.NavigationEnv` of that seed.
+            options: ``"reset_mask"``, which robots start, ``[N]`` of bool; ``"tasks"``, a
+                :class:`~mpfa_envs.Task` or None for each robot; ``"worlds"``, a world or None for
+                each. Both hold for this episode and no later one.
+
+        Returns:
+            Observations ``[N, O]`` and infos; a robot that does not start keeps its own.
+
+        Raises:
+            ValueError: If a seed is negative, or the options are not tasks that can be driven; the
+                episodes go on then.
+        """
+        seeded = read_seed(seed, self.num_envs)
+        chosen = read_reset_mask(options, self.num_envs)
+        given = read_tasks(options, self.num_envs, self._source.fixed, self._source.check)
+        if not self._begun and not chosen.all():
+            raise ResetNeeded("the first reset must start all robots, got a reset_mask")
+        robots = np.flatnonzero(chosen).tolist()
+        seeded = [rng if wanted else None for rng, wanted in zip(seeded, chosen, strict=True)]
+        rngs = self._generators(seeded)
+        renewed = [index for index in robots if seeded[index] is not None]
+        episodes = self._source.draw(robots, rngs, given, renewed)
+        self._rngs = rngs
+        self._begin(robots, episodes)
+        self._begun = True
+        self._batch.sense(chosen, self._rngs)
+        return self._batch.observations.copy(), self._infos(chosen)
+
+    def step(
+        self, actions: NDArray[np.float32], *, only: NDArray[np.bool_] | None = None
+    ) -> tuple[
+        NDArray[np.float32],
+        NDArray[np.float64],
+        NDArray[np.bool_],
+        NDArray[np.bool_],
+        dict[str, Any],
+    ]:
+        """Drive until the next actions are due.
+
+        Args:
+            actions: Speeds of the left and the right wheels in [-1, 1], ``[N, 2]``.
+            only: Which robots drive, ``[N]``; None: all. The others stand still and keep their
+                rows, with a reward of zero.
+
+        Returns:
+            Observations ``[N, O]``, rewards, terminations and truncations ``[N]``, and infos.
+
+        Raises:
+            ValueError: If the actions are not two numbers for each robot, or only is no mask of
+                them; nothing has moved then.
+            ResetNeeded: If there was no reset yet, or a robot's episode has ended and
+                autoreset_mode is ``DISABLED``.
+        """
+        if not self._begun:
+            raise ResetNeeded("no episode is running: call reset() before step()")
+        speeds = self._batch.wheel_speeds(actions)
+        chosen = read_mask("only", only, self.num_envs)
+        waiting = chosen & ~self._batch.running
+        if waiting.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+            raise ResetNeeded(
+                f"the episodes of robots {np.flatnonzero(waiting).tolist()} have ended: call "
+                "reset(options={'reset_mask': ...}) before step()"
+            )
+        moving = chosen & self._batch.running
+        self._begin_next(waiting)
+        self._batch.advance(speeds, moving, self._rngs)
+        self._batch.sense(chosen, self._rngs)
+        rewards, terminated, truncated = outcomes(self._batch.episodes, moving)
+        infos: dict[str, Any] = {}
+        ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            infos = final_infos(self._batch.observations, self._infos(ended), ended)
+            self._begin_next(ended)
+            self._batch.sense(ended, self._rngs)
+        infos = self._infos(None) | infos
+        return self.observations, rewards, terminated, truncated, infos
+
+    def _begin_next(self, waiting: NDArray[np.bool_]) -> None:
+        """Start the next episodes of the robots that wait for them."""
+        if robots := np.flatnonzero(waiting).tolist():
+            self._begin(robots, self._source.draw(robots, self._rngs))
+
+    def _begin(self, robots: Sequence[int], episodes: Sequence[Episode]) -> None:
+        """Start the next episodes of some robots."""
+        for index, episode in zip(robots, episodes, strict=True):
+            self._batch.begin(index, episode, self._rngs[index])
+
+    def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
+        """The infos of the chosen robots, or of all."""
+        return gather_infos(*self.info_tables, chosen)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Give all that the environment needs to go on elsewhere in the middle of episodes.
+
+        Returns:
+            Plain values and arrays. Worlds, tasks and motions are in it, sources of randomness too;
+            on wheels also what was driven in each episode.
+        """
+        return {
+            "arguments": describe(self, self._source),
+            "rngs": [rng.bit_generator.state for rng in self._rngs],
+            "begun": self._begun,
+            "source": self._source.state_dict(),
+            "batch": self._batch.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on where another environment with the same arguments was.
+
+        What follows is the same to the bit. On wheels the episodes so far are driven again from
+        their starts, which takes a moment and is as exact for up to 32 robots.
+
+        Args:
+            state: What :meth:`state_dict` gave.
+
+        Raises:
+            ValueError: If it is of an environment with other arguments, the first of which is
+                named, or no state; nothing has changed then.
+        """
+        state = check_alike(state, describe(self, self._source))
+        rngs = read_generators(state.get("rngs"), self.num_envs, begun=state["begun"])
+        worlds = self._source.read(state["source"])
+        self._batch.load_state_dict(state["batch"])
+        self._source.load(worlds)
+        self._rngs, self._begun = rngs, state["begun"]
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Render each robot's room from above.
+
+        Returns:
+            A picture for each robot, ``[H, W, 3]``, 480 the longer side; None without a mode.
+
+        Raises:
+            ResetNeeded: If no episode has started.
+        """
+        if self.render_mode is None:
+            return None
+        if not self._begun:
+            raise ResetNeeded("there is nothing to render: call reset() before render()")
+        return self._batch.render()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Release the physics server; keyword arguments are not used."""
+        # gymnasium 1.2 also closes what was never built, as its arguments were refused.
+        if hasattr(self, "_batch"):
+            self._batch.drives.close()

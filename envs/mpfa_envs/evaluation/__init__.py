@@ -1,0 +1,1 @@
+"""Greedy episodes of a policy, and what they gave."""

@@ -1,0 +1,363 @@
+"""Greedy episodes of a policy between fixed starts and goals, many at once."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from mpfa_envs.checks import check_count
+from mpfa_envs.env.vector import VectorNavigationEnv
+from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, spl
+from mpfa_envs.planners.dynamic_window import DynamicWindow
+from mpfa_envs.policies.policy import Policy
+from mpfa_envs.robots.drives import Physics
+from mpfa_envs.tasks.sets import WorldTask, world_tasks
+from mpfa_envs.worlds.world import World
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+    """All that a policy must be: a function from observation to action."""
+
+ENVS_AT_ONCE = 64
+"""How many episodes run together by default, if the policy is known to take many observations."""
+
+
+@runtime_checkable
+class Driver(Protocol):
+    """What may know more than the robot senses: it sees the environment that the robot is in."""
+
+    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+        """Get ready for an episode.
+
+        Args:
+            env: Where it has begun; ``env.worlds[robot]`` and ``env.tasks[robot]`` say which.
+            robot: Number of the robot.
+        """
+
+    def drive(
+        self,
+        env: VectorNavigationEnv,
+        robots: NDArray[np.int64],
+        observations: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Choose actions.
+
+        Args:
+            env: Where the robots are, ``env.poses``.
+            robots: Numbers of the N robots that are under way.
+            observations: What they sense, ``[N, O]``.
+
+        Returns:
+            Actions, ``[N, 2]``.
+        """
+
+
+class Blind:
+    """A policy as a :class:`Driver`: it sees the observations and nothing else.
+
+    Args:
+        policy: From observations to actions.
+        alone: Whether it takes a single observation.
+    """
+
+    def __init__(self, policy: Action, *, alone: bool = False) -> None:
+        self.policy = policy
+        self.alone = alone
+
+    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+        """Get ready for an episode, which takes nothing."""
+
+    def drive(
+        self,
+        env: VectorNavigationEnv,
+        robots: NDArray[np.int64],
+        observations: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """One action for each observation."""
+        if self.alone:
+            action = np.asarray(self.policy(observations[0]), dtype=np.float32)
+            if action.shape != (2,):
+                raise ValueError(
+                    f"policy must give an action of shape (2,) for one observation, got {action!r}"
+                )
+            return action[None]
+        actions = np.asarray(self.policy(observations), dtype=np.float32)
+        if actions.shape != (len(observations), 2):
+            raise ValueError(
+                f"policy must give actions of shape {(len(observations), 2)} for observations of "
+                f"shape {observations.shape}, got {actions.shape}; one that takes a single "
+                "observation runs with envs_at_once=1"
+            )
+        return actions
+
+
+def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
+    """A policy, or what is one already, as a :class:`Driver`.
+
+    Args:
+        policy: Either.
+        alone: Whether a policy takes a single observation.
+    """
+    return policy if isinstance(policy, Driver) else Blind(policy, alone=alone)
+
+
+def evaluate(
+    policy: Action | Driver,
+    world: str | os.PathLike[str] | World | Sequence[str | os.PathLike[str] | World] = "test",
+    *,
+    episodes: int | None = None,
+    seed: int = 0,
+    physics: Physics | None = None,
+    envs_at_once: int | None = None,
+    progress_bar: bool = False,
+    **env_arguments: Any,
+) -> list[EpisodeResult]:
+    """Run a policy on fixed tasks; contact is the only collision.
+
+    Args:
+        policy: A :class:`~mpfa_envs.Policy`, any function from observation to action, or a
+            :class:`Driver`, see :func:`run_tasks`.
+        world: What :func:`~mpfa_envs.world_tasks` takes: a world, or ``"bars:test"``, the test
+            worlds of a generator; or several of these.
+        episodes: Number of tasks in each; None: 200 in a world, 400 in the worlds of a generator.
+        seed: Seed of the tasks in a world.
+        physics: ``"wheels"`` or ``"kinematic"``; None: that of the policy.
+        envs_at_once: As in :func:`run_tasks`.
+        progress_bar: Whether to show one.
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv` in place of
+            ``policy.env_arguments``; ``max_steps`` counts where a task has no time limit of its
+            own, as those of generators and of the benchmark have.
+
+    Returns:
+        One result an episode, world by world. Those of a world are the same whichever others are
+        evaluated with it.
+
+    Raises:
+        ValueError: If an argument is out of its range; nothing has moved then.
+
+    Examples:
+        >>> from mpfa_envs import evaluate, summarize
+        >>> ahead = lambda observation: np.ones(2)
+        >>> results = evaluate(ahead, ["A", "rooms-7"], episodes=3, physics="kinematic")
+        >>> [(result.world, result.episode) for result in results[2:4]]
+        [('A', 2), ('rooms-7', 0)]
+        >>> sorted(summarize(results))[:3]
+        ['collision', 'decision_s', 'min_clearance']
+    """
+    arguments = {**getattr(policy, "env_arguments", {}), **env_arguments}
+    if physics is not None:
+        arguments["physics"] = physics
+    robot = arguments.get("robot", "turtlebot2")
+    several = [world] if isinstance(world, (str, os.PathLike, World)) else world
+    tasks = [
+        task
+        for each in several
+        for task in world_tasks(each, episodes=episodes, seed=seed, robot=robot)
+    ]
+    return run_tasks(
+        policy, tasks, envs_at_once=envs_at_once, progress_bar=progress_bar, **arguments
+    )
+
+
+def run_tasks(
+    policy: Action | Driver,
+    tasks: Sequence[WorldTask],
+    *,
+    envs_at_once: int | None = None,
+    progress_bar: bool = False,
+    on_end: Callable[[VectorNavigationEnv, int, int], object] | None = None,
+    **env_arguments: Any,
+) -> list[EpisodeResult]:
+    """Drive every task once.
+
+    Args:
+        policy: From observations, ``[N, O]``, to actions, ``[N, A]``, for the N episodes that are
+            under way; with ``envs_at_once=1`` from one observation, ``[O]``, to one action.
+        tasks: Tasks with their worlds.
+        envs_at_once: How many episodes run together, which changes no result of a
+            :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
+            wheels; None: 64 for one, a :class:`Driver` or a
+            :class:`~mpfa_envs.DynamicWindow`, else one at a time.
+        progress_bar: Whether to show one.
+        on_end: Called at the end of every episode with the environment, the number of the robot,
+            whose ``env.trail(robot)`` is the way that it took, and that of the task.
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`; ``max_steps``
+            counts where a task has no time limit of its own.
+
+    Returns:
+        One result a task, in the order of the tasks.
+
+    Raises:
+        ValueError: If an argument is out of its range, or the robot cannot drive a task, and
+            nothing has moved then; or if the policy gives no action for each observation.
+    """
+    for name in ("world", "num_envs", "autoreset_mode"):
+        if name in env_arguments:
+            raise ValueError(
+                f"{name} must be left to the tasks, which decide it, got {env_arguments[name]!r}"
+            )
+    if envs_at_once is None:
+        takes_many = isinstance(policy, (Policy, DynamicWindow, Driver))
+        envs_at_once = ENVS_AT_ONCE if takes_many else 1
+    check_count("envs_at_once", envs_at_once)
+    driver = as_driver(policy, alone=envs_at_once == 1)
+    results: dict[int, EpisodeResult] = {}
+    arguments = {"collision_distance": "contact", **env_arguments}
+    arguments["autoreset_mode"] = AutoresetMode.DISABLED
+    with ExitStack() as opened, _progress_bar(len(tasks) if progress_bar else None) as advance:
+        fleets = []
+        for numbers in _by_time_limit(tasks).values():
+            robots = min(envs_at_once, len(numbers))
+            arguments["world"] = _room_for([tasks[number].world for number in numbers])
+            limit = tasks[numbers[0]].limit(arguments)
+            env = VectorNavigationEnv(robots, **{**arguments, **limit})
+            fleets.append((opened.enter_context(closing(env)), numbers))
+        for env, numbers in fleets:
+            _check(env, tasks, numbers)
+        for env, numbers in fleets:
+            for ended in _drive(env, driver, tasks, deque(numbers)):
+                results[ended.number] = _result(tasks, ended)
+                advance()
+                if on_end:
+                    on_end(env, ended.robot, ended.number)
+    return [results[number] for number in range(len(tasks))]
+
+
+def _check(env: VectorNavigationEnv, tasks: Sequence[WorldTask], numbers: Sequence[int]) -> None:
+    """Refuse tasks that the robot cannot drive."""
+    for number in numbers:
+        world, task, *_ = tasks[number]
+        try:
+            env.check_task(0, *task, world)
+        except ValueError as error:
+            raise ValueError(f"task {number}, in world {world.name!r}: {error}") from error
+
+
+def _by_time_limit(tasks: Sequence[WorldTask]) -> dict[int | None, list[int]]:
+    """Numbers of the tasks that have the same time limit."""
+    found: dict[int | None, list[int]] = {}
+    for number, each in enumerate(tasks):
+        found.setdefault(each.max_steps, []).append(number)
+    return found
+
+
+def _room_for(worlds: Sequence[World]) -> World:
+    """An empty room as long and as wide as the largest: what bounds the observations."""
+    sides = zip(*(world.size for world in worlds), strict=True)
+    width, depth = (max(each) for each in sides)
+    return World(name="empty", size=(max(width, 10.0), max(depth, 10.0)))
+
+
+class _Ended(NamedTuple):
+    """An episode that has ended."""
+
+    robot: int
+    number: int
+    """Of the task."""
+    info: dict[str, NDArray[Any]]
+    plan_s: float
+    decision_s: float
+
+
+def _drive(
+    env: VectorNavigationEnv, driver: Driver, tasks: Sequence[WorldTask], waiting: deque[int]
+) -> Iterator[_Ended]:
+    """Drive the tasks that wait."""
+    at_work = np.full(env.num_envs, -1)
+    planned, decided = np.zeros(env.num_envs), np.zeros(env.num_envs)
+    decisions = np.zeros(env.num_envs, dtype=np.int64)
+    observations = np.empty(env.observation_space.shape or (), np.float32)
+    while waiting or (at_work >= 0).any():
+        begun = np.zeros(env.num_envs, dtype=np.bool_)
+        for robot in np.flatnonzero(at_work < 0)[: len(waiting)]:
+            at_work[robot], begun[robot] = waiting.popleft(), True
+        if begun.any():
+            observations = _begin(env, tasks, at_work, begun)
+            decided[begun], decisions[begun] = 0.0, 0
+        for robot in np.flatnonzero(begun).tolist():
+            start = time.perf_counter()
+            driver.begin(env, robot)
+            planned[robot] = time.perf_counter() - start
+        running = at_work >= 0
+        robots = np.flatnonzero(running)
+        actions = np.zeros((env.num_envs, 2), np.float32)
+        start = time.perf_counter()
+        actions[running] = driver.drive(env, robots, observations[running])
+        decided[running] += (time.perf_counter() - start) / len(robots)
+        decisions[running] += 1
+        observations, _, terminated, truncated, info = env.step(actions, only=running)
+        for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
+            number, at_work[robot] = int(at_work[robot]), -1
+            mean = float(decided[robot] / decisions[robot])
+            yield _Ended(robot, number, info, float(planned[robot]), mean)
+
+
+def _begin(
+    env: VectorNavigationEnv,
+    tasks: Sequence[WorldTask],
+    at_work: NDArray[np.int64],
+    begun: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Put robots at the start of their tasks; observations of all robots, ``[N, O]``."""
+    chosen = [
+        int(number) if begins else None for number, begins in zip(at_work, begun, strict=True)
+    ]
+    observations, _ = env.reset(
+        # The seed is that of walkers and noise: each task has its own, whichever robot drives it.
+        seed=[None if number is None else _seed(tasks, number) for number in chosen],
+        options={
+            "reset_mask": begun,
+            "worlds": [None if number is None else tasks[number].world for number in chosen],
+            "tasks": [None if number is None else tasks[number].task for number in chosen],
+        },
+    )
+    return observations
+
+
+def _seed(tasks: Sequence[WorldTask], number: int) -> int:
+    """The seed of a task's walkers and noise."""
+    seed = tasks[number].seed
+    return number if seed is None else seed
+
+
+def _result(tasks: Sequence[WorldTask], ended: _Ended) -> EpisodeResult:
+    robot, number, info = ended.robot, ended.number, ended.info
+    world = tasks[number].world
+    driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
+    success = bool(info["success"][robot])
+    return EpisodeResult(
+        episode=sum(each.world is world for each in tasks[:number]),
+        success=success,
+        collision=bool(info["collision"][robot]),
+        timeout=bool(info["timeout"][robot]),
+        time_s=float(info["sim_time"][robot]),
+        path_length=driven,
+        shortest_path=shortest,
+        min_clearance=float(info["min_clearance"][robot]),
+        spl=spl(success, path_length=driven, shortest_path=shortest),
+        plan_s=ended.plan_s,
+        decision_s=ended.decision_s,
+        world=world.name,
+        **({name: float(info[name][robot]) for name in ENCOUNTERS} if world.walkers else {}),
+    )
+
+
+@contextmanager
+def _progress_bar(total: int | None) -> Iterator[Callable[[], object]]:
+    """A function that advances a bar by one episode, if there is one."""
+    if total is None:
+        yield lambda: None
+        return
+    from tqdm import tqdm
+
+    with closing(tqdm(total=total, unit="episode")) as bar:
+        yield bar.update

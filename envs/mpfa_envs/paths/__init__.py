@@ -1,0 +1,1 @@
+"""Shortest paths of a robot among the obstacles of a world."""

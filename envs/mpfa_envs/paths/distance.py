@@ -1,0 +1,344 @@
+"""The shortest path from everywhere in a world to a goal, on a grid.
+
+Where :mod:`~mpfa_envs.paths.planner` answers one question exactly, a field answers it for all cells
+at once, and in milliseconds however many obstacles there are. Moves lead from a free cell to its 16
+neighbors, hence a path in the open is up to 1.4 % too long or too short. Around corners and in
+narrow passages the size of the cells adds to it: ``docs/worlds.md`` has what was measured.
+
+Centers of free cells keep the distance d. Between two that are a step L apart a path keeps
+√(d² - L²/4) at least: whatever is nearest to its middle is d away from both ends.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from mpfa_envs.checks import check_number, check_positive
+from mpfa_envs.paths.field_loops import ways_from
+from mpfa_envs.paths.grid_loops import (
+    MOVES,
+    STEP_SCALE,
+    clearance_grid,
+    fill_from_nearest,
+    interpolate,
+    neighbor_lists,
+    number_cells,
+    shortest_way,
+)
+from mpfa_envs.worlds.cell_loops import lower_clearances
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds.world import World
+
+__all__ = ["DistanceField", "FreeGrid", "shortest_way"]
+
+RESOLUTION: Final = 0.1
+"""Side of a cell unless another is asked for [m]."""
+_MOST_CELLS: Final = 4_000_000
+_MARGIN: Final = 3
+"""Cells by which a window is wider than the longest path."""
+
+
+class FreeGrid:
+    """Square cells over a room, and which of them a disc's center may be in.
+
+    Args:
+        world: The room and its obstacles.
+        distance: What a free cell's center keeps from every obstacle and wall [m].
+        resolution: Side of a cell [m], no longer than the distance, so that no move steps over a
+            wall. None: 0.1 m, or the distance if that is less.
+
+    Raises:
+        ValueError: If a number is out of its range, or there would be more than four million cells.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
+        >>> grid.clearance.shape, grid.origin
+        ((100, 100), (-4.95, -4.95))
+        >>> grid.index(0.0, 3.75), bool(grid.free[50, 87])  # In a box.
+        ((50, 87), False)
+    """
+
+    def __init__(self, world: World, *, distance: float, resolution: float | None = None) -> None:
+        self.world = world
+        self.distance = check_positive("distance", distance)
+        if resolution is None:
+            resolution = min(RESOLUTION, self.distance)
+        self.resolution = check_positive("resolution", resolution)
+        if self.resolution > self.distance:
+            raise ValueError(
+                f"resolution must be at most the distance, {distance} m, got {resolution}"
+            )
+        # The grid is as wide as the room or a little wider; what is behind a wall is not free.
+        sides = [max(1, math.ceil(round(side / resolution, 6))) for side in world.size]
+        if math.prod(sides) > _MOST_CELLS:
+            raise ValueError(
+                f"resolution must leave at most {_MOST_CELLS} cells in a room of {world.size} m, "
+                f"got {resolution}"
+            )
+        self.xs, self.ys = (_centers(count, self.resolution) for count in sides)
+        """Centers of the columns ``[nx]`` and the rows ``[ny]`` [m]."""
+        self.origin = (float(self.xs[0]), float(self.ys[0]))
+        """Center of the first cell (x, y) [m]."""
+        self.clearance: NDArray[np.float32] = clearance_grid(*world.arrays, self.xs, self.ys)
+        """Distance of each center from the nearest obstacle or wall [m], ``[nx, ny]``."""
+        if (cells := world.occupancy) is not None:
+            left, right, _ = cells.arrays
+            lower_clearances(left, right, cells.resolution, self.xs, self.ys, self.clearance)
+        self.free: NDArray[np.bool_] = self.clearance >= np.float32(self.distance)
+        """Where the center keeps the distance, ``[nx, ny]``."""
+
+    @cached_property
+    def cells(self) -> NDArray[np.int64]:
+        """Column and row of each free cell, shape ``[cells, 2]``."""
+        return np.argwhere(self.free)
+
+    @cached_property
+    def _numbers(self) -> NDArray[np.int32]:
+        """Place of each free cell in :attr:`cells`, -1 for the others, ``[nx, ny]``."""
+        return number_cells(self.free)
+
+    @cached_property
+    def moves(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+        """The moves between free cells, in compressed rows.
+
+        Where the moves of each of :attr:`cells` begin, ``[cells + 1]``; the numbers of the cells
+        that they lead to, and their lengths [m], ``[moves]``.
+        """
+        return neighbor_lists(self.free, self._numbers, MOVES, self.resolution * STEP_SCALE)
+
+    def index(self, x: float, y: float) -> tuple[int, int]:
+        """Find the cell of a position, the nearest one for a position outside.
+
+        Args:
+            x: Position [m].
+            y: Position [m].
+
+        Returns:
+            Column and row.
+        """
+        places = zip((x, y), self.origin, self.free.shape, strict=True)
+        i, j = (
+            min(max(round((at - first) / self.resolution), 0), count - 1)
+            for at, first, count in places
+        )
+        return i, j
+
+    def center(self, i: int, j: int) -> tuple[float, float]:
+        """Position (x, y) of a cell's center [m]."""
+        return float(self.xs[i]), float(self.ys[j])
+
+    def cells_around(self, place: tuple[float, float]) -> list[tuple[int, float]]:
+        """Find where ways to or from a position pass.
+
+        Args:
+            place: Position (x, y) [m].
+
+        Returns:
+            Numbers of the cells around it, or of the nearest one if its own is not free, and how
+            far they are from it [m].
+
+        Raises:
+            ValueError: If no cell is free.
+        """
+        if not self.free.any():
+            raise ValueError(f"grid must have a free cell, and {self.world.name!r} has none")
+        i, j = self.index(*place)
+        if not self.free[i, j]:
+            gaps = np.hypot(
+                self.xs[self.cells[:, 0]] - place[0], self.ys[self.cells[:, 1]] - place[1]
+            )
+            nearest = int(gaps.argmin())
+            return [(nearest, float(gaps[nearest]))]
+        starts, neighbors, _ = self.moves
+        number = self._numbers[i, j]
+        around = [number, *neighbors[starts[number] : starts[number + 1]]]
+        return [(int(at), math.dist(self.center(*self.cells[at]), place)) for at in around]
+
+    def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
+        """Measure the path between two positions.
+
+        Args:
+            start: Position (x, y) [m].
+            goal: Position (x, y) [m].
+
+        Returns:
+            Length [m]; infinite if there is no path.
+        """
+        if not self.free.any():
+            return math.inf
+        direct = math.dist(start, goal)
+        # In a map, which may be large, a window is looked through first.
+        windows = (1.2 * direct + 1.0, 2.0 * direct + 4.0) if self.world.occupancy else ()
+        for longest in windows:
+            found = DistanceField(self, goal, longest).length_from(start)
+            # A cell with a longer path was not found, but might have been the best one.
+            if found <= longest:
+                return found
+        return DistanceField(self, goal).length_from(start)
+
+    def graph_to(self, goal: tuple[float, float]) -> csr_array:
+        """Write the moves, and those from a goal to the cells around it, as a sparse matrix.
+
+        Args:
+            goal: Position (x, y) [m].
+
+        Returns:
+            Lengths [m], ``[cells + 1, cells + 1]``; the last row is the goal's.
+
+        Raises:
+            ValueError: If no cell is free.
+        """
+        first = self.cells_around(goal)
+        starts, neighbors, lengths = self.moves
+        count = len(starts) - 1
+        # The goal is a node of its own, the last one, from which the cells around it are reached.
+        numbers, gaps = zip(*first, strict=True)
+        return csr_array(
+            (
+                # A gap of zero would be no edge.
+                np.concatenate((lengths, np.maximum(gaps, 1e-12))),
+                np.concatenate((neighbors, np.array(numbers, dtype=np.int32))),
+                np.append(starts, np.int32(len(neighbors) + len(first))),
+            ),
+            shape=(count + 1, count + 1),
+        )
+
+
+def _centers(count: int, resolution: float) -> NDArray[np.float64]:
+    """Middles of cells side by side around zero [m]."""
+    return resolution * (np.arange(count, dtype=np.float64) - (count - 1) / 2)
+
+
+class DistanceField:
+    """The shortest path to one goal from every cell of a grid, or of a window around the goal.
+
+    Args:
+        grid: The grid.
+        goal: Position (x, y) [m]. If its cell is not free, the path ends at the nearest free one.
+        longest: Longest path that is measured [m]; the field is a window that has room for it.
+
+    Raises:
+        ValueError: If the goal is not two finite numbers, or no cell is free.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS, DistanceField, FreeGrid
+        >>> grid = FreeGrid(WORLDS["B"], distance=0.18)
+        >>> field = DistanceField(grid, (4.0, 0.0))
+        >>> round(field.at(3.9, 0.0), 1), round(field.at(0.0, 0.0), 1)  # [m]; a box is between
+        (0.1, 6.4)
+        >>> DistanceField(grid, (4.0, 0.0), longest=3.0).lengths.shape
+        (45, 69)
+    """
+
+    def __init__(
+        self, grid: FreeGrid, goal: tuple[float, float], longest: float = math.inf
+    ) -> None:
+        self.grid = grid
+        self.goal = (check_number("goal", goal[0]), check_number("goal", goal[1]))
+        if not grid.free.any():
+            raise ValueError(f"grid must have a free cell, and {grid.world.name!r} has none")
+        i, j = grid.index(*self.goal)
+        # Moves are measured a little short.
+        reach = min(longest / STEP_SCALE / grid.resolution, max(grid.free.shape))
+        wide = math.ceil(reach) + _MARGIN
+        self.first = max(i - wide, 0), max(j - wide, 0)
+        """Column and row of the grid that the window begins with."""
+        self.window = tuple(
+            slice(first, at + wide + 1) for first, at in zip(self.first, (i, j), strict=True)
+        )
+        free = grid.free[self.window]
+        seeds, gaps = self._around(free, i - self.first[0], j - self.first[1], self.goal)
+        step = grid.resolution * STEP_SCALE
+        self.lengths = ways_from(free, seeds, gaps, MOVES, step, float(longest))
+        """Lengths of the shortest paths [m], infinite where there is none, ``[columns, rows]``."""
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """Center of the window's first cell (x, y) [m]."""
+        return self.grid.center(*self.first)
+
+    @property
+    def resolution(self) -> float:
+        """Side of a cell [m]."""
+        return self.grid.resolution
+
+    @cached_property
+    def filled(self) -> NDArray[np.float32]:
+        """The same in single precision; cells without a path have what the nearest other has."""
+        return fill_from_nearest(self.lengths.astype(np.float32))
+
+    def at(self, x: float, y: float) -> float:
+        """Read the length of the path from a position, at the window's edge from outside of it.
+
+        Args:
+            x: Position [m].
+            y: Position [m].
+
+        Returns:
+            Length [m], interpolated between the centers of the cells.
+        """
+        return interpolate(self.filled, *self.origin, self.resolution, x, y)
+
+    def length_from(self, start: tuple[float, float]) -> float:
+        """Measure the path from a position.
+
+        Args:
+            start: Position (x, y) [m].
+
+        Returns:
+            Length [m]; infinite if there is no path in the window.
+        """
+        i, j = (at - first for at, first in zip(self.grid.index(*start), self.first, strict=True))
+        columns, rows = self.lengths.shape
+        if not (0 <= i < columns and 0 <= j < rows):
+            return math.inf
+        cells, gaps = self._around(self.grid.free[self.window], i, j, start)
+        return float((self.lengths[cells[:, 0], cells[:, 1]] + gaps).min(initial=math.inf))
+
+    def _around(
+        self,
+        free: NDArray[np.bool_],
+        i: int,
+        j: int,
+        place: tuple[float, float],
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Cells of the window around a place in cell (i, j), ``[cells, 2]``, and how far they are.
+
+        They are those of :meth:`~mpfa_envs.FreeGrid.cells_around`.
+        """
+        x, y = place
+        if free[i, j]:
+            cells = np.concatenate(([[i, j]], _neighbors(free, i, j)))
+        else:
+            cells = np.argwhere(free)
+        gaps = np.hypot(
+            self.grid.xs[cells[:, 0] + self.first[0]] - x,
+            self.grid.ys[cells[:, 1] + self.first[1]] - y,
+        )
+        if not free[i, j] and len(cells):
+            nearest = int(gaps.argmin())
+            cells, gaps = cells[nearest : nearest + 1], gaps[nearest : nearest + 1]
+        # A gap of zero would be no edge of a graph.
+        return cells.astype(np.int64), np.maximum(gaps, 1e-12)
+
+
+def _neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:
+    """Cells to which a move leads from a cell, ``[cells, 2]``."""
+    columns, rows = free.shape
+    to = MOVES[:, :2] + (i, j)
+    inside = ((to >= 0) & (to < (columns, rows))).all(axis=1)
+    to, moves = to[inside], MOVES[inside]
+    over, under = moves[:, 2:4] + (i, j), moves[:, 4:6] + (i, j)
+    is_open = (
+        free[to[:, 0], to[:, 1]] & free[over[:, 0], over[:, 1]] & free[under[:, 0], under[:, 1]]
+    )
+    return to[is_open]

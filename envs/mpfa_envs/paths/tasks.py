@@ -1,0 +1,204 @@
+"""Tasks over the cells of a grid: in milliseconds, however full or large a world is."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+
+from mpfa_envs.checks import check_positive, check_share
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.worlds.task import START_SLACK, Task
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds.world import Box, World
+
+LONGEST_PATH: Final = 20.0
+"""No sampled task in a map has a longer path [m]: a field over the whole map would be too large."""
+_ROOMY: Final = 0.1
+"""Share of the free cells with the usual clearance that a world must have to be asked for it."""
+_GOALS: Final = 30
+"""Goals that are tried before a world is said to have no task."""
+_GOALS_IN_MAP: Final = 100
+"""The same in a map, of which a window is looked at each time."""
+_DETOURS: Final = 5
+"""Goals that are tried for a detour before a straight path will do."""
+
+
+def sample_task_on_grid(
+    place: FreeGrid | World,
+    rng: np.random.Generator,
+    *,
+    distance: float | None = None,
+    min_goal_distance: float = 2.0,
+    max_goal_distance: float = math.inf,
+    detour_chance: float = 0.0,
+    start_clearance: float | None = None,
+    goal_clearance: float | None = None,
+) -> tuple[Task, DistanceField]:
+    """Sample a goal, and a start from which there is a way to it, over the cells of a grid.
+
+    It takes milliseconds however many obstacles there are and however rare tasks are, where
+    :func:`~mpfa_envs.sample_task` tries points one by one.
+
+    In the world of a map no way is longer than 20 m, start and goal have the usual clearance, and
+    the field is that of a window around the goal.
+
+    Args:
+        place: A grid, or a world, of which one is made.
+        rng: Source of randomness.
+        distance: What the way keeps from obstacles [m]; for a world only.
+        min_goal_distance: Least distance between start and goal [m].
+        max_goal_distance: Longest way between them [m].
+        detour_chance: Chance that the task must be a detour, if the world has any: its way is more
+            than 1.08 times the straight line and 0.3 m.
+        start_clearance: What the start keeps from obstacles [m]. None: 0.15 m more than the way,
+            or no more than it where fewer than a tenth of the free cells have that.
+        goal_clearance: The same of the goal.
+
+    Returns:
+        The task, its heading uniform; and the field of its goal.
+
+    Raises:
+        ValueError: If an argument is out of its range, or the world has no such task.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import WORLDS, sample_task_on_grid
+        >>> rng = np.random.default_rng(0)
+        >>> task, field = sample_task_on_grid(WORLDS["D"], rng, distance=0.25)
+        >>> WORLDS["D"].clearance(*task.goal) >= 0.4, field.at(*task.start[:2]) < 20.0
+        (True, True)
+    """
+    check_positive("min_goal_distance", min_goal_distance)
+    if not max_goal_distance > min_goal_distance:
+        raise ValueError(
+            f"max_goal_distance must be above min_goal_distance = {min_goal_distance}, got "
+            f"{max_goal_distance}"
+        )
+    check_share("detour_chance", detour_chance)
+    grid = _as_grid(place, distance)
+    world, in_map = grid.world, grid.world.occupancy is not None
+    start_room, goal_room = (
+        _clearance(grid, None if in_map else asked) for asked in (start_clearance, goal_clearance)
+    )
+    may_start, goals = _places(grid, start_room, goal_room)
+    longest = min(max_goal_distance, LONGEST_PATH) if in_map else max_goal_distance
+    slack = grid.resolution  # Start and goal leave the middle of their cells: by this much.
+    detour = detour_chance > 0.0 and rng.random() < detour_chance
+    straight: tuple[Task, DistanceField] | None = None
+    attempts = _GOALS_IN_MAP if in_map else _GOALS
+    for attempt in range(attempts if len(goals) and may_start.any() else 0):
+        if straight is not None and attempt >= _DETOURS:
+            break
+        i, j = np.unravel_index(goals[rng.integers(len(goals))], grid.free.shape)
+        goal = _within_cell(grid, rng, int(i), int(j), goal_room)
+        far = np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1]) >= min_goal_distance + slack
+        if not (may_start & far).any():  # The paths to this goal, which take time, are not needed.
+            continue
+        field = DistanceField(grid, goal, LONGEST_PATH if in_map else math.inf)
+        xs, ys = grid.xs[field.window[0], None], grid.ys[None, field.window[1]]
+        direct = np.hypot(xs - goal[0], ys - goal[1])
+        fits = may_start[field.window] & far[field.window]
+        fits &= np.isfinite(field.lengths) & (field.lengths <= longest - slack)
+        around = fits & (field.lengths > 1.08 * direct + 0.3)
+        wanted = detour and bool(around.any())
+        starts = np.flatnonzero(around if wanted else fits)
+        if not len(starts) or (detour and not wanted and straight is not None):
+            continue
+        column, row = np.unravel_index(starts[rng.integers(len(starts))], fits.shape)
+        cell = int(column) + field.first[0], int(row) + field.first[1]
+        start = _within_cell(grid, rng, *cell, start_room)
+        task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
+        if wanted or not detour:
+            return task, field
+        straight = task, field
+    if straight is not None:  # Nothing in this world is in a robot's path.
+        return straight
+    raise ValueError(
+        f"world {world.name!r} has no start and goal at least min_goal_distance = "
+        f"{min_goal_distance} m apart with a path of at most {longest} m between them that keeps "
+        f"{grid.distance} m"
+    )
+
+
+def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
+    """Tell whether there is a start and a goal with a path between them.
+
+    It looks for a part of the free cells that hangs together and is wide enough in x or in y.
+
+    Args:
+        grid: The grid.
+        min_goal_distance: Least distance between start and goal [m].
+
+    Returns:
+        Whether :func:`sample_task_on_grid` finds one.
+    """
+    parts, _ = label(grid.free)
+    parts = np.where(grid.clearance >= np.float32(_clearance(grid, None)), parts, 0)
+    steps = min_goal_distance / grid.resolution + 1.0
+    return any(
+        place is not None and max(span.stop - span.start - 1 for span in place) > steps
+        for place in find_objects(parts)
+    )
+
+
+def _as_grid(place: FreeGrid | World, distance: float | None) -> FreeGrid:
+    """The grid that is meant."""
+    if isinstance(place, FreeGrid):
+        if distance is not None:
+            raise ValueError(f"distance must be None for a grid, which has one, got {distance}")
+        return place
+    if distance is None:
+        raise ValueError("distance must be given for a world, got None")
+    return FreeGrid(place, distance=distance)
+
+
+def _clearance(grid: FreeGrid, wanted: float | None) -> float:
+    """The clearance that starts or goals keep [m]."""
+    if wanted is not None:
+        return max(check_positive("clearance", wanted), grid.distance)
+    usual = grid.distance + START_SLACK
+    roomy = np.count_nonzero(grid.clearance >= np.float32(usual))
+    return usual if roomy >= _ROOMY * np.count_nonzero(grid.free) else grid.distance
+
+
+@lru_cache(maxsize=8)
+def _places(
+    grid: FreeGrid, start_room: float, goal_room: float
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Where episodes may start, ``[nx, ny]``, and numbers of the cells where goals may lie."""
+    starts, goals = (
+        grid.free & (grid.clearance >= np.float32(room)) & _inside(grid, regions)
+        for room, regions in (
+            (start_room, grid.world.start_regions),
+            (goal_room, grid.world.goal_regions),
+        )
+    )
+    return starts, np.flatnonzero(goals)
+
+
+def _inside(grid: FreeGrid, regions: tuple[Box, ...]) -> NDArray[np.bool_]:
+    """Tell which cells lie in one of the regions, ``[nx, ny]``; all do if there are none."""
+    inside = np.full(grid.free.shape, not regions)
+    for region in regions:
+        columns = (region.x_min <= grid.xs) & (grid.xs <= region.x_max)
+        rows = (region.y_min <= grid.ys) & (grid.ys <= region.y_max)
+        inside |= columns[:, None] & rows
+    return inside
+
+
+def _within_cell(
+    grid: FreeGrid, rng: np.random.Generator, i: int, j: int, clearance: float
+) -> tuple[float, float]:
+    """A point of a cell that keeps the clearance, its center (x, y) if no other is found [m]."""
+    x, y = grid.center(i, j)
+    for across, up in (grid.resolution * (rng.random((4, 2)) - 0.5)).tolist():
+        if grid.world.clearance(x + across, y + up) >= clearance:
+            return x + across, y + up
+    return x, y

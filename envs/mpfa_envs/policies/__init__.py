@@ -1,0 +1,1 @@
+"""Trained policies and their files, npz and ONNX."""

@@ -1,0 +1,143 @@
+"""Policies as files: written as npz, read as npz or ONNX without executing anything in them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mpfa_envs.files import check_replaceable, read_file, write_atomically
+from mpfa_envs.policies.layers import KINDS, arrays_of
+from mpfa_envs.policies.onnx_policy import OnnxPolicy
+from mpfa_envs.policies.policy import Policy, PolicyFileError
+
+FILE_NAME: Final = "policy.npz"
+"""What the file is called in the folder of a run."""
+_FORMAT: Final = 1
+_ABOUT: Final = "about"
+"""The entry with all that is not a weight: JSON as bytes."""
+_LARGEST: Final = 2**28
+"""A file that unpacks to more than this is no policy [bytes]."""
+
+
+def save_policy(policy: Policy, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+    """Write a policy to a file, whole or not at all.
+
+    Args:
+        policy: The policy.
+        path: The file; in a folder it is called ``policy.npz``. Another policy there is replaced.
+        overwrite: Whether anything else there is replaced, too.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileExistsError: If there is a file that holds no policy, and overwrite is false.
+        ValueError: If it is out of an ONNX file, which holds no layers.
+
+    Examples:
+        >>> import tempfile
+        >>> from mpfa_envs import Policy, load_policy, save_policy
+        >>> from mpfa_envs.policies.layers import Linear
+        >>> policy = Policy([Linear(np.ones((2, 24), np.float32), np.zeros(2, np.float32))])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = save_policy(policy, folder)
+        ...     load_policy(folder)
+        Policy(24 -> 2: Linear)
+    """
+    if not policy.layers:
+        raise ValueError(f"policy must have layers, got {policy!r}: copy its file and its card")
+    file = _file(path)
+    plain = [
+        {
+            "kind": type(layer).__name__,
+            **{k: v for k, v in asdict(layer).items() if not isinstance(v, np.ndarray)},
+        }
+        for layer in policy.layers
+    ]
+    about = {
+        "format": _FORMAT,
+        "layers": plain,
+        "card": policy.card,
+        "env_arguments": policy.env_arguments,
+    }
+    arrays = {
+        f"{number}.{name}": value
+        for number, layer in enumerate(policy.layers)
+        for name, value in arrays_of(layer).items()
+    }
+    packed = io.BytesIO()
+    text = json.dumps(about, indent=1).encode()
+    np.savez(packed, allow_pickle=False, **{_ABOUT: np.frombuffer(text, np.uint8)}, **arrays)
+    check_replaceable(file, _load, "policy", overwrite=overwrite)
+    write_atomically(packed.getvalue(), file)
+    return file
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Read a policy without executing anything in the file.
+
+    Args:
+        path: The file, or the folder of a run; or an ONNX file of :func:`~mpfa_envs.export_policy`
+            with its card beside it, which needs onnxruntime.
+
+    Returns:
+        The policy.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        PolicyFileError: If it is no policy, was damaged, or is of another version.
+    """
+    file = _file(path)
+    if file.suffix == ".onnx":
+        return OnnxPolicy(file)
+    return _load(file)
+
+
+def _load(file: Path) -> Policy:
+    """Read a policy that :func:`save_policy` wrote."""
+    try:
+        return _read(read_file(file, _LARGEST))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no policy at {file}") from None
+    # A damaged archive fails in many ways: a wrong checksum, header, length, number, password.
+    except Exception as error:
+        raise PolicyFileError(f"{file} holds no policy, or is damaged: {error}") from error
+
+
+def _read(content: bytes) -> Policy:
+    """Read a policy from the bytes of its file."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+        if size > _LARGEST:
+            raise ValueError(f"it unpacks to {size} bytes")
+        # The checksums, once over everything: arrays are read no further than their shape says.
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"the checksum of {damaged!r} does not match")
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        about = json.loads(bytes(arrays[_ABOUT]).decode())
+        if about["format"] != _FORMAT:
+            raise ValueError(f"its format is {about['format']!r}, not {_FORMAT}")
+        layers = []
+        for number, entry in enumerate(about["layers"]):
+            kind = KINDS[entry.pop("kind")]
+            prefix = f"{number}."
+            weights = {
+                name.removeprefix(prefix): np.asarray(arrays[name], dtype=np.float32)
+                for name in arrays.files
+                if name.startswith(prefix)
+            }
+            layers.append(kind(**entry, **weights))
+    return Policy(layers, card=about["card"], env_arguments=about["env_arguments"])
+
+
+def _file(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    return path / FILE_NAME if path.is_dir() else path

@@ -1,0 +1,1 @@
+"""Two-wheeled robots: their measures, their motion and its errors."""

@@ -1,0 +1,274 @@
+"""Two ways to move many robots: exact kinematics, or PyBullet's physics."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+
+import numpy as np
+
+from mpfa_envs.robots.motion_loops import drive_arcs
+from mpfa_envs.saved import read_array
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.robots.model import RobotModel
+    from mpfa_envs.robots.simulation import Simulation
+
+SUBSTEP: Final = 1 / 30
+"""Duration of a step of the physics engine [s].
+
+The wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do not.
+"""
+Physics = Literal["kinematic", "wheels"]
+"""How the robot moves."""
+_SERVERS: Final = 32
+"""Physics servers at most."""
+
+
+class Drives(Protocol):
+    """What :class:`~mpfa_envs.VectorNavigationEnv` needs of a way to move."""
+
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Put a robot at rest at a pose [m, m, rad]."""
+        ...
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What brings the robots where they are in their episodes."""
+        ...
+
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Raises:
+            ValueError: If something is missing or of another shape.
+        """
+        ...
+
+    def load(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Bring them there from their starts ``[N, 3]``."""
+        ...
+
+    def close(self) -> None:
+        """Release what the drives hold."""
+        ...
+
+
+class KinematicDrives:
+    """Moves robots on exact arcs: the wheels have their speed at once and never slip.
+
+    Args:
+        robot: The robot.
+        time_step: Duration of a step [s].
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import ROBOTS
+        >>> from mpfa_envs.robots.drives import KinematicDrives
+        >>> drives = KinematicDrives(ROBOTS["turtlebot2"], time_step=0.1)
+        >>> motions = np.zeros((2, 5))
+        >>> drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
+        >>> motions[:, 0]
+        array([0.05, 0.  ])
+    """
+
+    def __init__(self, robot: RobotModel, *, time_step: float) -> None:
+        self._wheel_base = robot.wheel_base
+        self._time_step = time_step
+
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Nothing is held: the motions say where the robots are."""
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        drive_arcs(motions, running, speeds, self._wheel_base, self._time_step)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing is held."""
+        return {}
+
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Nothing is held."""
+        return {}
+
+    def load(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Nothing is held."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class WheelDrives:
+    """Moves robots by PyBullet: motors turn the wheels, friction moves the robot.
+
+    Up to 32 robots have a physics server each and drive the same bits as alone. A server takes
+    35 MB; more robots therefore share 32 of them, where they pass through each other. There
+    PyBullet's solver stops at other last digits, and trajectories part slowly.
+
+    Args:
+        robot: The robot.
+        robots: Number of robots.
+        time_step: Duration of a step [s].
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import ROBOTS
+        >>> from mpfa_envs.robots.drives import WheelDrives
+        >>> drives = WheelDrives(ROBOTS["turtlebot2"], 2, time_step=0.1)
+        >>> motions = np.zeros((2, 5))
+        >>> for _ in range(20):
+        ...     drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
+        >>> motions[:, 3].round(2)
+        array([0.5, 0. ])
+        >>> drives.close()
+    """
+
+    def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
+        # Imported here so that kinematic environments run without PyBullet.
+        from mpfa_envs.robots.simulation import Simulation
+
+        self._wheel_radius = robot.wheel_radius
+        self._simulations = [
+            Simulation(time_step=time_step, substeps=max(1, round(time_step / SUBSTEP)))
+            for _ in range(min(robots, _SERVERS))
+        ]
+        self._names = [f"robot_{index}" for index in range(robots)]
+        # Speeds of each robot in its episode so far, and their number.
+        self._driven = np.zeros((robots, 64, 2))
+        self._counts = np.zeros(robots, dtype=np.int64)
+        for index, name in enumerate(self._names):
+            self._simulation_of(index).add_robot(robot, name=name)
+        for index in range(robots):
+            self.place(index, 0.0, 0.0, 0.0)
+
+    def _simulation_of(self, index: int) -> Simulation:
+        """The server of a robot."""
+        return self._simulations[index % len(self._simulations)]
+
+    def place(self, index: int, x: float, y: float, heading: float) -> None:
+        """Put a robot at rest at a pose [m, m, rad]."""
+        self._simulation_of(index).place_robot(x, y, heading, name=self._names[index])
+        self._counts[index] = 0
+
+    def move(
+        self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
+    ) -> None:
+        """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
+        self._remember(running, speeds)
+        turning = np.where(running[:, None], speeds / self._wheel_radius, 0.0).tolist()
+        moving = np.flatnonzero(running).tolist()
+        # In a server of its own, a robot that does not run is not simulated; in a shared one it
+        # stops.
+        shared = len(self._names) > len(self._simulations)
+        for index in range(len(self._names)) if shared else moving:
+            left, right = turning[index]
+            simulation = self._simulation_of(index)
+            simulation.set_wheel_speeds(left, right, name=self._names[index])
+        for number in {index % len(self._simulations) for index in moving}:
+            self._simulations[number].step()
+        for index in moving:
+            motions[index] = _motion(self._simulation_of(index), self._names[index])
+
+    def _remember(self, running: NDArray[np.bool_], speeds: NDArray[np.float64]) -> None:
+        """Keep what the robots have driven since the start of their episodes."""
+        if self._counts.max() == self._driven.shape[1]:
+            self._driven = np.concatenate((self._driven, np.zeros_like(self._driven)), axis=1)
+        self._driven[running, self._counts[running]] = speeds[running]
+        self._counts[running] += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """The wheel speeds of the episodes so far: the engine cannot save all that it knows."""
+        counts = self._counts.copy()
+        return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
+
+    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
+
+        Args:
+            state: What it gave.
+
+        Returns:
+            Its arrays.
+
+        Raises:
+            ValueError: If something is missing or of another shape.
+        """
+        counts = read_array(state, "counts", self._counts)
+        if counts.min() < 0:
+            raise ValueError(f"counts of the state must not be negative, got {counts.tolist()}")
+        speeds = read_array(state, "speeds", np.zeros((len(counts), counts.max(), 2)))
+        return {"counts": counts, "speeds": speeds}
+
+    def load(
+        self,
+        arrays: Mapping[str, NDArray[Any]],
+        starts: NDArray[np.float64],
+        motions: NDArray[np.float64],
+    ) -> None:
+        """Drive the episodes again from their starts.
+
+        Args:
+            arrays: What :meth:`read` gave.
+            starts: Poses at the start (x, y, heading) [m, m, rad], ``[N, 3]``.
+            motions: Poses and speeds, ``[N, 5]``, changed on the way.
+        """
+        counts, speeds = arrays["counts"], arrays["speeds"]
+        last = int(counts.max())
+        # All end at once; who has driven for a shorter time is placed later.
+        for step in range(last + 1):
+            for index in np.flatnonzero(counts == last - step).tolist():
+                self.place(index, *starts[index].tolist())
+            if step == last:
+                return
+            running = step >= last - counts
+            now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
+            self.move(motions, running, now)
+
+    def close(self) -> None:
+        """Shut the physics servers down; a second call does nothing."""
+        for simulation in self._simulations:
+            simulation.close()
+
+
+def _motion(simulation: Simulation, name: str) -> tuple[float, ...]:
+    """Pose and speeds (x, y, heading, forward, turning) of a simulated robot."""
+    x, y, heading, speed_x, speed_y, turn = simulation.robot_motion(name)
+    return x, y, heading, speed_x * math.cos(heading) + speed_y * math.sin(heading), turn
+
+
+def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:
+    """Make the way to move that a name stands for.
+
+    Args:
+        physics: How the robots move.
+        robot: What they are.
+        robots: Number of robots.
+        time_step: Duration of a step [s].
+
+    Returns:
+        The drives.
+    """
+    if physics == "kinematic":
+        return KinematicDrives(robot, time_step=time_step)
+    return WheelDrives(robot, robots, time_step=time_step)

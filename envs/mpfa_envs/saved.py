@@ -1,0 +1,54 @@
+"""Reading arrays and lists from a saved state, with errors that name the entry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArray[Any]:
+    """Read an array of a state.
+
+    Args:
+        state: Where it is.
+        name: Its name.
+        like: An array of the same shape and kind.
+
+    Returns:
+        A copy of it.
+
+    Raises:
+        ValueError: If it is missing, of another shape, or not finite.
+    """
+    values = np.array(state.get(name), dtype=like.dtype if name in state else object)
+    if values.shape != like.shape:
+        raise ValueError(f"{name} of the state must have shape {like.shape}, got {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} of the state must be finite numbers")
+    return values
+
+
+def read_list(state: Mapping[str, Any], name: str, robots: int) -> Sequence[Any]:
+    """Read what a state has of each robot.
+
+    Args:
+        state: Where it is.
+        name: Its name.
+        robots: Number of robots.
+
+    Returns:
+        It.
+
+    Raises:
+        ValueError: If it is missing, or not there for each robot.
+    """
+    values = state.get(name)
+    if not isinstance(values, list | tuple) or len(values) != robots:
+        found = len(values) if isinstance(values, list | tuple) else repr(values)
+        raise ValueError(f"{name} of the state must have {robots} entries, got {found}")
+    return values

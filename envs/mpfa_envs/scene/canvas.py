@@ -1,0 +1,226 @@
+"""What pictures of a world from above are made on, without a display."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mpfa_envs.scene.colors import (
+    FLOOR,
+    GOAL,
+    GOAL_AREA,
+    GOAL_EDGE,
+    GRID,
+    OBSTACLE,
+    OBSTACLE_EDGE,
+    PAPER,
+    ROBOT,
+    ROBOT_FRONT,
+    ROUND,
+    WALKER,
+    WALKER_EDGE,
+    WALL,
+    Color,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds.occupancy import OccupancyGrid
+    from mpfa_envs.worlds.world import World
+
+Point = tuple[float, float]
+
+FINE: Final = 3
+"""Pictures are drawn this many times larger and then reduced, which smooths all edges."""
+_BORDER: Final = 0.2
+"""Thickness of the walls in a picture [m]."""
+
+
+class Canvas:
+    """A picture of a world to draw on in meters.
+
+    Args:
+        world: The world.
+        size: Longer side of the picture [px].
+        footer: Height of a strip for text below [px].
+        least_width: Of the picture [px]; a narrower world has white on either side.
+    """
+
+    def __init__(self, world: World, *, size: int, footer: int = 0, least_width: int = 0) -> None:
+        if isinstance(size, bool) or not isinstance(size, int) or size < 32:
+            raise ValueError(f"size must be an integer of at least 32, got {size!r}")
+        width, depth = (side + 2 * _BORDER for side in world.size)
+        self._scale = FINE * size / max(width, depth)
+        pixels = [round(size * side / max(width, depth)) for side in (width, depth)]
+        self._shape = max(pixels[0], least_width), pixels[1] + footer
+        beside = FINE * (self._shape[0] - pixels[0]) // 2
+        self._left, self._top = width / 2 + beside / self._scale, depth / 2
+        self.image = Image.new("RGBA", (FINE * self._shape[0], FINE * self._shape[1]), PAPER)
+        self.draw = ImageDraw.Draw(self.image)
+        self.footer_top = FINE * pixels[1]
+        walls = [(beside, 0), (beside + FINE * pixels[0] - 1, self.footer_top - 1)]
+        self.draw.rectangle(walls, fill=WALL)
+        self._draw_world(world)
+
+    def at(self, x: float, y: float) -> Point:
+        """Pixel of a position [m]."""
+        return (x + self._left) * self._scale, (self._top - y) * self._scale
+
+    def length(self, meters: float) -> float:
+        """Pixels of a length [m]."""
+        return meters * self._scale
+
+    def _draw_world(self, world: World) -> None:
+        room = world.room
+        self.rectangle(room.x_min, room.y_min, room.x_max, room.y_max, fill=FLOOR)
+        for x in range(math.ceil(room.x_min), math.floor(room.x_max) + 1):
+            self.line([(x, room.y_min), (x, room.y_max)], GRID, 1.0)
+        for y in range(math.ceil(room.y_min), math.floor(room.y_max) + 1):
+            self.line([(room.x_min, y), (room.x_max, y)], GRID, 1.0)
+        self.obstacles(world)
+        for walker in world.walkers:
+            for leg in walker.legs:
+                self.line(leg, ROUND, 1.2)
+
+    def obstacles(self, world: World) -> None:
+        """Draw what stands in a room, above what was drawn before."""
+        for box in world.boxes:
+            self.rectangle(
+                box.x_min, box.y_min, box.x_max, box.y_max, fill=OBSTACLE, outline=OBSTACLE_EDGE
+            )
+        for cylinder in world.cylinders:
+            self.disc(cylinder.x, cylinder.y, cylinder.radius, fill=OBSTACLE, outline=OBSTACLE_EDGE)
+        for polygon in world.polygons:
+            self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
+        if world.occupancy is not None:
+            self._draw_cells(world.occupancy)
+
+    def _draw_cells(self, grid: OccupancyGrid) -> None:
+        """Fill the occupied cells; a pixel with any is an obstacle."""
+        half = grid.size[0] / 2, grid.size[1] / 2
+        left, top = map(round, self.at(-half[0], half[1]))
+        right, bottom = map(round, self.at(half[0], -half[1]))
+        cells = Image.fromarray(np.flipud(grid.occupied.T).astype(np.uint8) * 255)
+        shrunk = cells.resize((right - left, bottom - top), Image.Resampling.BOX)
+        mask = shrunk.point([0] + 255 * [255])
+        self.image.paste(OBSTACLE, (left, top, right, bottom), mask)
+
+    def rectangle(
+        self,
+        x_min: float,
+        y_min: float,
+        x_max: float,
+        y_max: float,
+        *,
+        fill: Color,
+        outline: Color | None = None,
+    ) -> None:
+        """Fill a rectangle given by its edges [m]."""
+        corners = [self.at(x_min, y_max), self.at(x_max, y_min)]
+        self.draw.rectangle(corners, fill=fill, outline=outline, width=FINE)
+
+    def polygon(self, vertices: Sequence[Point], *, fill: Color, outline: Color) -> None:
+        """Fill a polygon given by its corners [m]."""
+        corners = [self.at(*vertex) for vertex in vertices]
+        self.draw.polygon(corners, fill=fill, outline=outline, width=FINE)
+
+    def disc(
+        self,
+        x: float,
+        y: float,
+        radius: float,
+        *,
+        fill: Color | None = None,
+        outline: Color | None = None,
+    ) -> None:
+        """Fill a disc given by its center and radius [m]."""
+        corners = [self.at(x - radius, y + radius), self.at(x + radius, y - radius)]
+        self.draw.ellipse(corners, fill=fill, outline=outline, width=FINE)
+
+    def ring(self, x: float, y: float, radius: float, color: Color) -> None:
+        """Draw a circle as thick as a path."""
+        corners = [self.at(x - radius, y + radius), self.at(x + radius, y - radius)]
+        self.draw.ellipse(corners, outline=color, width=round(1.5 * FINE))
+
+    def line(self, points: Sequence[Point], color: Color, width: float) -> None:
+        """Draw a line through positions [m], its width in final pixels."""
+        if len(points) > 1:
+            pixels = [self.at(*point) for point in points]
+            self.draw.line(pixels, fill=color, width=round(width * FINE), joint="curve")
+
+    def layer(self) -> Layer:
+        """Open a transparent layer; leaving it lays it over the picture."""
+        return Layer(self)
+
+    def goal(self, x: float, y: float, radius: float | None = None) -> None:
+        """Draw a goal as the paper does, a square of 0.4 m, and the disc that reaches it."""
+        if radius is not None:
+            with self.layer():
+                self.disc(x, y, radius, fill=GOAL_AREA, outline=GOAL_EDGE)
+        self.rectangle(x - 0.2, y - 0.2, x + 0.2, y + 0.2, fill=GOAL)
+
+    def robot(
+        self, x: float, y: float, heading: float, radius: float, color: Color = ROBOT
+    ) -> None:
+        """Draw a robot as a disc with a white arrow to its front."""
+        self.disc(x, y, radius + 0.02, fill=ROBOT_FRONT)
+        self.disc(x, y, radius, fill=color)
+        arrow = [
+            self.at(x + reach * radius * math.cos(angle), y + reach * radius * math.sin(angle))
+            for reach, angle in ((0.78, heading), (0.6, heading + 2.5), (0.6, heading - 2.5))
+        ]
+        self.draw.polygon(arrow, fill=ROBOT_FRONT)
+
+    def cross(self, x: float, y: float, color: Color) -> None:
+        """Draw a cross of 0.24 m, as where a collision was."""
+        for sign in (-1.0, 1.0):
+            tips = [(x - 0.12, y - 0.12 * sign), (x + 0.12, y + 0.12 * sign)]
+            self.line(tips, color, 2.4)
+
+    def square(self, x: float, y: float, color: Color) -> None:
+        """Draw a hollow square of 0.24 m, as where the time was up."""
+        corners = [self.at(x - 0.12, y + 0.12), self.at(x + 0.12, y - 0.12)]
+        self.draw.rectangle(corners, fill=ROBOT_FRONT, outline=color, width=2 * FINE)
+
+    def walker(self, state: Sequence[float]) -> None:
+        """Draw a walker as a disc with a line to where it will be in a second."""
+        x, y, speed_x, speed_y, radius = state
+        self.disc(x, y, radius, fill=WALKER, outline=WALKER_EDGE)
+        self.line([(x, y), (x + speed_x, y + speed_y)], WALKER_EDGE, 1.6)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """The finished picture, shape ``[height, width, 3]``."""
+        picture = self.image.convert("RGB").resize(self._shape, Image.Resampling.BOX)
+        return np.asarray(picture, dtype=np.uint8).copy()
+
+
+class Layer:
+    """Redirects a canvas to a transparent picture and lays it over on leaving."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self._canvas = canvas
+        self._below = canvas.image
+
+    def __enter__(self) -> None:
+        self._canvas.image = Image.new("RGBA", self._below.size, (0, 0, 0, 0))
+        self._canvas.draw = ImageDraw.Draw(self._canvas.image)
+
+    def __exit__(self, *error: object) -> None:
+        # A layer is empty but for a small part, which takes less time.
+        box = self._canvas.image.getbbox()
+        if box is not None:
+            self._below.alpha_composite(self._canvas.image, box[:2], box)
+        self._canvas.image = self._below
+        self._canvas.draw = ImageDraw.Draw(self._below)
+
+
+@cache
+def font(size: int = 13) -> Any:
+    """The font of all words, in final pixels."""
+    return ImageFont.load_default(size * FINE)

@@ -1,0 +1,95 @@
+"""One moment of an episode from above."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from mpfa_envs.scene.canvas import Canvas, Point
+from mpfa_envs.scene.colors import MET, RAY, RAY_AREA, RIVAL, TRAIL, WAY
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mpfa_envs.robots.model import RobotModel
+    from mpfa_envs.sensing.map_memory import Sketch
+    from mpfa_envs.worlds.world import World
+
+
+def render_scene(
+    world: World,
+    *,
+    robot: RobotModel,
+    pose: tuple[float, float, float],
+    goal: Point,
+    goal_radius: float,
+    trail: Sequence[Point] = (),
+    rays: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    sketch: Sketch | None = None,
+    walkers: NDArray[np.float64] | None = None,
+    rival: tuple[tuple[float, float, float], Sequence[Point]] | None = None,
+    size: int = 480,
+) -> NDArray[np.uint8]:
+    """Render one moment of an episode.
+
+    Args:
+        world: The room and its obstacles.
+        robot: The robot.
+        pose: Where it is, (x, y, heading) [m, m, rad].
+        goal: Where it should go (x, y) [m].
+        goal_radius: Distance that reaches the goal [m].
+        trail: Where it has been (x, y) [m].
+        rays: Angles in the robot's frame [rad] and ranges [m] of its lidar.
+        sketch: What the robot remembers, if it makes a map.
+        walkers: (x, y), the speeds in both directions and the radius [m, m/s] of each walker,
+            ``[K, 5]``.
+        rival: Pose and trail of a second robot in the same room, in another color.
+        size: Longer side of the picture [px].
+
+    Returns:
+        Picture of shape ``[height, width, 3]``.
+
+    Raises:
+        ValueError: If the size is not an integer of at least 32.
+
+    Examples:
+        >>> from mpfa_envs import ROBOTS, WORLDS
+        >>> from mpfa_envs.render import render_scene
+        >>> render_scene(
+        ...     WORLDS["B"], robot=ROBOTS["turtlebot2"], pose=(0.0, 0.0, 0.0), goal=(2.0, 3.0),
+        ...     goal_radius=0.5,
+        ... ).shape
+        (480, 480, 3)
+    """
+    canvas = Canvas(world, size=size)
+    x, y, heading = pose
+    if sketch is not None:
+        half = sketch.resolution / 2
+        with canvas.layer():
+            for at_x, at_y in sketch.blocked:
+                canvas.rectangle(at_x - half, at_y - half, at_x + half, at_y + half, fill=MET)
+        canvas.line([(x, y), *sketch.way], WAY, 1.5)
+    if rays is not None:
+        ends = [
+            (x + reach * math.cos(heading + angle), y + reach * math.sin(heading + angle))
+            for angle, reach in zip(rays[0].tolist(), rays[1].tolist(), strict=True)
+        ]
+        with canvas.layer():
+            if len(ends) > 1:
+                canvas.draw.polygon([canvas.at(*end) for end in ((x, y), *ends)], fill=RAY_AREA)
+            for end in ends:
+                canvas.line([(x, y), end], (*RAY[:3], 70), 0.7)
+            for end in ends:
+                canvas.disc(*end, 0.035, fill=RAY)
+    canvas.goal(*goal, goal_radius)
+    if rival is not None:
+        canvas.line(rival[1], RIVAL, 2.0)
+    canvas.line(trail, TRAIL, 2.0)
+    for walker in () if walkers is None else walkers.tolist():
+        canvas.walker(walker)
+    if rival is not None:
+        canvas.robot(*rival[0], robot.radius, RIVAL)
+    canvas.robot(x, y, heading, robot.radius)
+    return canvas.pixels()

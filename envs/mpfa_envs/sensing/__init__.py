@@ -1,0 +1,1 @@
+"""What a robot senses: lidar, the map that it makes, and the observation."""

@@ -1,0 +1,212 @@
+"""What robots remember: a map of what their lidar hit, and the way to the goal that it leaves."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from mpfa_envs.saved import read_array
+from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, follow_way, remember
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.robots.model import RobotModel
+
+RESOLUTION: Final = 0.1
+"""Side of a cell [m]."""
+_MARGIN: Final = 5
+"""Cells around the room: where it ends is not known before a wall was seen."""
+_BLOCKED: Final = 0.06
+"""Clearance of the robot's rim below which a cell is blocked [m]."""
+_NEAR: Final = 0.22
+"""Clearance below which a cell is near an obstacle [m]."""
+
+
+class Rays(Protocol):
+    """What a map is made from: a :class:`~mpfa_envs.Lidar`, or one of a real robot."""
+
+    angles: NDArray[np.float64]
+    """Direction of each ray in the robot's frame [rad], ``[rays]``."""
+    max_range: float
+    """What a ray reports that meets nothing [m]."""
+
+
+class Place(Protocol):
+    """What is mapped: a :class:`~mpfa_envs.World`, or no more than its size is known."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and depth [m]."""
+
+
+class Sketch(NamedTuple):
+    """A robot's map as a picture needs it."""
+
+    blocked: list[tuple[float, float]]
+    """Centers of the cells where the robot's center cannot be (x, y) [m]."""
+    way: list[tuple[float, float]]
+    """Centers of the cells of its way to the goal, in order (x, y) [m]."""
+    resolution: float
+    """Side of a cell [m]."""
+
+
+class MapMemory:
+    """A map for each of many robots, empty when an episode begins.
+
+    The map has square cells. A cell from which a point that the lidar hit is nearer than the
+    robot's rim can be is blocked; what was not seen is held to be free. The way is the cheapest one
+    to the goal over the map, where cells near an obstacle cost three times as much as free ones and
+    blocked cells thirty times, found anew whenever something seen makes it costlier. Its direction
+    is that of the farthest of its next cells, two meters away at most, to which a straight line is
+    no narrower than its ends.
+
+    It holds what the lidar told and where the robot was, as odometry gives it, and nothing else of
+    the room.
+
+    Args:
+        count: Number of robots N.
+        robot: Whose radius decides where its center fits.
+        lidar: What the robots see by.
+
+    Examples:
+        >>> from mpfa_envs import Box, Lidar, MapMemory, World
+        >>> from mpfa_envs.robots.model import ROBOTS
+        >>> wall = World(name="wall", boxes=(Box(0.9, -1.5, 1.1, 1.5),))
+        >>> memory = MapMemory(1, ROBOTS["turtlebot2"], lidar := Lidar(wall))
+        >>> memory.begin(0, wall)
+        >>> ranges = lidar.cast(0.0, 0.0, 0.0)[None]
+        >>> way = memory.remember(np.zeros((1, 5)), np.array([[3.0, 0.0]]), ranges)[0]
+        >>> bool(abs(way[1]) > 0.5), bool(way[2] > 3.0)  # Around the wall, which is longer.
+        (True, True)
+    """
+
+    def __init__(self, count: int, robot: RobotModel, lidar: Rays) -> None:
+        self.arrays = MapArrays(
+            np.zeros((count, 0, 0), dtype=np.uint8),
+            np.zeros((count, 0, 0), dtype=np.int32),
+            np.zeros((count, 2), dtype=np.int64),
+            np.zeros((count, 2)),
+        )
+        """The maps, as compiled loops read them."""
+        self._ways = np.zeros((count, 3))
+        self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
+        self._lengths = RESOLUTION, robot.radius + _BLOCKED, robot.radius + _NEAR, lidar.max_range
+
+    def begin(self, index: int, world: Place) -> None:
+        """Forget what a robot has seen.
+
+        Args:
+            index: Number of the robot.
+            world: Where its next episode is; the map has room for it.
+        """
+        sides = [math.ceil(side / RESOLUTION) + 2 * _MARGIN for side in world.size]
+        self._make_room(*sides)
+        arrays = self.arrays
+        arrays.shapes[index] = sides
+        arrays.origins[index] = [-(side - 1) / 2 * RESOLUTION for side in sides]
+        arrays.levels[index] = 0
+        arrays.costs[index] = UNKNOWN
+        self._ways[index] = 0.0
+
+    def remember(
+        self,
+        motions: NDArray[np.float64],
+        goals: NDArray[np.float64],
+        ranges: NDArray[np.float64],
+        chosen: NDArray[np.bool_] | None = None,
+        *,
+        directions: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.float64]:
+        """Enter a scan in the maps and find the ways.
+
+        Args:
+            motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
+            goals: Positions (x, y) [m], ``[N, 2]``.
+            ranges: Range of each ray [m], ``[N, rays]``.
+            chosen: Which robots have looked around, ``[N]``; None: all. The others' ways stay.
+            directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``;
+                None: those of the lidar.
+
+        Returns:
+            Direction (x, y) in the robot's frame and length [m] of the way, ``[N, 3]``; the length
+            counts a meter near obstacles as three.
+        """
+        if chosen is None:
+            chosen = np.ones(len(motions), dtype=np.bool_)
+        directions = self._directions if directions is None else directions
+        lengths = self._lengths
+        remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._ways)
+        return self._ways
+
+    def sketch(self, index: int, x: float, y: float) -> Sketch:
+        """What a robot remembers, to be drawn.
+
+        Args:
+            index: Number of the robot.
+            x: Where it is [m].
+            y: Where it is [m].
+
+        Returns:
+            Its map and its way.
+        """
+        columns, rows = self.arrays.shapes[index]
+        levels = self.arrays.levels[index, :columns, :rows]
+        costs = self.arrays.costs[index, :columns, :rows]
+        origin = self.arrays.origins[index]
+        places = [
+            np.argwhere(levels == BLOCKED),
+            follow_way(levels, costs, *self._cell(index, x, y)),
+        ]
+        blocked, way = ((origin + RESOLUTION * cells).tolist() for cells in places)
+        return Sketch([(u, v) for u, v in blocked], [(u, v) for u, v in way], RESOLUTION)
+
+    def _cell(self, index: int, x: float, y: float) -> tuple[int, int]:
+        """Column and row of a position in a robot's map."""
+        place = (np.array((x, y)) - self.arrays.origins[index]) / RESOLUTION
+        cell = np.clip(np.floor(place + 0.5).astype(int), 0, self.arrays.shapes[index] - 1)
+        return int(cell[0]), int(cell[1])
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """The maps and the ways, as arrays."""
+        values = {**self.arrays._asdict(), "ways": self._ways}
+        return {name: array.copy() for name, array in values.items()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what :meth:`state_dict` gave.
+
+        Args:
+            state: What it gave.
+
+        Raises:
+            ValueError: If something is missing or of another shape; nothing has changed then.
+        """
+        count = len(self._ways)
+        sides = np.shape(state.get("levels", ()))[1:]
+        if len(sides) != 2:
+            raise ValueError(f"levels of the state must have shape [N, columns, rows], got {sides}")
+        likes = {
+            **self.arrays._asdict(),
+            "levels": np.zeros((count, *sides), dtype=np.uint8),
+            "costs": np.zeros((count, *sides), dtype=np.int32),
+        }
+        arrays = {name: read_array(state, name, like) for name, like in likes.items()}
+        self._ways = read_array(state, "ways", self._ways)
+        self.arrays = MapArrays(**arrays)
+
+    def _make_room(self, columns: int, rows: int) -> None:
+        """Have maps of so many cells at least."""
+        levels = self.arrays.levels
+        most = max(columns, levels.shape[1]), max(rows, levels.shape[2])
+        if most == levels.shape[1:]:
+            return
+        wider = {}
+        for name in ("levels", "costs"):
+            old = getattr(self.arrays, name)
+            wider[name] = np.zeros((len(old), *most), dtype=old.dtype)
+            wider[name][:, : old.shape[1], : old.shape[2]] = old
+        self.arrays = self.arrays._replace(**wider)

@@ -1,0 +1,187 @@
+"""The reward of the task, Eq. (25) of the paper, and the seam for another one.
+
+The equation is from https://doi.org/10.3389/fnbot.2023.1281166.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+from mpfa_envs.checks import check_number
+
+PROGRESS_SCALE: Final = 5.0
+"""ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
+
+With 15 the way pays more than the arrival, so that a place near the goal is worth less than one
+far away, and a critic that is a little too smooth would rather circle than arrive.
+"""
+
+
+class StepOutcome(NamedTuple):
+    """What a reward may look at after one step."""
+
+    previous_distance: float
+    """Way to the goal before the step, straight or as ``progress`` measures it [m]."""
+    distance: float
+    """The same after the step [m]."""
+    success: bool
+    """The goal was reached in this step."""
+    collision: bool
+    """The robot came too near to an obstacle or a wall in this step."""
+    clearance: float
+    """Distance of the robot's rim from the nearest obstacle or wall [m]."""
+    linear_speed: float
+    """Forward speed after the step [m/s]."""
+    angular_speed: float
+    """Turning speed after the step, to the left [rad/s]."""
+
+
+class RewardTerms(NamedTuple):
+    """The parts of a reward; the reward is their sum."""
+
+    goal: float = 0.0
+    collision: float = 0.0
+    progress: float = 0.0
+    other: float = 0.0
+    """What a reward of your own adds beside the paper's three terms."""
+
+    @property
+    def total(self) -> float:
+        """The reward."""
+        return self.goal + self.collision + self.progress + self.other
+
+
+RewardFunction = Callable[[StepOutcome], RewardTerms]
+"""The type of the ``reward`` argument of :class:`~mpfa_envs.NavigationEnv`."""
+
+
+def navigation_reward(
+    outcome: StepOutcome,
+    *,
+    progress_scale: float = PROGRESS_SCALE,
+    goal_reward: float = 10.0,
+    collision_reward: float = -5.0,
+) -> RewardTerms:
+    r"""Reward one step by Eq. (25), with the sign that rewards an approach.
+
+    .. math::
+
+        R = \begin{cases} 10 & \text{goal} \\ -5 & \text{collision} \\
+        \varepsilon_p (d_{t-1} - d_t) & \text{otherwise} \end{cases}
+
+    The paper prints :math:`d_t - d_{t-1}`, which pays a robot for leaving; its text, "motivating
+    the robot to navigate closer", asks for the opposite, and so do we.
+
+    Args:
+        outcome: What the step led to.
+        progress_scale: ε_p, reward per meter of approach [1/m].
+        goal_reward: Reward for the goal.
+        collision_reward: Reward for a collision.
+
+    Returns:
+        The terms. As in the equation only one of them is not zero, and the goal comes first.
+
+    Examples:
+        >>> from mpfa_envs import StepOutcome, navigation_reward
+        >>> step = StepOutcome(2.0, 1.96, False, False, 1.0, 0.4, 0.0)
+        >>> round(navigation_reward(step).total, 6)
+        0.2
+    """
+    if outcome.success:
+        return RewardTerms(goal=goal_reward)
+    if outcome.collision:
+        return RewardTerms(collision=collision_reward)
+    # Eq. (25), last case, with its sign corrected.
+    return RewardTerms(progress=progress_scale * (outcome.previous_distance - outcome.distance))
+
+
+def resolve_reward(
+    reward: RewardFunction | None, *, progress: str, progress_scale: float
+) -> RewardFunction:
+    """Find the function that rewards a task.
+
+    Args:
+        reward: One of the user's; None: Eq. (25).
+        progress: What an approach is measured by; ``"none"``: Eq. (25) does not pay it, whatever
+            its scales are.
+        progress_scale: ε_p of Eq. (25) unless a function is given [1/m].
+
+    Returns:
+        The function.
+
+    Raises:
+        ValueError: If it cannot be called, or Eq. (25) is to pay what is no number.
+    """
+    if reward is None:
+        return partial(
+            navigation_reward, progress_scale=0.0 if progress == "none" else progress_scale
+        )
+    if not callable(reward):
+        raise ValueError(f"reward must be callable or None, got {reward!r}")
+    if payments_of(reward) is not None and progress == "none":
+        equation: Callable[..., RewardTerms] = reward
+        return partial(equation, progress_scale=0.0)
+    return reward
+
+
+def read_terms(terms: Any) -> RewardTerms:
+    """Read what a reward function gave.
+
+    Args:
+        terms: The goal's, the collision's, the progress's and other reward.
+
+    Returns:
+        The same as floats.
+
+    Raises:
+        ValueError: If they are not four finite numbers.
+
+    Examples:
+        >>> from mpfa_envs.tasks.reward import read_terms
+        >>> read_terms(1.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: reward must give RewardTerms of four finite numbers, got 1.0
+    """
+    try:
+        goal, collision, progress, other = terms
+        # It takes no text, which float would read as a number.
+        sound = all(map(math.isfinite, (goal, collision, progress, other)))
+    except (TypeError, ValueError, OverflowError):
+        sound = False
+    if not sound:
+        raise ValueError(f"reward must give RewardTerms of four finite numbers, got {terms!r}")
+    return RewardTerms(float(goal), float(collision), float(progress), float(other))
+
+
+def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
+    """Read what Eq. (25) pays.
+
+    Args:
+        reward: A reward function.
+
+    Returns:
+        Rewards for the goal, for a collision and per meter of approach; None if the function is
+        neither :func:`~mpfa_envs.navigation_reward` nor a ``functools.partial`` of it by keywords.
+
+    Raises:
+        ValueError: If a keyword is not one of its own, or its value no finite number.
+    """
+    function = reward.func if isinstance(reward, partial) else reward
+    if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
+        return None
+    keywords = reward.keywords if isinstance(reward, partial) else {}
+    try:
+        given = inspect.signature(navigation_reward).bind_partial(**keywords)
+    except TypeError as error:
+        raise ValueError(f"reward must have keywords of navigation_reward: {error}") from error
+    given.apply_defaults()
+    goal, collision, progress = (
+        check_number(name, given.arguments[name])
+        for name in ("goal_reward", "collision_reward", "progress_scale")
+    )
+    return goal, collision, progress

@@ -1,0 +1,288 @@
+"""Tasks: where an episode starts and where its goal lies."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from mpfa_envs.checks import check_count, check_seed
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.planner import grid_for, is_small, planner_for, shortest_length
+from mpfa_envs.robots.model import (
+    PAPER_CLEARANCE,
+    RobotModel,
+    resolve_collision_distance,
+    resolve_robot,
+)
+from mpfa_envs.worlds.task import START_SLACK, Task
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from mpfa_envs.worlds.world import Box, World
+
+GOAL_CLEARANCE = 0.5
+"""No goal lies nearer to an obstacle or a wall than this [m]."""
+_GRID_SLACK = 0.04
+"""A way on a grid keeps so much less than the distance that it was made for, at most [m]."""
+_AROUND = [(math.cos(turn), math.sin(turn)) for turn in np.arange(16) * math.tau / 16]
+"""Directions in which it is looked for what reaches a goal."""
+_STARTS = 60
+_GOALS_PER_START = 50
+_ATTEMPTS = 1000
+_EVALUATION_STREAM = 1281166
+
+
+def sample_task(
+    world: World,
+    rng: np.random.Generator,
+    *,
+    collision_distance: float,
+    min_goal_distance: float = 2.0,
+    detour_chance: float = 0.0,
+) -> Task:
+    """Sample a start and a goal uniformly over the free space of their regions.
+
+    The two are joined by a path that keeps the collision distance, so every task can be solved.
+    Worlds with many obstacles, and narrow ones in which no point keeps the usual distance of goals,
+    are sampled by :func:`~mpfa_envs.sample_task_on_grid`.
+
+    Args:
+        world: The room, its obstacles and its regions.
+        rng: Source of randomness.
+        collision_distance: Distance of the center from an obstacle that is a collision [m].
+        min_goal_distance: Least distance between start and goal [m].
+        detour_chance: Chance that the straight line between them must come too near to an obstacle,
+            in a world that has any; 0: no condition.
+
+    Returns:
+        The task; its heading is uniform.
+
+    Raises:
+        ValueError: If a region has no free space, or no start and goal fit together.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import WORLDS, sample_task
+        >>> task = sample_task(WORLDS["A"], np.random.default_rng(0), collision_distance=0.35)
+        >>> len(task.start), len(task.goal)
+        (3, 2)
+    """
+    asked = collision_distance, min_goal_distance, detour_chance
+    if not is_small(world):
+        return _sample_cells(world, rng, *asked)
+    try:
+        return _sample_points(world, rng, *asked)
+    except ValueError:
+        try:
+            return _sample_cells(world, rng, *asked)
+        except ValueError:
+            pass
+        raise
+
+
+def _sample_cells(
+    world: World,
+    rng: np.random.Generator,
+    collision_distance: float,
+    min_goal_distance: float,
+    detour_chance: float,
+) -> Task:
+    """Sample a task on a grid, which is quick in any world, and finds the rarest."""
+    # Imported here because it needs Numba, which takes half a second, and many worlds do not.
+    from mpfa_envs.paths.tasks import sample_task_on_grid
+
+    grid = grid_for(world, collision_distance)
+    return sample_task_on_grid(
+        grid, rng, min_goal_distance=min_goal_distance, detour_chance=detour_chance
+    )[0]
+
+
+def _sample_points(
+    world: World,
+    rng: np.random.Generator,
+    collision_distance: float,
+    min_goal_distance: float,
+    detour_chance: float,
+) -> Task:
+    """Sample points until two of them make a task."""
+    planner = planner_for(world, collision_distance)
+    start_clearance = collision_distance + START_SLACK
+    goal_clearance = max(GOAL_CLEARANCE, collision_distance)
+    detour = detour_chance > 0.0 and world.obstacle_count > 0 and rng.random() < detour_chance
+    straight: Task | None = None
+    for _ in range(_STARTS):
+        start = _sample_point(world, rng, world.start_regions, start_clearance, "start")
+        for _ in range(_GOALS_PER_START):
+            goal = _sample_point(world, rng, world.goal_regions, goal_clearance, "goal")
+            far = math.dist(start, goal) >= min_goal_distance
+            if not (far and planner.is_reachable(start, goal)):
+                continue
+            task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
+            if not (detour and planner.is_straight(start, goal)):
+                return task
+            straight = straight or task
+    if straight is not None:  # Nothing in this world stands in anyone's way.
+        return straight
+    raise ValueError(
+        f"world {world.name!r} has no start and goal at least min_goal_distance = "
+        f"{min_goal_distance} m apart with a path between them"
+    )
+
+
+def check_task(
+    world: World,
+    options: Mapping[str, Any],
+    *,
+    collision_distance: float,
+    goal_radius: float,
+    radius: float,
+) -> Task:
+    """Read a task from the options of a reset.
+
+    Args:
+        world: The room and its obstacles.
+        options: ``{"start": (x, y, heading), "goal": (x, y)}`` [m, m, rad].
+        collision_distance: Distance of the center from an obstacle that is a collision [m].
+        goal_radius: Distance that reaches the goal [m].
+        radius: Radius of the robot [m].
+
+    Returns:
+        The task.
+
+    Raises:
+        ValueError: If the keys or the numbers are wrong, the start is a collision or at the goal,
+            no path leads to the goal, or none without a collision to where it is reached.
+    """
+    if set(options) != {"start", "goal"}:
+        raise ValueError(f"options must have the keys 'start' and 'goal', got {sorted(options)}")
+    numbers: dict[str, list[float]] = {}
+    for name, size in (("start", 3), ("goal", 2)):
+        try:
+            values = np.asarray(options[name], dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise ValueError(f"{name} must be {size} finite numbers, got {options[name]!r}")
+        numbers[name] = values.tolist()
+    x, y, heading = numbers["start"]
+    goal = (numbers["goal"][0], numbers["goal"][1])
+    clearance = world.clearance(x, y)
+    if clearance <= collision_distance:
+        raise ValueError(
+            f"start must be farther than collision_distance = {collision_distance} m from "
+            f"obstacles and walls, got {(x, y)} with {clearance:.3f} m"
+        )
+    if math.dist((x, y), goal) <= goal_radius:
+        raise ValueError(
+            f"goal must be farther than goal_radius = {goal_radius} m from the start {(x, y)}, "
+            f"got {goal}"
+        )
+    if shortest_length(world, radius, (x, y), goal) == math.inf:
+        raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
+    kept = max(radius, collision_distance - _GRID_SLACK)
+    if kept > radius and not _can_be_won(world, kept, (x, y), goal, goal_radius):
+        raise ValueError(
+            f"goal must be within reach of the start {(x, y)} by a way that keeps "
+            f"collision_distance = {collision_distance} m from obstacles and walls, got {goal}"
+        )
+    return Task((x, y, heading), goal)
+
+
+def _can_be_won(
+    world: World,
+    distance: float,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    goal_radius: float,
+) -> bool:
+    """Tell whether a way that keeps the distance leads to the goal, or near enough to reach it."""
+    # A goal may lie nearer to a wall than a robot comes, and is reached from beside it then.
+    around = [
+        (goal[0] + share * goal_radius * across, goal[1] + share * goal_radius * up)
+        for share in (0.5, 0.99)
+        for across, up in _AROUND
+    ]
+    return any(
+        shortest_length(world, distance, start, place) < math.inf for place in (goal, *around)
+    )
+
+
+def _sample_point(
+    world: World,
+    rng: np.random.Generator,
+    regions: tuple[Box, ...],
+    clearance: float,
+    what: str,
+) -> tuple[float, float]:
+    """Sample a point with the clearance [m] from the union of the regions."""
+    regions = regions or (world.room,)
+    shares = np.cumsum([region.area for region in regions])
+    for _ in range(_ATTEMPTS):
+        pick, across, up = rng.random(3).tolist()
+        index = int(np.searchsorted(shares, pick * shares[-1], side="right"))
+        region = regions[min(index, len(regions) - 1)]
+        x = region.x_min + across * (region.x_max - region.x_min)
+        y = region.y_min + up * (region.y_max - region.y_min)
+        if world.clearance(x, y) >= clearance:
+            return x, y
+    raise ValueError(
+        f"world {world.name!r} has no free {what}: {_ATTEMPTS} samples found no point "
+        f"{clearance:.2f} m from every obstacle and wall"
+    )
+
+
+def evaluation_pairs(
+    world: str | os.PathLike[str] | World,
+    n: int,
+    seed: int,
+    *,
+    robot: str | RobotModel = "turtlebot2",
+    collision_distance: float | Literal["contact"] | None = None,
+    min_goal_distance: float = 2.0,
+) -> list[Task]:
+    """Sample a fixed list of tasks, the same for everyone who asks with the same arguments.
+
+    Args:
+        world: A name, the path of a YAML file or a world.
+        n: Number of tasks.
+        seed: Seed of the sampling; the first tasks of a longer list are those of a shorter one.
+        robot: Whose radius counts.
+        collision_distance: What the start, the goal and a path between them keep [m]. None: the
+            paper's, the robot's radius and 0.17 m, whatever it trained with; ``"contact"``: its
+            radius.
+        min_goal_distance: Least distance between start and goal [m].
+
+    Returns:
+        The tasks.
+
+    Raises:
+        ValueError: If n or the seed is out of its range, or the world has no room for a task.
+
+    Examples:
+        >>> from mpfa_envs import NavigationEnv, evaluation_pairs
+        >>> env = NavigationEnv(world="test", physics="kinematic")
+        >>> task = evaluation_pairs("test", 2, seed=0)[1]
+        >>> observation, info = env.reset(options=task._asdict())
+        >>> (info["x"], info["y"]) == task.start[:2]
+        True
+    """
+    check_count("n", n)
+    check_seed(seed)
+    world = resolve_world(world)
+    robot = resolve_robot(robot)
+    # Not the distance of training: settings may change it, and the tasks must stay the same.
+    distance = (
+        round(robot.radius + PAPER_CLEARANCE, 9)
+        if collision_distance is None
+        else resolve_collision_distance(collision_distance, robot)
+    )
+    # A stream of its own: an environment with the same seed must not train on these tasks.
+    rng = np.random.default_rng((_EVALUATION_STREAM, seed))
+    return [
+        sample_task(world, rng, collision_distance=distance, min_goal_distance=min_goal_distance)
+        for _ in range(n)
+    ]

@@ -1,0 +1,120 @@
+"""The tasks that policies are compared on: of a world, of a generator's worlds, of a benchmark."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast, get_args
+
+from mpfa_envs.checks import check_count
+from mpfa_envs.generators import GENERATORS, Split, generator_tasks
+from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.tasks.sampling import evaluation_pairs
+from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world
+from mpfa_envs.worlds.task import Task
+from mpfa_envs.worlds.world import World
+
+if TYPE_CHECKING:
+    from mpfa_envs.robots.model import RobotModel
+
+TASKS_PER_WORLD: Final = 4
+"""In each world of a generator."""
+_STANDARD_TIME_STEP: Final = 0.1
+"""What time limits are counted in [s]."""
+GENERATED_MAX_STEPS: Final = 1500
+"""Time limit in the worlds of a generator, of which some have ways of 40 m."""
+BARN_MAX_STEPS: Final = 1000
+"""The benchmark's 100 s."""
+_IN_A_WORLD: Final = 200
+_OF_A_GENERATOR: Final = 400
+
+
+class WorldTask(NamedTuple):
+    """One episode to drive, and where."""
+
+    world: World
+    task: Task
+    max_steps: int | None = None
+    """Time limit in steps of 0.1 s, whatever the environment's; None: that of the environment."""
+    seed: int | None = None
+    """Of walkers and noise; None: the number of the task among those that are driven."""
+
+    def limit(self, env_arguments: Mapping[str, Any]) -> dict[str, int]:
+        """The time limit as an argument of an environment; nothing where that has its own.
+
+        Args:
+            env_arguments: The environment's other arguments, ``time_step`` [s] perhaps among them.
+
+        Examples:
+            >>> from mpfa_envs import world_tasks
+            >>> world_tasks("bars:test", episodes=1)[0].limit({"time_step": 0.05})  # 150 s
+            {'max_steps': 3000}
+        """
+        if self.max_steps is None:
+            return {}
+        time_step = env_arguments.get("time_step", _STANDARD_TIME_STEP)
+        return {"max_steps": round(self.max_steps * _STANDARD_TIME_STEP / time_step)}
+
+
+def world_tasks(
+    name: str | os.PathLike[str] | World,
+    *,
+    episodes: int | None = None,
+    seed: int = 0,
+    robot: str | RobotModel = "turtlebot2",
+) -> list[WorldTask]:
+    """Make the tasks that a name stands for, the same for everyone who asks for them.
+
+    Args:
+        name: A world, as in :class:`~mpfa_envs.NavigationEnv`, with tasks of
+            :func:`~mpfa_envs.evaluation_pairs`; ``"bars:test"`` or ``"bars:validation"``, the
+            worlds of that split of a generator, four tasks in each, of
+            :func:`~mpfa_envs.generator_tasks`; or ``"barn"``, the benchmark's own task in its
+            twenty worlds.
+        episodes: Number of tasks; None: 200 in a world, 400 in the worlds of a generator, 20 in
+            those of the benchmark. The first tasks of a longer list are those of a shorter one.
+        seed: Seed of the tasks in a world; those of a generator are fixed.
+        robot: Whose radius counts in a world; those of a generator are for a TurtleBot2.
+
+    Returns:
+        The tasks with their worlds.
+
+    Raises:
+        ValueError: If nothing has that name, or a number is out of its range.
+
+    Examples:
+        >>> from mpfa_envs import world_tasks
+        >>> [each.world.name for each in world_tasks("bars:test", episodes=5)[3:]]
+        ['bars-test-0', 'bars-test-1']
+    """
+    if episodes is not None:
+        check_count("episodes", episodes)
+    if name == "barn":
+        # The robot starts at one pose in all of them: more episodes would be the same ones again.
+        worlds = map(barn_world, range(len(BARN_WORLDS)))
+        tasks = [WorldTask(world, barn_task(), BARN_MAX_STEPS) for world in worlds][:episodes]
+        return _numbered(tasks)
+    if isinstance(name, str) and name.partition(":")[0] in GENERATORS:
+        generator, _, split = name.partition(":")
+        if split not in get_args(Split)[1:]:
+            raise ValueError(
+                f"world must be {generator}:validation or {generator}:test to stand for tasks in "
+                f"the worlds of a generator, got {name!r}"
+            )
+        count = _OF_A_GENERATOR if episodes is None else episodes
+        made = generator_tasks(
+            generator,
+            cast("Split", split),
+            worlds=-(-count // TASKS_PER_WORLD),
+            tasks=TASKS_PER_WORLD,
+        )
+        return _numbered([WorldTask(*each, GENERATED_MAX_STEPS) for each in made[:count]])
+    world = resolve_world(name)
+    count = _IN_A_WORLD if episodes is None else episodes
+    pairs = evaluation_pairs(world, count, seed, robot=robot)
+    return _numbered([WorldTask(world, task) for task in pairs])
+
+
+def _numbered(tasks: Sequence[WorldTask]) -> list[WorldTask]:
+    """Seed each task by its number in its set, whichever tasks are driven along with it."""
+    return [each._replace(seed=number) for number, each in enumerate(tasks)]

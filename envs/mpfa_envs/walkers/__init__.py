@@ -1,0 +1,1 @@
+"""Cylinders that walk about: where they start and how they move."""

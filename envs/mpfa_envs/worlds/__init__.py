@@ -1,0 +1,1 @@
+"""Rooms and what stands in them: shapes, worlds, and the files that they are read from."""

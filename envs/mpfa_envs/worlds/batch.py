@@ -1,0 +1,166 @@
+"""The worlds of many robots as arrays that compiled loops read."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds.occupancy import OccupancyGrid
+    from mpfa_envs.worlds.world import World
+
+
+class GridArrays(NamedTuple):
+    """The maps that robots drive in; of each table only the first columns and rows count."""
+
+    left: NDArray[np.int16]
+    """The nearest occupied column to the left, ``[maps, most columns, most rows]``."""
+    right: NDArray[np.int16]
+    """The nearest to the right."""
+    gaps: NDArray[np.uint8]
+    """Columns or rows to the nearest occupied cell."""
+    shapes: NDArray[np.int64]
+    """Numbers of columns and rows, ``[maps, 2]``."""
+    resolutions: NDArray[np.float64]
+    """Side of a cell [m], ``[maps]``."""
+
+
+class BatchArrays(NamedTuple):
+    """Shapes by robot; of each row only the first few count, and no others are looked at."""
+
+    half_sizes: NDArray[np.float64]
+    """Half the width and the depth of the rooms [m], ``[N, 2]``."""
+    boxes: NDArray[np.float64]
+    """(x_min, y_min, x_max, y_max) [m], ``[N, most boxes, 4]``."""
+    circles: NDArray[np.float64]
+    """(x, y, radius) [m], ``[N, most circles, 3]``; walkers come after the cylinders."""
+    segments: NDArray[np.float64]
+    """Edges of polygons (x0, y0, x1, y1) [m], ``[N, most edges, 4]``."""
+    polygon_ends: NDArray[np.int64]
+    """Where the edges of each polygon end in segments, ``[N, most polygons]``."""
+    counts: NDArray[np.int64]
+    """Numbers of boxes, circles, segments and polygons, ``[N, 4]``."""
+    grids: GridArrays
+    """Maps; robots in the same one share it."""
+    grid_of: NDArray[np.int64]
+    """Number of each robot's map, -1 without one, ``[N]``."""
+
+
+class WorldBatch:
+    """A world for each of many robots; setting one copies its shapes and nothing else.
+
+    Walkers have a row each behind the cylinders, for others to write where they are.
+
+    Args:
+        worlds: The worlds, in the order of the robots.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.worlds.batch import WorldBatch
+        >>> batch = WorldBatch([WORLDS["A"], WORLDS["B"]])
+        >>> batch.arrays.counts[:, 0]  # boxes
+        array([0, 4])
+        >>> batch[0] = WORLDS["B"]
+        >>> batch.arrays.counts[:, 0]
+        array([4, 4])
+    """
+
+    def __init__(self, worlds: Sequence[World]) -> None:
+        robots = len(worlds)
+        self._worlds = list(worlds)
+        self._rooms = BatchArrays(
+            np.empty((robots, 2)),
+            np.empty((robots, 0, 4)),
+            np.empty((robots, 0, 3)),
+            np.empty((robots, 0, 4)),
+            np.empty((robots, 0), dtype=np.int64),
+            np.zeros((robots, 4), dtype=np.int64),
+            _grid_arrays([]),
+            np.full(robots, -1),
+        )
+        self._grids: list[OccupancyGrid] = []
+        # The same without the walkers.
+        self._standing = self._rooms.counts.copy()
+        for robot, world in enumerate(worlds):
+            self[robot] = world
+
+    @property
+    def arrays(self) -> BatchArrays:
+        """What the compiled loops read; setting a larger world may replace the arrays."""
+        return self._rooms
+
+    @property
+    def standing(self) -> BatchArrays:
+        """The same arrays, in which only what stands counts."""
+        return self._rooms._replace(counts=self._standing)
+
+    def __len__(self) -> int:
+        return len(self._worlds)
+
+    def __iter__(self) -> Iterator[World]:
+        return iter(self._worlds)
+
+    def __getitem__(self, robot: int) -> World:
+        return self._worlds[robot]
+
+    def __setitem__(self, robot: int, world: World) -> None:
+        rows = world.arrays
+        walkers = [(0.0, 0.0, walker.radius) for walker in world.walkers]
+        if walkers:
+            rows = rows._replace(circles=np.concatenate((rows.circles, walkers)))
+        self._rooms.half_sizes[robot] = rows.half_size
+        for column, name in enumerate(("boxes", "circles", "segments", "polygon_ends")):
+            count = len(getattr(rows, name))
+            table = getattr(self._rooms, name)
+            if count > table.shape[1]:
+                table = _widened(table, count)
+                self._rooms = self._rooms._replace(**{name: table})  # type: ignore[arg-type]
+            table[robot, :count] = getattr(rows, name)
+            self._rooms.counts[robot, column] = count
+        self._standing[robot] = self._rooms.counts[robot]
+        self._standing[robot, 1] -= len(walkers)
+        self._worlds[robot] = world
+        self._rooms.grid_of[robot] = -1
+        if world.occupancy is not None:
+            self._set_grid(robot, world.occupancy)
+
+    def _set_grid(self, robot: int, grid: OccupancyGrid) -> None:
+        """Let a robot drive in a map, which it shares with whoever does so already."""
+        grids = self._grids
+        if grid not in grids:
+            used = {int(number) for number in self._rooms.grid_of if number >= 0}
+            kept = [number for number in range(len(grids)) if number in used]
+            places = np.full(len(grids) + 1, -1)
+            places[kept] = np.arange(len(kept))
+            self._grids = grids = [*(grids[number] for number in kept), grid]
+            # The last place stands for none: -1 stays -1.
+            self._rooms.grid_of[:] = places[self._rooms.grid_of]
+            self._rooms = self._rooms._replace(grids=_grid_arrays(grids))
+        self._rooms.grid_of[robot] = grids.index(grid)
+
+
+def _grid_arrays(grids: Sequence[OccupancyGrid]) -> GridArrays:
+    """Copy maps into tables."""
+    shapes = np.array([grid.occupied.shape for grid in grids], dtype=np.int64).reshape(-1, 2)
+    most = shapes.max(axis=0, initial=0)
+    left, right, gaps = (
+        np.zeros((len(grids), *most), kind) for kind in (np.int16, np.int16, np.uint8)
+    )
+    for number, (grid, (columns, rows)) in enumerate(zip(grids, shapes, strict=True)):
+        for table, values in zip((left, right, gaps), grid.arrays, strict=True):
+            table[number, :columns, :rows] = values
+    resolutions = np.array([grid.resolution for grid in grids], dtype=np.float64)
+    return GridArrays(left, right, gaps, shapes, resolutions)
+
+
+def _widened(table: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """A copy with room for at least so many shapes a robot, and half as many as now to spare."""
+    most = max(count, table.shape[1] * 3 // 2)
+    wider = np.zeros((len(table), most, *table.shape[2:]), dtype=table.dtype)
+    wider[:, : table.shape[1]] = table
+    return wider

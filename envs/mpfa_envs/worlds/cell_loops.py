@@ -1,0 +1,165 @@
+"""Rays and distances among the occupied cells of a map.
+
+A ray steps from one square without an occupied cell to the next, as large as the cells around
+allow (Amanatides and Woo 1987 with the jumps of Cohen and Sheffer 1994): in a hall it takes few
+steps, and beside a wall one for each cell. Where it enters an occupied cell is exact, as for a box.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from mpfa_envs.compiled import njit
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@njit
+def cast_at_cells(
+    x: float,
+    y: float,
+    beams: NDArray[np.float64],
+    gaps: NDArray[np.uint8],
+    resolution: float,
+    max_range: float,
+    row: NDArray[np.float64],
+) -> bool:
+    """Shorten the rays that meet an occupied cell.
+
+    Args:
+        x: Position of the sensor [m].
+        y: Position of the sensor [m].
+        beams: Directions of the rays (cosine, sine), none of them zero, and one over these,
+            ``[4, rays]``.
+        gaps: Columns or rows to the nearest occupied cell, ``[columns, rows]``.
+        resolution: Side of a cell [m].
+        max_range: Greatest range [m].
+        row: Range of each ray so far, changed in place [m], ``[rays]``.
+
+    Returns:
+        Whether the sensor is in an occupied cell.
+    """
+    columns, rows = gaps.shape
+    # In cells from the lower left corner.
+    u, v = x / resolution + 0.5 * columns, y / resolution + 0.5 * rows
+    first = min(max(math.floor(u), 0), columns - 1)
+    second = min(max(math.floor(v), 0), rows - 1)
+    if gaps[first, second] == 0:
+        return True
+    for ray in range(row.shape[0]):
+        across, up, per_across, per_up = (
+            beams[0, ray],
+            beams[1, ray],
+            beams[2, ray],
+            beams[3, ray],
+        )
+        end = min(row[ray], max_range) / resolution
+        i, j, length = first, second, 0.0
+        while length < end:
+            free = int(gaps[i, j])
+            if free == 0:
+                row[ray] = length * resolution
+                break
+            side = i + free if across > 0.0 else i - free + 1
+            edge = j + free if up > 0.0 else j - free + 1
+            to_side, to_edge = (side - u) * per_across, (edge - v) * per_up
+            if to_side < to_edge:
+                length = max(to_side, 0.0)
+                i = side if across > 0.0 else side - 1
+                at = math.floor(v + length * up)
+                j = min(max(at, j - free + 1, 0), j + free - 1, rows - 1)
+            else:
+                length = max(to_edge, 0.0)
+                j = edge if up > 0.0 else edge - 1
+                at = math.floor(u + length * across)
+                i = min(max(at, i - free + 1, 0), i + free - 1, columns - 1)
+            if i < 0 or j < 0 or i >= columns or j >= rows:
+                break
+    return False
+
+
+@njit
+def clearance_of_cells(
+    left: NDArray[np.int16],
+    right: NDArray[np.int16],
+    resolution: float,
+    x: float,
+    y: float,
+    nearest: float,
+) -> float:
+    """Measure the distance from a point to the nearest occupied cell.
+
+    It looks at the cell's own row, then at the next above and below, and so on, of each of which
+    the nearest cells to the left and to the right are known.
+
+    Args:
+        left: The nearest occupied column to the left, ``[columns, rows]``.
+        right: The nearest to the right.
+        resolution: Side of a cell [m].
+        x: Position [m].
+        y: Position [m].
+        nearest: A distance beyond which none is looked for [m].
+
+    Returns:
+        Distance [m], zero in an occupied cell; ``nearest`` if none is nearer.
+    """
+    if nearest <= 0.0:
+        return nearest
+    columns, rows = left.shape
+    u, v = x / resolution + 0.5 * columns, y / resolution + 0.5 * rows
+    i = min(max(math.floor(u), 0), columns - 1)
+    j = min(max(math.floor(v), 0), rows - 1)
+    limit = (nearest / resolution) ** 2
+    square = limit
+    for away in range(rows):
+        above, below = max(j + away - v, 0.0), max(v - (j - away + 1), 0.0)
+        if min(above, below) ** 2 >= square:
+            break
+        if j + away < rows:
+            beside = min(u - (left[i, j + away] + 1.0), right[i, j + away] - u)
+            square = min(square, max(beside, 0.0) ** 2 + above * above)
+        if j - away >= 0:
+            beside = min(u - (left[i, j - away] + 1.0), right[i, j - away] - u)
+            square = min(square, max(beside, 0.0) ** 2 + below * below)
+    return math.sqrt(square) * resolution if square < limit else nearest
+
+
+@njit
+def lower_clearances(
+    left: NDArray[np.int16],
+    right: NDArray[np.int16],
+    resolution: float,
+    xs: NDArray[np.float64],
+    ys: NDArray[np.float64],
+    found: NDArray[np.float32],
+) -> None:
+    """Lower the clearances of the points of a grid to the distance from the nearest occupied cell.
+
+    Args:
+        left: As in :func:`clearance_of_cells`.
+        right: The same to the right.
+        resolution: Side of a cell of the map [m].
+        xs: Columns of the grid [m], ``[nx]``.
+        ys: Rows of the grid [m], ``[ny]``.
+        found: Clearances, changed in place [m], ``[nx, ny]``.
+    """
+    for i in range(len(xs)):
+        for j in range(len(ys)):
+            found[i, j] = clearance_of_cells(left, right, resolution, xs[i], ys[j], found[i, j])
+
+
+@njit
+def clearances_of_cells(
+    left: NDArray[np.int16],
+    right: NDArray[np.int16],
+    resolution: float,
+    points: NDArray[np.float64],
+    found: NDArray[np.float64],
+) -> None:
+    """The same for any points ``[N, 2]`` [m]."""
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        found[k] = clearance_of_cells(left, right, resolution, x, y, found[k])

@@ -1,0 +1,116 @@
+"""Worlds as plain values, to be saved and read back exactly."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
+from mpfa_envs.worlds.walker import Walker
+from mpfa_envs.worlds.world import World
+
+
+def world_to_plain(world: World) -> dict[str, Any]:
+    """Turn a world into strings, numbers and lists.
+
+    Args:
+        world: The world.
+
+    Returns:
+        Its fields by name.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
+        >>> world_from_plain(world_to_plain(WORLDS["B"])) == WORLDS["B"]
+        True
+    """
+    return {
+        "name": world.name,
+        "size": list(world.size),
+        "boxes": [_edges(box) for box in world.boxes],
+        "cylinders": [[c.x, c.y, c.radius] for c in world.cylinders],
+        "polygons": [[list(vertex) for vertex in polygon.vertices] for polygon in world.polygons],
+        "start_regions": [_edges(box) for box in world.start_regions],
+        "goal_regions": [_edges(box) for box in world.goal_regions],
+        "walkers": [walker_to_plain(walker) for walker in world.walkers],
+        **({} if world.occupancy is None else {"occupancy": world.occupancy.plain}),
+    }
+
+
+def walker_to_plain(walker: Walker) -> dict[str, Any]:
+    """Turn a walker into plain values.
+
+    Args:
+        walker: The walker.
+
+    Returns:
+        Its fields by name.
+    """
+    return {
+        "radius": float(walker.radius),
+        "speed": float(walker.speed),
+        "behavior": walker.behavior,
+        "waypoints": [list(point) for point in walker.waypoints],
+    }
+
+
+def world_from_plain(values: dict[str, Any]) -> World:
+    """Make a world of what :func:`world_to_plain` gave.
+
+    Args:
+        values: Its fields by name.
+
+    Returns:
+        The world.
+
+    Raises:
+        ValueError: If a shape is none, or the fields are not those of a world.
+    """
+    try:
+        return World(
+            name=values["name"],
+            size=(values["size"][0], values["size"][1]),
+            boxes=tuple(Box(*edges) for edges in values["boxes"]),
+            cylinders=tuple(Cylinder(*numbers) for numbers in values["cylinders"]),
+            polygons=tuple(
+                Polygon(tuple((x, y) for x, y in vertices)) for vertices in values["polygons"]
+            ),
+            start_regions=tuple(Box(*edges) for edges in values["start_regions"]),
+            goal_regions=tuple(Box(*edges) for edges in values["goal_regions"]),
+            walkers=tuple(
+                Walker(**{**walker, "waypoints": tuple((x, y) for x, y in walker["waypoints"])})
+                for walker in values["walkers"]
+            ),
+            occupancy=(
+                OccupancyGrid.from_plain(values["occupancy"]) if "occupancy" in values else None
+            ),
+        )
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"worlds must hold the fields of a World, got {values!r}") from error
+
+
+def fingerprint(world: World) -> str:
+    """Tell a world from others, those of its name included.
+
+    Args:
+        world: The world.
+
+    Returns:
+        Its name, and eight digits that are the same for equal worlds in every process.
+
+    Examples:
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.worlds.plain import fingerprint
+        >>> fingerprint(WORLDS["A"])
+        'A (8db8ff63)'
+    """
+    # 1 and 1.0 are the same number, but not the same text.
+    values = json.loads(json.dumps(world_to_plain(world), default=float), parse_int=float)
+    return f"{world.name} ({hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]})"
+
+
+def _edges(box: Box) -> list[float]:
+    return [box.x_min, box.y_min, box.x_max, box.y_max]

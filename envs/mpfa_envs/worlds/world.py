@@ -1,0 +1,399 @@
+"""A world: a rectangular room with boxes, cylinders and polygons on its floor, and walkers."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.checks import all_finite
+from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.shapes import LARGEST_SIDE, Box, Cylinder, Polygon, Shape
+from mpfa_envs.worlds.walker import MOST_WALKERS, Walker
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from mpfa_envs.worlds.shapes import Point
+
+__all__ = ["MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
+
+MOST_OBSTACLES: Final = 1000
+"""No room has more obstacles."""
+_APART: Final = 0.05
+"""Places of a line whose clearance is looked at are this far apart, at most [m]."""
+_CHUNK: Final = 2_000_000
+"""Distances between points and obstacles that are computed at once."""
+_PARTS: Final[Mapping[str, type[Shape | Walker]]] = {
+    "boxes": Box,
+    "cylinders": Cylinder,
+    "polygons": Polygon,
+    "start_regions": Box,
+    "goal_regions": Box,
+    "walkers": Walker,
+}
+"""What the fields of a world hold that are tuples."""
+
+
+class WorldArrays(NamedTuple):
+    """The numbers of a world in contiguous arrays of float64, for kernels."""
+
+    half_size: NDArray[np.float64]
+    """Half of the room's width and depth [m], shape ``[2]``."""
+    boxes: NDArray[np.float64]
+    """(x_min, y_min, x_max, y_max) [m], shape ``[boxes, 4]``."""
+    circles: NDArray[np.float64]
+    """(x, y, radius) [m], shape ``[cylinders, 3]``."""
+    segments: NDArray[np.float64]
+    """Edges of the polygons (x0, y0, x1, y1) [m], counter-clockwise, shape ``[edges, 4]``."""
+    polygon_ends: NDArray[np.int64]
+    """Where each polygon's edges end in ``segments``, shape ``[polygons]``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """A walled room around the origin, x to the right and y up, with obstacles.
+
+    Args:
+        name: What messages and pictures call it.
+        size: Inner width and depth (x, y) [m], at most 1,000 each; the walls stand around it.
+        boxes: Obstacles with sides parallel to the walls.
+        cylinders: Round obstacles.
+        polygons: Obstacles with straight sides in any direction. All obstacles may overlap; there
+            are at most 1,000.
+        start_regions: Where an episode may start; empty: anywhere in the room.
+        goal_regions: Where a goal may lie; empty: anywhere in the room.
+        walkers: What moves, at most 100. All else that is said of a world, its clearance, its
+            paths, its tasks, is said of the obstacles, which stand.
+        occupancy: Cells of a map, as large as the room, the occupied ones of which are obstacles
+            too, any number of them.
+
+    Raises:
+        ValueError: If a field is of another kind, the size is out of its range, there are too many
+            obstacles or walkers, or something does not lie in the room or a walker cannot go
+            between its waypoints.
+
+    Examples:
+        >>> from mpfa_envs import Box, World
+        >>> world = World(name="pillar", boxes=(Box(-0.5, -0.5, 0.5, 0.5),))
+        >>> world.clearance(2.0, 0.0)  # [m]
+        1.5
+    """
+
+    name: str
+    size: tuple[float, float] = (10.0, 10.0)
+    boxes: tuple[Box, ...] = ()
+    cylinders: tuple[Cylinder, ...] = ()
+    polygons: tuple[Polygon, ...] = ()
+    start_regions: tuple[Box, ...] = ()
+    goal_regions: tuple[Box, ...] = ()
+    walkers: tuple[Walker, ...] = ()
+    occupancy: OccupancyGrid | None = None
+
+    def __post_init__(self) -> None:
+        self._check_kinds()
+        if len(self.size) != 2 or not all(side > 0 for side in self.size):
+            raise ValueError(f"size must be two positive lengths, got {self.size}")
+        if max(self.size) > LARGEST_SIDE:
+            raise ValueError(f"size must be at most {LARGEST_SIDE:g} m, got {self.size}")
+        if self.obstacle_count > MOST_OBSTACLES:
+            raise ValueError(
+                f"boxes, cylinders and polygons must be at most {MOST_OBSTACLES} in all, got "
+                f"{self.obstacle_count}"
+            )
+        for field in ("boxes", "cylinders", "polygons", "start_regions", "goal_regions"):
+            for shape in getattr(self, field):
+                if not self.holds(shape):
+                    raise ValueError(f"{field} must lie in the room {self.room}, got {shape}")
+        grid = self.occupancy
+        if grid is not None and not np.allclose(grid.size, self.size, rtol=1e-9, atol=0.0):
+            raise ValueError(f"size must be that of the occupancy, {grid.size}, got {self.size}")
+        self._check_walkers()
+
+    def _check_kinds(self) -> None:
+        """Refuse fields of another kind, and make tuples of lists, as worlds are keys."""
+        if not isinstance(self.name, str):
+            raise ValueError(f"name must be text, got {self.name!r}")
+        size = tuple(self.size) if isinstance(self.size, Iterable) else ()
+        if not all_finite(size or (math.nan,)):
+            raise ValueError(f"size must be two positive lengths, got {self.size}")
+        # The dataclass is frozen; these are its only changes, before anyone sees it.
+        object.__setattr__(self, "size", size)
+        for field, kind in _PARTS.items():
+            given = getattr(self, field)
+            parts = tuple(given) if isinstance(given, Iterable) else (given,)
+            for part in parts:
+                if not isinstance(part, kind) or part is given:
+                    raise ValueError(f"{field} must be a tuple of {kind.__name__}, got {given!r}")
+            object.__setattr__(self, field, parts)
+        if not isinstance(self.occupancy, OccupancyGrid | None):
+            raise ValueError(f"occupancy must be an OccupancyGrid, got {self.occupancy!r}")
+
+    def _check_walkers(self) -> None:
+        """Refuse walkers that have no room."""
+        if len(self.walkers) > MOST_WALKERS:
+            raise ValueError(f"walkers must be at most {MOST_WALKERS}, got {len(self.walkers)}")
+        for walker in self.walkers:
+            if 2 * walker.radius >= min(self.size):
+                raise ValueError(f"walkers must fit in the room {self.room}, got {walker}")
+            for leg in walker.legs:
+                if self.clearance_along(*leg) < walker.radius:
+                    raise ValueError(
+                        "walkers must keep their radius from obstacles and walls between their "
+                        f"waypoints, which {walker} does not from {leg[0]} to {leg[1]}"
+                    )
+
+    @staticmethod
+    def from_map(
+        path: str | os.PathLike[str], *, unknown: Literal["occupied", "free"] = "occupied"
+    ) -> World:
+        """Read a map of ROS as a world, whose room is what the map knows of.
+
+        What lies around the outermost free cells, and the cells that touch them, is cut off.
+
+        Args:
+            path: The YAML file; the image's path in it is relative to its folder.
+            unknown: What cells are of which the map knows nothing.
+
+        Returns:
+            The world, called as the file. ``world.occupancy.center`` is where its (0, 0) is on the
+            map.
+
+        Raises:
+            WorldFileError: If a file cannot be read or is no map; the message names the line.
+            ValueError: If unknown is neither.
+        """
+        # Imported here because it needs Pillow and PyYAML, and most worlds come from elsewhere.
+        from mpfa_envs.worlds.ros_map import read_map
+
+        path = Path(path)
+        grid = read_map(path, unknown=unknown)
+        return World(name=path.stem, size=grid.size, occupancy=grid)
+
+    def to_map(self, path: str | os.PathLike[str], *, resolution: float | None = None) -> None:
+        """Write a map for ROS, as :func:`~mpfa_envs.worlds.ros_map.save_map` does.
+
+        Args:
+            path: The YAML file; an image with the ending .pgm is written beside it.
+            resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
+
+        Raises:
+            ValueError: If the map would have too many cells, or the path does not end in .yaml.
+        """
+        from mpfa_envs.worlds.ros_map import save_map
+
+        save_map(self, path, resolution=resolution)
+
+    def __hash__(self) -> int:
+        """Worlds are keys of caches, and hundreds of obstacles are hashed once only."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Hash of all but the name."""
+        regions = self.start_regions, self.goal_regions
+        return hash((self.size, self.obstacles, *regions, self.walkers, self.occupancy))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the hash, which differs between processes as those of texts and None do."""
+        return {name: value for name, value in self.__dict__.items() if name != "_hash"}
+
+    def renamed(self, name: str) -> World:
+        """Give the same world another name; what was computed of it is kept."""
+        world = copy.copy(self)
+        # The dataclass is frozen; this is the copy's only change, before anyone sees it.
+        object.__setattr__(world, "name", name)
+        return world
+
+    @cached_property
+    def room(self) -> Box:
+        """The floor between the walls [m]."""
+        width, depth = self.size
+        return Box(-width / 2, -depth / 2, width / 2, depth / 2)
+
+    @property
+    def diagonal(self) -> float:
+        """Longest distance in the room [m]."""
+        return math.hypot(*self.size)
+
+    @property
+    def obstacles(self) -> tuple[Shape, ...]:
+        """Boxes, cylinders and polygons, in this order."""
+        return (*self.boxes, *self.cylinders, *self.polygons)
+
+    @property
+    def obstacle_count(self) -> int:
+        """How many obstacles there are."""
+        return len(self.boxes) + len(self.cylinders) + len(self.polygons)
+
+    @property
+    def covered_area(self) -> float:
+        """Area under obstacles, overlaps counted twice [m²]."""
+        cells = 0.0 if self.occupancy is None else self.occupancy.area
+        return sum(obstacle.area for obstacle in self.obstacles) + cells
+
+    def holds(self, shape: Shape) -> bool:
+        """Tell whether a shape lies in the room; it may touch the walls."""
+        room = self.room
+        x_min, y_min, x_max, y_max = shape.bounds
+        return (
+            room.x_min <= x_min
+            and x_max <= room.x_max
+            and room.y_min <= y_min
+            and y_max <= room.y_max
+        )
+
+    @cached_property
+    def arrays(self) -> WorldArrays:
+        """All numbers of the world in arrays, for kernels."""
+        circles = [(cylinder.x, cylinder.y, cylinder.radius) for cylinder in self.cylinders]
+        edges = [edge for polygon in self.polygons for edge in polygon.edges]
+        counts = [len(polygon.vertices) for polygon in self.polygons]
+        return WorldArrays(
+            np.array(self.size, dtype=np.float64) / 2,
+            np.array(self._edges, dtype=np.float64).reshape(-1, 4),
+            np.array(circles, dtype=np.float64).reshape(-1, 3),
+            np.array(edges, dtype=np.float64).reshape(-1, 4),
+            np.cumsum(counts, dtype=np.int64),
+        )
+
+    @cached_property
+    def _edges(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Edges of the boxes (x_min, y_min, x_max, y_max) [m]."""
+        return tuple((box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes)
+
+    @cached_property
+    def _circles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centers ``[2, cylinders]`` and radii ``[cylinders]`` [m]."""
+        rows = self.arrays.circles
+        return np.ascontiguousarray(rows[:, :2].T), np.ascontiguousarray(rows[:, 2])
+
+    def clearance(self, x: float, y: float) -> float:
+        """Measure the distance from a point to the nearest obstacle or wall.
+
+        Args:
+            x: Position [m].
+            y: Position [m].
+
+        Returns:
+            Distance [m]; zero in a box or an occupied cell, negative in a cylinder, in a polygon
+            and behind a wall.
+        """
+        half_width, half_depth = self.size[0] / 2, self.size[1] / 2
+        nearest = min(half_width - abs(x), half_depth - abs(y))
+        # For a room's dozen boxes a plain loop takes a fifth of the time of NumPy calls.
+        square = math.inf
+        for x_min, y_min, x_max, y_max in self._edges:
+            across = x_min - x if x < x_min else x - x_max if x > x_max else 0.0
+            up = y_min - y if y < y_min else y - y_max if y > y_max else 0.0
+            gap = across * across + up * up
+            if gap < square:
+                square = gap
+        nearest = min(nearest, math.sqrt(square))
+        if self.cylinders:
+            centers, radii = self._circles
+            nearest = min(nearest, float((np.hypot(*(centers - ((x,), (y,)))) - radii).min()))
+        if self.polygons:
+            nearest = min(nearest, float(self._to_polygons(np.array([[x, y]]))[0]))
+        if self.occupancy is not None:
+            # Imported here because it needs Numba, which takes half a second.
+            from mpfa_envs.worlds.cell_loops import clearance_of_cells
+
+            left, right, _ = self.occupancy.arrays
+            nearest = clearance_of_cells(left, right, self.occupancy.resolution, x, y, nearest)
+        return nearest
+
+    def clearances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Measure the distance from many points to the nearest obstacle or wall.
+
+        Args:
+            points: Positions, shape ``[N, 2]`` [m].
+
+        Returns:
+            Distances, shape ``[N]`` [m], negative in an obstacle and behind a wall; zero in an
+            occupied cell.
+        """
+        x, y = points[:, 0], points[:, 1]
+        nearest = np.minimum(self.size[0] / 2 - np.abs(x), self.size[1] / 2 - np.abs(y))
+        edges = self.arrays.boxes.T
+        (center_x, center_y), radii = self._circles
+        rows = max(1, _CHUNK // max(1, len(self.boxes) + len(radii) + len(self.arrays.segments)))
+        for first in range(0, len(points), rows):
+            part = slice(first, first + rows)
+            px, py = x[part, None], y[part, None]
+            # How far outside of each box; negative inside.
+            across = np.maximum(edges[0] - px, px - edges[2])
+            up = np.maximum(edges[1] - py, py - edges[3])
+            outside = np.hypot(np.maximum(across, 0.0), np.maximum(up, 0.0))
+            to_boxes = outside + np.minimum(np.maximum(across, up), 0.0)
+            to_circles = np.hypot(center_x - px, center_y - py) - radii
+            for gaps in (to_boxes, to_circles):
+                if gaps.size:
+                    nearest[part] = np.minimum(nearest[part], gaps.min(axis=1))
+            if self.polygons:
+                nearest[part] = np.minimum(nearest[part], self._to_polygons(points[part]))
+        if self.occupancy is not None:
+            from mpfa_envs.worlds.cell_loops import clearances_of_cells
+
+            left, right, _ = self.occupancy.arrays
+            clearances_of_cells(left, right, self.occupancy.resolution, points, nearest)
+        return nearest
+
+    def clearance_along(self, start: Point, end: Point) -> float:
+        """Measure the least clearance on the line between two points.
+
+        Args:
+            start: Position (x, y) [m].
+            end: Position (x, y) [m].
+
+        Returns:
+            Distance [m], the least of places 0.05 m apart.
+        """
+        steps = math.ceil(math.dist(start, end) / _APART) + 1
+        return float(self.clearances(np.linspace(start, end, steps)).min())
+
+    def inside_polygons(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell in which polygons points lie.
+
+        A point is inside if the line from it to the right crosses the outline an odd number of
+        times.
+
+        Args:
+            points: Positions, shape ``[N, 2]`` [m].
+
+        Returns:
+            Shape ``[N, polygons]``.
+        """
+        x, y = points[:, :1], points[:, 1:]
+        x0, y0, x1, y1 = self.arrays.segments.T
+        spans = (y0 <= y) != (y1 <= y)
+        # Left of an upward edge or right of a downward one.
+        side = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
+        crossings = spans & ((side > 0.0) == (y1 > y0))
+        return np.logical_xor.reduceat(crossings, self._polygon_starts, axis=1)
+
+    @cached_property
+    def _polygon_starts(self) -> NDArray[np.int64]:
+        """Where each polygon's edges begin in ``arrays.segments``."""
+        return np.concatenate(([0], self.arrays.polygon_ends[:-1]))
+
+    def _to_polygons(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance from points ``[N, 2]`` to the nearest polygon [m], negative in one, ``[N]``."""
+        x, y = points[:, :1], points[:, 1:]
+        x0, y0, x1, y1 = self.arrays.segments.T
+        along_x, along_y = x1 - x0, y1 - y0
+        share = (x - x0) * along_x + (y - y0) * along_y
+        share = np.clip(share / (along_x * along_x + along_y * along_y), 0.0, 1.0)
+        gaps = np.hypot(x0 + share * along_x - x, y0 + share * along_y - y)
+        to_outlines = np.minimum.reduceat(gaps, self._polygon_starts, axis=1)
+        signed = np.where(self.inside_polygons(points), -to_outlines, to_outlines)
+        return np.asarray(signed.min(axis=1))
