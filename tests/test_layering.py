@@ -5,6 +5,8 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 REPLAY = sorted((ROOT / "torchrl_mpfa").rglob("*.py"))
 TASKS = sorted((ROOT / "envs/mpfa_envs").rglob("*.py"))
@@ -52,6 +54,76 @@ def test_the_files_that_are_looked_at_are_there():
     assert len(REPLAY) >= 10
     assert len(TASKS) >= 5
     assert len(EVERYTHING) >= 200
+
+
+@cache
+def arrows(package):
+    """Which files of a package import which, by module; imports inside functions count too.
+
+    Imports for the sake of types do not, nor does the package's own face, which imports all.
+    """
+    folder = {"torchrl_mpfa": ROOT / "torchrl_mpfa", "mpfa_envs": ROOT / "envs/mpfa_envs"}[package]
+    files = {
+        ".".join(path.relative_to(folder.parent).with_suffix("").parts).removesuffix(
+            ".__init__"
+        ): path
+        for path in folder.rglob("*.py")
+    }
+    found = {}
+    for module, path in files.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        typing = {
+            id(each)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+            for each in ast.walk(node)
+        }
+        names = {
+            name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and id(node) not in typing
+            for alias in node.names
+            for name in (f"{node.module}.{alias.name}", node.module)
+            if name in files
+        }
+        found[module] = names - {module, package}
+    del found[package]
+    return found
+
+
+@pytest.mark.parametrize("package", ["torchrl_mpfa", "mpfa_envs"])
+def test_no_files_import_each_other_in_a_circle(package):
+    left = {module: set(names) for module, names in arrows(package).items()}
+    while ends := [module for module, names in left.items() if not names & set(left)]:
+        for module in ends:
+            del left[module]
+    assert not left, f"these import each other in a circle, or what does: {sorted(left)}"
+
+
+ROOMS = (
+    {"checks", "files", "later", "compiled", "saved"},
+    {"worlds"},
+    {"paths", "robots"},
+    {"generators", "sensing"},
+    {"walkers", "tasks", "scene", "deploy"},
+    {"env"},
+    {"policies", "planners", "ros"},
+    {"evaluation"},
+    {"render"},
+)
+"""The rooms of the navigation task, from the ground up."""
+
+
+def test_a_room_of_the_navigation_task_imports_those_below_it_alone():
+    floor = {room: number for number, rooms in enumerate(ROOMS) for room in rooms}
+    wrong = [
+        f"{module} imports {name}"
+        for module, names in arrows("mpfa_envs").items()
+        for name in names
+        if (ours := module.split(".")[1]) != (theirs := name.split(".")[1])
+        and floor[theirs] >= floor[ours]
+    ]
+    assert not wrong
 
 
 def test_the_replay_parts_import_torch_and_torchrl_and_little_else():
