@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 import report
+import strength
 from navigation.report import study_pages
 
 pytestmark = pytest.mark.usefixtures("tables_alone")
@@ -74,6 +76,7 @@ def test_the_numbers_of_the_study_in_the_results_are_those_of_its_pages() -> Non
     rows = [line for line in section.splitlines() if line.startswith("| ")]
     pages = (DOCS / "results/study").glob("*.md")
     known = {line for page in pages for line in page.read_text("utf-8").splitlines()}
+    known |= set(strength.tables_of(pd.read_csv(DOCS / "results/strength.csv")).splitlines())
     assert len(rows) > 5
     assert [line for line in rows if line not in known] == []
 
