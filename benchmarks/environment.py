@@ -30,7 +30,7 @@ from mpfa_envs import (
     render_trajectories,
 )
 from mpfa_envs.render import tiled
-from mpfa_envs.robots.simulation import Simulation
+from tests.envs.bullet_world import BulletWorld
 
 ROUNDS = 5
 PAIRS = 200
@@ -174,8 +174,7 @@ def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
 def _measure_lidar(seconds: float) -> list[dict[str, Any]]:
     """Compare the lidar with PyBullet's ray test."""
     lidar = Lidar(WORLDS["D"])
-    simulation = Simulation(time_step=0.02)
-    simulation.add_world(WORLDS["D"])
+    bullet = BulletWorld(WORLDS["D"])
 
     def ours(count: int) -> None:
         for _ in range(count):
@@ -183,10 +182,10 @@ def _measure_lidar(seconds: float) -> list[dict[str, Any]]:
 
     def engine(count: int) -> None:
         for _ in range(count):
-            simulation.cast_rays((0.1, 0.2), lidar.angles + 0.3, height=0.3, reach=10.0)
+            bullet.cast_rays(0.1, 0.2, lidar.angles + 0.3, reach=10.0)
 
     rates = _rate(engine, seconds), _rate(ours, seconds)
-    simulation.close()
+    bullet.close()
     return [
         _entry("lidar_pybullet", rates[0], "scans/s"),
         _entry("lidar", rates[1], "scans/s", ratio=rates[1] / rates[0], baseline="lidar_pybullet"),

@@ -9,7 +9,7 @@ import pytest
 
 from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, RobotModel, World
 from mpfa_envs.robots.drives import WheelDrives
-from mpfa_envs.robots.simulation import Simulation
+from tests.envs.bullet_world import BulletWorld
 
 
 class Wheels:
@@ -55,8 +55,7 @@ def test_the_simulated_robot_drives_and_turns_as_commanded(name: str, wheels: st
 
 
 def test_a_wall_stops_the_simulated_robot() -> None:
-    simulation = Simulation(time_step=0.1, substeps=3)
-    simulation.add_world(WORLDS["A"])
+    simulation = BulletWorld(WORLDS["A"], time_step=0.1, substeps=3)
     simulation.add_robot(robot := ROBOTS["turtlebot2"])
     simulation.place_robot(4.5, 0.0, 0.0)
     simulation.set_wheel_speeds(0.5 / robot.wheel_radius, 0.5 / robot.wheel_radius)
@@ -82,20 +81,12 @@ def test_a_drive_does_not_depend_on_earlier_ones_however_short() -> None:
         drive.drives.close()
 
 
-def test_bodies_have_names_and_a_name_is_used_once() -> None:
-    simulation = Simulation(time_step=0.02)
-    simulation.add_world(WORLDS["B"])
-    simulation.add_robot(ROBOTS["burger"])
-    assert {"floor", "wall_0", "box_3", "robot"} <= set(simulation.bodies)
-    with pytest.raises(ValueError, match="name must be new, got 'box_0'"):
-        simulation.add_cylinder("box_0", x=0, y=0, radius=1, height=1)
+def test_a_server_can_be_closed_twice() -> None:
+    simulation = BulletWorld(WORLDS["B"])
     client = simulation.client
     simulation.close()
     simulation.close()
     assert not pybullet.isConnected(physicsClientId=client)
-    assert not simulation.is_connected
-    with pytest.raises(ValueError, match="time_step must be positive, got 0"):
-        Simulation(time_step=0)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +101,9 @@ def test_bodies_have_names_and_a_name_is_used_once() -> None:
         ({"min_wheel_speed": 0.5}, "min_wheel_speed must be below max_wheel_speed = 0.5, got 0.5"),
     ],
 )
-def test_a_robot_that_cannot_be_is_refused(change: dict[str, object], message: str) -> None:
+def test_a_robot_with_impossible_measures_is_rejected(
+    change: dict[str, object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(ROBOTS["turtlebot2"], **change)
 
@@ -132,8 +125,7 @@ def test_the_engine_feels_obstacles_where_the_world_has_them() -> None:
             Polygon(((-3.0, -3.0), (-0.5, -3.2), (-1.6, -2.4), (-0.8, -0.6), (-2.2, -1.6))),
         ),
     )
-    simulation = Simulation(time_step=0.02)
-    simulation.add_world(world)
+    simulation = BulletWorld(world)
     simulation.add_robot(ROBOTS["turtlebot2"])
     rng = np.random.default_rng(0)
     compared = 0
@@ -144,18 +136,6 @@ def test_the_engine_feels_obstacles_where_the_world_has_them() -> None:
             continue
         compared += 1
         simulation.place_robot(x, y, 0.0)
-        gaps = [
-            contact[8]
-            for name, body in simulation.bodies.items()
-            if name not in ("floor", "robot")
-            for contact in pybullet.getClosestPoints(
-                simulation.bodies["robot"],
-                body,
-                1.0,
-                linkIndexA=-1,
-                physicsClientId=simulation.client,
-            )
-        ]
         # The engine rounds edges by millimeters.
-        assert min(gaps) == pytest.approx(clearance, abs=0.006)
+        assert simulation.gap(simulation.bodies["robot"]) == pytest.approx(clearance, abs=0.006)
     simulation.close()

@@ -1,0 +1,90 @@
+"""A world in PyBullet, whose contacts and ray test check ours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pybullet
+
+from mpfa_envs.robots.simulation import Simulation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mpfa_envs import World
+
+_HEIGHT = 1.0
+"""Of walls and obstacles [m]."""
+_THICKNESS = 0.2
+"""Of walls [m]."""
+
+
+class BulletWorld(Simulation):
+    """A physics server with the walls and the obstacles of a world."""
+
+    def __init__(self, world: World, *, time_step: float = 0.02, substeps: int = 1) -> None:
+        super().__init__(time_step=time_step, substeps=substeps)
+        self.obstacles: list[int] = []
+        """The engine's numbers of the bodies that stand."""
+        room, thick = world.room, _THICKNESS
+        low_x, low_y = room.x_min - thick, room.y_min - thick
+        high_x, high_y = room.x_max + thick, room.y_max + thick
+        self._add_box(low_x, low_y, room.x_min, high_y)
+        self._add_box(room.x_max, low_y, high_x, high_y)
+        self._add_box(low_x, low_y, high_x, room.y_min)
+        self._add_box(low_x, room.y_max, high_x, high_y)
+        for box in world.boxes:
+            self._add_box(box.x_min, box.y_min, box.x_max, box.y_max)
+        for cylinder in world.cylinders:
+            shape = pybullet.createCollisionShape(
+                pybullet.GEOM_CYLINDER,
+                radius=cylinder.radius,
+                height=_HEIGHT,
+                physicsClientId=self.client,
+            )
+            self._add_fixed(shape, cylinder.x, cylinder.y)
+        for polygon in world.polygons:
+            for part in polygon.convex_parts:
+                corners = [[x, y, z] for z in (-_HEIGHT / 2, _HEIGHT / 2) for x, y in part]
+                shape = pybullet.createCollisionShape(
+                    pybullet.GEOM_MESH, vertices=corners, physicsClientId=self.client
+                )
+                self._add_fixed(shape, 0.0, 0.0)
+
+    def _add_box(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
+        halves = [(x_max - x_min) / 2, (y_max - y_min) / 2, _HEIGHT / 2]
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=halves, physicsClientId=self.client
+        )
+        self._add_fixed(shape, (x_min + x_max) / 2, (y_min + y_max) / 2)
+
+    def _add_fixed(self, shape: int, x: float, y: float) -> None:
+        body = pybullet.createMultiBody(
+            baseMass=0,
+            baseCollisionShapeIndex=shape,
+            basePosition=[x, y, _HEIGHT / 2],
+            physicsClientId=self.client,
+        )
+        self.obstacles.append(body)
+
+    def cast_rays(
+        self, x: float, y: float, angles: NDArray[np.float64], *, reach: float
+    ) -> NDArray[np.float64]:
+        """Ranges of rays at these angles in the room [m], ``[rays]``, by the engine's ray test."""
+        start = np.tile([x, y, 0.3], (len(angles), 1))
+        end = start.copy()
+        end[:, 0] += reach * np.cos(angles)
+        end[:, 1] += reach * np.sin(angles)
+        hits: Any = pybullet.rayTestBatch(start, end, physicsClientId=self.client)
+        return np.array([hit[2] for hit in hits]) * reach
+
+    def gap(self, body: int) -> float:
+        """Distance from a body's base to the nearest wall or obstacle [m]."""
+        return min(
+            contact[8]
+            for other in self.obstacles
+            for contact in pybullet.getClosestPoints(
+                body, other, 1.0, linkIndexA=-1, physicsClientId=self.client
+            )
+        )
