@@ -18,7 +18,6 @@ from mpfa_envs import (
     generate_world,
     sample_task_on_grid,
 )
-from mpfa_envs.paths.distance import shortest_way
 from mpfa_envs.paths.tasks import has_task
 
 MIXED = World(
@@ -132,7 +131,7 @@ def test_cells_without_a_way_take_what_is_nearest() -> None:
     np.testing.assert_allclose(field.filled[finite], field.lengths[finite], rtol=1e-6)
 
 
-def test_positions_are_read_bilinearly_one_by_one_or_many_at_once() -> None:
+def test_positions_are_read_bilinearly() -> None:
     field = DistanceField(FreeGrid(MIXED, distance=0.2), (-0.5, 2.0))
     grid = field.grid
     assert field.at(*grid.center(30, 40)) == pytest.approx(field.filled[30, 40], abs=1e-6)
@@ -141,9 +140,6 @@ def test_positions_are_read_bilinearly_one_by_one_or_many_at_once() -> None:
     expected = 0.7 * 0.6 * square[0][0] + 0.3 * 0.6 * square[1][0]
     expected += 0.7 * 0.4 * square[0][1] + 0.3 * 0.4 * square[1][1]
     assert field.at(x + 0.03, y + 0.04) == pytest.approx(expected, abs=1e-6)
-    places = np.random.default_rng(0).uniform(-4.0, 4.0, (2, 50))
-    many = shortest_way(field.filled, grid.origin, grid.resolution, *places)
-    assert many.tolist() == [field.at(a, b) for a, b in places.T.tolist()]
 
 
 def test_a_goal_off_the_free_cells_is_reached_from_the_nearest_one() -> None:

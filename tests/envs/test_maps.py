@@ -23,7 +23,7 @@ from mpfa_envs import (
     load_world,
     save_world,
 )
-from mpfa_envs.paths.field_loops import ways_from
+from mpfa_envs.paths.field_loops import path_lengths
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 
@@ -336,9 +336,9 @@ def test_cells_in_buckets_find_the_ways_of_dijkstra_to_the_bit():
     graph = grid.graph_to((0.3, 0.2))
     expected = dijkstra(graph, indices=[graph.shape[0] - 1])[0, :-1]
     step = grid.resolution * STEP_SCALE
-    found = ways_from(grid.free, seeds, gaps, MOVES, step, math.inf)[grid.free]
+    found = path_lengths(grid.free, seeds, gaps, MOVES, step, math.inf)[grid.free]
     np.testing.assert_array_equal(found, expected)
-    near = ways_from(grid.free, seeds, gaps, MOVES, step, 3.0)[grid.free]
+    near = path_lengths(grid.free, seeds, gaps, MOVES, step, 3.0)[grid.free]
     np.testing.assert_array_equal(near, np.where(expected <= 3.0, expected, math.inf))
 
 

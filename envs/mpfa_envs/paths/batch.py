@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 class FieldArrays(NamedTuple):
-    """Ways by robot; of each table only the first columns and rows count."""
+    """Path lengths by robot; of each table only the first columns and rows count."""
 
     values: NDArray[np.float32]
-    """Length of the way to the goal from each cell [m], ``[N, most columns, most rows]``."""
+    """Length of the path to the goal from each cell [m], ``[N, most columns, most rows]``."""
     shapes: NDArray[np.int64]
     """Numbers of columns and rows, ``[N, 2]``."""
     origins: NDArray[np.float64]
@@ -26,19 +26,7 @@ class FieldArrays(NamedTuple):
 
 
 class FieldBatch:
-    """A distance field for each of many robots.
-
-    Args:
-        robots: Number of robots.
-
-    Examples:
-        >>> from mpfa_envs import WORLDS, DistanceField, FreeGrid
-        >>> from mpfa_envs.paths.batch import FieldBatch
-        >>> batch = FieldBatch(2)
-        >>> batch[1] = DistanceField(FreeGrid(WORLDS["B"], distance=0.25), (4.0, 0.0))
-        >>> batch.arrays.shapes.tolist()
-        [[0, 0], [100, 100]]
-    """
+    """A distance field for each of many robots."""
 
     def __init__(self, robots: int) -> None:
         self._fields = FieldArrays(
@@ -50,7 +38,7 @@ class FieldBatch:
 
     @property
     def arrays(self) -> FieldArrays:
-        """What the compiled loops read; setting a larger field may replace the arrays."""
+        """Arrays for compiled loops; setting a larger field may replace them."""
         return self._fields
 
     def __setitem__(self, robot: int, field: DistanceField) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mpfa_envs.checks import check_number, check_positive
-from mpfa_envs.paths.field_loops import ways_from
+from mpfa_envs.paths.field_loops import path_lengths
 from mpfa_envs.paths.grid_loops import (
     MOVES,
     STEP_SCALE,
@@ -28,7 +28,6 @@ from mpfa_envs.paths.grid_loops import (
     interpolate,
     neighbor_lists,
     number_cells,
-    shortest_way,
 )
 from mpfa_envs.worlds.cell_loops import lower_clearances
 
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.worlds.world import World
-
-__all__ = ["DistanceField", "FreeGrid", "shortest_way"]
 
 RESOLUTION: Final = 0.1
 """Side of a cell unless another is asked for [m]."""
@@ -94,7 +91,7 @@ class FreeGrid:
             left, right, _ = cells.arrays
             lower_clearances(left, right, cells.resolution, self.xs, self.ys, self.clearance)
         self.free: NDArray[np.bool_] = self.clearance >= np.float32(self.distance)
-        """Where the center keeps the distance, ``[nx, ny]``."""
+        """Whether the center keeps the distance, ``[nx, ny]``."""
 
     @cached_property
     def cells(self) -> NDArray[np.int64]:
@@ -137,7 +134,7 @@ class FreeGrid:
         return float(self.xs[i]), float(self.ys[j])
 
     def cells_around(self, place: tuple[float, float]) -> list[tuple[int, float]]:
-        """Find where ways to or from a position pass.
+        """Find the cells through which paths to or from a position pass.
 
         Args:
             place: Position (x, y) [m].
@@ -258,7 +255,7 @@ class DistanceField:
         free = grid.free[self.window]
         seeds, gaps = self._around(free, i - self.first[0], j - self.first[1], self.goal)
         step = grid.resolution * STEP_SCALE
-        self.lengths = ways_from(free, seeds, gaps, MOVES, step, float(longest))
+        self.lengths = path_lengths(free, seeds, gaps, MOVES, step, float(longest))
         """Lengths of the shortest paths [m], infinite where there is none, ``[columns, rows]``."""
 
     @property
@@ -311,10 +308,8 @@ class DistanceField:
         j: int,
         place: tuple[float, float],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Cells of the window around a place in cell (i, j), ``[cells, 2]``, and how far they are.
-
-        They are those of :meth:`~mpfa_envs.FreeGrid.cells_around`.
-        """
+        """Cells of the window around a place in (i, j), ``[cells, 2]``, and their distances [m]."""
+        # They are those of :meth:`~mpfa_envs.FreeGrid.cells_around`.
         x, y = place
         if free[i, j]:
             cells = np.concatenate(([[i, j]], _neighbors(free, i, j)))

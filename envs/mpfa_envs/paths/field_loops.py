@@ -1,4 +1,4 @@
-"""Shortest ways over the cells of a grid from one place, as far as they are asked for."""
+"""Shortest paths over the cells of a grid from one place, up to a longest length."""
 
 from __future__ import annotations
 
@@ -17,33 +17,20 @@ _BUCKETS: Final = 8
 
 
 @njit
-def ways_from(
-    free: NDArray[np.bool_],
-    seeds: NDArray[np.int64],
-    gaps: NDArray[np.float64],
+def path_lengths(
+    free: NDArray[np.bool_],  # [nx, ny]
+    seeds: NDArray[np.int64],  # [seeds, 2]
+    gaps: NDArray[np.float64],  # [m] [seeds]
     moves: NDArray[np.int64],
-    step: float,
-    limit: float,
+    step: float,  # [m]
+    limit: float,  # [m]
 ) -> NDArray[np.float64]:
-    """Measure the shortest ways from a place to all cells that are near enough.
-
-    They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the shortest
-    move: no cell of a bucket is reached by a shorter way through another one of it, so that they
-    need not be sorted (Dial 1969).
-
-    Args:
-        free: Which cells are free, ``[nx, ny]``.
-        seeds: Columns and rows of the cells around the place, ``[seeds, 2]``.
-        gaps: How far they are from it [m], ``[seeds]``.
-        moves: Steps to the neighbors and the cells that they pass, ``[16, 6]``.
-        step: Length of a straight step [m].
-        limit: Longest way [m].
-
-    Returns:
-        Lengths [m], infinite where there is no way or only a longer one, ``[nx, ny]``.
-    """
+    """Lengths of the shortest paths to all cells that are near enough [m], ``[nx, ny]``."""
+    # They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the
+    # shortest move: no cell of a bucket is reached by a shorter path through another one of it, so
+    # that they need not be sorted (Dial 1969).
     nx, ny = free.shape
-    ways = np.full((nx, ny), math.inf)
+    lengths_to = np.full((nx, ny), math.inf)
     settled = np.zeros((nx, ny), np.bool_)
     lengths = np.sqrt((moves[:, 0] ** 2 + moves[:, 1] ** 2).astype(np.float64)) * step
     # Lists of cells: the first of each bucket, and behind each entry the next.
@@ -52,8 +39,8 @@ def ways_from(
     entries, waiting = 0, 0
     for k in range(len(seeds)):
         i, j = seeds[k]
-        if gaps[k] <= limit and gaps[k] < ways[i, j]:
-            ways[i, j] = gaps[k]
+        if gaps[k] <= limit and gaps[k] < lengths_to[i, j]:
+            lengths_to[i, j] = gaps[k]
             bucket = int(gaps[k] / step) % _BUCKETS
             cells[entries], nexts[entries] = i * ny + j, heads[bucket]
             heads[bucket] = entries
@@ -78,17 +65,17 @@ def ways_from(
             to_i, to_j = i + moves[k, 0], j + moves[k, 1]
             if to_i < 0 or to_j < 0 or to_i >= nx or to_j >= ny or not free[to_i, to_j]:
                 continue
-            way = ways[i, j] + lengths[k]
-            if way > limit or way >= ways[to_i, to_j]:
+            length = lengths_to[i, j] + lengths[k]
+            if length > limit or length >= lengths_to[to_i, to_j]:
                 continue
             if not free[i + moves[k, 2], j + moves[k, 3]]:
                 continue
             if not free[i + moves[k, 4], j + moves[k, 5]]:
                 continue
-            ways[to_i, to_j] = way
-            later = int(way / step) % _BUCKETS
+            lengths_to[to_i, to_j] = length
+            later = int(length / step) % _BUCKETS
             cells[entries], nexts[entries] = to_i * ny + to_j, heads[later]
             heads[later] = entries
             entries += 1
             waiting += 1
-    return ways
+    return lengths_to

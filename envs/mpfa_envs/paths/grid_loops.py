@@ -14,11 +14,9 @@ if TYPE_CHECKING:
 
 
 def _moves() -> NDArray[np.int64]:
-    """Steps to the 16 neighbors of a cell: straight, diagonal, and a knight's, shape ``[16, 6]``.
-
-    Each row has columns and rows of the step, and those of the two cells whose squares its line
-    crosses on the way; for straight and diagonal steps, which cross none, the cell itself.
-    """
+    """Steps to the 16 neighbors of a cell: straight, diagonal and a knight's, ``[16, 6]``."""
+    # Each row has columns and rows of the step, and those of the two cells whose squares its line
+    # crosses; for straight and diagonal steps, which cross none, the cell itself.
     rows = [(across, up, 0, 0, 0, 0) for across in (-1, 0, 1) for up in (-1, 0, 1) if across or up]
     for long in (-2, 2):
         for short in (-1, 1):
@@ -30,9 +28,9 @@ def _moves() -> NDArray[np.int64]:
 
 MOVES: Final = _moves()
 _STRETCH: Final = math.cos(math.atan(0.5) / 2)
-"""The length of the longest way with these moves is the straight line over this."""
+"""The longest path with these moves is the straight line over this."""
 STEP_SCALE: Final = 2.0 / (1.0 + 1.0 / _STRETCH)
-"""What the lengths of moves are multiplied by, so that ways are as much too long as too short.
+"""Factor of the lengths of moves, so that paths are as much too long as too short.
 
 With whole lengths they would be up to 2.8 % too long, and with these they are off by up to 1.4 %
 in either direction (Borgefors 1986, https://doi.org/10.1016/S0734-189X(86)80047-0).
@@ -134,28 +132,15 @@ def _measure_polygons(
 
 @njit
 def clearance_grid(
-    half_size: NDArray[np.float64],
-    boxes: NDArray[np.float64],
-    circles: NDArray[np.float64],
-    segments: NDArray[np.float64],
-    polygon_ends: NDArray[np.int64],
-    xs: NDArray[np.float64],
-    ys: NDArray[np.float64],
+    half_size: NDArray[np.float64],  # [m]
+    boxes: NDArray[np.float64],  # (x_min, y_min, x_max, y_max) [boxes, 4] [m]
+    circles: NDArray[np.float64],  # (x, y, radius) [cylinders, 3] [m]
+    segments: NDArray[np.float64],  # (x0, y0, x1, y1) [edges, 4] [m]
+    polygon_ends: NDArray[np.int64],  # [polygons]
+    xs: NDArray[np.float64],  # [nx] [m]
+    ys: NDArray[np.float64],  # [m] [ny]
 ) -> NDArray[np.float32]:
-    """Measure the distance from the points of a grid to the nearest obstacle or wall.
-
-    Args:
-        half_size: Half of the room's width and depth [m], shape ``[2]``.
-        boxes: (x_min, y_min, x_max, y_max) [m], shape ``[boxes, 4]``.
-        circles: (x, y, radius) [m], shape ``[cylinders, 3]``.
-        segments: Edges of the polygons (x0, y0, x1, y1) [m], shape ``[edges, 4]``.
-        polygon_ends: Where each polygon's edges end, shape ``[polygons]``.
-        xs: Columns of the grid, ascending [m], shape ``[nx]``.
-        ys: Rows of the grid, ascending [m], shape ``[ny]``.
-
-    Returns:
-        Distances [m], shape ``[nx, ny]``, negative in an obstacle and behind a wall.
-    """
+    """Distance of each point from the nearest obstacle or wall [m], ``[nx, ny]``."""
     nx, ny = len(xs), len(ys)
     found = np.empty((nx, ny), np.float32)
     # One column at a time: loops over its rows have no branches and no function calls.
@@ -181,14 +166,7 @@ def clearance_grid(
 
 @njit
 def number_cells(free: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Count the free cells.
-
-    Args:
-        free: Which cells are free, shape ``[nx, ny]``.
-
-    Returns:
-        Number of each free cell, -1 for the others, shape ``[nx, ny]``.
-    """
+    """Number the free cells, -1 for the others, ``[nx, ny]``."""
     numbers = np.full(free.shape, -1, np.int32)
     count = 0
     for i in range(free.shape[0]):
@@ -201,23 +179,12 @@ def number_cells(free: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 @njit
 def neighbor_lists(
-    free: NDArray[np.bool_],
-    numbers: NDArray[np.int32],
+    free: NDArray[np.bool_],  # [nx, ny]
+    numbers: NDArray[np.int32],  # [nx, ny]
     moves: NDArray[np.int64],
-    step: float,
+    step: float,  # [m]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Write the graph of the free cells as a sparse matrix in compressed rows.
-
-    Args:
-        free: Which cells are free, shape ``[nx, ny]``.
-        numbers: Number of each, shape ``[nx, ny]``.
-        moves: Steps to the neighbors and the cells that they pass, :data:`MOVES`.
-        step: Length of a straight step [m].
-
-    Returns:
-        Where each cell's neighbors begin, shape ``[cells + 1]``; their numbers; and the lengths
-        of the moves to them [m].
-    """
+    """Moves in compressed rows: starts ``[cells + 1]``, neighbors and lengths [m]."""
     nx, ny = free.shape
     # Two more cells on each side, none of them free, so that no move leads out of the grid.
     wide = ny + 4
@@ -249,17 +216,9 @@ def neighbor_lists(
 
 @njit
 def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Give each infinite value the nearest finite one.
-
-    Two sweeps hand on where the nearest is, as in Danielsson's distance transform, which may be
-    wrong by less than a cell.
-
-    Args:
-        values: Shape ``[nx, ny]``.
-
-    Returns:
-        The same with no infinite value, if there was a finite one.
-    """
+    """Give each infinite value the nearest finite one, ``[nx, ny]``."""
+    # Two sweeps hand on where the nearest is, as in Danielsson's distance transform, which may be
+    # wrong by less than a cell.
     nx, ny = values.shape
     away_x = np.zeros((nx, ny), np.int32)
     away_y = np.zeros((nx, ny), np.int32)
@@ -289,26 +248,14 @@ def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit
 def interpolate(
-    values: NDArray[np.float32],
-    x_first: float,
-    y_first: float,
-    resolution: float,
-    x: float,
-    y: float,
+    values: NDArray[np.float32],  # [nx, ny]
+    x_first: float,  # [m]
+    y_first: float,  # [m]
+    resolution: float,  # [m]
+    x: float,  # [m]
+    y: float,  # [m]
 ) -> float:
-    """Read a grid between its points, bilinearly; outside as at its edge.
-
-    Args:
-        values: Shape ``[nx, ny]``.
-        x_first: Where its first column is [m].
-        y_first: Where its first row is [m].
-        resolution: Distance of its points [m].
-        x: Position [m].
-        y: Position [m].
-
-    Returns:
-        The value.
-    """
+    """Read a grid between its points, bilinearly; outside as at its edge."""
     nx, ny = values.shape
     column = min(max((x - x_first) / resolution, 0.0), nx - 1.0)
     row = min(max((y - y_first) / resolution, 0.0), ny - 1.0)
@@ -318,29 +265,3 @@ def interpolate(
     low = (1.0 - a) * values[i, j] + a * values[right, j]
     high = (1.0 - a) * values[i, above] + a * values[right, above]
     return (1.0 - b) * low + b * high
-
-
-@njit
-def shortest_way(
-    values: NDArray[np.float32],
-    origin: tuple[float, float],
-    resolution: float,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Read a grid at many positions, bilinearly.
-
-    Args:
-        values: A field's ``filled`` [m], shape ``[nx, ny]``.
-        origin: Its grid's ``origin``, where its first point is (x, y) [m].
-        resolution: Distance of its points [m].
-        x: Positions [m], shape ``[N]``.
-        y: Positions [m], shape ``[N]``.
-
-    Returns:
-        Distances to the goal [m], shape ``[N]``.
-    """
-    found = np.empty(len(x))
-    for k in range(len(x)):
-        found[k] = interpolate(values, origin[0], origin[1], resolution, x[k], y[k])
-    return found

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 _TOUCH = 1e-9
-"""What grazes a grown obstacle by less than this does not cross it [m]."""
+"""A line that grazes a grown obstacle by less than this does not cross it [m]."""
 _CORNER_ANGLES = np.radians([15.0, 45.0, 75.0])
 """Three tangents to the quarter circle around a corner meet its polygon at these angles [rad]."""
 _WIDEST_ANGLE = math.pi / 6
@@ -117,7 +117,7 @@ class PathPlanner:
             goal: Position (x, y) [m].
 
         Returns:
-            Whether nothing is in the way.
+            Whether the line is free.
         """
         return bool(self._visible(start, np.array([goal]))[0])
 
@@ -240,11 +240,9 @@ class PathPlanner:
         return self._neighbors[node]
 
     def _visible(self, origin: Point, targets: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which targets ``[N, 2]`` are joined to the origin by a free line, shape ``[N]``.
-
-        All of these points are far enough from obstacles themselves, so that a line comes too near
-        to a box only by crossing it or by passing one of its corners.
-        """
+        """Tell which targets ``[N, 2]`` are joined to the origin by a free line, shape ``[N]``."""
+        # All of these points are far enough from obstacles themselves, so that a line comes too
+        # near to a box only by crossing it or by passing one of its corners.
         x, y = origin
         step_x, step_y = np.ascontiguousarray((targets - origin).T)
         free = np.ones(len(targets), dtype=np.bool_)
@@ -274,10 +272,8 @@ class PathPlanner:
         return free
 
     def _crosses_edges(self, origin: Point, targets: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which lines from the origin to the targets ``[N, 2]`` cross an edge, ``[N]``.
-
-        A line through the end of an edge is not asked for: it passes a corner too near.
-        """
+        """Tell which lines from the origin to the targets ``[N, 2]`` cross an edge, ``[N]``."""
+        # A line through the end of an edge is not asked for: it passes a corner too near.
         x0, y0, x1, y1 = self._segments
         x, y = origin
         to_x, to_y = targets[:, :1], targets[:, 1:]
@@ -309,30 +305,10 @@ def is_small(world: World) -> bool:
 
 
 def shortest_length(world: World, radius: float, start: Point, goal: Point) -> float:
-    """Measure the shortest path of a disc.
-
-    In a world with few corners it is that of the :class:`PathPlanner`. In others it comes from a
-    grid of 0.05 m, or 0.1 m in a room of more than 250 m²: within 2.5 % of the planner's where that
-    was measured, and infinite for passages that are wider than the disc by less than a cell.
-
-    Args:
-        world: The room and its obstacles.
-        radius: Radius of the disc [m].
-        start: Position (x, y) [m].
-        goal: Position (x, y) [m].
-
-    Returns:
-        Length [m]; infinite if there is no path.
-
-    Examples:
-        >>> from mpfa_envs import WORLDS, barn_task, barn_world
-        >>> from mpfa_envs.paths.planner import shortest_length
-        >>> round(shortest_length(WORLDS["B"], 0.18, (0.0, 0.0), (4.0, 0.0)), 2)  # [m]
-        6.39
-        >>> start, goal = barn_task()
-        >>> round(shortest_length(barn_world(9), 0.18, start[:2], goal), 1)
-        10.4
-    """
+    """Measure the shortest path of a disc [m]; infinite without one."""
+    # In a world with few corners it is that of the :class:`PathPlanner`. In others it comes from a
+    # grid of 0.05 m, or 0.1 m in a room of more than 250 m²: within 2.5 % of the planner's where
+    # that was measured, and infinite for passages that are wider than the disc by less than a cell.
     measure = _length_of_planner if is_small(world) else _length_on_grid
     return measure(world, radius, start, goal)
 
@@ -350,21 +326,13 @@ def _length_on_grid(world: World, radius: float, start: Point, goal: Point) -> f
     for point in (start, goal):
         if world.clearance(*point) < radius - _TOUCH:
             return math.inf
-    # Moves are measured a little short, so that a straight way is not shorter than its line.
+    # Moves are measured a little short, so that a straight path is not shorter than its line.
     return max(grid_for(world, radius).length(start, goal), math.dist(start, goal))
 
 
 @lru_cache(maxsize=4)
 def grid_for(world: World, distance: float) -> FreeGrid:
-    """Share one grid, and its graph of several megabytes, among the users of a world.
-
-    Args:
-        world: The room and its obstacles.
-        distance: What the cells keep from obstacles [m].
-
-    Returns:
-        The grid.
-    """
+    """Share one grid, and its graph of several megabytes, among the users of a world."""
     # Imported here because it needs Numba, which takes half a second, and many worlds do not.
     from mpfa_envs.paths.distance import FreeGrid
 
@@ -374,13 +342,5 @@ def grid_for(world: World, distance: float) -> FreeGrid:
 
 @lru_cache(maxsize=64)
 def planner_for(world: World, radius: float) -> PathPlanner:
-    """Share one planner, and the lines of sight it has found, among the users of a world.
-
-    Args:
-        world: The room and its obstacles.
-        radius: Radius of the disc [m].
-
-    Returns:
-        The planner.
-    """
+    """Share one planner, and the lines of sight it has found, among the users of a world."""
     return PathPlanner(world, radius=radius)

@@ -41,23 +41,23 @@ def sample_task_on_grid(
     start_clearance: float | None = None,
     goal_clearance: float | None = None,
 ) -> tuple[Task, DistanceField]:
-    """Sample a goal, and a start from which there is a way to it, over the cells of a grid.
+    """Sample a goal, and a start from which there is a path to it, over the cells of a grid.
 
     It takes milliseconds however many obstacles there are and however rare tasks are, where
     :func:`~mpfa_envs.sample_task` tries points one by one.
 
-    In the world of a map no way is longer than 20 m, start and goal have the usual clearance, and
+    In the world of a map no path is longer than 20 m, start and goal have the usual clearance, and
     the field is that of a window around the goal.
 
     Args:
         place: A grid, or a world, of which one is made.
         rng: Source of randomness.
-        distance: What the way keeps from obstacles [m]; for a world only.
+        distance: What the path keeps from obstacles [m]; for a world only.
         min_goal_distance: Least distance between start and goal [m].
-        max_goal_distance: Longest way between them [m].
-        detour_chance: Chance that the task must be a detour, if the world has any: its way is more
+        max_goal_distance: Longest path between them [m].
+        detour_chance: Chance that the task must be a detour, if the world has any: its path is more
             than 1.08 times the straight line and 0.3 m.
-        start_clearance: What the start keeps from obstacles [m]. None: 0.15 m more than the way,
+        start_clearance: What the start keeps from obstacles [m]. None: 0.15 m more than the path,
             or no more than it where fewer than a tenth of the free cells have that.
         goal_clearance: The same of the goal.
 
@@ -128,17 +128,8 @@ def sample_task_on_grid(
 
 
 def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
-    """Tell whether there is a start and a goal with a path between them.
-
-    It looks for a part of the free cells that hangs together and is wide enough in x or in y.
-
-    Args:
-        grid: The grid.
-        min_goal_distance: Least distance between start and goal [m].
-
-    Returns:
-        Whether :func:`sample_task_on_grid` finds one.
-    """
+    """Tell whether there is a start and a goal with a path between them."""
+    # It looks for a part of the free cells that hangs together and is wide enough in x or in y.
     parts, _ = label(grid.free)
     parts = np.where(grid.clearance >= np.float32(_clearance(grid, None)), parts, 0)
     steps = min_goal_distance / grid.resolution + 1.0
@@ -172,7 +163,7 @@ def _clearance(grid: FreeGrid, wanted: float | None) -> float:
 def _places(
     grid: FreeGrid, start_room: float, goal_room: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Where episodes may start, ``[nx, ny]``, and numbers of the cells where goals may lie."""
+    """Cells where episodes may start, ``[nx, ny]``, and numbers of those where goals may lie."""
     starts, goals = (
         grid.free & (grid.clearance >= np.float32(room)) & _inside(grid, regions)
         for room, regions in (
