@@ -1,8 +1,8 @@
 """Worlds without end: a generator's name and a seed are the same world for everyone, for ever.
 
 A generator is a function of a source of randomness and a difficulty. :func:`generate_world` seeds
-it, and redraws what no robot can drive in. Seeds for training, validation and test are apart by
-construction (:func:`world_seed`).
+it, and samples again where no robot can drive. Seeds for training, validation and test are apart
+by construction (:func:`world_seed`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mpfa_envs.worlds.world import World
 Generator: TypeAlias = Callable[[random.Random, float], World]
 """Samples a world of a difficulty in [0, 1]."""
 Split = Literal["train", "validation", "test"]
-"""What a seed is for."""
+"""Uses of a seed."""
 
 _BUILT_IN: Final[Mapping[str, Generator]] = {
     "rooms": rooms,
@@ -49,7 +49,7 @@ _registered = dict(_BUILT_IN)
 GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(_registered)
 """The generators by name; :func:`register_generator` adds one."""
 ROBOT_DISTANCE: Final = 0.25
-"""In every world there is a task whose way keeps this: a TurtleBot2 with 0.07 m to spare [m]."""
+"""In every world there is a task whose path keeps this: a TurtleBot2 with 0.07 m to spare [m]."""
 _SPLIT_SIZE: Final = 10**9
 _ATTEMPTS: Final = 100
 _HALFWAY: Final = ("rooms", "crowd")
@@ -67,7 +67,7 @@ def register_generator(name: str, generator: Generator) -> None:
     Args:
         name: Lower-case letters. A generator of your own that has this name is replaced.
         generator: From a source of randomness and a difficulty in [0, 1] to a world, at most 50 m
-            from corner to corner. It must draw all its random numbers from that source.
+            from corner to corner. It must take all its random numbers from that source.
 
     Raises:
         ValueError: If the name has other characters, or is taken by a built-in generator or world,
@@ -178,7 +178,7 @@ def _source(name: str, seed: int, attempt: int) -> random.Random:
 
 
 def _world_name(name: str, seed: int, difficulty: float | None) -> str:
-    """What a world is called, and can be asked for by."""
+    """Name of a world, by which it can be made again."""
     split, index = divmod(seed, _SPLIT_SIZE)
     middle = "" if split == 0 else f"-{get_args(Split)[split]}"
     if difficulty is None:
@@ -193,20 +193,7 @@ def _can_be_driven(world: World) -> bool:
 
 
 def world_of_name(name: str) -> World | None:
-    """Make the world that a name such as ``"bars-test-7"`` stands for.
-
-    Args:
-        name: The name of a generator, ``-validation`` or ``-test`` unless it is a training world,
-            a number, and ``@0.5`` for a difficulty.
-
-    Returns:
-        The world, or None if the name is none of these.
-
-    Examples:
-        >>> from mpfa_envs.generators import world_of_name
-        >>> world_of_name("bars-test-7@0.5").name
-        'bars-test-7@0.5'
-    """
+    """Make the world that a name such as ``"bars-test-7"`` stands for."""
     found = _NAME.fullmatch(name)
     if found is None or found[1] not in GENERATORS:
         return None
@@ -262,7 +249,7 @@ def generator_tasks(
         tasks: How many tasks in each.
 
     Returns:
-        Worlds and tasks, each solved by a way that keeps a TurtleBot2's radius and 0.07 m.
+        Worlds and tasks, each solved by a path that keeps a TurtleBot2's radius and 0.07 m.
 
     Raises:
         ValueError: If an argument is out of its range.

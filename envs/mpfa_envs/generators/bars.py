@@ -12,14 +12,9 @@ def bars(rng: random.Random, difficulty: float) -> World:
     """Sample a room of 8 to 14 m a side with bars, Ls and Us, of which some meet.
 
     Walls are 0.15 to 0.5 m thick and 1 to 4 m long. Half of the pieces are straight, a quarter each
-    are an L, which has a corner, and a U, a pocket that a robot has to leave the way it came.
+    are an L, which has a corner, and a U, a pocket that a robot has to leave as it came.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: 5 pieces in 100 m² at 0, 12 at 1.
-
-    Returns:
-        The world.
+    Difficulty: 5 pieces in 100 m² at 0, 12 at 1.
     """
     size = sample_size(rng, 8.0, 14.0)
     boxes: list[Box | None] = []

@@ -14,12 +14,7 @@ def clutter(rng: random.Random, difficulty: float) -> World:
     Boxes have sides of 0.3 to 2.5 m, cylinders, one obstacle in four, radii of 0.1 to 0.6 m. They
     may overlap and leave gaps of any width.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: 5 obstacles in 100 m² at 0, 16 at 1.
-
-    Returns:
-        The world.
+    Difficulty: 5 obstacles in 100 m² at 0, 16 at 1.
     """
     size = sample_size(rng, 8.0, 14.0)
     boxes: list[Box] = []

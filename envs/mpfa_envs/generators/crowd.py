@@ -27,12 +27,7 @@ def crowd(rng: random.Random, difficulty: float) -> World:
     others have a round of three waypoints. They are 0.2 to 0.3 m in radius and walk at 0.1 to
     0.3 m/s, slower than a robot that cannot look back.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: 2 walkers at 0, 6 at 0.5, 10 at 1.
-
-    Returns:
-        The world.
+    Difficulty: 2 walkers at 0, 6 at 0.5, 10 at 1.
     """
     size = sample_size(rng, 9.0, 11.0)
     boxes: list[Box] = []

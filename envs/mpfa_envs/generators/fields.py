@@ -18,12 +18,12 @@ _OPEN: Final = 1.2
 """Depth of the strips without cylinders at both ends [m]."""
 _MOST_CYLINDERS: Final = 600
 _NEEDED: Final = 0.29
-"""What the way through a field keeps from the cylinders [m]."""
+"""Distance that the path through a field keeps from the cylinders [m]."""
 _ATTEMPTS: Final = 30
 
 
 def fields(rng: random.Random, difficulty: float) -> World:
-    """Sample a corridor with a field of cylinders across it and a way through the field.
+    """Sample a corridor with a field of cylinders across it and a path through the field.
 
     The corridor is 4 to 7 m wide. A field of 3 to 7 m depth lies between two open strips. Its cells
     are filled at random, and a few times those with few filled neighbors are emptied and those with
@@ -31,13 +31,8 @@ def fields(rng: random.Random, difficulty: float) -> World:
     2020, https://arxiv.org/abs/2008.13315). Half of the fields have BARN's cylinders, with
     a radius of 0.075 m, the others have thicker ones of up to 0.15 m.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: The share of the cells that is filled at first, 0.14 at 0 and 0.3 at 1; it is
-            a twentieth less with each attempt that leaves no way through.
-
-    Returns:
-        The world; the way through keeps at least 0.29 m.
+    Difficulty: The share of the cells that is filled at first, 0.14 at 0 and 0.3 at 1; it
+    is a twentieth less with each attempt that leaves no path through.
     """
     radius = 0.075 if rng.random() < 0.5 else round(rng.uniform(0.08, 0.15), 3)
     cell = 2 * radius

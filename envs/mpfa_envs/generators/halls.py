@@ -19,12 +19,7 @@ def halls(rng: random.Random, difficulty: float) -> World:
     corners and up to 2.4 m across, two have the shape of an L, and one is a column with a radius of
     0.15 to 0.5 m. They may overlap.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: 5 obstacles in 100 m² at 0, 16 at 1.
-
-    Returns:
-        The world.
+    Difficulty: 5 obstacles in 100 m² at 0, 16 at 1.
     """
     size = sample_size(rng, 10.0, 20.0)
     polygons: list[Polygon] = []

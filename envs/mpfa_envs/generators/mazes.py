@@ -1,4 +1,4 @@
-"""Mazes: corridors between thin walls, with dead ends and a few ways around."""
+"""Mazes: corridors between thin walls, with dead ends and a few detours."""
 
 from __future__ import annotations
 
@@ -21,15 +21,10 @@ def mazes(rng: random.Random, difficulty: float) -> World:
     """Sample a maze of 8 to 14 m a side in which every place can be reached.
 
     Corridors of one width wind through square cells, by a random walk that steps back where it
-    is stuck. Then some more walls fall, which makes ways around.
+    is stuck. Then some more walls fall, which makes detours.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: Corridors are 1.5 m wide at 0, 1.15 m at 0.5 and 0.8 m at 1. Of the walls that
-            are left between cells, a third falls at 0, and one in twenty at 1.
-
-    Returns:
-        The world; its walls are 0.1 to 0.3 m thick.
+    Difficulty: Corridors are 1.5 m wide at 0, 1.15 m at 0.5 and 0.8 m at 1. Of the walls
+    that are left between cells, a third falls at 0, and one in twenty at 1.
     """
     passage, thick = round(between(1.5, 0.8, difficulty), 3), round(rng.uniform(0.1, 0.3), 3)
     pitch = passage + thick
@@ -43,7 +38,7 @@ def mazes(rng: random.Random, difficulty: float) -> World:
 
 
 def _carve(rng: random.Random, columns: int, rows: int) -> set[Wall]:
-    """Walls of a maze in which exactly one way leads from any cell to any other."""
+    """Walls of a maze in which exactly one path leads from any cell to any other."""
     walls = {((i, j), (i + 1, j)) for i in range(columns - 1) for j in range(rows)}
     walls |= {((i, j), (i, j + 1)) for i in range(columns) for j in range(rows - 1)}
     first = rng.randrange(columns), rng.randrange(rows)

@@ -16,13 +16,5 @@ _KINDS = (rooms, clutter, bars, fields, halls, mazes)
 
 
 def mixed(rng: random.Random, difficulty: float) -> World:
-    """Sample one of the other generators, each as often, and a world of it.
-
-    Args:
-        rng: Source of randomness.
-        difficulty: What it means for that generator.
-
-    Returns:
-        The world.
-    """
+    """Sample a world of one of the other generators, each as often."""
     return rng.choice(_KINDS)(rng, difficulty)

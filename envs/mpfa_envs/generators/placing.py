@@ -1,4 +1,4 @@
-"""What the generators share: rooms, and shapes cut to them."""
+"""Parts that the generators share: rooms, and shapes cut to them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import random
 from mpfa_envs.worlds.world import Box, Cylinder, Polygon
 
 _LEAST_SIDE = 0.05
-"""What is left of a box at a wall is left out if it is thinner than this [m]."""
+"""A box that a wall cuts to less than this is left out [m]."""
 
 
 def between(low: float, high: float, difficulty: float) -> float:
-    """What lies between its value at difficulty 0 and that at difficulty 1."""
+    """Interpolate between the values at difficulty 0 and 1."""
     return low + (high - low) * difficulty
 
 

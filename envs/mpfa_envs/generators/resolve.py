@@ -16,19 +16,7 @@ _GAZEBO: Final = (".world", ".sdf", ".world.gz", ".sdf.gz")
 
 
 def resolve_world(world: str | os.PathLike[str] | World) -> World:
-    """Find a world by name or read it from a file; a :class:`World` is returned as it is.
-
-    Args:
-        world: A name in :data:`WORLDS`, ``"bars-7"``, ``"bars-test-7"`` and the like for
-            :func:`~mpfa_envs.generate_world`, the path of a YAML file, or a world of your own.
-
-    Returns:
-        The world.
-
-    Raises:
-        ValueError: If nothing has that name.
-        WorldFileError: If the file cannot be read as a world.
-    """
+    """Find a world by name or read it from a file; a :class:`World` is returned as it is."""
     if isinstance(world, World):
         return world
     if isinstance(world, str) and world in WORLDS:

@@ -1,4 +1,4 @@
-"""Rooms of 10 x 10 m with boxes that leave a way between any two of them."""
+"""Rooms of 10 x 10 m with boxes that leave a path between any two of them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,8 @@ def rooms(rng: random.Random, difficulty: float) -> World:
     About half of them touch a wall, where they make dead ends. What does not touch leaves a
     passage, so that a narrower robot reaches every free place.
 
-    Args:
-        rng: Source of randomness.
-        difficulty: 8 boxes that leave 1.1 m at 0, 13 and 0.9 m at 0.5, 18 and 0.7 m at 1; fewer
-            where so many find no place.
-
-    Returns:
-        The world.
+    Difficulty: 8 boxes that leave 1.1 m at 0, 13 and 0.9 m at 0.5, 18 and 0.7 m at 1;
+    fewer where so many find no place.
     """
     boxes = round(8 + 10 * difficulty)
     passage = round(1.1 - 0.4 * difficulty, 3)
@@ -67,7 +62,7 @@ def _sample_box(rng: random.Random) -> Box:
 def _leaves_way(box: Box, others: list[Box], passage: float) -> bool:
     """Whether a box touches a wall or leaves a passage to it, and one to every other box."""
     walls = (box.x_min + _HALF, _HALF - box.x_max, box.y_min + _HALF, _HALF - box.y_max)
-    return not any(0.0 < way < passage for way in walls) and all(
+    return not any(0.0 < gap < passage for gap in walls) and all(
         _gap(box, other) >= passage for other in others
     )
 
