@@ -30,17 +30,7 @@ left and right in arcs that get tighter. A TurtleBot turns by 0, 0.49, 1.22 and 
 
 
 def check_pairs(pairs: WheelPairs) -> Tensor:
-    """The pairs as a tensor, shape ``[K, 2]``.
-
-    Args:
-        pairs: Two or more different actions of the two wheels, each in [-1, 1].
-
-    Returns:
-        The tensor.
-
-    Raises:
-        ValueError: If they are not.
-    """
+    """The pairs as a tensor, shape ``[K, 2]``."""
     found = torch.as_tensor(pairs, dtype=torch.float32)
     if found.ndim != 2 or found.shape[1] != 2 or len(found) < 2:
         raise ValueError(f"pairs must be two or more pairs of numbers, got {pairs!r}")
@@ -52,21 +42,7 @@ def check_pairs(pairs: WheelPairs) -> Tensor:
 
 
 def mirrored_places(pairs: WheelPairs) -> Tensor:
-    """Which pair is the mirror image of each: its wheels have changed places.
-
-    Args:
-        pairs: Pairs of wheel speeds.
-
-    Returns:
-        Places in ``pairs``, shape ``[K]``.
-
-    Raises:
-        ValueError: If a pair has no mirror image among them.
-
-    Examples:
-        >>> mirrored_places(WHEEL_PAIRS).tolist()
-        [0, 2, 1, 4, 3, 6, 5]
-    """
+    """Index of each pair's mirror image, in which the wheels have changed places, ``[K]``."""
     speeds = check_pairs(pairs)
     same = (speeds.flip(1).unsqueeze(1) == speeds.unsqueeze(0)).all(-1)
     alone = (~same.any(1)).nonzero().flatten().tolist()

@@ -1,4 +1,4 @@
-"""Two ways to move many robots: exact kinematics, or PyBullet's physics."""
+"""Motion of many robots: exact kinematics, or PyBullet's physics."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ SUBSTEP: Final = 1 / 30
 The wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do not.
 """
 Physics = Literal["kinematic", "wheels"]
-"""How the robot moves."""
+"""Kinds of motion."""
 _SERVERS: Final = 32
 """Physics servers at most."""
 
 
 class Drives(Protocol):
-    """What :class:`~mpfa_envs.VectorNavigationEnv` needs of a way to move."""
+    """Motion of many robots, as :class:`~mpfa_envs.VectorNavigationEnv` uses it."""
 
     def place(self, index: int, x: float, y: float, heading: float) -> None:
         """Put a robot at rest at a pose [m, m, rad]."""
@@ -43,15 +43,11 @@ class Drives(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """What brings the robots where they are in their episodes."""
+        """State that brings the robots back to where they are in their episodes."""
         ...
 
     def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
-
-        Raises:
-            ValueError: If something is missing or of another shape.
-        """
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
         ...
 
     def load(
@@ -69,22 +65,7 @@ class Drives(Protocol):
 
 
 class KinematicDrives:
-    """Moves robots on exact arcs: the wheels have their speed at once and never slip.
-
-    Args:
-        robot: The robot.
-        time_step: Duration of a step [s].
-
-    Examples:
-        >>> import numpy as np
-        >>> from mpfa_envs import ROBOTS
-        >>> from mpfa_envs.robots.drives import KinematicDrives
-        >>> drives = KinematicDrives(ROBOTS["turtlebot2"], time_step=0.1)
-        >>> motions = np.zeros((2, 5))
-        >>> drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
-        >>> motions[:, 0]
-        array([0.05, 0.  ])
-    """
+    """Moves robots on exact arcs: the wheels have their speed at once and never slip."""
 
     def __init__(self, robot: RobotModel, *, time_step: float) -> None:
         self._wheel_base = robot.wheel_base
@@ -120,29 +101,11 @@ class KinematicDrives:
 
 
 class WheelDrives:
-    """Moves robots by PyBullet: motors turn the wheels, friction moves the robot.
+    """Moves robots by PyBullet: motors turn the wheels, friction moves the robot."""
 
-    Up to 32 robots have a physics server each and drive the same bits as alone. A server takes
-    35 MB; more robots therefore share 32 of them, where they pass through each other. There
-    PyBullet's solver stops at other last digits, and trajectories part slowly.
-
-    Args:
-        robot: The robot.
-        robots: Number of robots.
-        time_step: Duration of a step [s].
-
-    Examples:
-        >>> import numpy as np
-        >>> from mpfa_envs import ROBOTS
-        >>> from mpfa_envs.robots.drives import WheelDrives
-        >>> drives = WheelDrives(ROBOTS["turtlebot2"], 2, time_step=0.1)
-        >>> motions = np.zeros((2, 5))
-        >>> for _ in range(20):
-        ...     drives.move(motions, np.array([True, False]), np.full((2, 2), 0.5))
-        >>> motions[:, 3].round(2)
-        array([0.5, 0. ])
-        >>> drives.close()
-    """
+    # Up to 32 robots have a physics server each and drive the same bits as alone. A server takes 35
+    # MB; more robots therefore share 32 of them, where they pass through each other. There
+    # PyBullet's solver stops at other last digits, and trajectories part slowly.
 
     def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
         # Imported here so that kinematic environments run without PyBullet.
@@ -203,17 +166,7 @@ class WheelDrives:
         return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
 
     def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
-
-        Args:
-            state: What it gave.
-
-        Returns:
-            Its arrays.
-
-        Raises:
-            ValueError: If something is missing or of another shape.
-        """
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
         counts = read_array(state, "counts", self._counts)
         if counts.min() < 0:
             raise ValueError(f"counts of the state must not be negative, got {counts.tolist()}")
@@ -223,19 +176,13 @@ class WheelDrives:
     def load(
         self,
         arrays: Mapping[str, NDArray[Any]],
-        starts: NDArray[np.float64],
-        motions: NDArray[np.float64],
+        starts: NDArray[np.float64],  # (x, y, heading) [N, 3] [m, m, rad]
+        motions: NDArray[np.float64],  # [N, 5]
     ) -> None:
-        """Drive the episodes again from their starts.
-
-        Args:
-            arrays: What :meth:`read` gave.
-            starts: Poses at the start (x, y, heading) [m, m, rad], ``[N, 3]``.
-            motions: Poses and speeds, ``[N, 5]``, changed on the way.
-        """
+        """Drive the episodes again from their starts."""
         counts, speeds = arrays["counts"], arrays["speeds"]
         last = int(counts.max())
-        # All end at once; who has driven for a shorter time is placed later.
+        # All end at once; one that has driven for a shorter time is placed later.
         for step in range(last + 1):
             for index in np.flatnonzero(counts == last - step).tolist():
                 self.place(index, *starts[index].tolist())
@@ -258,17 +205,7 @@ def _motion(simulation: Simulation, name: str) -> tuple[float, ...]:
 
 
 def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:
-    """Make the way to move that a name stands for.
-
-    Args:
-        physics: How the robots move.
-        robot: What they are.
-        robots: Number of robots.
-        time_step: Duration of a step [s].
-
-    Returns:
-        The drives.
-    """
+    """Make the drives that a name stands for."""
     if physics == "kinematic":
         return KinematicDrives(robot, time_step=time_step)
     return WheelDrives(robot, robots, time_step=time_step)

@@ -246,17 +246,7 @@ ROBOTS: Final[Mapping[str, RobotModel]] = {
 
 
 def resolve_robot(robot: str | RobotModel) -> RobotModel:
-    """Look a robot up by name; a :class:`RobotModel` is returned as it is.
-
-    Args:
-        robot: A name in :data:`ROBOTS` or a model of your own.
-
-    Returns:
-        The model.
-
-    Raises:
-        ValueError: If no robot has that name.
-    """
+    """Look a robot up by name; a :class:`RobotModel` is returned as it is."""
     if isinstance(robot, RobotModel):
         return robot
     if isinstance(robot, str) and robot in ROBOTS:
@@ -268,19 +258,7 @@ def resolve_robot(robot: str | RobotModel) -> RobotModel:
 def resolve_collision_distance(
     value: float | Literal["contact"] | None, robot: RobotModel
 ) -> float:
-    """Turn a collision rule into a distance.
-
-    Args:
-        value: A distance of the robot's center from an obstacle [m], ``"contact"`` for the robot's
-            radius, or None for :attr:`RobotModel.collision_distance`.
-        robot: The robot.
-
-    Returns:
-        The distance at or below which the robot has collided [m].
-
-    Raises:
-        ValueError: If the value is neither, or below the radius.
-    """
+    """Turn a collision rule into a distance of the robot's center [m]."""
     if value is None:
         return robot.collision_distance
     if isinstance(value, str) and value == "contact":

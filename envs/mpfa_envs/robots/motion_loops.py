@@ -16,17 +16,7 @@ if TYPE_CHECKING:
 def scale_actions(
     actions: NDArray[np.float64], slow: float, fast: float, speeds: NDArray[np.float64]
 ) -> bool:
-    """Turn actions into speeds, as :meth:`mpfa_envs.RobotModel.wheel_speeds` does for one robot.
-
-    Args:
-        actions: Left and right wheel, ``[N, 2]``; what is beyond [-1, 1] is clipped.
-        slow: Speed for -1 [m/s].
-        fast: Speed for 1 [m/s].
-        speeds: Where the speeds go [m/s], ``[N, 2]``.
-
-    Returns:
-        Whether all actions are numbers.
-    """
+    """Turn clipped actions into speeds [m/s], both ``[N, 2]``; tell whether all are numbers."""
     middle, span = 0.5 * (fast + slow), 0.5 * (fast - slow)
     numbers = True
     for robot in range(actions.shape[0]):
@@ -39,21 +29,13 @@ def scale_actions(
 
 @njit
 def drive_arcs(
-    motions: NDArray[np.float64],
-    running: NDArray[np.bool_],
-    speeds: NDArray[np.float64],
-    wheel_base: float,
-    time_step: float,
+    motions: NDArray[np.float64],  # (x, y, heading, forward, turning) [N, 5]
+    running: NDArray[np.bool_],  # [N]
+    speeds: NDArray[np.float64],  # [N, 2] [m/s]
+    wheel_base: float,  # [m]
+    time_step: float,  # [s]
 ) -> None:
-    """Move robots on exact arcs, as :class:`mpfa_envs.robots.drives.KinematicDrive` moves one.
-
-    Args:
-        motions: Poses and speeds (x, y, heading, forward, turning), ``[N, 5]``; changed in place.
-        running: Which robots move, ``[N]``.
-        speeds: Speeds of the left and the right wheel [m/s], ``[N, 2]``.
-        wheel_base: Distance between the wheels [m].
-        time_step: How long the speeds are held [s].
-    """
+    """Move robots on exact arcs, in place."""
     for robot in range(motions.shape[0]):
         if not running[robot]:
             continue

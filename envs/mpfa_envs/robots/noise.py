@@ -1,4 +1,4 @@
-"""What a real robot adds to the task: errors of lidar, wheels, time and odometry."""
+"""Errors of a real robot: of lidar, wheels, time and odometry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MOST_SLIP = 0.45
-"""Above this mean a wheel could lose nearly all of its way."""
+"""Above this mean a wheel could lose nearly all of its path."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +26,13 @@ class RobotNoise:
     Args:
         range_noise: Standard deviation of the Gaussian error of each ray of the lidar [m].
         dropout: Chance that a ray comes back with nothing and reports the lidar's greatest range.
-        slip: Mean share of its way that a wheel loses, uniform from none to twice this, drawn anew
+        slip: Mean share of its path that a wheel loses, uniform from none to twice this, sampled
             for each wheel and time step. Odometry, which counts the turns of the wheels, does not
             see it.
         latency: Time steps after which an action reaches the wheels; until the first one does, the
             robot stands.
-        drift: Standard deviation of the share by which odometry measures ways too long or too
-            short, and of that by which it measures turns; the two are drawn for each episode. The
+        drift: Standard deviation of the share by which odometry measures paths too long or too
+            short, and of that by which it measures turns; the two are sampled for each episode. The
             goal's direction and distance, the speeds and the robot's map are by odometry.
 
     Raises:
@@ -84,17 +84,7 @@ class RobotNoise:
 
 
 def resolve_noise(noise: RobotNoise | Mapping[str, Any] | None) -> RobotNoise:
-    """Read an argument of an environment.
-
-    Args:
-        noise: The noise, its numbers by name, or None for none.
-
-    Returns:
-        The noise.
-
-    Raises:
-        ValueError: If it is neither, or a number is out of its range.
-    """
+    """Read an argument of an environment."""
     if noise is None:
         return RobotNoise()
     if isinstance(noise, RobotNoise):
@@ -108,14 +98,7 @@ def resolve_noise(noise: RobotNoise | Mapping[str, Any] | None) -> RobotNoise:
 
 
 class NoisyMotion:
-    """The late and slipping wheels of many robots, and where their odometry holds them to be.
-
-    Args:
-        noise: How much of it there is.
-        robots: Number of robots N.
-        wheel_base: Distance between the wheels [m].
-        time_step: Duration of a time step [s].
-    """
+    """The late and slipping wheels of many robots, and where their odometry holds them to be."""
 
     def __init__(
         self, noise: RobotNoise, robots: int, *, wheel_base: float, time_step: float
@@ -133,13 +116,7 @@ class NoisyMotion:
         """Poses and speeds (x, y, heading, forward, turning) by odometry, ``[N, 5]``."""
 
     def begin(self, index: int, pose: Sequence[float], rng: np.random.Generator) -> None:
-        """Start an episode of a robot, which knows where it is.
-
-        Args:
-            index: Number of the robot.
-            pose: Where it starts (x, y, heading) [m, m, rad].
-            rng: Source of its errors.
-        """
+        """Start an episode of a robot at a pose [m, m, rad] that it knows."""
         self._commands[index] = 0.0
         self._kept[index] = 1.0
         self._poses[index] = pose
@@ -149,20 +126,11 @@ class NoisyMotion:
 
     def drive(
         self,
-        speeds: NDArray[np.float64],
-        running: NDArray[np.bool_],
+        speeds: NDArray[np.float64],  # [N, 2] [m/s]
+        running: NDArray[np.bool_],  # [N]
         rngs: Sequence[np.random.Generator],
     ) -> NDArray[np.float64]:
-        """Give the speeds that the ground sees of those that the wheels are told.
-
-        Args:
-            speeds: Of the left and the right wheel [m/s], ``[N, 2]``.
-            running: Which robots move in this time step, ``[N]``.
-            rngs: Source of each robot's errors.
-
-        Returns:
-            Speeds [m/s], ``[N, 2]``.
-        """
+        """Speeds of the wheels over the ground [m/s], ``[N, 2]``, from the commanded ones."""
         self._commands[running, :-1] = self._commands[running, 1:]
         self._commands[running, -1] = speeds[running]
         due = self._commands[:, 0]
@@ -173,29 +141,24 @@ class NoisyMotion:
         return due * self._kept
 
     def measure(self, motions: NDArray[np.float64], running: NDArray[np.bool_]) -> None:
-        """Let odometry follow a time step.
-
-        Args:
-            motions: Where the robots are now and how they move, ``[N, 5]``.
-            running: Which of them have moved, ``[N]``.
-        """
+        """Let odometry follow a time step to motions ``[N, 5]``."""
         if not self.has_odometry:
             return
         before, now = self._poses[running], motions[running, :3]
         turned = _wrapped(now[:, 2] - before[:, 2])
-        way = _arc(now[:, :2] - before[:, :2], before[:, 2], turned)
+        driven = _arc(now[:, :2] - before[:, :2], before[:, 2], turned)
         # What the wheels have turned: what they have driven, and what they have lost.
         across = 0.5 * turned * self._wheel_base
-        left, right = (np.stack((way - across, way + across), axis=1) / self._kept[running]).T
-        way = 0.5 * (left + right) * self._scales[running, 0]
+        left, right = (np.stack((driven - across, driven + across), axis=1) / self._kept[running]).T
+        driven = 0.5 * (left + right) * self._scales[running, 0]
         turned = (right - left) / self._wheel_base * self._scales[running, 1]
         held = self.odometry[running]
         middle = held[:, 2] + 0.5 * turned
-        chord = way * np.sinc(0.5 * turned / np.pi)
+        chord = driven * np.sinc(0.5 * turned / np.pi)
         held[:, 0] += chord * np.cos(middle)
         held[:, 1] += chord * np.sin(middle)
         held[:, 2] = _wrapped(held[:, 2] + turned)
-        held[:, 3], held[:, 4] = way / self._time_step, turned / self._time_step
+        held[:, 3], held[:, 4] = driven / self._time_step, turned / self._time_step
         self.odometry[running] = held
         self._poses[running] = now
 
