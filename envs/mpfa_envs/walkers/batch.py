@@ -36,27 +36,7 @@ _BEHAVIORS: Final = {"straight": STRAIGHT, "waypoints": WAYPOINTS, "orca": ORCA}
 
 
 class WalkerBatch:
-    """The walkers in the worlds of many robots.
-
-    Args:
-        worlds: The worlds; their circles are kept where the walkers are.
-        radius: Radius of the robots [m].
-        time_step: Duration of a time step [s].
-
-    Examples:
-        >>> import numpy as np
-        >>> from mpfa_envs import Walker, World
-        >>> from mpfa_envs.walkers.batch import WalkerBatch
-        >>> from mpfa_envs.walkers.starts import start_walkers
-        >>> from mpfa_envs.worlds.batch import WorldBatch
-        >>> worlds = WorldBatch([World(name="one", walkers=(Walker(),))])
-        >>> batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
-        >>> batch.begin(0, start_walkers(worlds[0], (0.0, 0.0), np.random.default_rng(0)))
-        >>> before = batch.of(0)
-        >>> batch.move(np.array([True]), np.zeros((1, 5)))
-        >>> float(np.hypot(*(batch.of(0) - before)[0, :2]).round(6))  # 0.3 m/s for 0.1 s
-        0.03
-    """
+    """The walkers in the worlds of many robots."""
 
     def __init__(self, worlds: WorldBatch, *, radius: float, time_step: float) -> None:
         count = len(worlds)
@@ -72,15 +52,10 @@ class WalkerBatch:
             counts=np.zeros(count, dtype=np.int64),
         )
         self._rooms: dict[int, OrcaRoom] = {}
-        """The worlds of the robots around whom somebody avoids others."""
+        """Worlds of the robots around which walkers avoid others, by robot."""
 
     def begin(self, index: int, starts: WalkerStarts) -> None:
-        """Put the walkers of a robot's world where they start.
-
-        Args:
-            index: Number of the robot.
-            starts: What :func:`~mpfa_envs.walkers.starts.start_walkers` gave for that world.
-        """
+        """Put the walkers of a robot's world where they start."""
         self._set(index, self._worlds[index])
         states, targets = starts
         count = len(states)
@@ -90,12 +65,7 @@ class WalkerBatch:
         self._place(index)
 
     def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
-        """Let walkers walk for one time step.
-
-        Args:
-            running: The walkers of which robots, ``[N]``.
-            motions: Poses and speeds of the robots, ``[N, 5]``, for those who avoid them.
-        """
+        """Let walkers walk for one time step."""
         for index, room in self._rooms.items():
             if running[index]:
                 count = self._arrays.counts[index]
@@ -110,11 +80,7 @@ class WalkerBatch:
         return bool(self._arrays.counts.any())
 
     def of(self, index: int) -> NDArray[np.float64]:
-        """The walkers of a robot: (x, y), speeds in both directions, radius [m, m/s], ``[K, 5]``.
-
-        Args:
-            index: Number of the robot.
-        """
+        """Walkers of a robot: (x, y), speeds in both directions, radius [m, m/s], ``[K, 5]``."""
         count = self._arrays.counts[index]
         return np.concatenate(
             (self._arrays.states[index, :count], self._arrays.bodies[index, :count, :1]), axis=1
@@ -130,34 +96,18 @@ class WalkerBatch:
 
     def count_encounters(
         self,
-        motions: NDArray[np.float64],
-        running: NDArray[np.bool_],
-        counts: NDArray[np.float64],
+        motions: NDArray[np.float64],  # [N, 5]
+        running: NDArray[np.bool_],  # [N]
+        counts: NDArray[np.float64],  # [m] [s]
     ) -> None:
-        """Take in how near the walkers are to robots that have moved.
-
-        Args:
-            motions: Poses and speeds of the robots, ``[N, 5]``.
-            running: Which have moved, ``[N]``.
-            counts: Least distance between the rims [m], time in personal space [s] and least time
-                to collision [s] so far, ``[3, N]``; changed in place.
-        """
+        """Take in how near the walkers are to robots that have moved."""
         if self.present:
             count_encounters(self._arrays, motions, running, self._radius, self._time_step, counts)
 
     def without(
         self, motions: NDArray[np.float64], lidar: Lidar, ranges: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Ranges in which the rays that met a walker have met nothing.
-
-        Args:
-            motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
-            lidar: What the robots see by.
-            ranges: Range of each ray [m], ``[N, rays]``.
-
-        Returns:
-            The same array if there are no walkers, else another one.
-        """
+        """Ranges [m], ``[N, rays]``, in which the rays that met a walker have met nothing."""
         if not self.present:
             return ranges
         seen = ranges.copy()
@@ -167,23 +117,11 @@ class WalkerBatch:
         return seen
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
-        """Where the walkers are and go, as arrays; the worlds have the rest."""
+        """Positions, speeds and targets of the walkers; the worlds have the rest."""
         return {name: getattr(self._arrays, name).copy() for name in _CHANGING}
 
     def read(self, state: Mapping[str, Any], worlds: list[World]) -> dict[str, NDArray[Any]]:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
-
-        Args:
-            state: What it gave.
-            worlds: The worlds that go with it.
-
-        Returns:
-            Its arrays.
-
-        Raises:
-            ValueError: If something is missing, of another shape or not finite, or leads to a
-                waypoint that there is not.
-        """
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
         most = np.shape(state.get("states", ()))[1:2]
         need = max((len(world.walkers) for world in worlds), default=0)
         if len(most) != 1 or most[0] < need:
@@ -213,7 +151,7 @@ class WalkerBatch:
             self._place(index)
 
     def _set(self, index: int, world: World) -> None:
-        """Take in who walks in a world."""
+        """Take in the walkers of a world."""
         count = len(world.walkers)
         self._make_room(count, max((len(each.waypoints) for each in world.walkers), default=0))
         arrays = self._arrays

@@ -19,7 +19,7 @@ STRAIGHT: Final = 0
 WAYPOINTS: Final = 1
 ORCA: Final = 2
 _ARRIVED: Final = 0.3
-"""Who avoids others has been at a waypoint when it was this near [m]."""
+"""A walker that avoids others has reached a waypoint at this distance [m]."""
 _ROUNDING: Final = 1e-9
 """More than what rounding does to a slack [m]."""
 _NUDGE: Final = 1e-3
@@ -32,9 +32,9 @@ class WalkerArrays(NamedTuple):
     states: NDArray[np.float64]
     """(x, y) and the speeds in both directions [m, m/s], ``[N, most, 4]``; changed in place."""
     targets: NDArray[np.int64]
-    """Which waypoint comes next, ``[N, most]``; changed in place."""
+    """Index of the next waypoint, ``[N, most]``; changed in place."""
     slacks: NDArray[np.float64]
-    """How far each may go before what stands can be in its way [m], ``[N, most]``; changed in
+    """Distance that each can go before it may meet an obstacle [m], ``[N, most]``; changed in
     place. Zero is true of any walker, and makes it look around."""
     bodies: NDArray[np.float64]
     """Radius and speed [m, m/s], ``[N, most, 2]``."""
@@ -52,41 +52,34 @@ class WalkerArrays(NamedTuple):
 def walk(
     walkers: WalkerArrays, rooms: BatchArrays, running: NDArray[np.bool_], time_step: float
 ) -> None:
-    """Move the walkers of some robots for one time step.
-
-    Args:
-        walkers: The walkers.
-        rooms: What stands around them; in its circles they have the rows behind the cylinders.
-        running: Whose walkers move, ``[N]``.
-        time_step: How long [s].
-    """
+    """Move the walkers of some robots for one time step."""
     states, circles = walkers.states, rooms.circles
     for robot in range(running.shape[0]):
         if not running[robot]:
             continue
         behind = rooms.counts[robot, 1]
         for index in range(walkers.counts[robot]):
-            way = walkers.bodies[robot, index, 1] * time_step
+            length = walkers.bodies[robot, index, 1] * time_step
             if walkers.behaviors[robot, index] == WAYPOINTS:
                 target = walkers.targets[robot, index]
                 across = walkers.waypoints[robot, index, target, 0] - states[robot, index, 0]
                 up = walkers.waypoints[robot, index, target, 1] - states[robot, index, 1]
-                on_its_way = across * across + up * up > way * way
+                is_free = across * across + up * up > length * length
             elif walkers.behaviors[robot, index] == ORCA:
-                on_its_way = False
+                is_free = False
             else:
-                on_its_way = walkers.slacks[robot, index] - way > _ROUNDING
-                on_its_way &= way <= walkers.bodies[robot, index, 0]
-                walkers.slacks[robot, index] -= way
+                is_free = walkers.slacks[robot, index] - length > _ROUNDING
+                is_free &= length <= walkers.bodies[robot, index, 0]
+                walkers.slacks[robot, index] -= length
                 x = states[robot, index, 0] + states[robot, index, 2] * time_step
                 y = states[robot, index, 1] + states[robot, index, 3] * time_step
                 for other in range(walkers.counts[robot]):
                     across, up = x - states[robot, other, 0], y - states[robot, other, 1]
                     reach = walkers.bodies[robot, index, 0] + walkers.bodies[robot, other, 0]
                     near = other != index and across * across + up * up < reach * reach
-                    on_its_way &= not near
+                    is_free &= not near
             # Plain numbers for most: to call a function with all arrays costs more than the step.
-            if on_its_way:
+            if is_free:
                 states[robot, index, 0] += states[robot, index, 2] * time_step
                 states[robot, index, 1] += states[robot, index, 3] * time_step
             elif walkers.behaviors[robot, index] == WAYPOINTS:
@@ -143,7 +136,7 @@ def _glide(
 def _bounce(
     walkers: WalkerArrays, rooms: BatchArrays, robot: int, index: int, time_step: float
 ) -> None:
-    """Go straight ahead, off what is in the way and, where that leads nowhere, back."""
+    """Go straight ahead, bounce off obstacles and, where that leads nowhere, go back."""
     state, radius = walkers.states[robot, index], walkers.bodies[robot, index, 0]
     # A stride is no longer than the radius, lest it lead through a thin wall.
     strides = math.ceil(walkers.bodies[robot, index, 1] * time_step / radius)
@@ -196,17 +189,7 @@ def _normal(
 
 @njit
 def nearest_walker(walkers: WalkerArrays, robot: int, x: float, y: float) -> float:
-    """Measure the distance from a point to the rim of the nearest walker.
-
-    Args:
-        walkers: The walkers.
-        robot: Whose walkers count.
-        x: Position [m].
-        y: Position [m].
-
-    Returns:
-        Distance [m], negative in a walker; infinite without one.
-    """
+    """Measure the distance from a point to the rim of the nearest walker [m]."""
     nearest = math.inf
     for index in range(walkers.counts[robot]):
         state = walkers.states[robot, index]
@@ -219,22 +202,13 @@ def nearest_walker(walkers: WalkerArrays, robot: int, x: float, y: float) -> flo
 @njit
 def hide_walkers(
     walkers: WalkerArrays,
-    motions: NDArray[np.float64],
+    motions: NDArray[np.float64],  # (x, y, heading) [N, 5] [m, m, rad]
     directions: NDArray[np.float64],
-    margin: float,
-    max_range: float,
-    ranges: NDArray[np.float64],
+    margin: float,  # [m]
+    max_range: float,  # [m]
+    ranges: NDArray[np.float64],  # [N, rays] [m]
 ) -> None:
-    """Let the rays that end at a walker report that they met nothing.
-
-    Args:
-        walkers: The walkers.
-        motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
-        directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``.
-        margin: How far from the rim a ray still ends at a walker [m].
-        max_range: Range of a ray that met nothing [m].
-        ranges: Range of each ray [m], ``[N, rays]``, changed in place.
-    """
+    """Let the rays that end at a walker report that they met nothing."""
     for robot in range(ranges.shape[0]):
         if walkers.counts[robot] == 0:
             continue
@@ -251,23 +225,13 @@ def hide_walkers(
 @njit
 def count_encounters(
     walkers: WalkerArrays,
-    motions: NDArray[np.float64],
-    running: NDArray[np.bool_],
-    radius: float,
-    time_step: float,
-    counts: NDArray[np.float64],
+    motions: NDArray[np.float64],  # (x, y, heading, forward, turning) [N, 5]
+    running: NDArray[np.bool_],  # [N]
+    radius: float,  # [m]
+    time_step: float,  # [s]
+    counts: NDArray[np.float64],  # Least gap [m], time in personal space, to collision [s], [3, N]
 ) -> None:
-    """Take in how near the walkers are to their robots.
-
-    Args:
-        walkers: The walkers.
-        motions: Poses and speeds (x, y, heading, forward, turning), ``[N, 5]``.
-        running: Which robots have moved, ``[N]``.
-        radius: Radius of the robots [m].
-        time_step: How long they have [s].
-        counts: Least distance between the rims [m], time in personal space [s] and least time to
-            collision [s] of the episode so far, ``[3, N]``; changed in place.
-    """
+    """Take in how near the walkers are to their robots."""
     for robot in range(running.shape[0]):
         if not running[robot] or walkers.counts[robot] == 0:
             continue
@@ -293,18 +257,7 @@ def count_encounters(
 
 @njit
 def time_to_collision(x: float, y: float, speed_x: float, speed_y: float, reach: float) -> float:
-    """Find out when two discs touch if both go on as they go.
-
-    Args:
-        x: Where the other is as seen from the one [m].
-        y: Likewise.
-        speed_x: How fast it moves as seen from the one [m/s].
-        speed_y: Likewise.
-        reach: Sum of the radii [m].
-
-    Returns:
-        Time [s], the least t >= 0 with |p + v t| = reach; at most 10.
-    """
+    """Time until two discs touch [s], the least t >= 0 with |p + v t| = reach; at most 10."""
     beyond = x * x + y * y - reach * reach
     if beyond <= 0.0:
         return 0.0

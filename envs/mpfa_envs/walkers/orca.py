@@ -14,30 +14,21 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 _REACH: Final = 5.0
-"""Who is farther away is not looked at [m]."""
+"""Walkers farther away are ignored [m]."""
 _HORIZON: Final = 3.0
-"""How far ahead collisions with others are avoided [s]."""
+"""Time ahead for which collisions with others are avoided [s]."""
 _WALL_HORIZON: Final = 1.0
-"""How far ahead collisions with what stands are avoided [s]."""
+"""Time ahead for which collisions with obstacles are avoided [s]."""
 _CORNERS: Final = 12
 """Corners of the polygon that a cylinder is to the library."""
 
 
 class OrcaRoom:
-    """One robot's world as the library sees it: all walkers, the robot, and what stands.
+    """One robot's world as the library sees it: all walkers, the robot, and what stands."""
 
-    ORCA (van den Berg et al. 2011, https://doi.org/10.1007/978-3-642-19457-3_1) gives each walker
-    the velocity nearest to the one that it wants with which nobody collides if both do their half.
-    Nothing but the obstacles is kept from one time step to the next.
-
-    Args:
-        world: The world.
-        radius: Radius of the robot [m].
-        time_step: Duration of a time step [s].
-
-    Raises:
-        ImportError: If there is no pyrvo.
-    """
+    # ORCA (van den Berg et al. 2011, https://doi.org/10.1007/978-3-642-19457-3_1) gives each walker
+    # the velocity nearest to the one that it wants with which none collide if both do their
+    # half. Nothing but the obstacles is kept from one time step to the next.
 
     def __init__(self, world: World, *, radius: float, time_step: float) -> None:
         try:
@@ -61,17 +52,10 @@ class OrcaRoom:
     def choose(
         self,
         motion: NDArray[np.float64],
-        states: NDArray[np.float64],
-        targets: NDArray[np.int64],
+        states: NDArray[np.float64],  # (x, y) [K, 4] [m, m/s]
+        targets: NDArray[np.int64],  # [K]
     ) -> None:
-        """Choose the next velocities of the walkers with ``"orca"``.
-
-        Args:
-            motion: The robot's pose and speeds (x, y, heading, forward, turning), ``[5]``.
-            states: (x, y) and the speeds in both directions of all walkers [m, m/s], ``[K, 4]``;
-                the speeds are changed.
-            targets: Which waypoint comes next, ``[K]``.
-        """
+        """Choose the next velocities of the walkers with ``"orca"``."""
         x, y, heading, speed, _ = motion.tolist()
         self._set(0, x, y, speed * math.cos(heading), speed * math.sin(heading), None)
         for number, (walker, state) in enumerate(zip(self._walkers, states.tolist(), strict=True)):
@@ -98,7 +82,7 @@ class OrcaRoom:
         speed_y: float,
         wanted: tuple[float, float] | None,
     ) -> None:
-        """Tell the library where someone is, how he moves and would like to."""
+        """Tell the library an agent's position, velocity and wanted velocity."""
         simulator = self._simulator
         simulator.set_agent_position(agent, (x, y))
         simulator.set_agent_velocity(agent, (speed_x, speed_y))
@@ -106,7 +90,7 @@ class OrcaRoom:
 
 
 def _outlines(world: World) -> list[list[Point]]:
-    """What stands in a world: counter-clockwise polygons, and clockwise the room around them."""
+    """Outlines of obstacles, counter-clockwise, and of the room around them, clockwise."""
     room = world.room
     walls = [
         (room.x_min, room.y_min), (room.x_min, room.y_max),
@@ -117,7 +101,7 @@ def _outlines(world: World) -> list[list[Point]]:
         for b in world.boxes
     ]
     turns = [math.tau * corner / _CORNERS for corner in range(_CORNERS)]
-    # Around the cylinder, so that nobody comes too near to it.
+    # Around the cylinder, so that none comes too near to it.
     wider = 1.0 / math.cos(math.pi / _CORNERS)
     cylinders = [
         [

@@ -1,4 +1,4 @@
-"""Where walkers are when an episode begins."""
+"""Starts of walkers at the beginning of an episode."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 WalkerStarts: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.int64]]"
-"""What :func:`start_walkers` gives."""
+"""(x, y) and both speeds [m, m/s], ``[K, 4]``; the index of the next waypoint, ``[K]``."""
 _START: Final = 1.0
-"""How far from the robot's center a walker's rim is at the start, if there is such a place [m]."""
+"""Distance of a walker's rim from the robot's center at the start, where that is possible [m]."""
 _SLACK: Final = 0.02
-"""How much farther from an obstacle than its radius a walker starts [m]."""
+"""Distance of a walker's rim from obstacles at the start [m]."""
 _SAMPLES: Final = 256
 """Places that are sampled at once."""
 _FEW: Final = 16
@@ -28,22 +28,7 @@ _ROUNDS: Final = 20
 
 
 def start_walkers(world: World, start: Point, rng: np.random.Generator) -> WalkerStarts:
-    """Sample where the walkers of a world start.
-
-    They keep 1 m from the robot and do not overlap, where there is room for that.
-
-    Args:
-        world: The world.
-        start: Where the robot starts (x, y) [m].
-        rng: Source of randomness; a world without walkers takes nothing of it.
-
-    Returns:
-        (x, y) and the speeds in both directions [m, m/s], ``[K, 4]``; which waypoint comes next,
-        ``[K]``.
-
-    Raises:
-        ValueError: If a walker fits nowhere.
-    """
+    """Sample the starts of a world's walkers."""
     states = np.zeros((len(world.walkers), 4))
     targets = np.zeros(len(world.walkers), dtype=np.int64)
     taken = [(*start, _START)]
@@ -98,10 +83,10 @@ def _sample_round(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Places anywhere on a walker's round: (x, y), the next waypoint and the heading to it."""
     points = np.array(walker.waypoints)
-    ways = np.roll(points, -1, axis=0) - points
-    ends = np.cumsum(np.hypot(*ways.T))
+    steps = np.roll(points, -1, axis=0) - points
+    ends = np.cumsum(np.hypot(*steps.T))
     along = rng.uniform(0.0, ends[-1], _SAMPLES)
     legs = np.minimum(np.searchsorted(ends, along, side="right"), len(points) - 1)
-    shares = 1.0 - (ends[legs] - along) / np.hypot(*ways[legs].T)
-    places = points[legs] + shares[:, None] * ways[legs]
-    return places, (legs + 1) % len(points), np.arctan2(ways[legs, 1], ways[legs, 0])
+    shares = 1.0 - (ends[legs] - along) / np.hypot(*steps[legs].T)
+    places = points[legs] + shares[:, None] * steps[legs]
+    return places, (legs + 1) % len(points), np.arctan2(steps[legs, 1], steps[legs, 0])
