@@ -25,7 +25,7 @@ BARN_WORLDS: Final = tuple(range(5, 300, 15))
 _FILE: Final = Path(__file__).parents[1] / "data" / "barn" / "barn_sample.npz"
 _RADIUS: Final = 0.075
 _CENTER: Final = (-2.25, 7.0)
-"""What lies in the middle of the room, in the benchmark's coordinates [m]."""
+"""Middle of the room in the benchmark's coordinates [m]."""
 _SIZE: Final = (10.0, 15.0)
 
 

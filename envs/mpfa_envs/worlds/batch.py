@@ -42,7 +42,7 @@ class BatchArrays(NamedTuple):
     segments: NDArray[np.float64]
     """Edges of polygons (x0, y0, x1, y1) [m], ``[N, most edges, 4]``."""
     polygon_ends: NDArray[np.int64]
-    """Where the edges of each polygon end in segments, ``[N, most polygons]``."""
+    """End of each polygon's edges in segments, ``[N, most polygons]``."""
     counts: NDArray[np.int64]
     """Numbers of boxes, circles, segments and polygons, ``[N, 4]``."""
     grids: GridArrays
@@ -52,23 +52,9 @@ class BatchArrays(NamedTuple):
 
 
 class WorldBatch:
-    """A world for each of many robots; setting one copies its shapes and nothing else.
+    """A world for each of many robots; setting one copies its shapes and nothing else."""
 
-    Walkers have a row each behind the cylinders, for others to write where they are.
-
-    Args:
-        worlds: The worlds, in the order of the robots.
-
-    Examples:
-        >>> from mpfa_envs import WORLDS
-        >>> from mpfa_envs.worlds.batch import WorldBatch
-        >>> batch = WorldBatch([WORLDS["A"], WORLDS["B"]])
-        >>> batch.arrays.counts[:, 0]  # boxes
-        array([0, 4])
-        >>> batch[0] = WORLDS["B"]
-        >>> batch.arrays.counts[:, 0]
-        array([4, 4])
-    """
+    # Walkers have a row each behind the cylinders, for others to write where they are.
 
     def __init__(self, worlds: Sequence[World]) -> None:
         robots = len(worlds)
@@ -91,7 +77,7 @@ class WorldBatch:
 
     @property
     def arrays(self) -> BatchArrays:
-        """What the compiled loops read; setting a larger world may replace the arrays."""
+        """Arrays for compiled loops; setting a larger world may replace them."""
         return self._rooms
 
     @property

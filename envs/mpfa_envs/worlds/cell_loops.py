@@ -19,29 +19,15 @@ if TYPE_CHECKING:
 
 @njit
 def cast_at_cells(
-    x: float,
-    y: float,
+    x: float,  # [m]
+    y: float,  # [m]
     beams: NDArray[np.float64],
-    gaps: NDArray[np.uint8],
-    resolution: float,
-    max_range: float,
-    row: NDArray[np.float64],
+    gaps: NDArray[np.uint8],  # [columns, rows]
+    resolution: float,  # [m]
+    max_range: float,  # [m]
+    row: NDArray[np.float64],  # [rays] [m]
 ) -> bool:
-    """Shorten the rays that meet an occupied cell.
-
-    Args:
-        x: Position of the sensor [m].
-        y: Position of the sensor [m].
-        beams: Directions of the rays (cosine, sine), none of them zero, and one over these,
-            ``[4, rays]``.
-        gaps: Columns or rows to the nearest occupied cell, ``[columns, rows]``.
-        resolution: Side of a cell [m].
-        max_range: Greatest range [m].
-        row: Range of each ray so far, changed in place [m], ``[rays]``.
-
-    Returns:
-        Whether the sensor is in an occupied cell.
-    """
+    """Shorten the rays that meet an occupied cell."""
     columns, rows = gaps.shape
     # In cells from the lower left corner.
     u, v = x / resolution + 0.5 * columns, y / resolution + 0.5 * rows
@@ -83,29 +69,16 @@ def cast_at_cells(
 
 @njit
 def clearance_of_cells(
-    left: NDArray[np.int16],
+    left: NDArray[np.int16],  # [columns, rows]
     right: NDArray[np.int16],
-    resolution: float,
-    x: float,
-    y: float,
-    nearest: float,
+    resolution: float,  # [m]
+    x: float,  # [m]
+    y: float,  # [m]
+    nearest: float,  # [m]
 ) -> float:
-    """Measure the distance from a point to the nearest occupied cell.
-
-    It looks at the cell's own row, then at the next above and below, and so on, of each of which
-    the nearest cells to the left and to the right are known.
-
-    Args:
-        left: The nearest occupied column to the left, ``[columns, rows]``.
-        right: The nearest to the right.
-        resolution: Side of a cell [m].
-        x: Position [m].
-        y: Position [m].
-        nearest: A distance beyond which none is looked for [m].
-
-    Returns:
-        Distance [m], zero in an occupied cell; ``nearest`` if none is nearer.
-    """
+    """Measure the distance from a point to the nearest occupied cell [m]."""
+    # It looks at the cell's own row, then at the next above and below, and so on, of each of which
+    # the nearest cells to the left and to the right are known.
     if nearest <= 0.0:
         return nearest
     columns, rows = left.shape
@@ -131,21 +104,12 @@ def clearance_of_cells(
 def lower_clearances(
     left: NDArray[np.int16],
     right: NDArray[np.int16],
-    resolution: float,
-    xs: NDArray[np.float64],
-    ys: NDArray[np.float64],
-    found: NDArray[np.float32],
+    resolution: float,  # [m]
+    xs: NDArray[np.float64],  # [nx] [m]
+    ys: NDArray[np.float64],  # [m] [ny]
+    found: NDArray[np.float32],  # [nx, ny] [m]
 ) -> None:
-    """Lower the clearances of the points of a grid to the distance from the nearest occupied cell.
-
-    Args:
-        left: As in :func:`clearance_of_cells`.
-        right: The same to the right.
-        resolution: Side of a cell of the map [m].
-        xs: Columns of the grid [m], ``[nx]``.
-        ys: Rows of the grid [m], ``[ny]``.
-        found: Clearances, changed in place [m], ``[nx, ny]``.
-    """
+    """Lower the clearances of grid points to the distance from the nearest occupied cell."""
     for i in range(len(xs)):
         for j in range(len(ys)):
             found[i, j] = clearance_of_cells(left, right, resolution, xs[i], ys[j], found[i, j])

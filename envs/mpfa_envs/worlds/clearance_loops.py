@@ -17,17 +17,7 @@ if TYPE_CHECKING:
 
 @njit
 def clearance_at(worlds: BatchArrays, robot: int, x: float, y: float) -> float:
-    """Measure the distance from a point in a robot's world to the nearest obstacle or wall.
-
-    Args:
-        worlds: The room of each robot.
-        robot: Whose room counts.
-        x: Position [m].
-        y: Position [m].
-
-    Returns:
-        Distance [m], that of :meth:`mpfa_envs.World.clearance`.
-    """
+    """Measure the distance from a point in a robot's world to the nearest obstacle or wall [m]."""
     half_size = worlds.half_sizes[robot]
     nearest = min(half_size[0] - abs(x), half_size[1] - abs(y))
     square = math.inf

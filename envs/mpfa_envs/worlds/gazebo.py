@@ -27,7 +27,7 @@ _LARGEST_FILE: Final = 20_000_000
 _DEEPEST: Final = 100
 """Elements in each other, at most."""
 _FLOOR: Final = 0.01
-"""What is no higher than this can be driven over [m]."""
+"""Greatest height of an obstacle that a robot drives over [m]."""
 _FARTHEST: Final = 1e9
 """No number is as large as this [m, rad]."""
 _STRAIGHT: Final = 1e-6
@@ -46,7 +46,7 @@ class _Element:
 
     @property
     def text(self) -> str:
-        """What it holds beside its children."""
+        """Text between its children."""
         return "".join(self.pieces).strip()
 
     def all(self, tag: str) -> Iterator[_Element]:
@@ -59,7 +59,7 @@ class _Element:
 
 
 class _Pose(NamedTuple):
-    """Where something is: x, y, z [m] and the turn around the upright [rad]."""
+    """A pose: x, y, z [m] and the turn around the upright [rad]."""
 
     x: float = 0.0
     y: float = 0.0
@@ -163,11 +163,11 @@ def _parse(path: Path, text: bytes) -> _Element:
     def add(text: str) -> None:
         open_ones[-1].pieces.append(text)
 
-    def refuse(*_: object) -> None:
+    def reject(*_: object) -> None:
         raise error("must not have a document type, as that may define entities")
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = add, refuse
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = add, reject
     try:
         parser.Parse(text, True)
     except WorldFileError:
@@ -187,7 +187,7 @@ class _Reader:
         self.left_out: Counter[str] = Counter()
 
     def state(self, state: _Element | None) -> dict[str, _Element]:
-        """Where models are by name, if the file says so apart from them."""
+        """Poses of models by name, if the file gives them apart."""
         models = () if state is None else state.all("model")
         places = ((model.attributes.get("name", ""), model.first("pose")) for model in models)
         return {name: pose for name, pose in places if pose is not None}
@@ -195,14 +195,7 @@ class _Reader:
     def model(
         self, model: _Element, outer: _Pose, moved: _Element | None = None, static: bool = False
     ) -> None:
-        """Collect the obstacles of a model and those in it.
-
-        Args:
-            model: The model.
-            outer: What its pose is relative to.
-            moved: Its pose, in place of its own.
-            static: Whether the model that it is in is static.
-        """
+        """Collect the obstacles of a model and those in it."""
         flag = model.first("static")
         static |= flag is not None and flag.text.lower() in ("1", "true")
         inner = self._pose(moved or model.first("pose"))
@@ -244,7 +237,7 @@ class _Reader:
         return _Pose(x, y, z, yaw)
 
     def _collision(self, collision: _Element, pose: _Pose) -> None:
-        """Collect the shape of a collision, if it is in the way."""
+        """Collect the shape of a collision, if a robot can hit it."""
         geometry = collision.first("geometry")
         kinds = [] if geometry is None else geometry.children
         for kind in kinds:

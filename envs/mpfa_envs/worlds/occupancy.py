@@ -1,4 +1,4 @@
-"""Which cells of a map are occupied, as a lidar's SLAM or a floor plan gives them."""
+"""Occupied cells of a map, as a lidar's SLAM or a floor plan gives them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FARTHEST: Final = 255
 
 
 class CellArrays(NamedTuple):
-    """What loops over rays and distances read of a map, each ``[columns, rows]``."""
+    """Tables of a map for loops over rays and distances, each ``[columns, rows]``."""
 
     left: NDArray[np.int16]
     """The nearest occupied column in a cell's row, from it to the left; -32,768 if none is."""
@@ -69,7 +69,7 @@ class OccupancyGrid:
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        cells = np.array(self.occupied)  # A copy, which nobody changes.
+        cells = np.array(self.occupied)  # A copy, which stays as it is.
         if cells.ndim != 2 or cells.dtype != np.bool_ or not cells.size:
             raise ValueError(
                 "occupied must be an array [columns, rows] of bool, got shape "
@@ -84,7 +84,7 @@ class OccupancyGrid:
         origin = tuple(check_number("origin", value) for value in self.origin)
         if len(origin) != 2:
             raise ValueError(f"origin must be two numbers, got {self.origin}")
-        # The dataclass is frozen; these are its only changes, before anyone sees it.
+        # The dataclass is frozen; these are its only changes, before it is used.
         object.__setattr__(self, "occupied", cells)
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "resolution", check_positive("resolution", self.resolution))
@@ -101,7 +101,7 @@ class OccupancyGrid:
 
     @property
     def center(self) -> tuple[float, float]:
-        """Where the world's (0, 0) is in the frame of the map (x, y) [m]."""
+        """Position of the world's (0, 0) in the frame of the map (x, y) [m]."""
         width, depth = self.size
         return self.origin[0] + width / 2, self.origin[1] + depth / 2
 
@@ -112,7 +112,7 @@ class OccupancyGrid:
 
     @cached_property
     def arrays(self) -> CellArrays:
-        """What loops over rays and distances read."""
+        """Tables for loops over rays and distances."""
         columns = np.arange(len(self.occupied), dtype=np.int16)[:, None]
         left = np.where(self.occupied, columns, np.int16(-32768))
         right = np.where(self.occupied, columns, np.int16(32767))
@@ -144,7 +144,7 @@ class OccupancyGrid:
 
     @cached_property
     def plain(self) -> dict[str, Any]:
-        """The grid as strings, numbers and lists; :meth:`from_plain` makes it anew."""
+        """The grid as strings, numbers and lists; :meth:`from_plain` makes it again."""
         packed = zlib.compress(np.packbits(self.occupied).tobytes())
         return {
             "shape": list(self.occupied.shape),

@@ -13,20 +13,7 @@ from mpfa_envs.worlds.world import World
 
 
 def world_to_plain(world: World) -> dict[str, Any]:
-    """Turn a world into strings, numbers and lists.
-
-    Args:
-        world: The world.
-
-    Returns:
-        Its fields by name.
-
-    Examples:
-        >>> from mpfa_envs import WORLDS
-        >>> from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
-        >>> world_from_plain(world_to_plain(WORLDS["B"])) == WORLDS["B"]
-        True
-    """
+    """Turn a world into strings, numbers and lists."""
     return {
         "name": world.name,
         "size": list(world.size),
@@ -41,14 +28,7 @@ def world_to_plain(world: World) -> dict[str, Any]:
 
 
 def walker_to_plain(walker: Walker) -> dict[str, Any]:
-    """Turn a walker into plain values.
-
-    Args:
-        walker: The walker.
-
-    Returns:
-        Its fields by name.
-    """
+    """Turn a walker into plain values."""
     return {
         "radius": float(walker.radius),
         "speed": float(walker.speed),
@@ -58,17 +38,7 @@ def walker_to_plain(walker: Walker) -> dict[str, Any]:
 
 
 def world_from_plain(values: dict[str, Any]) -> World:
-    """Make a world of what :func:`world_to_plain` gave.
-
-    Args:
-        values: Its fields by name.
-
-    Returns:
-        The world.
-
-    Raises:
-        ValueError: If a shape is none, or the fields are not those of a world.
-    """
+    """Make a world of what :func:`world_to_plain` gave."""
     try:
         return World(
             name=values["name"],
@@ -93,20 +63,7 @@ def world_from_plain(values: dict[str, Any]) -> World:
 
 
 def fingerprint(world: World) -> str:
-    """Tell a world from others, those of its name included.
-
-    Args:
-        world: The world.
-
-    Returns:
-        Its name, and eight digits that are the same for equal worlds in every process.
-
-    Examples:
-        >>> from mpfa_envs import WORLDS
-        >>> from mpfa_envs.worlds.plain import fingerprint
-        >>> fingerprint(WORLDS["A"])
-        'A (8db8ff63)'
-    """
+    """Tell a world from others, those of its name included."""
     # 1 and 1.0 are the same number, but not the same text.
     values = json.loads(json.dumps(world_to_plain(world), default=float), parse_int=float)
     return f"{world.name} ({hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]})"

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 Mode = Literal["trinary", "scale", "raw"]
-"""What shades between the thresholds mean."""
+"""Meanings of shades between the thresholds."""
 Unknown = Literal["occupied", "free"]
-"""What cells are of which the map knows nothing."""
+"""Readings of cells of which the map knows nothing."""
 _KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _FORMATS: Final = ("PPM", "PNG", "BMP")
 """Kinds of images; PGM is among the first."""
@@ -53,7 +53,7 @@ _UNKNOWN: Final = 205
 
 
 class _Rule(NamedTuple):
-    """How shades become cells."""
+    """Rules that turn shades into cells."""
 
     mode: str
     negate: bool
@@ -64,22 +64,8 @@ class _Rule(NamedTuple):
 def read_map(
     path: Path, root: yaml.Node | None = None, *, unknown: Unknown = "occupied"
 ) -> OccupancyGrid:
-    """Read the cells of a map of ROS, a room of what the map knows of.
-
-    What lies around the outermost free cells, and the cells that touch them, is cut off.
-
-    Args:
-        path: The YAML file; the image's path in it is relative to its folder.
-        root: The nodes of the file, if they have been read already.
-        unknown: What cells are of which the map knows nothing.
-
-    Returns:
-        The cells; ``center`` is where the (0, 0) of their world is on the map.
-
-    Raises:
-        WorldFileError: If a file cannot be read or is no map; the message names the line.
-        ValueError: If unknown is neither.
-    """
+    """Read the cells of a map of ROS, a room of what the map knows of."""
+    # What lies around the outermost free cells, and the cells that touch them, is cut off.
     if unknown not in get_args(Unknown):
         raise ValueError(f"unknown must be one of {get_args(Unknown)}, got {unknown!r}")
     root = read_nodes(path) if root is None else root
@@ -185,7 +171,7 @@ class _Reader(NodeReader):
         try:
             content = io.BytesIO(read_file(path, _LARGEST_IMAGE))
             with warnings.catch_warnings():
-                # Pillow warns of what is refused below.
+                # Pillow warns of what is rejected below.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
                 image = Image.open(content, formats=_FORMATS)
             with image:
@@ -230,31 +216,11 @@ def _shades(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | 
 def save_map(
     world: World, path: str | os.PathLike[str], *, resolution: float | None = None
 ) -> None:
-    """Write the obstacles of a world as a map for ROS's map_server.
-
-    The cells of a map are written as they are, and :meth:`~mpfa_envs.World.from_map` reads an equal
-    world. Of shapes a cell is occupied if its middle is within half a cell of an obstacle, and
-    walls are one cell thick, so that nothing thin is lost. Walkers and regions are not in a map.
-
-    Args:
-        world: The world.
-        path: The YAML file; an image of the same name with the ending .pgm is written beside it.
-        resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
-
-    Raises:
-        ValueError: If the map would have too many cells, or the path does not end in .yaml; nothing
-            is written then.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from mpfa_envs import WORLDS, World
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     WORLDS["B"].to_map(Path(folder) / "b.yaml")
-        ...     copy = World.from_map(Path(folder) / "b.yaml")
-        >>> copy.occupancy.occupied.shape  # 200 x 200 cells, and the walls
-        (202, 202)
-    """
+    """Write the obstacles of a world as a map for ROS's map_server."""
+    # The cells of a map are written as they are, and :meth:`~mpfa_envs.World.from_map` reads an
+    # equal world. Of shapes a cell is occupied if its middle is within half a cell of an obstacle,
+    # and walls are one cell thick, so that nothing thin is lost. Walkers and regions are not in a
+    # map.
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path must end in .yaml, got {str(path)!r}")

@@ -1,4 +1,4 @@
-"""What stands in a world: boxes, cylinders and polygons, all upright."""
+"""Obstacles of a world: boxes, cylinders and polygons, all upright."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class Polygon:
             raise ValueError(f"polygon must have two finite numbers a vertex, got {self.vertices}")
         vertices = tuple((float(x), float(y)) for x, y in given)
         area = _signed_area(vertices)
-        # The dataclass is frozen; this is its only change, before anyone sees it.
+        # The dataclass is frozen; this is its only change, before it is used.
         object.__setattr__(self, "vertices", vertices if area > 0 else vertices[::-1])
         if area == 0.0 or not (_is_convex(self.vertices) or _is_simple(self.edges)):
             raise ValueError(

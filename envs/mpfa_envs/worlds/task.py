@@ -18,11 +18,7 @@ class Task(NamedTuple):
 
 
 def read_task(values: Any) -> Task:
-    """Make a task of a start and a goal.
-
-    Raises:
-        ValueError: If they are not three and two numbers.
-    """
+    """Make a task of a start and a goal."""
     try:
         (x, y, heading), (goal_x, goal_y) = values
         return Task((float(x), float(y), float(heading)), (float(goal_x), float(goal_y)))

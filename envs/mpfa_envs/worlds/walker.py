@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.shapes import Point
 
 Behavior = Literal["straight", "waypoints", "orca"]
-"""How a walker finds its way."""
+"""Rule by which a walker chooses its path."""
 
 MOST_WALKERS: Final = 100
 """No world has more walkers."""
@@ -36,7 +36,7 @@ HORIZON: Final = 10.0
 class Walker:
     """An upright cylinder that moves through a room, say a person.
 
-    Where it starts is drawn in every episode, by the robot's seed.
+    Its start is sampled in every episode, by the robot's seed.
 
     Args:
         radius: Radius [m], at least 0.01.
@@ -95,7 +95,7 @@ class Walker:
         if not all(len(point) == 2 and all_finite(point) for point in given):
             raise ValueError(f"waypoints must be finite positions (x, y), got {self.waypoints}")
         points = tuple((float(x), float(y)) for x, y in given)
-        # The dataclass is frozen; nobody has seen the walker yet.
+        # The dataclass is frozen; this is its only change, before it is used.
         object.__setattr__(self, "waypoints", points)
         for one, other in self.legs:
             if math.dist(one, other) < _SHORTEST_LEG:
@@ -105,15 +105,10 @@ class Walker:
 
     @property
     def legs(self) -> tuple[tuple[Point, Point], ...]:
-        """The ways from each waypoint to the next, and from the last to the first [m]."""
+        """Lines from each waypoint to the next, and from the last to the first [m]."""
         return tuple(zip(self.waypoints, (*self.waypoints[1:], *self.waypoints[:1]), strict=True))
 
 
 def no_encounters() -> tuple[float, float, float]:
-    """What is counted of encounters with walkers when an episode begins.
-
-    Returns:
-        Least distance between the rims [m], time in personal space [s] and least time to collision
-        [s]. They are finite, as what is stored and logged must be.
-    """
+    """Least distance [m], time in personal space [s] and time to collision [s] at the start."""
     return FAR, 0.0, HORIZON

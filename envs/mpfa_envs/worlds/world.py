@@ -41,7 +41,7 @@ _PARTS: Final[Mapping[str, type[Shape | Walker]]] = {
     "goal_regions": Box,
     "walkers": Walker,
 }
-"""What the fields of a world hold that are tuples."""
+"""Types in the fields that are tuples."""
 
 
 class WorldArrays(NamedTuple):
@@ -56,7 +56,7 @@ class WorldArrays(NamedTuple):
     segments: NDArray[np.float64]
     """Edges of the polygons (x0, y0, x1, y1) [m], counter-clockwise, shape ``[edges, 4]``."""
     polygon_ends: NDArray[np.int64]
-    """Where each polygon's edges end in ``segments``, shape ``[polygons]``."""
+    """End of each polygon's edges in ``segments``, shape ``[polygons]``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,7 @@ class World:
         size = tuple(self.size) if isinstance(self.size, Iterable) else ()
         if not all_finite(size or (math.nan,)):
             raise ValueError(f"size must be two positive lengths, got {self.size}")
-        # The dataclass is frozen; these are its only changes, before anyone sees it.
+        # The dataclass is frozen; these are its only changes, before it is used.
         object.__setattr__(self, "size", size)
         for field, kind in _PARTS.items():
             given = getattr(self, field)
@@ -210,7 +210,7 @@ class World:
     def renamed(self, name: str) -> World:
         """Give the same world another name; what was computed of it is kept."""
         world = copy.copy(self)
-        # The dataclass is frozen; this is the copy's only change, before anyone sees it.
+        # The dataclass is frozen; this is the copy's only change, before it is used.
         object.__setattr__(world, "name", name)
         return world
 
@@ -232,7 +232,7 @@ class World:
 
     @property
     def obstacle_count(self) -> int:
-        """How many obstacles there are."""
+        """Number of obstacles."""
         return len(self.boxes) + len(self.cylinders) + len(self.polygons)
 
     @property
@@ -383,7 +383,7 @@ class World:
 
     @cached_property
     def _polygon_starts(self) -> NDArray[np.int64]:
-        """Where each polygon's edges begin in ``arrays.segments``."""
+        """Start of each polygon's edges in ``arrays.segments``."""
         return np.concatenate(([0], self.arrays.polygon_ends[:-1]))
 
     def _to_polygons(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -112,7 +112,7 @@ class _Reader(NodeReader):
         )
 
     def built(self, node: yaml.Node | None, **parts: Any) -> World:
-        """Build a world, with the line of a node if that is refused."""
+        """Build a world, with the line of a node in its error."""
         try:
             return World(**parts)
         except ValueError as error:
@@ -206,11 +206,9 @@ class _Reader(NodeReader):
 
 
 def _has_room(world: World, region: Box) -> bool | None:
-    """Tell whether a region has a point that is clear; None if it is too large to tell.
-
-    The region is cut in four again and again. Within a rectangle the clearance differs from that of
-    its middle by half its diagonal at most, so that most rectangles are decided at once.
-    """
+    """Tell whether a region has a point that is clear; None if it is too large to tell."""
+    # The region is cut in four again and again. Within a rectangle the clearance differs from that
+    # of its middle by half its diagonal at most, so that most rectangles are decided at once.
     half = np.array([region.x_max - region.x_min, region.y_max - region.y_min]) / 2
     middles = np.array([[region.x_min, region.y_min]]) + half
     corners = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
@@ -238,7 +236,7 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
     Raises:
         FileExistsError: If there is a file that is no world, and overwrite is false.
         ValueError: If the world has the cells of a map, which :meth:`World.to_map` writes, or
-            :func:`load_world` would refuse the file, as it does one without a name; nothing is
+            :func:`load_world` would reject the file, as it does one without a name; nothing is
             written then.
 
     Examples:

@@ -22,17 +22,7 @@ class WorldFileError(ValueError):
 
 
 def read_nodes(path: Path) -> yaml.Node | None:
-    """Read a file as nodes, which carry line numbers, and of which no tag can run anything.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The outermost node; None if the file is empty.
-
-    Raises:
-        WorldFileError: If the file cannot be read, is too large, or is not YAML.
-    """
+    """Read a file as nodes, which carry line numbers, and of which no tag can run anything."""
     try:
         content = read_file(path, _LARGEST_FILE)
     except OSError as error:
@@ -41,18 +31,7 @@ def read_nodes(path: Path) -> yaml.Node | None:
 
 
 def parse_nodes(content: bytes, path: Path) -> yaml.Node | None:
-    """Turn the content of a file into nodes.
-
-    Args:
-        content: The content.
-        path: The file, for messages.
-
-    Returns:
-        The outermost node; None if there is none.
-
-    Raises:
-        WorldFileError: If the content is too long, or not YAML.
-    """
+    """Turn the content of a file into nodes."""
     if len(content) > _LARGEST_FILE:  # Not yet looked at where it is about to be written.
         raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
     try:
@@ -83,11 +62,7 @@ def is_map(root: yaml.Node | None) -> bool:
 
 
 class NodeReader:
-    """Reads values from the nodes of one file.
-
-    Args:
-        path: The file, for messages.
-    """
+    """Reads values from the nodes of one file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
