@@ -14,15 +14,7 @@ for is made one by one or held at once, so that a slip of the pen takes all time
 
 
 def check_number(name: str, value: Any) -> float:
-    """A finite number.
-
-    Raises:
-        ValueError: If it is not.
-
-    Examples:
-        >>> check_number("goal_reward", 10)
-        10.0
-    """
+    """A finite number."""
     if isinstance(value, (bool, str, bytes)):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
     try:
@@ -35,12 +27,7 @@ def check_number(name: str, value: Any) -> float:
 
 
 def all_finite(values: Iterable[Any]) -> bool:
-    """Tell whether all are finite numbers; neither text nor a truth value is one.
-
-    Examples:
-        >>> all_finite((1, 2.5)), all_finite((1, "2.5")), all_finite((True,))
-        (True, False, False)
-    """
+    """Tell whether all are finite numbers; neither text nor a truth value is one."""
     try:
         return all(math.isfinite(value) and not isinstance(value, bool) for value in values)
     except (TypeError, ValueError, OverflowError):
@@ -48,17 +35,7 @@ def all_finite(values: Iterable[Any]) -> bool:
 
 
 def check_positive(name: str, value: Any) -> float:
-    """A finite number above zero.
-
-    Raises:
-        ValueError: If it is not.
-
-    Examples:
-        >>> check_positive("time_step", "0.1")
-        Traceback (most recent call last):
-        ...
-        ValueError: time_step must be a finite number, got '0.1'
-    """
+    """A finite number above zero."""
     number = check_number(name, value)
     if number <= 0.0:
         raise ValueError(f"{name} must be positive, got {value!r}")
@@ -66,11 +43,7 @@ def check_positive(name: str, value: Any) -> float:
 
 
 def check_share(name: str, value: Any) -> float:
-    """A number in [0, 1].
-
-    Raises:
-        ValueError: If it is not.
-    """
+    """A number in [0, 1]."""
     number = check_number(name, value)
     if not 0.0 <= number <= 1.0:
         raise ValueError(f"{name} must be in [0, 1], got {value!r}")
@@ -78,21 +51,7 @@ def check_share(name: str, value: Any) -> float:
 
 
 def check_count(name: str, value: Any, *, least: int = 1, most: float = MOST) -> int:
-    """An integer from ``least`` to ``most``.
-
-    Raises:
-        ValueError: If it is not.
-
-    Examples:
-        >>> check_count("seed", -1, least=0)
-        Traceback (most recent call last):
-        ...
-        ValueError: seed must be an integer of at least 0, got -1
-        >>> check_count("episodes", 2**31)
-        Traceback (most recent call last):
-        ...
-        ValueError: episodes must be at most 100000, got 2147483648
-    """
+    """An integer from ``least`` to ``most``."""
     try:
         number = None if isinstance(value, bool) else index(value)
     except TypeError:
@@ -106,20 +65,11 @@ def check_count(name: str, value: Any, *, least: int = 1, most: float = MOST) ->
 
 
 def check_seed(value: Any) -> int:
-    """A seed, an integer of any size that is not negative.
-
-    Raises:
-        ValueError: If it is not.
-    """
+    """A seed, an integer of any size that is not negative."""
     return check_count("seed", value, least=0, most=math.inf)
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The question that ends an error about an unknown name; empty if no known one is near.
-
-    Examples:
-        >>> did_you_mean("burgr", ["burger", "waffle"])
-        "did you mean 'burger'?"
-    """
+    """The question that ends an error about an unknown name; empty if no known one is near."""
     near = get_close_matches(str(name), list(known), n=1)
     return f"did you mean {near[0]!r}?" if near else ""

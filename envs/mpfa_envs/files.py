@@ -10,18 +10,7 @@ from pathlib import Path
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Read a file, unless it is a pipe or a device, which may never end, or too large.
-
-    Args:
-        path: The file.
-        most: Its largest size [bytes].
-
-    Returns:
-        Its content.
-
-    Raises:
-        OSError: If it is missing, not a regular file, too large, or cannot be read.
-    """
+    """Read a file, unless it is a pipe or a device, which may never end, or too large."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError("it is not a regular file")
     with path.open("rb") as file:
@@ -34,17 +23,7 @@ def read_file(path: Path, most: int) -> bytes:
 def check_replaceable(
     path: Path, load: Callable[[Path], object], what: str, *, overwrite: bool
 ) -> None:
-    """Check that a path is free, or that what would be replaced there is of the same kind.
-
-    Args:
-        path: Where something will be written.
-        load: Reads a file of that kind, and raises an OSError or a ValueError for another.
-        what: What messages call it.
-        overwrite: Whether anything may be replaced.
-
-    Raises:
-        FileExistsError: If there is something else.
-    """
+    """Check that a path is free, or that what would be replaced there is of the same kind."""
     if overwrite or not os.path.lexists(path):
         return
     try:
@@ -62,7 +41,7 @@ def write_atomically(content: bytes, path: Path) -> None:
             new.write(content)
             new.flush()
             os.fsync(new.fileno())
-            # Temporary files are for their owner alone; this one is for whom the folder is.
+            # Temporary files are for their owner alone; this one is for all who read the folder.
             os.chmod(new.name, 0o644)
             os.replace(new.name, path)
         except BaseException:

@@ -13,12 +13,7 @@ if TYPE_CHECKING:
 
 
 def after_import(awaited: str, module: str) -> None:
-    """Import a module as soon as another one is imported, or now if that is there already.
-
-    Args:
-        awaited: Name of a module that may never be imported, or may not be installed.
-        module: Name of the module that is imported after it.
-    """
+    """Import a module as soon as another one is imported, or now if that is there already."""
     if sys.modules.get(awaited) is not None:
         import_module(module)
     elif not any(isinstance(each, _Waiting) and each.module == module for each in sys.meta_path):
@@ -47,7 +42,7 @@ class _Waiting(MetaPathFinder):
 
             def execute_and_import(loaded: Any) -> None:
                 execute(loaded)
-                # Only now: who asks whether a module is there need not import it.
+                # Only now: to ask whether a module is there does not import it.
                 if self in sys.meta_path:
                     sys.meta_path.remove(self)
                 import_module(self.module)

@@ -12,19 +12,7 @@ if TYPE_CHECKING:
 
 
 def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArray[Any]:
-    """Read an array of a state.
-
-    Args:
-        state: Where it is.
-        name: Its name.
-        like: An array of the same shape and kind.
-
-    Returns:
-        A copy of it.
-
-    Raises:
-        ValueError: If it is missing, of another shape, or not finite.
-    """
+    """Read an array of a state."""
     values = np.array(state.get(name), dtype=like.dtype if name in state else object)
     if values.shape != like.shape:
         raise ValueError(f"{name} of the state must have shape {like.shape}, got {values.shape}")
@@ -34,19 +22,7 @@ def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArr
 
 
 def read_list(state: Mapping[str, Any], name: str, robots: int) -> Sequence[Any]:
-    """Read what a state has of each robot.
-
-    Args:
-        state: Where it is.
-        name: Its name.
-        robots: Number of robots.
-
-    Returns:
-        It.
-
-    Raises:
-        ValueError: If it is missing, or not there for each robot.
-    """
+    """Read what a state has of each robot."""
     values = state.get(name)
     if not isinstance(values, list | tuple) or len(values) != robots:
         found = len(values) if isinstance(values, list | tuple) else repr(values)
