@@ -33,7 +33,7 @@ def envs(**arguments: Any) -> tuple[VectorNavigationEnv, list[NavigationEnv]]:
 
 
 @pytest.mark.parametrize("memory", ["none", "map"])
-def test_the_earlier_scans_are_those_of_the_decisions_before_newest_first(memory: str) -> None:
+def test_the_earlier_scans_come_newest_first(memory: str) -> None:
     plain, long = (
         NavigationEnv(world="D", physics="kinematic", memory=memory, history=history)
         for history in (0, 3)
@@ -74,7 +74,7 @@ def test_many_robots_sense_the_same_scans_as_alone(memory: str, mode: AutoresetM
     assert ends > 2
 
 
-def test_the_earlier_scans_are_saved_and_those_of_a_robot_that_waits_stay() -> None:
+def test_the_earlier_scans_are_saved_and_stay_while_waiting() -> None:
     env, other = (envs()[0] for _ in range(2))
     env.reset(seed=0)
     for step in range(10):
@@ -107,6 +107,6 @@ def test_torchrl_has_room_for_the_earlier_scans() -> None:
 
 
 @pytest.mark.parametrize("history", [-1, 1.5, "two"])
-def test_a_history_that_is_no_count_is_refused(history: object) -> None:
+def test_a_history_that_is_no_count_is_rejected(history: object) -> None:
     with pytest.raises(ValueError, match=r"history must be .*integer"):
         NavigationEnv(physics="kinematic", history=history)  # type: ignore[arg-type]

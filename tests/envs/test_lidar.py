@@ -17,7 +17,7 @@ def test_the_rays_go_from_left_to_right_over_the_front() -> None:
     assert np.degrees(single.angles[[0, 1, -1]]) == pytest.approx([85, 75, -85])
 
 
-def test_a_field_of_view_of_a_whole_turn_sees_what_is_behind() -> None:
+def test_a_field_of_view_of_360_degrees_sees_behind() -> None:
     world = World(name="behind", cylinders=(Cylinder(-1.5, 0.0, 0.25),))
     whole = Lidar(world, sectors=36, field_of_view=360.0)
     assert np.degrees(whole.angles[[0, -1]]) == pytest.approx([180 - 5 / 3, -180 + 5 / 3])
@@ -29,7 +29,7 @@ def test_a_field_of_view_of_a_whole_turn_sees_what_is_behind() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, -90.0, 361.0, math.nan])
-def test_a_field_of_view_that_no_lidar_has_is_refused(angle: float) -> None:
+def test_a_field_of_view_that_no_lidar_has_is_rejected(angle: float) -> None:
     with pytest.raises(ValueError, match="field_of_view"):
         Lidar(WORLDS["A"], field_of_view=angle)
 
@@ -57,7 +57,7 @@ def test_a_box_and_a_cylinder_are_seen_at_their_faces() -> None:
     assert lidar.scan(-2.0, 0.1, 0.0) == pytest.approx(0.0)
 
 
-def test_a_ray_along_the_face_of_a_box_is_no_number_problem() -> None:
+def test_a_ray_along_the_face_of_a_box_is_finite() -> None:
     world = World(name="edge", boxes=(Box(1.0, 0.0, 2.0, 1.0),))
     with np.errstate(all="raise", under="ignore"):
         ranges = Lidar(world, sectors=1, reduction="single").scan(0.0, 0.0, 0.0)

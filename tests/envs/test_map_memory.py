@@ -1,4 +1,4 @@
-"""The way on a robot's map, against SciPy's Dijkstra on the same map, and what it is good for."""
+"""The path on a robot's map, against SciPy's Dijkstra on the same map, and what it is good for."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def levels_of_points(points: np.ndarray, memory: MapMemory) -> np.ndarray:
 
 
 def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
-    """Costs of the ways from all cells to the goal, by SciPy."""
+    """Costs of the paths from all cells to the goal, by SciPy."""
     columns, rows = levels.shape
     edges = []
     for i in range(columns):
@@ -67,7 +67,7 @@ def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_way_is_the_cheapest_on_the_map_after_every_scan(seed: int) -> None:
+def test_the_path_is_the_cheapest_after_every_scan(seed: int) -> None:
     rng = np.random.default_rng(seed)
     world = random_shapes(rng, boxes=4, cylinders=4)
     lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
@@ -82,39 +82,39 @@ def test_the_way_is_the_cheapest_on_the_map_after_every_scan(seed: int) -> None:
             pose[:2] + r * np.array([math.cos(a), math.sin(a)])
             for r, a in zip(ranges[met], angles[met], strict=True)
         ]
-        way = scan(memory, lidar, tuple(pose), goal)
+        path = scan(memory, lidar, tuple(pose), goal)
         levels = levels_of_points(np.array(points), memory)
         np.testing.assert_array_equal(memory.arrays.levels[0], levels)
         cell, end = (
             tuple(np.rint((np.array(at) - memory.arrays.origins[0]) / RESOLUTION).astype(int))
             for at in (pose[:2], goal)
         )
-        assert way[2] == pytest.approx(cheapest(levels, end)[cell] * RESOLUTION / 10)
-        assert math.hypot(way[0], way[1]) == pytest.approx(1.0)
+        assert path[2] == pytest.approx(cheapest(levels, end)[cell] * RESOLUTION / 10)
+        assert math.hypot(path[0], path[1]) == pytest.approx(1.0)
         pose += [rng.uniform(0.0, 0.6), rng.uniform(0.0, 0.5), rng.uniform(-0.5, 0.5)]
 
 
-def test_the_way_leads_straight_to_a_goal_that_can_be_seen() -> None:
+def test_the_path_leads_straight_to_a_visible_goal() -> None:
     world = World(name="empty")
     memory = MapMemory(1, ROBOT, Lidar(world))
     memory.begin(0, world)
     # Not the middle of a cell.
-    way = scan(memory, Lidar(world), (0.0, 0.0, 0.5), (1.0, 0.93))
+    path = scan(memory, Lidar(world), (0.0, 0.0, 0.5), (1.0, 0.93))
     bearing = math.atan2(0.93, 1.0) - 0.5
-    assert way[:2] == pytest.approx([math.cos(bearing), math.sin(bearing)])
-    assert way[2] == pytest.approx(1.37, abs=0.1)
+    assert path[:2] == pytest.approx([math.cos(bearing), math.sin(bearing)])
+    assert path[2] == pytest.approx(1.37, abs=0.1)
 
 
-def test_a_robot_that_has_not_looked_around_keeps_its_map_and_its_way() -> None:
+def test_a_robot_without_a_scan_keeps_its_map_and_path() -> None:
     lidar, memory = Lidar(POCKET), MapMemory(2, ROBOT, Lidar(POCKET))
     motions, goals = np.zeros((2, 5)), np.full((2, 2), 3.0)
     for index in range(2):
         memory.begin(index, POCKET)
     ranges = np.tile(lidar.cast(0.0, 0.0, 0.0), (2, 1))
-    ways = memory.remember(motions, goals, ranges, np.array([False, True])).copy()
+    paths = memory.remember(motions, goals, ranges, np.array([False, True])).copy()
     assert not memory.arrays.levels[0].any() and memory.arrays.levels[1].any()
-    np.testing.assert_array_equal(ways[0], 0.0)
-    assert ways[1].any()
+    np.testing.assert_array_equal(paths[0], 0.0)
+    assert paths[1].any()
 
 
 def test_an_episode_begins_with_an_empty_map() -> None:
@@ -130,13 +130,13 @@ def test_an_episode_begins_with_an_empty_map() -> None:
 
 def test_nothing_of_the_room_is_known_before_it_was_seen() -> None:
     lidar, empty = Lidar(POCKET), Lidar(World(name="empty"))
-    ways = []
+    paths = []
     for sensor in (lidar, empty):
         memory = MapMemory(1, ROBOT, sensor)
         memory.begin(0, POCKET)
         # The pocket is behind the robot.
-        ways.append(scan(memory, sensor, (-2.0, 0.0, math.pi), (3.0, 0.0)))
-    assert ways[0] == ways[1]
+        paths.append(scan(memory, sensor, (-2.0, 0.0, math.pi), (3.0, 0.0)))
+    assert paths[0] == paths[1]
 
 
 def follow(observation: np.ndarray, part: str) -> np.ndarray:
@@ -147,7 +147,7 @@ def follow(observation: np.ndarray, part: str) -> np.ndarray:
     return np.clip(2 * np.array([speed - turn, speed + turn]) - 1, -1.0, 1.0)
 
 
-def test_the_way_leads_out_of_a_pocket_that_the_straight_line_leads_into() -> None:
+def test_the_path_leads_out_of_a_pocket() -> None:
     env = NavigationEnv(world=POCKET, physics="kinematic", memory="map", max_steps=1000)
     ends = {}
     for part in ("way_direction", "goal_direction"):
@@ -161,7 +161,7 @@ def test_the_way_leads_out_of_a_pocket_that_the_straight_line_leads_into() -> No
     env.close()
 
 
-def test_the_map_adds_to_the_observation_and_changes_nothing_of_it() -> None:
+def test_the_map_extends_the_observation_and_changes_nothing_else() -> None:
     worlds = [generate_world("mazes", 3), generate_world("halls", 4)]
     envs = [
         VectorNavigationEnv(2, world=worlds, physics="kinematic", memory=memory)
@@ -178,25 +178,25 @@ def test_the_map_adds_to_the_observation_and_changes_nothing_of_it() -> None:
         env.close()
 
 
-def test_an_unknown_memory_is_refused() -> None:
+def test_an_unknown_memory_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"memory must be one of \('none', 'map'\), got 'lstm'"):
         NavigationEnv(memory="lstm")  # type: ignore[arg-type]
 
 
-def test_a_picture_shows_what_was_met_and_the_way_to_the_goal() -> None:
+def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     env = NavigationEnv(
         world=POCKET, physics="kinematic", memory="map", render_mode="rgb_array", max_steps=20
     )
     env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
     memory = env.robots._batch.memory
     sketch = memory.sketch(0, 0.0, 0.0)
-    assert math.dist(sketch.way[0], (0.0, 0.0)) < 0.25
-    assert math.dist(sketch.way[-1], (3.0, 0.0)) < 0.1
-    steps = [math.dist(a, b) for a, b in zip(sketch.way, sketch.way[1:], strict=False)]
+    assert math.dist(sketch.path[0], (0.0, 0.0)) < 0.25
+    assert math.dist(sketch.path[-1], (3.0, 0.0)) < 0.1
+    steps = [math.dist(a, b) for a, b in zip(sketch.path, sketch.path[1:], strict=False)]
     assert max(steps) == pytest.approx(math.sqrt(2) * RESOLUTION)
     assert len(sketch.blocked) == (memory.arrays.levels[0] == 2).sum() > 50
     # Past what it sees of an arm of the pocket, which is the part before it.
-    assert min(x for x, y in sketch.way if abs(y) > 1.4) < -0.3
+    assert min(x for x, y in sketch.path if abs(y) > 1.4) < -0.3
     orange = (env.render() == WAY[:3]).all(axis=-1)
     assert 50 < orange.sum() < 5000
     env.close()

@@ -15,7 +15,7 @@ def mirrored(world: World) -> World:
     return World(name="mirrored", boxes=boxes)
 
 
-def test_the_mirror_shows_what_a_robot_in_the_mirrored_world_sees(physics: str) -> None:
+def test_the_mirror_shows_the_view_in_the_mirrored_world(physics: str) -> None:
     world, mirror = WORLDS["D"], Mirror()
     env = paper_env(world=world, physics=physics)
     other = paper_env(world=mirrored(world), physics=physics)
@@ -67,7 +67,7 @@ def sample(chance: float, *, seed: int = 0) -> tuple[TensorDict, TensorDict]:
     return rollout, buffer.sample()
 
 
-def test_each_transition_is_mirrored_as_a_whole_and_half_of_them_are() -> None:
+def test_half_of_the_transitions_are_mirrored_each_as_a_whole() -> None:
     rollout, batch = sample(0.5)
     mirror, stored = Mirror(), rollout[batch["index"]]
     images = stored.clone()
@@ -85,7 +85,7 @@ def test_each_transition_is_mirrored_as_a_whole_and_half_of_them_are() -> None:
     assert batch["next", "reward"].equal(stored["next", "reward"])
 
 
-def test_what_is_stored_stays_as_it_was_and_draws_follow_the_seed() -> None:
+def test_stored_data_stays_and_samples_follow_the_seed() -> None:
     rollout, batch = sample(0.0)
     assert batch["observation"].equal(rollout["observation"][batch["index"]])
     torch.manual_seed(1)
@@ -95,12 +95,12 @@ def test_what_is_stored_stays_as_it_was_and_draws_follow_the_seed() -> None:
 
 
 @pytest.mark.parametrize("chance", [-0.1, 1.5, float("nan")])
-def test_a_chance_out_of_range_is_refused(chance: float) -> None:
+def test_a_chance_out_of_range_is_rejected(chance: float) -> None:
     with pytest.raises(ValueError, match=r"chance must be (in \[0, 1\]|a finite number), got"):
         RandomMirror(chance=chance)
 
 
-def test_the_action_without_noise_is_mirrored_with_the_action_where_a_batch_has_it() -> None:
+def test_the_action_without_noise_is_mirrored_with_the_action() -> None:
     rows = TensorDict(
         {
             "observation": torch.rand(6, 24),

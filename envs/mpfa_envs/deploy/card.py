@@ -14,8 +14,8 @@ from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.sensing.observation import (
     DISTANCE_SCALE,
     GOAL_CLOSENESS_DISTANCE,
+    PATH_BOUND,
     SPEED_BOUND,
-    WAY_BOUND,
     observation_slices,
 )
 
@@ -28,7 +28,7 @@ SCALES: Final = {
     "goal_closeness_distance": GOAL_CLOSENESS_DISTANCE,
     "distance": DISTANCE_SCALE,
     "speed_bound": SPEED_BOUND,
-    "way_bound": WAY_BOUND,
+    "way_bound": PATH_BOUND,
 }
 """The scales of the observation that are the same for all policies, as cards have them."""
 _REDUCTIONS = ("min", "median", "single")

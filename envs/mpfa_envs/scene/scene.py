@@ -70,7 +70,7 @@ def render_scene(
         with canvas.layer():
             for at_x, at_y in sketch.blocked:
                 canvas.rectangle(at_x - half, at_y - half, at_x + half, at_y + half, fill=MET)
-        canvas.line([(x, y), *sketch.way], WAY, 1.5)
+        canvas.line([(x, y), *sketch.path], WAY, 1.5)
     if rays is not None:
         ends = [
             (x + reach * math.cos(heading + angle), y + reach * math.sin(heading + angle))

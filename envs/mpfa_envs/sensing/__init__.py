@@ -1,1 +1,1 @@
-"""What a robot senses: lidar, the map that it makes, and the observation."""
+"""Lidar, the map that a robot makes of its scans, and the observation."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 Reduction = Literal["min", "median", "single"]
-"""How the rays of a sector become one range."""
+"""The range of a sector: its nearest ray, the median, or its only one."""
 
 
 class Lidar:

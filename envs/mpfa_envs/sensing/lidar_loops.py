@@ -28,25 +28,15 @@ _END = 1e-12
 
 @njit
 def cast_rays(
-    motions: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
+    motions: NDArray[np.float64],  # x, y, heading first [m, m, rad], [N, 5]
+    chosen: NDArray[np.bool_],  # [N]; the others' ranges stay
     worlds: BatchArrays,
-    directions: NDArray[np.float64],
-    view: float,
+    directions: NDArray[np.float64],  # cosine and sine in the robot's frame, [2, rays]
+    view: float,  # each ray is in the middle of an equal part of it [rad]
     max_range: float,
-    ranges: NDArray[np.float64],
+    ranges: NDArray[np.float64],  # [m], [N, rays]
 ) -> None:
-    """Measure every ray of the chosen robots, without noise.
-
-    Args:
-        motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
-        chosen: Which robots look around, ``[N]``; the others' ranges stay.
-        worlds: The room of each robot.
-        directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``.
-        view: The field of view, of which each ray is in the middle of an equal part [rad].
-        max_range: Greatest range [m].
-        ranges: Where the ranges go [m], ``[N, rays]``; zero in an obstacle.
-    """
+    """Write the noise-free range of every ray of the chosen robots; zero in an obstacle."""
     rays = directions.shape[1]
     # Directions (cosine, sine) of the rays in the room, and one over them.
     beams = np.empty((4, rays))
@@ -125,11 +115,7 @@ def _span(
     view: float,
     rays: int,
 ) -> tuple[int, int]:
-    """First and last ray between the directions of two points, by the shorter way.
-
-    The points are relative to the robot; where no ray points between them, the last one comes
-    before the first.
-    """
+    """First and last ray on the shorter arc between two points; without rays, last before first."""
     cosine, sine = ahead
     front0, left0 = cosine * x0 + sine * y0, cosine * y0 - sine * x0
     front1, left1 = cosine * x1 + sine * y1, cosine * y1 - sine * x1
@@ -139,7 +125,7 @@ def _span(
     if low > high:
         low, high = high, low
     if high - low > math.pi:
-        # The way between them leads around the back, where a wide view has both its ends.
+        # The arc between them leads around the back, where a wide view has both its ends.
         if view > math.pi:
             return 0, rays - 1
         low, high = (high, math.pi) if abs(high) < abs(low) else (-math.pi, low)
@@ -160,10 +146,8 @@ def _rays_between(low: float, high: float, view: float, rays: int) -> tuple[int,
 
 @njit
 def _direction(front: float, left: float) -> float:
-    """Direction of a point, as ``math.atan2(left, front)`` with an error below 0.001 [rad].
-
-    It takes a fraction of its time: a polynomial for the arc tangent of at most one.
-    """
+    """``math.atan2(left, front)`` with an error below 0.001 rad, in a fraction of its time."""
+    # A polynomial for the arc tangent of at most one.
     ahead, aside = abs(front), abs(left)
     slope = min(ahead, aside) / max(ahead, aside, 1e-300)
     square = slope * slope

@@ -1,4 +1,4 @@
-"""Maps that robots make of what their lidar hit, and the ways to the goal that these leave open."""
+"""Maps that robots make of what their lidar hit, and the paths to the goal on them."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ NEAR: Final = 1
 BLOCKED: Final = 2
 """A cell where the robot's center cannot be."""
 FACTORS: Final = np.array((1, 3, 30), dtype=np.int64)
-"""What a step in a free cell, one near an obstacle and a blocked one costs. None is infinite: a
-robot may stand where it should not, and where all ways are blocked it goes on looking."""
+"""Cost of a step in a free cell, one near an obstacle and a blocked one. None is infinite: a
+robot may stand where it should not, and where all paths are blocked it goes on looking."""
 STRAIGHT: Final = 10
 """Length of a step to the cell beside."""
 DIAGONAL: Final = 14
 """Length of a step over a corner."""
 UNKNOWN: Final = int(np.iinfo(np.int32).max)
-"""Cost of a cell to which no way was looked for."""
+"""Cost of a cell to which no path was looked for."""
 _RING: Final = 512
 """More than the costliest step."""
 _NEXT_CELLS: Final = 20
-"""Cells of the way that its direction depends on."""
+"""Cells of the path that its direction depends on."""
 _AROUND: Final = 8
-"""By how many steps a way may be longer to be found beside the robot's own."""
+"""By how many steps a path may be longer to be found beside the robot's own."""
 _ACROSS: Final = np.array((1, 0, -1, 0, 1, -1, -1, 1), dtype=np.int64)
 _UP: Final = np.array((0, 1, 0, -1, 1, 1, -1, -1), dtype=np.int64)
 """The steps: four straight ones, four diagonal ones."""
@@ -42,7 +42,7 @@ class MapArrays(NamedTuple):
     levels: NDArray[np.uint8]
     """0 where nothing was met, :data:`NEAR` or :data:`BLOCKED`, ``[N, columns, rows]``."""
     costs: NDArray[np.int32]
-    """Cost of the cheapest way to the goal, ``[N, columns, rows]``."""
+    """Cost of the cheapest path to the goal, ``[N, columns, rows]``."""
     shapes: NDArray[np.int64]
     """Numbers of columns and rows, ``[N, 2]``."""
     origins: NDArray[np.float64]
@@ -51,28 +51,16 @@ class MapArrays(NamedTuple):
 
 @njit
 def remember(
-    motions: NDArray[np.float64],
-    goals: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
-    directions: NDArray[np.float64],
+    motions: NDArray[np.float64],  # x, y, heading first [m, m, rad], [N, 5]
+    goals: NDArray[np.float64],  # x, y [m], [N, 2]
+    ranges: NDArray[np.float64],  # [m], [N, rays]
+    chosen: NDArray[np.bool_],  # [N]; the others' rows stay
+    directions: NDArray[np.float64],  # cosine and sine in the robot's frame, [2, rays]
     maps: MapArrays,
-    lengths: tuple[float, float, float, float],
-    ways: NDArray[np.float64],
+    lengths: tuple[float, float, float, float],  # cell, blocked below, near below, max_range [m]
+    paths: NDArray[np.float64],  # direction (x, y) in the robot's frame and length [m], [N, 3]
 ) -> None:
-    """Enter a scan of the chosen robots in their maps, and find their ways.
-
-    Args:
-        motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
-        goals: Positions (x, y) [m], ``[N, 2]``.
-        ranges: Range of each ray [m], ``[N, rays]``.
-        chosen: Which robots have looked around, ``[N]``; the others' rows stay.
-        directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``.
-        maps: The maps.
-        lengths: Side of a cell; distance from an obstacle below which a cell is blocked, and below
-            which it is near; range of a ray that met nothing [m].
-        ways: Where direction (x, y) in the robot's frame and length [m] of the ways go, ``[N, 3]``.
-    """
+    """Enter a scan of the chosen robots in their maps, and find the paths to their goals."""
     resolution, blocked, near, max_range = lengths
     blocked, near = blocked / resolution, near / resolution
     links = np.empty((3, maps.levels.shape[1] * maps.levels.shape[2]), dtype=np.int32)
@@ -99,16 +87,16 @@ def remember(
                 _cell((goals[robot, 0] - maps.origins[robot, 0]) / resolution, nx),
                 _cell((goals[robot, 1] - maps.origins[robot, 1]) / resolution, ny),
             )
-            _find_ways(levels, goal, (i, j), costs, links)
+            _find_paths(levels, goal, (i, j), costs, links)
         ahead_i, ahead_j, ends = _look_ahead(levels, costs, i, j)
         across, up = ahead_i - u, ahead_j - v
         if ends:
             across, up = goals[robot, 0] - x, goals[robot, 1] - y
         length = math.hypot(across, up)
         if length > 0.0:
-            ways[robot, 0] = (across * cosine + up * sine) / length
-            ways[robot, 1] = (up * cosine - across * sine) / length
-        ways[robot, 2] = costs[i, j] * resolution / STRAIGHT
+            paths[robot, 0] = (across * cosine + up * sine) / length
+            paths[robot, 1] = (up * cosine - across * sine) / length
+        paths[robot, 2] = costs[i, j] * resolution / STRAIGHT
 
 
 @njit
@@ -145,31 +133,19 @@ def _step_cost(levels: NDArray[np.uint8], i: int, j: int, move: int) -> int:
 
 @njit
 def _costs_the_same(levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int, j: int) -> bool:
-    """Tell whether the way from a cell still costs what it did when it was found.
-
-    It is the cheapest then: what is seen makes other ways costlier, and none cheaper.
-    """
-    cells = follow_way(levels, costs, i, j)
+    """Tell whether the path from a cell still costs what it did when it was found."""
+    # It is the cheapest then: what is seen makes other paths costlier, and none cheaper.
+    cells = follow_path(levels, costs, i, j)
     if len(cells) > 0:
         i, j = cells[-1, 0], cells[-1, 1]
     return bool(costs[i, j] == 0)
 
 
 @njit
-def follow_way(
+def follow_path(
     levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int, j: int
 ) -> NDArray[np.int64]:
-    """Give the cells of the way from a cell to the goal, as far as it was found.
-
-    Args:
-        levels: The map, ``[columns, rows]``.
-        costs: Costs of the ways, ``[columns, rows]``.
-        i: Column of the cell.
-        j: Its row.
-
-    Returns:
-        Columns and rows, ``[cells, 2]``, without the first cell.
-    """
+    """Columns and rows, ``[cells, 2]``, of the path behind a cell, as far as it was found."""
     cells = np.empty((costs.size, 2), dtype=np.int64)
     count = 0
     while 0 < costs[i, j] < UNKNOWN:
@@ -186,18 +162,16 @@ def follow_way(
 
 
 @njit
-def _find_ways(
+def _find_paths(
     levels: NDArray[np.uint8],
     goal: tuple[int, int],
     start: tuple[int, int],
     costs: NDArray[np.int32],
     links: NDArray[np.int32],
 ) -> None:
-    """Find the cheapest ways to the goal from the start and from around it.
-
-    It is A* from the goal to the start, with Dial's ring of buckets: as costs are small integers,
-    the cells that wait are kept in a list for each cost, and no heap is needed.
-    """
+    """Find the cheapest paths to the goal from the start and from around it."""
+    # A* from the goal to the start, with Dial's ring of buckets: as costs are small integers, the
+    # cells that wait are kept in a list for each cost, and no heap is needed.
     ny = levels.shape[1]
     costs[:, :] = UNKNOWN
     heads = np.full(_RING, -1, dtype=np.int32)
@@ -235,7 +209,7 @@ def _find_ways(
 
 @njit
 def _least_cost(i: int, j: int, start: tuple[int, int]) -> int:
-    """Cost of the way between two cells if all were free."""
+    """Cost of the path between two cells if all were free."""
     across, up = abs(i - start[0]), abs(j - start[1])
     return STRAIGHT * max(across, up) + (DIAGONAL - STRAIGHT) * min(across, up)
 
@@ -276,11 +250,7 @@ def _take_out(
 def _look_ahead(
     levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int, j: int
 ) -> tuple[int, int, bool]:
-    """Follow the way as far as a straight line from its start goes.
-
-    Returns:
-        Column and row of the cell, and whether it is the goal's.
-    """
+    """Farthest cell of the path in an open straight line, and whether it is the goal's."""
     ahead_i, ahead_j, at_i, at_j = i, j, i, j
     for _ in range(_NEXT_CELLS):
         least = costs[at_i, at_j]

@@ -1,4 +1,4 @@
-"""What robots remember: a map of what their lidar hit, and the way to the goal that it leaves."""
+"""A robot's memory: a map of what its lidar hit, and the path to the goal that it leaves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 import numpy as np
 
 from mpfa_envs.saved import read_array
-from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, follow_way, remember
+from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, follow_path, remember
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,16 +28,16 @@ _NEAR: Final = 0.22
 
 
 class Rays(Protocol):
-    """What a map is made from: a :class:`~mpfa_envs.Lidar`, or one of a real robot."""
+    """The rays that a map is made from: a :class:`~mpfa_envs.Lidar`, or one of a real robot."""
 
     angles: NDArray[np.float64]
     """Direction of each ray in the robot's frame [rad], ``[rays]``."""
     max_range: float
-    """What a ray reports that meets nothing [m]."""
+    """Range of a ray that meets nothing [m]."""
 
 
 class Place(Protocol):
-    """What is mapped: a :class:`~mpfa_envs.World`, or no more than its size is known."""
+    """The mapped room: a :class:`~mpfa_envs.World`, or a size alone."""
 
     @property
     def size(self) -> tuple[float, float]:
@@ -49,8 +49,8 @@ class Sketch(NamedTuple):
 
     blocked: list[tuple[float, float]]
     """Centers of the cells where the robot's center cannot be (x, y) [m]."""
-    way: list[tuple[float, float]]
-    """Centers of the cells of its way to the goal, in order (x, y) [m]."""
+    path: list[tuple[float, float]]
+    """Centers of the cells of its path to the goal, in order (x, y) [m]."""
     resolution: float
     """Side of a cell [m]."""
 
@@ -58,12 +58,11 @@ class Sketch(NamedTuple):
 class MapMemory:
     """A map for each of many robots, empty when an episode begins.
 
-    The map has square cells. A cell from which a point that the lidar hit is nearer than the
-    robot's rim can be is blocked; what was not seen is held to be free. The way is the cheapest one
-    to the goal over the map, where cells near an obstacle cost three times as much as free ones and
-    blocked cells thirty times, found anew whenever something seen makes it costlier. Its direction
-    is that of the farthest of its next cells, two meters away at most, to which a straight line is
-    no narrower than its ends.
+    The map has square cells. A cell nearer to a point that the lidar hit than the robot's rim can
+    be is blocked; unseen cells count as free. The path is the cheapest one to the goal over the
+    map, where cells near an obstacle cost three times as much as free ones and blocked cells thirty
+    times, found again whenever a scan makes it costlier. Its direction is that of the farthest of
+    its next cells, two meters away at most, to which a straight line is no narrower than its ends.
 
     It holds what the lidar told and where the robot was, as odometry gives it, and nothing else of
     the room.
@@ -80,8 +79,8 @@ class MapMemory:
         >>> memory = MapMemory(1, ROBOTS["turtlebot2"], lidar := Lidar(wall))
         >>> memory.begin(0, wall)
         >>> ranges = lidar.cast(0.0, 0.0, 0.0)[None]
-        >>> way = memory.remember(np.zeros((1, 5)), np.array([[3.0, 0.0]]), ranges)[0]
-        >>> bool(abs(way[1]) > 0.5), bool(way[2] > 3.0)  # Around the wall, which is longer.
+        >>> path = memory.remember(np.zeros((1, 5)), np.array([[3.0, 0.0]]), ranges)[0]
+        >>> bool(abs(path[1]) > 0.5), bool(path[2] > 3.0)  # Around the wall, which is longer.
         (True, True)
     """
 
@@ -93,7 +92,7 @@ class MapMemory:
             np.zeros((count, 2)),
         )
         """The maps, as compiled loops read them."""
-        self._ways = np.zeros((count, 3))
+        self._paths = np.zeros((count, 3))
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         self._lengths = RESOLUTION, robot.radius + _BLOCKED, robot.radius + _NEAR, lidar.max_range
 
@@ -111,7 +110,7 @@ class MapMemory:
         arrays.origins[index] = [-(side - 1) / 2 * RESOLUTION for side in sides]
         arrays.levels[index] = 0
         arrays.costs[index] = UNKNOWN
-        self._ways[index] = 0.0
+        self._paths[index] = 0.0
 
     def remember(
         self,
@@ -122,37 +121,34 @@ class MapMemory:
         *,
         directions: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Enter a scan in the maps and find the ways.
+        """Enter a scan in the maps and find the paths.
 
         Args:
             motions: Poses (x, y, heading) in the first three columns [m, m, rad], ``[N, 5]``.
             goals: Positions (x, y) [m], ``[N, 2]``.
             ranges: Range of each ray [m], ``[N, rays]``.
-            chosen: Which robots have looked around, ``[N]``; None: all. The others' ways stay.
+            chosen: Which robots have looked around, ``[N]``; None: all. The others' paths stay.
             directions: Cosine and sine of each ray's angle in the robot's frame, ``[2, rays]``;
                 None: those of the lidar.
 
         Returns:
-            Direction (x, y) in the robot's frame and length [m] of the way, ``[N, 3]``; the length
+            Direction (x, y) in the robot's frame and length [m] of the path, ``[N, 3]``; the length
             counts a meter near obstacles as three.
         """
         if chosen is None:
             chosen = np.ones(len(motions), dtype=np.bool_)
         directions = self._directions if directions is None else directions
         lengths = self._lengths
-        remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._ways)
-        return self._ways
+        remember(motions, goals, ranges, chosen, directions, self.arrays, lengths, self._paths)
+        return self._paths
 
     def sketch(self, index: int, x: float, y: float) -> Sketch:
-        """What a robot remembers, to be drawn.
+        """Give a robot's map and its path from a position, for a picture.
 
         Args:
             index: Number of the robot.
             x: Where it is [m].
             y: Where it is [m].
-
-        Returns:
-            Its map and its way.
         """
         columns, rows = self.arrays.shapes[index]
         levels = self.arrays.levels[index, :columns, :rows]
@@ -160,10 +156,10 @@ class MapMemory:
         origin = self.arrays.origins[index]
         places = [
             np.argwhere(levels == BLOCKED),
-            follow_way(levels, costs, *self._cell(index, x, y)),
+            follow_path(levels, costs, *self._cell(index, x, y)),
         ]
-        blocked, way = ((origin + RESOLUTION * cells).tolist() for cells in places)
-        return Sketch([(u, v) for u, v in blocked], [(u, v) for u, v in way], RESOLUTION)
+        blocked, path = ((origin + RESOLUTION * cells).tolist() for cells in places)
+        return Sketch([(u, v) for u, v in blocked], [(u, v) for u, v in path], RESOLUTION)
 
     def _cell(self, index: int, x: float, y: float) -> tuple[int, int]:
         """Column and row of a position in a robot's map."""
@@ -172,20 +168,17 @@ class MapMemory:
         return int(cell[0]), int(cell[1])
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
-        """The maps and the ways, as arrays."""
-        values = {**self.arrays._asdict(), "ways": self._ways}
+        """The maps and the paths, as arrays."""
+        values = {**self.arrays._asdict(), "ways": self._paths}
         return {name: array.copy() for name, array in values.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from what :meth:`state_dict` gave.
 
-        Args:
-            state: What it gave.
-
         Raises:
             ValueError: If something is missing or of another shape; nothing has changed then.
         """
-        count = len(self._ways)
+        count = len(self._paths)
         sides = np.shape(state.get("levels", ()))[1:]
         if len(sides) != 2:
             raise ValueError(f"levels of the state must have shape [N, columns, rows], got {sides}")
@@ -195,7 +188,7 @@ class MapMemory:
             "costs": np.zeros((count, *sides), dtype=np.int32),
         }
         arrays = {name: read_array(state, name, like) for name, like in likes.items()}
-        self._ways = read_array(state, "ways", self._ways)
+        self._paths = read_array(state, "ways", self._paths)
         self.arrays = MapArrays(**arrays)
 
     def _make_room(self, columns: int, rows: int) -> None:

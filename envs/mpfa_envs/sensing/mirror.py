@@ -17,8 +17,8 @@ class Mirror(nn.Module):
 
     Args:
         sectors: Number of sectors of the lidar.
-        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
-        history: Number of earlier scans that it senses.
+        memory: ``"map"`` if observations have the path on the robot's map.
+        history: Number of earlier scans in an observation.
         pairs: The pairs of wheel speeds that actions choose among, one-hot, as behind
             :class:`~mpfa_envs.DiscreteWheels`; None: actions are wheel speeds.
 
@@ -62,27 +62,12 @@ class Mirror(nn.Module):
         self.register_buffer("sign", sign, persistent=False)
 
     def observation(self, observation: Tensor) -> Tensor:
-        """What the robot would see in the mirrored world.
-
-        Args:
-            observation: Observations, shape ``[..., O]``.
-
-        Returns:
-            Their mirror images, of the same shape.
-        """
+        """Mirror observations, shape ``[..., O]``."""
         order, sign = self.order.to(observation.device), self.sign.to(observation.device)
         return observation.index_select(-1, order) * sign
 
     def action(self, action: Tensor) -> Tensor:
-        """What drives the mirrored path: the wheels change places.
-
-        Args:
-            action: Actions, shape ``[..., 2]``, or one-hot choices among ``K`` pairs,
-                ``[..., K]``.
-
-        Returns:
-            Their mirror images, of the same shape.
-        """
+        """Mirror actions, ``[..., 2]``, or one-hot choices among ``K`` pairs, ``[..., K]``."""
         return action.index_select(-1, self.swapped.to(action.device))
 
 
@@ -90,17 +75,16 @@ class RandomMirror(Transform):
     """Shows a learner each sampled transition as it was, or in the mirror.
 
     The mirror image of a transition is as true as the transition itself, with the same reward and
-    end. What a loss then writes, say the TD error, is that of what it was shown. A learner that
-    sees both has twice as many worlds to learn from, and no favorite side. Append it to a replay
-    buffer; what is stored stays as it was. ``"behavior_mean"``, an action without its noise, is
-    mirrored where a batch has it.
+    end. A signal that a loss then writes, say the TD error, is that of what it was shown. Append it
+    to a replay buffer; stored transitions stay as they were. ``"behavior_mean"``, an action without
+    its noise, is mirrored where a batch has it.
 
     Args:
         chance: Share of the transitions that are mirrored, in [0, 1].
         sectors: Number of sectors of the lidar.
-        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
-        history: Number of earlier scans that it senses.
-        pairs: As in :class:`Mirror`.
+        memory: As for :class:`Mirror`.
+        history: As for :class:`Mirror`.
+        pairs: As for :class:`Mirror`.
         generator: Source of the choices; None: PyTorch's own.
 
     Raises:
@@ -135,14 +119,7 @@ class RandomMirror(Transform):
         self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Mirror some of a batch.
-
-        Args:
-            tensordict: Transitions, batch size ``[B]``, changed in place.
-
-        Returns:
-            The same.
-        """
+        """Mirror some transitions of a batch ``[B]`` in place."""
         number = torch.rand(tensordict.batch_size, generator=self.generator)
         chosen = (number < self.chance).unsqueeze(-1).to(tensordict.get("action").device)
         for key in ("observation", ("next", "observation")):

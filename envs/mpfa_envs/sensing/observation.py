@@ -1,4 +1,4 @@
-"""What the robot senses and what the info dictionary holds: names, order and scales."""
+"""Names, order and scales of the observation's parts, and the keys of the info dictionary."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
 
 
 Memory = Literal["none", "map"]
-"""What a robot remembers of its episode."""
+"""A robot's memory of its episode: none, or a map of its scans."""
 
 GOAL_CLOSENESS_DISTANCE: Final = 0.3
 """A goal at this distance or nearer has closeness one [m]."""
 DISTANCE_SCALE: Final = 10.0
-"""What the distance to the goal is divided by in the observation [m]."""
+"""Divides the distance to the goal in the observation [m]."""
 SPEED_BOUND: Final = 2.0
 """Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
 
-WAY_BOUND: Final = 10.0
-"""The scaled length of the way is clipped to this: where all ways are blocked it is very long."""
+PATH_BOUND: Final = 10.0
+"""The scaled length of the path is clipped to this: it is very long where all paths are blocked."""
 
 _FLAGS = ("success", "collision", "timeout")
 _NUMBERS = (
@@ -57,11 +57,11 @@ def observation_slices(
 
     Args:
         sectors: Number of sectors of the lidar.
-        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
-        history: Number of earlier scans that it senses.
+        memory: ``"map"`` adds the path on the robot's map.
+        history: Number of earlier scans.
 
     Returns:
-        Where each part lies, in order.
+        The slice of each part, in order.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -99,24 +99,13 @@ OBSERVATION: Final = observation_slices()
 def observation_bounds(
     sectors: int, diagonal: float, *, memory: Memory = "none", history: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Give the least and the greatest observation.
-
-    Args:
-        sectors: Number of sectors of the lidar.
-        diagonal: Longest distance in the room [m].
-        memory: What the robot remembers, as in :class:`~mpfa_envs.NavigationEnv`.
-        history: Number of earlier scans that it senses.
-
-    Returns:
-        Two arrays of shape ``[sectors + 6]``, with a map ``[sectors + 9]``, and ``sectors`` more
-        for each earlier scan.
-    """
+    """The least and the greatest observation, ``[O]``, in a room with this diagonal [m]."""
     far = diagonal / DISTANCE_SCALE
     low = [0.0] * sectors + [-1.0, -1.0, 0.0, 0.0, -SPEED_BOUND, -SPEED_BOUND]
     high = [1.0] * sectors + [1.0, 1.0, 1.0, far, SPEED_BOUND, SPEED_BOUND]
     if memory == "map":
         low += [-1.0, -1.0, 0.0]
-        high += [1.0, 1.0, WAY_BOUND]
+        high += [1.0, 1.0, PATH_BOUND]
     low += [0.0] * sectors * history
     high += [1.0] * sectors * history
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)

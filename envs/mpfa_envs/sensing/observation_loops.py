@@ -11,8 +11,8 @@ from mpfa_envs.compiled import njit
 from mpfa_envs.sensing.observation import (
     DISTANCE_SCALE,
     GOAL_CLOSENESS_DISTANCE,
+    PATH_BOUND,
     SPEED_BOUND,
-    WAY_BOUND,
 )
 
 if TYPE_CHECKING:
@@ -21,37 +21,20 @@ if TYPE_CHECKING:
 
 @njit
 def observe_all(
-    motions: NDArray[np.float64],
-    goals: NDArray[np.float64],
-    distances: NDArray[np.float64],
-    fresh: NDArray[np.bool_],
-    chosen: NDArray[np.bool_],
-    ranges: NDArray[np.float64],
-    median: bool,
-    scales: tuple[float, float, float],
-    ways: NDArray[np.float64],
+    motions: NDArray[np.float64],  # poses and speeds by odometry [m, m, rad, m/s, rad/s], [N, 5]
+    goals: NDArray[np.float64],  # x, y [m], [N, 2]
+    distances: NDArray[np.float64],  # of the two [m], [N]
+    fresh: NDArray[np.bool_],  # begins its episode: has always seen what it sees, [N]
+    chosen: NDArray[np.bool_],  # [N]; the others' observations stay
+    ranges: NDArray[np.float64],  # [m], [N, rays]
+    median: bool,  # of a sector's rays, in place of the nearest
+    scales: tuple[float, float, float],  # closeness_distance [m], top speeds [m/s, rad/s]
+    paths: NDArray[np.float64],  # direction (x, y) and length [m], [N, 3]; [0, 3] without maps
     sectors: int,
     history: int,
-    observations: NDArray[np.float32],
+    observations: NDArray[np.float32],  # [N, O]
 ) -> None:
-    """Build the observations of the chosen robots.
-
-    Args:
-        motions: Poses and speeds (x, y, heading, forward, turning) that the robots hold to be
-            theirs [m, m, rad, m/s, rad/s], ``[N, 5]``.
-        goals: Where they should go (x, y) [m], ``[N, 2]``.
-        distances: Distances of the two [m], ``[N]``.
-        fresh: Whose episode begins: they have always seen what they see, ``[N]``.
-        chosen: Which robots sense, ``[N]``; the others' observations stay.
-        ranges: Range of each ray [m], ``[N, rays]``.
-        median: Whether a sector reports the median of its rays and not the nearest.
-        scales: Range with closeness one [m]; fastest speed of a wheel [m/s], fastest turn [rad/s].
-        ways: Direction (x, y) and length [m] of the ways that the robots' maps leave, ``[N, 3]``;
-            without rows where there are no maps.
-        sectors: Number of sectors of the lidar.
-        history: Number of earlier scans in the observations.
-        observations: Where the observations go, ``[N, O]``.
-    """
+    """Write the observations of the chosen robots."""
     count = ranges.shape[1] // sectors
     near, fastest, fastest_turn = scales
     for robot in range(observations.shape[0]):
@@ -87,9 +70,9 @@ def observe_all(
         seen[sectors + 2], seen[sectors + 3] = closeness, distance / DISTANCE_SCALE
         seen[sectors + 4] = min(max(speed, -SPEED_BOUND), SPEED_BOUND)
         seen[sectors + 5] = min(max(turn, -SPEED_BOUND), SPEED_BOUND)
-        if ways.shape[0] > 0:
-            seen[sectors + 6], seen[sectors + 7] = ways[robot, 0], ways[robot, 1]
-            seen[sectors + 8] = min(ways[robot, 2] / DISTANCE_SCALE, WAY_BOUND)
+        if paths.shape[0] > 0:
+            seen[sectors + 6], seen[sectors + 7] = paths[robot, 0], paths[robot, 1]
+            seen[sectors + 8] = min(paths[robot, 2] / DISTANCE_SCALE, PATH_BOUND)
 
 
 @njit
