@@ -30,7 +30,7 @@ def test_a_held_action_equals_the_same_action_given_again(physics: str) -> None:
     held.close(), single.close()
 
 
-def test_the_episode_ends_at_the_time_step_that_reaches_the_goal() -> None:
+def test_the_episode_ends_at_the_time_step_at_the_goal() -> None:
     ends = []
     for repeat in (1, 4):
         env = make_env(repeat)
@@ -63,6 +63,6 @@ def test_the_time_limit_counts_time_steps() -> None:
 
 
 @pytest.mark.parametrize("value", [0, -1, 1.5, True])
-def test_a_repeat_that_is_no_positive_integer_is_refused(value: object) -> None:
+def test_a_repeat_that_is_no_positive_integer_is_rejected(value: object) -> None:
     with pytest.raises(ValueError, match=f"action_repeat must be a positive integer, got {value}"):
         NavigationEnv(action_repeat=value)  # type: ignore[arg-type]

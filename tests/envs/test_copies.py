@@ -11,31 +11,31 @@ import pytest
 
 from mpfa_envs import NavigationEnv, VectorNavigationEnv
 
-WAYS = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
+COPIES = [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))]
 MAKERS = [NavigationEnv, lambda **arguments: VectorNavigationEnv(2, **arguments)]
 
 
-@pytest.mark.parametrize("way", WAYS, ids=["copy", "pickle"])
+@pytest.mark.parametrize("duplicate", COPIES, ids=["copy", "pickle"])
 @pytest.mark.parametrize("make", MAKERS, ids=["one", "many"])
-def test_a_copy_without_wheels_drives_the_same_episode_on_its_own(
-    make: Callable, way: Callable
+def test_a_kinematic_copy_drives_the_same_episode_independently(
+    make: Callable, duplicate: Callable
 ) -> None:
     env = make(world="A", physics="kinematic")
     env.reset(seed=0)
     action = np.full(env.action_space.shape, 0.5)
     env.step(action)
-    other = way(env)
+    other = duplicate(env)
     theirs = [other.step(action)[0] for _ in range(3)]
     for expected in theirs:
         np.testing.assert_array_equal(env.step(action)[0], expected)
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
 
 
-@pytest.mark.parametrize("way", WAYS, ids=["copy", "pickle"])
-def test_a_copy_on_wheels_is_refused_as_it_would_move_the_same_robot(way: Callable) -> None:
+@pytest.mark.parametrize("duplicate", COPIES, ids=["copy", "pickle"])
+def test_a_copy_on_wheels_is_rejected(duplicate: Callable) -> None:
     pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     for make in MAKERS:
         env = make(world="A", physics="wheels")
         with pytest.raises(TypeError, match=r"'wheels' cannot be copied .* state_dict\(\)"):
-            way(env)
+            duplicate(env)
         env.close()

@@ -294,7 +294,7 @@ def test_a_step_outside_an_episode_asks_for_a_reset() -> None:
         ({"start": (0, 0, 0), "goal": "ab"}, "goal must be 2 finite numbers, got 'ab'"),
     ],
 )
-def test_a_bad_task_is_refused_and_the_episode_goes_on(
+def test_a_bad_task_is_rejected_and_the_episode_goes_on(
     options: dict[str, object], message: str
 ) -> None:
     env = paper_env(physics="kinematic")
@@ -371,7 +371,7 @@ def test_lidar_noise_is_sampled_from_the_seed() -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_wheels_and_kinematics_agree_once_the_robot_is_up_to_speed(robot: str) -> None:
+def test_wheels_and_kinematics_agree_at_constant_speed(robot: str) -> None:
     ends = []
     for physics in ("kinematic", "wheels"):
         env = paper_env(robot=robot, physics=physics)
@@ -395,7 +395,7 @@ def test_the_ids_are_the_class_with_its_defaults() -> None:
     assert repeated.unwrapped.config.action_repeat == 3
 
 
-def test_the_papers_task_counts_collisions_farther_away_and_pays_more_for_an_approach() -> None:
+def test_the_papers_task_has_wider_collisions_and_pays_more_progress() -> None:
     study, paper = (
         NavigationEnv(physics="kinematic", **task)
         for task in ({}, {**PAPER_TASK, "action_repeat": 2})
@@ -408,7 +408,7 @@ def test_the_papers_task_counts_collisions_farther_away_and_pays_more_for_an_app
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1", True])
-def test_a_bad_seed_is_refused_and_the_episode_goes_on(seed: object) -> None:
+def test_a_bad_seed_is_rejected_and_the_episode_goes_on(seed: object) -> None:
     env = paper_env(physics="kinematic")
     env.reset(options=STRAIGHT)
     with pytest.raises(ValueError, match=f"seed must be an integer of at least 0, got {seed!r}"):
@@ -417,7 +417,7 @@ def test_a_bad_seed_is_refused_and_the_episode_goes_on(seed: object) -> None:
 
 
 @pytest.mark.parametrize("seed", [None, 1])
-def test_an_episode_goes_on_where_the_next_one_has_no_place_for_a_walker(
+def test_an_episode_goes_on_if_the_next_lacks_room(
     seed: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env, twin = (NavigationEnv(world="A", physics="kinematic") for _ in range(2))

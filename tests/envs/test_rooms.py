@@ -58,7 +58,7 @@ def test_the_id_makes_one_robot_or_many_of_one_task(env: NavigationEnv) -> None:
     many.close()
 
 
-def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: NavigationEnv) -> None:
+def test_a_seed_repeats_worlds_that_change_with_each_episode(env: NavigationEnv) -> None:
     seen = []
     for seed in (3, None, None, None, np.int64(3), None):
         observation, info = env.reset(seed=seed)
@@ -69,7 +69,7 @@ def test_each_episode_is_in_a_new_world_and_a_seed_begins_them_again(env: Naviga
     assert seen[4:] == seen[:2]
 
 
-def test_a_step_after_the_end_of_an_episode_asks_for_a_reset(env: NavigationEnv) -> None:
+def test_a_step_after_the_end_asks_for_a_reset(env: NavigationEnv) -> None:
     env.reset(seed=4)
     for action in np.tile(ACTIONS, (20, 1)):
         *_, terminated, truncated, info = env.step(action)
@@ -106,7 +106,7 @@ def test_an_episode_can_be_fixed(env: NavigationEnv) -> None:
         ({"world": World(name="tiny", size=(0.8, 0.8))}, "world 'tiny' has no"),
     ],
 )
-def test_options_that_are_no_episode_are_refused_and_the_last_one_goes_on(
+def test_bad_options_are_rejected_and_the_episode_goes_on(
     env: NavigationEnv, options: dict[str, object], message: str
 ) -> None:
     env.reset(seed=0)

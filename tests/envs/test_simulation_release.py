@@ -24,7 +24,7 @@ def test_sixty_environments_that_are_dropped_leave_no_server() -> None:
     assert servers() == before
 
 
-def test_a_closed_server_is_not_closed_again_when_its_number_is_another_ones() -> None:
+def test_closing_again_spares_a_new_server_of_its_number() -> None:
     first = NavigationEnv(world="A")
     number = first.robots._batch.drives._simulations[0].client
     first.close()

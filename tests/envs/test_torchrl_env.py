@@ -83,7 +83,7 @@ def as_serial() -> SerialEnv:
     ],
     ids=["one", "two", "transformed", "serial"],
 )
-def test_a_reset_with_a_seed_begins_as_after_it_was_set(make: Callable[[], EnvBase]) -> None:
+def test_a_reset_with_a_seed_equals_set_seed_and_reset(make: Callable[[], EnvBase]) -> None:
     env, other = make(), make()
     first, again = env.reset(seed=3), env.reset(seed=3)
     assert torch.equal(first["observation"], again["observation"])
@@ -118,7 +118,7 @@ def test_a_time_limit_is_truncated_and_a_collision_terminated() -> None:
     assert last["info", "collision"].item() and last["reward"].item() == -5.0
 
 
-def test_a_task_holds_for_the_next_episode_of_its_environment_only() -> None:
+def test_a_task_holds_for_the_next_episode_only() -> None:
     env = make_navigation_env("test", num_envs=2, physics="kinematic", seed=0)
     pair = evaluation_pairs("test", 1, seed=0)[0]
     env.set_task(*pair, index=1)
@@ -131,7 +131,7 @@ def test_a_task_holds_for_the_next_episode_of_its_environment_only() -> None:
         env.set_task((5.0, 0.0, 0.0), (0.0, 0.0))
 
 
-def test_a_rollout_can_wait_for_the_last_episode_of_a_batch() -> None:
+def test_a_rollout_can_wait_for_the_last_episode() -> None:
     env = make_navigation_env("A", num_envs=2, physics="kinematic", action_repeat=1, seed=0)
     env.set_task((0.0, 0.0, 0.0), (1.0, 0.0), index=0)
     env.set_task((0.0, 0.0, 0.0), (2.0, 0.0), index=1)
@@ -160,7 +160,7 @@ def test_the_usual_transforms_and_the_collector_work() -> None:
     assert batches == [32, 32]
 
 
-def test_who_loads_a_state_of_torchrl_is_told_where_that_of_the_robots_is() -> None:
+def test_loading_a_state_of_torchrl_warns_that_robots_stay() -> None:
     env = NavigationTorchEnv(num_envs=2, world="bars", physics="kinematic")
     twin = NavigationTorchEnv(num_envs=2, world="bars", physics="kinematic")
     other = TransformedEnv(twin, StepCounter())
@@ -176,7 +176,7 @@ def test_who_loads_a_state_of_torchrl_is_told_where_that_of_the_robots_is() -> N
 
 
 # A creator gives each environment the state of a first one; with its robots, all would be alike.
-def test_environments_of_a_creator_are_left_to_chance_without_a_word() -> None:
+def test_environments_of_a_creator_start_at_random_without_a_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         create = EnvCreator(partial(NavigationTorchEnv, world="A", physics="kinematic"))
@@ -253,7 +253,7 @@ def test_a_mask_resets_the_robots_that_it_names() -> None:
     assert (env.env.poses == before).all(axis=1).tolist() == [True, False, True]
 
 
-def test_batches_of_robots_can_be_collected_and_put_in_a_row() -> None:
+def test_batches_of_robots_can_be_collected_and_flattened() -> None:
     def make() -> NavigationTorchEnv:
         return NavigationTorchEnv(num_envs=2, world="A", physics="kinematic", max_steps=8)
 

@@ -248,7 +248,7 @@ def test_options_fix_the_next_episode_and_no_later_one() -> None:
         ({"worlds": [None, TINY]}, "world 'tiny' has no free start"),
     ],
 )
-def test_bad_options_are_refused_and_the_episodes_go_on(options: dict, message: str) -> None:
+def test_bad_options_are_rejected_and_the_episodes_go_on(options: dict, message: str) -> None:
     env = make(2, world="A")
     env.reset(seed=0)
     before = env.step(np.ones((2, 2)))[0]
@@ -263,7 +263,7 @@ def test_bad_options_are_refused_and_the_episodes_go_on(options: dict, message: 
     np.testing.assert_array_equal(twin.reset()[0], env.reset()[0])
 
 
-def test_a_refused_reset_takes_no_randomness_and_no_world_of_a_generator() -> None:
+def test_a_rejected_reset_takes_no_randomness_and_no_world() -> None:
     arguments = {"world": "rooms", "physics": "kinematic", "max_goal_distance": 20.0}
     env, twin = (VectorNavigationEnv(3, episodes_per_world=2, **arguments) for _ in range(2))
     for each in (env, twin):
@@ -337,7 +337,7 @@ def test_a_mask_of_other_robots_moves_nothing(only: object) -> None:
         (np.array([1, 2]), r"seed must be an integer of at least 0, got array\(\[1, 2\]\)"),
     ],
 )
-def test_a_bad_seed_is_refused(seed: object, message: str) -> None:
+def test_a_bad_seed_is_rejected(seed: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(2).reset(seed=seed)
 

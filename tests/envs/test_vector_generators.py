@@ -129,7 +129,7 @@ def test_a_robot_drives_a_generated_world_as_alone() -> None:
         running &= ~terminated
 
 
-def test_a_world_without_a_task_is_drawn_anew_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_world_without_a_task_is_replaced_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     full = World(name="full", size=(4.0, 4.0), boxes=(Box(-1.9, -1.9, 1.9, 1.9),))
     asked = []
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ from mpfa_envs import (
     WORLDS,
     Box,
     RewardTerms,
+    RobotModel,
     VectorNavigationEnv,
     World,
     navigation_reward,
@@ -172,7 +173,7 @@ def with_value(value: object, *keys: str | int) -> Callable[[dict[str, Any]], No
         (with_value([2, 0], "source", "left"), "worlds .* hold a world wherever left is not 0"),
     ],
 )
-def test_what_is_no_state_of_this_environment_is_refused(
+def test_another_environments_state_is_rejected(
     spoil: Callable[[dict[str, Any]], None], message: str
 ) -> None:
     env = VectorNavigationEnv(2, world="B", physics="kinematic")
@@ -189,7 +190,7 @@ def test_what_is_no_state_of_this_environment_is_refused(
 
 
 @pytest.mark.parametrize("name", ["commands", "kept", "scales", "poses", "odometry"])
-def test_noise_that_is_no_number_is_refused(name: str) -> None:
+def test_noise_that_is_no_number_is_rejected(name: str) -> None:
     env = VectorNavigationEnv(
         2, world="B", physics="kinematic", noise={"slip": 0.1, "latency": 1, "drift": 0.1}
     )
@@ -200,7 +201,7 @@ def test_noise_that_is_no_number_is_refused(name: str) -> None:
         env.load_state_dict(state)
 
 
-def test_a_state_whose_ways_cannot_be_measured_is_refused_before_anything_changes() -> None:
+def test_a_state_without_measurable_paths_is_rejected_before_any_change() -> None:
     env, other = (
         VectorNavigationEnv(2, world="rooms", physics="kinematic", progress="shortest_path")
         for _ in range(2)
@@ -262,15 +263,13 @@ def burgers(**arguments: object) -> VectorNavigationEnv:
 
 
 @pytest.mark.parametrize(("arguments", "message"), OTHERS, ids=[message for _, message in OTHERS])
-def test_a_state_of_an_environment_with_another_argument_is_refused(
-    arguments: dict[str, Any], message: str
-) -> None:
+def test_a_state_of_another_argument_is_rejected(arguments: dict[str, Any], message: str) -> None:
     state = burgers(**arguments).state_dict()
     with pytest.raises(ValueError, match=f"state must be of an environment with {message}"):
         burgers().load_state_dict(state)
 
 
-def test_a_state_of_worlds_of_another_difficulty_is_refused() -> None:
+def test_a_state_of_another_difficulty_is_rejected() -> None:
     state = burgers(world="bars", difficulty=0.3).state_dict()
     with pytest.raises(ValueError, match=r"difficulty = None, got one with 0\.3"):
         burgers(world="bars").load_state_dict(state)
@@ -286,9 +285,26 @@ def test_a_state_that_describes_fewer_arguments_is_loaded() -> None:
     assert drive(other, 0, 20) == drive(env, 0, 20)
 
 
-def test_equal_worlds_have_one_fingerprint_and_others_of_their_name_do_not() -> None:
+def test_equal_worlds_alone_have_the_same_fingerprint() -> None:
     whole = World(name="hall", size=(8, 6), boxes=(Box(1, 1, 2, 2),))
     same = World(name="hall", size=(8.0, 6.0), boxes=(Box(1.0, 1.0, 2.0, 2.0),))
     assert fingerprint(whole) == fingerprint(same)
     assert fingerprint(replace(whole, boxes=())) != fingerprint(whole)
     assert len({fingerprint(world) for world in WORLDS.values()}) == len(WORLDS)
+
+
+def test_saved_states_keep_the_names_of_their_arguments() -> None:
+    env = VectorNavigationEnv(1, physics="kinematic")
+    names = set(env.state_dict()["arguments"])
+    env.close()
+    assert {name for name in names if "." not in name} == {
+        *("num_envs", "robot", "physics", "max_steps", "time_step", "action_repeat"),
+        *("goal_radius", "collision_distance", "closeness_distance", "progress", "memory"),
+        *("reward", "goal_reward", "collision_reward", "progress_scale", "history", "noise"),
+        *("rays", "sectors", "min_goal_distance", "detour_chance", "world", "difficulty"),
+        *("max_goal_distance", "episodes_per_world", "split", "autoreset_mode"),
+    }
+    lidar = {"reduction", "max_range", "noise", "field_of_view", "dropout"}
+    robot = {field.name for field in fields(RobotModel)} - {"name"}
+    prefixed = {f"lidar.{name}" for name in lidar} | {f"robot.{name}" for name in robot}
+    assert {name for name in names if "." in name} == prefixed

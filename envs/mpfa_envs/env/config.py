@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
@@ -17,11 +17,11 @@ from mpfa_envs.robots.model import ROBOTS, RobotModel, resolve_collision_distanc
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
 from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
-from mpfa_envs.tasks.reward import PROGRESS_SCALE, RewardFunction, resolve_reward
+from mpfa_envs.tasks.reward import PROGRESS_SCALE, RewardFunction, payments_of, resolve_reward
 from mpfa_envs.worlds.world import World
 
 Progress = Literal["straight_line", "shortest_path", "none"]
-"""What the reward's progress is measured along."""
+"""Measure of the reward's progress."""
 
 PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
@@ -39,6 +39,8 @@ The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, 
 _MOST_STEPS: Final = 1_000_000
 """No episode has more time steps: a policy that never arrives must come to an end."""
 _EMPTY: Final = World(name="empty")
+_OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
+_PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +85,7 @@ class TaskConfig:
     progress_scale: float = PROGRESS_SCALE
     """The paper's ε_p in Eq. (25), reward per meter of approach [1/m]."""
     progress: Progress = "straight_line"
-    """What an approach is measured by: ``"straight_line"``, the distance to the goal as in Eq.
+    """Measure of an approach: ``"straight_line"``, the distance to the goal as in Eq.
     (25); ``"shortest_path"``, the path to it that keeps the collision distance
     (:class:`~mpfa_envs.DistanceField`); or ``"none"``, only goal and collision count."""
     reward: RewardFunction | None = None
@@ -98,8 +100,8 @@ class TaskConfig:
     the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it senses what is
     before it and nothing else."""
     history: int = 0
-    """How many earlier scans it senses beside the last one, sector by sector: those of the
-    decisions before, the newest first, by which it may tell what moves."""
+    """Number of earlier scans that it senses beside the last one, sector by sector: those of the
+    decisions before, the newest first, which show what moves."""
     noise: RobotNoise = field(default_factory=RobotNoise)
     """Errors of the lidar, the wheels, the time and the odometry, none by default: a
     :class:`~mpfa_envs.RobotNoise` or its numbers by name."""
@@ -198,11 +200,33 @@ class TaskConfig:
         return observation_slices(sectors, memory=self.memory, history=self.history)
 
     def make_spaces(self, diagonal: float) -> tuple[BoxSpace[np.float32], BoxSpace[np.float32]]:
-        """Make the spaces of one robot's observations and actions.
-
-        Args:
-            diagonal: Longest distance in a room [m].
-        """
+        """Make the spaces of one robot's observations and actions in rooms of a diagonal [m]."""
         sectors = self.make_lidar().sectors
         low, high = observation_bounds(sectors, diagonal, memory=self.memory, history=self.history)
         return BoxSpace(low, high, dtype=np.float32), BoxSpace(-1.0, 1.0, (2,), np.float32)
+
+    def describe(self) -> dict[str, Any]:
+        """Plain values by name: the settings that saved states must share."""
+        described = {
+            each.name: getattr(self, each.name)
+            for each in fields(self)
+            if each.name not in ("robot", "reward", "progress_scale", "lidar")
+        }
+        robot, lidar, payments = (
+            asdict(self.robot),
+            self.make_lidar(),
+            payments_of(self.reward_function),
+        )
+        described["robot"] = robot.pop("name")
+        described.update({f"robot.{name}": float(value) for name, value in robot.items()})
+        # None without, as states had it before there was any.
+        described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
+        if payments is None:
+            described["reward"] = "a function of your own"
+        else:
+            described |= {
+                "reward": "navigation_reward",
+                **dict(zip(_PAYMENTS, payments, strict=True)),
+            }
+        described.update(rays=lidar.angles.size, sectors=lidar.sectors)
+        return described | {f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR}

@@ -1,4 +1,4 @@
-"""Where the episodes of many robots come from: fixed worlds, or new ones of a generator."""
+"""The source of many robots' episodes: fixed worlds, or new ones of a generator."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from mpfa_envs.walkers.starts import WalkerStarts
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
-"""What stands for one world."""
+"""A built-in world's name, the path of a world file, or a world."""
 GENERATED_DIAGONAL: Final = 50.0
 """No room of a generator is longer than this from corner to corner [m]."""
 _WORLDS: Final = 50
-"""Worlds of a generator that are drawn before it is said to have no task."""
+"""Worlds of a generator that are tried before it is said to have no task."""
 
 
 class Episode(NamedTuple):
-    """A task in its world, and what its robot's progress is measured by."""
+    """A task in its world, and the measure of its robot's progress."""
 
     world: World
     """The room."""
@@ -46,15 +46,15 @@ class Episode(NamedTuple):
     shortest_path: float
     """The shortest path to the goal's center [m]."""
     field: DistanceField | None
-    """Lengths of the ways to the goal, if the progress is along the shortest path."""
+    """Lengths of the paths to the goal, if the progress is along the shortest path."""
     walkers: WalkerStarts
-    """Where the walkers start."""
+    """Starts of the walkers."""
 
 
 class Whereabouts(NamedTuple):
-    """How far the robots are among the worlds of a generator."""
+    """The robots' progress through the worlds of a generator."""
 
-    refused: int
+    rejected: int
     """Worlds that had no task."""
     left: list[int]
     """Episodes that each robot still has in its world."""
@@ -75,16 +75,7 @@ _kept_grid_of = lru_cache(maxsize=4)(_grid_of)
 
 
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
-    """Measure the ways to a goal from everywhere in a world.
-
-    Args:
-        world: The room and its obstacles.
-        distance: What the ways keep from obstacles and walls [m].
-        goal: Where they lead (x, y) [m].
-
-    Returns:
-        The field; in the world of a map, that of a window around the goal.
-    """
+    """Measure the paths to a goal that keep a distance [m]; on a map only around the goal."""
     from mpfa_envs.paths.distance import DistanceField
 
     longest = math.inf if world.occupancy is None else LONGEST_PATH
@@ -93,7 +84,7 @@ def distance_field(world: World, distance: float, goal: tuple[float, float]) -> 
 
 @contextmanager
 def keeping(rngs: Iterable[np.random.Generator]) -> Iterator[None]:
-    """Let sources of randomness be as they were if what they are needed for is refused."""
+    """Restore sources of randomness if an error is raised."""
     before = [(rng, rng.bit_generator.state) for rng in rngs]
     try:
         yield
@@ -103,23 +94,10 @@ def keeping(rngs: Iterable[np.random.Generator]) -> Iterator[None]:
         raise
 
 
-def draw_episode(
+def sample_episode(
     config: TaskConfig, world: World, rng: np.random.Generator, task: Task | None = None
 ) -> Episode:
-    """Draw an episode in a fixed world.
-
-    Args:
-        config: The arguments of the task.
-        world: The room.
-        rng: Source of randomness.
-        task: Start and goal; None: any.
-
-    Returns:
-        The episode.
-
-    Raises:
-        ValueError: If the world has no task, or a walker fits nowhere.
-    """
+    """Sample an episode in a fixed world, with a task of its own or the given one."""
     distance = config.collision_distance
     if task is None:
         task = sample_task(
@@ -136,21 +114,7 @@ def draw_episode(
 
 
 class EpisodeSource:
-    """Draws the episodes of each robot: a task in its world, or in a new world.
-
-    Args:
-        world: What :class:`~mpfa_envs.NavigationEnv` takes, a sequence of it, of which robot i has
-            number ``i % len``, or the name of a generator.
-        robots: Number of robots.
-        config: The arguments of the task.
-        split: Which worlds of a generator are drawn.
-        difficulty: Difficulty of a generator's worlds; None: each world's own.
-        episodes_per_world: Episodes of a robot in a world of a generator before the next one.
-        max_goal_distance: Longest way between a sampled start and goal [m].
-
-    Raises:
-        ValueError: If an argument is out of its range, or a world has no task.
-    """
+    """Samples the episodes of each robot: a task in its world, or in a new world."""
 
     def __init__(
         self,
@@ -163,8 +127,8 @@ class EpisodeSource:
         episodes_per_world: int,
         max_goal_distance: float,
     ) -> None:
-        self.refused = 0
-        """Worlds of the generator that were drawn anew, as they had no task."""
+        self.rejected = 0
+        """Worlds of the generator that had no task."""
         self._config = config
         self._max_goal_distance = check_goal_distance(config.min_goal_distance, max_goal_distance)
         self._episodes_per_world = check_count("episodes_per_world", episodes_per_world)
@@ -188,55 +152,41 @@ class EpisodeSource:
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
         self.diagonal = GENERATED_DIAGONAL
         """Longest distance in the rooms [m]."""
-        diagonals = [self._draw(probe, rng).world.diagonal for probe in probes]
+        diagonals = [self._sample(probe, rng).world.diagonal for probe in probes]
         if self._generator:
-            self.refused = 0
+            self.rejected = 0
         else:
             self.diagonal = max(diagonals)
 
-    def draw(
+    def sample(
         self,
         robots: Sequence[int],
-        rngs: Sequence[np.random.Generator],
-        given: Sequence[tuple[World, Task | None] | None] | None = None,
-        renewed: Iterable[int] = (),
+        rngs: Sequence[np.random.Generator],  # of all robots
+        given: Sequence[tuple[World, Task | None] | None] | None = None,  # of all, for once
+        renewed: Iterable[int] = (),  # in a new world, as after a seed
     ) -> list[Episode]:
-        """Draw the next episodes of some robots, or none if one of them has none.
-
-        Args:
-            robots: Their numbers.
-            rngs: The sources of randomness of all robots.
-            given: For each robot, a world for this episode alone, with a task or None for any of
-                that world; or None.
-            renewed: Robots whose episode is in a new world, as after a seed.
-
-        Returns:
-            The episodes.
-
-        Raises:
-            ValueError: If no world with a task is found; nothing is drawn then.
-        """
-        before = Whereabouts(self.refused, list(self._left), list(self._worlds))
+        """Sample the next episodes of some robots, or none if one of them has none."""
+        before = Whereabouts(self.rejected, list(self._left), list(self._worlds))
         try:
             with keeping(rngs[robot] for robot in robots):
                 for robot in renewed:
                     self.forget(robot)
                 return [
-                    self._draw_next(each, rngs[each], None if given is None else given[each])
+                    self._sample_next(each, rngs[each], None if given is None else given[each])
                     for each in robots
                 ]
         except BaseException:
             self.load(before)
             raise
 
-    def _draw_next(
+    def _sample_next(
         self, robot: int, rng: np.random.Generator, given: tuple[World, Task | None] | None
     ) -> Episode:
-        """Draw the next episode of a robot."""
+        """Sample the next episode of a robot."""
         if given is not None:
-            return self._draw_in(given[0], rng, given[1])
+            return self._sample_in(given[0], rng, given[1])
         kept = self._worlds[robot] if self._generator is None or self._left[robot] else None
-        episode = self._draw(kept, rng)
+        episode = self._sample(kept, rng)
         if self._generator:
             new = episode.world is not kept
             self._left[robot] = (self._episodes_per_world if new else self._left[robot]) - 1
@@ -252,7 +202,7 @@ class EpisodeSource:
         return None if self._generator else self._worlds[robot]
 
     def describe(self) -> dict[str, Any]:
-        """What decides which episodes come, as plain values by name."""
+        """Plain values by name: the arguments that decide which episodes come."""
         world: str | list[str] | None = self._generator
         if world is None:
             names = {id(each): fingerprint(each) for each in self._worlds if each is not None}
@@ -267,26 +217,16 @@ class EpisodeSource:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Where each robot is among the worlds of a generator."""
+        """The world of each robot among those of a generator."""
         kept = zip(self._worlds, self._left, strict=True)
         return {
-            "refused": self.refused,
+            "refused": self.rejected,
             "left": list(self._left),
             "worlds": [world_to_plain(world) if left and world else None for world, left in kept],
         }
 
     def read(self, state: Mapping[str, Any]) -> Whereabouts:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it.
-
-        Args:
-            state: What it gave.
-
-        Returns:
-            Where it says that the robots are.
-
-        Raises:
-            ValueError: If something is missing, or not there for each robot.
-        """
+        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
         counts, values = (read_list(state, name, len(self._left)) for name in ("left", "worlds"))
         left = [check_count("left", count, least=0) for count in counts]
         worlds = [None if each is None else world_from_plain(each) for each in values]
@@ -298,12 +238,12 @@ class EpisodeSource:
 
     def load(self, found: Whereabouts) -> None:
         """Go on from what :meth:`read` gave."""
-        self.refused, self._left = found.refused, found.left
+        self.rejected, self._left = found.rejected, found.left
         if self._generator:
             self._worlds = found.worlds
 
     def check(self, world: World, task: Task | None) -> Task | None:
-        """Refuse a world that is too large, or a task that cannot be driven."""
+        """Reject a world that is too large, or a task that cannot be driven."""
         if world.diagonal > self.diagonal:
             raise ValueError(
                 f"world {world.name!r} must be at most {self.diagonal:.4g} m from corner to "
@@ -312,7 +252,7 @@ class EpisodeSource:
         return None if task is None else self._read_task(world, *task)
 
     def check_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
-        """Read a task in a world, and refuse it likewise."""
+        """Read a task in a world, and reject it likewise."""
         self.check(world, None)
         return self._read_task(world, start, goal)
 
@@ -326,16 +266,16 @@ class EpisodeSource:
             radius=config.robot.radius,
         )
 
-    def _draw(self, world: World | None, rng: np.random.Generator) -> Episode:
-        """Draw an episode in a world, in a new one where it is None or has no task."""
+    def _sample(self, world: World | None, rng: np.random.Generator) -> Episode:
+        """Sample an episode in a world, in a new one where it is None or has no task."""
         if self._generator is None and world is not None:
-            return self._draw_in(world, rng)
+            return self._sample_in(world, rng)
         reason: ValueError | None = None
         for _ in range(_WORLDS):
             try:
-                return self._draw_on_grid(world or self._new_world(rng), rng)
+                return self._sample_on_grid(world or self._new_world(rng), rng)
             except ValueError as error:
-                self.refused += 1
+                self.rejected += 1
                 world, reason = None, error
         raise ValueError(
             f"world = {self._generator!r} cannot be driven: {_WORLDS} of its worlds in a row have "
@@ -351,14 +291,16 @@ class EpisodeSource:
         self.check(world, None)
         return world
 
-    def _draw_in(self, world: World, rng: np.random.Generator, task: Task | None = None) -> Episode:
-        """Draw an episode in a fixed world, as :class:`~mpfa_envs.NavigationEnv` does."""
+    def _sample_in(
+        self, world: World, rng: np.random.Generator, task: Task | None = None
+    ) -> Episode:
+        """Sample an episode in a fixed world."""
         if task is None and math.isfinite(self._max_goal_distance):
-            return self._draw_on_grid(world, rng)
-        return draw_episode(self._config, world, rng, task)
+            return self._sample_on_grid(world, rng)
+        return sample_episode(self._config, world, rng, task)
 
-    def _draw_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
-        """Draw an episode over the cells of a grid, in milliseconds however full the world is."""
+    def _sample_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
+        """Sample an episode over the cells of a grid, in milliseconds however full the world is."""
         from mpfa_envs.paths.tasks import sample_task_on_grid
 
         config = self._config
@@ -375,11 +317,7 @@ class EpisodeSource:
 
 
 def resolve_generator(world: object) -> str | None:
-    """The name of a generator, or None for what stands for fixed worlds.
-
-    Raises:
-        ValueError: If it is a word that is neither a generator nor a world.
-    """
+    """The name of a generator, or None for fixed worlds."""
     from mpfa_envs.generators import GENERATORS
 
     if not isinstance(world, str):
@@ -406,11 +344,7 @@ def _resolve_worlds(world: WorldChoice | Sequence[WorldChoice]) -> list[World]:
 
 
 def check_goal_distance(least: float, most: float) -> float:
-    """A longest way that is above the least distance between start and goal [m].
-
-    Raises:
-        ValueError: If it is not.
-    """
+    """A greatest path length that is above the least distance between start and goal [m]."""
     if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
         raise ValueError(
             f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"

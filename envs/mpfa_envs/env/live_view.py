@@ -1,4 +1,4 @@
-"""How environments are rendered: as pictures, or in a live window."""
+"""Rendering of environments as pictures or in a live window."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from mpfa_envs.scene.window import Window
 
 RenderMode = Literal["human", "rgb_array"]
-"""What rendering does: shows a live window, or gives a picture."""
+"""Rendering in a live window, or to a picture."""
 
 
 class LiveView:

@@ -51,7 +51,7 @@ class NavigationEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.f
 
     ====== ================ ==================================================== ==========
     24-25  way_direction    cosine and sine of the direction, in the robot's     [-1, 1]
-                            frame, of the way to the goal on its map
+                            frame, of the path to the goal on its map
     26     way_length       ``length / 10 m``, longer where it is narrow         [0, 10]
     ====== ================ ==================================================== ==========
 
@@ -138,7 +138,7 @@ class NavigationEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.f
 
     @property
     def lidar(self) -> Lidar:
-        """What the robot sees by, in the world that it is in."""
+        """The robot's lidar, in the world that it is in."""
         return self.config.make_lidar(self.world)
 
     @property

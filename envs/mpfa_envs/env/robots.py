@@ -17,7 +17,7 @@ from mpfa_envs.env.step_loops import (
     SHORTEST_PATH,
     EpisodeArrays,
     judge,
-    measure_ways,
+    measure_remaining,
     settle,
 )
 from mpfa_envs.paths.batch import FieldBatch
@@ -51,17 +51,11 @@ NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
 """Its numbers, likewise."""
 _TRAIL = 500
 """Time steps that there is room for at first."""
-_NO_WAYS = np.zeros((0, 3))
+_NO_PATHS = np.zeros((0, 3))
 
 
 class RobotBatch:
-    """What is known of each of many robots, and what happens to them.
-
-    Args:
-        config: The arguments of the task.
-        lidar: What the robots see by.
-        worlds: The world of each robot before its first episode.
-    """
+    """The state of many robots, and its changes."""
 
     def __init__(self, config: TaskConfig, lidar: Lidar, worlds: Sequence[World]) -> None:
         count = len(worlds)
@@ -74,7 +68,7 @@ class RobotBatch:
         self.walkers = WalkerBatch(
             self.worlds, radius=config.robot.radius, time_step=config.time_step
         )
-        """What moves around each robot."""
+        """The walkers around each robot."""
         self._fields = FieldBatch(count) if config.progress == "shortest_path" else None
         self.episodes = EpisodeArrays(
             motions=np.zeros((count, 5)),
@@ -87,7 +81,7 @@ class RobotBatch:
         )
         """Their episodes so far."""
         self.running = np.zeros(count, dtype=np.bool_)
-        """Whose episode has begun and not ended, ``[N]``."""
+        """Whether an episode has begun and not ended, ``[N]``."""
         self.trails = np.zeros((count, min(config.max_steps, _TRAIL) + 1, 2))
         """Positions since the start of the episode [m], ``[N, steps, 2]``."""
         self.ranges = np.zeros((count, lidar.angles.size))
@@ -96,11 +90,11 @@ class RobotBatch:
         """The maps that they make, if they make any."""
         width = max(part.stop for part in config.observation_slices.values())
         self.observations = np.zeros((count, width), dtype=np.float32)
-        """What they sense, ``[N, O]``."""
+        """The last observations, ``[N, O]``."""
         self.drives = make_drives(config.physics, config.robot, count, time_step=config.time_step)
-        """How they move."""
+        """The physics."""
         self.noise = config.make_noise(count)
-        """What disturbs their motion, if anything does."""
+        """Errors of their motion, if there are any."""
         self._held = np.zeros((len(NUMBERS), count))
         robot = config.robot
         self._lengths = (
@@ -113,23 +107,17 @@ class RobotBatch:
         self._payments = payments_of(config.reward_function)
 
     def begin(self, index: int, episode: Episode, rng: np.random.Generator) -> None:
-        """Start an episode of a robot.
-
-        Args:
-            index: Number of the robot.
-            episode: What it is to drive.
-            rng: Its source of randomness, of which its odometry takes its errors.
-        """
+        """Start an episode of a robot, whose odometry takes its errors from ``rng``."""
         task, episodes = episode.task, self.episodes
         if self.worlds[index] is not episode.world:
             self.worlds[index] = episode.world
         x, y, heading = task.start
         heading = math.remainder(heading, math.tau)
         distance = math.dist((x, y), task.goal)
-        way = distance
+        remaining = distance
         if self._fields is not None and episode.field is not None:
             self._fields[index] = episode.field
-            way = episode.field.at(x, y)
+            remaining = episode.field.at(x, y)
         self.walkers.begin(index, episode.walkers)
         clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
         clearance -= self._config.robot.radius
@@ -140,7 +128,7 @@ class RobotBatch:
         episodes.flags[:, index] = False
         episodes.steps[index] = 0
         episodes.clearances[index] = clearance
-        episodes.ways[:, index] = way
+        episodes.ways[:, index] = remaining
         numbers = episodes.numbers[:, index]
         numbers[:] = 0.0
         numbers[SHORTEST_PATH] = max(episode.shortest_path - self._config.goal_radius, 0.0)
@@ -156,17 +144,7 @@ class RobotBatch:
             self.memory.begin(index, episode.world)
 
     def wheel_speeds(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Read actions, as :meth:`~mpfa_envs.RobotModel.wheel_speeds` reads one.
-
-        Args:
-            actions: Left and right wheel, ``[N, 2]``.
-
-        Returns:
-            Speeds [m/s], ``[N, 2]``.
-
-        Raises:
-            ValueError: If they are not two numbers for each robot.
-        """
+        """Speeds [m/s] of the left and the right wheel, ``[N, 2]``, by actions of that shape."""
         values = np.ascontiguousarray(actions, dtype=np.float64)
         if values.shape != (len(self.tasks), 2):
             raise ValueError(f"actions must have shape ({len(self.tasks)}, 2), got {values.shape}")
@@ -183,13 +161,7 @@ class RobotBatch:
         moving: NDArray[np.bool_],
         rngs: Sequence[np.random.Generator],
     ) -> None:
-        """Hold the wheel speeds until the next actions are due.
-
-        Args:
-            speeds: Of the left and the right wheel [m/s], ``[N, 2]``.
-            moving: Which robots move, ``[N]``; the others' rows stay.
-            rngs: Source of each robot's noise.
-        """
+        """Hold the wheel speeds [m/s], ``[N, 2]``, of the moving robots, ``[N]``, for an action."""
         episodes, worlds, running = self.episodes, self.worlds.arrays, moving.copy()
         episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
         self._lengthen_trails(int(episodes.steps.max()) + self._config.action_repeat)
@@ -202,7 +174,7 @@ class RobotBatch:
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
             judge(episodes, worlds, running, self.trails, self._lengths, self._config.max_steps)
             if self._fields is not None:
-                measure_ways(episodes, running, self._fields.arrays)
+                measure_remaining(episodes, running, self._fields.arrays)
             if self._payments is None:
                 self._pay_by_function(running)
             if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0)):
@@ -210,7 +182,7 @@ class RobotBatch:
         self.running[moving] = running[moving]
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is known of the robots, as plain values and arrays."""
+        """The state of the robots as plain values and arrays."""
         last = int(self.episodes.steps.max())
         return {
             "worlds": [world_to_plain(world) for world in self.worlds],
@@ -223,14 +195,7 @@ class RobotBatch:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave.
-
-        Args:
-            state: What it gave.
-
-        Raises:
-            ValueError: If something is missing or of another shape; nothing has changed then.
-        """
+        """Go on from what :meth:`state_dict` gave; if it is rejected, nothing has changed."""
         arrays = self._arrays()
         values = {name: read_array(state, name, like) for name, like in arrays.items()}
         plain, given = (read_list(state, name, len(self.tasks)) for name in ("worlds", "tasks"))
@@ -297,22 +262,17 @@ class RobotBatch:
             )
 
     def sense(self, chosen: NDArray[np.bool_], rngs: Sequence[np.random.Generator]) -> None:
-        """Sense the worlds and build the observations.
-
-        Args:
-            chosen: Which robots sense, ``[N]``; the others' rows stay.
-            rngs: Source of each robot's noise.
-        """
+        """Sense the worlds, and build the observations of the chosen robots, ``[N]``."""
         lidar, ranges = self._lidar, self.ranges
         lidar.cast_all(self.episodes.motions, chosen, self.worlds.arrays, ranges)
         if lidar.is_noisy:
             for index in np.flatnonzero(chosen).tolist():
                 lidar.disturb(ranges[index], rngs[index])
         held = self._by_odometry()
-        ways = _NO_WAYS
+        paths = _NO_PATHS
         if self.memory is not None:
             seen = self.walkers.without(self.episodes.motions, lidar, ranges)
-            ways = self.memory.remember(held.motions, held.goals, seen, chosen)
+            paths = self.memory.remember(held.motions, held.goals, seen, chosen)
         median = lidar.reduction == "median"
         observe_all(
             held.motions,
@@ -323,7 +283,7 @@ class RobotBatch:
             ranges,
             median,
             self._scales,
-            ways,
+            paths,
             lidar.sectors,
             self._config.history,
             self.observations,

@@ -1,4 +1,4 @@
-"""What a time step leads to, for many robots: where they are, what ended, and Eq. (25)."""
+"""The results of a time step for many robots: distances, ends of episodes, and Eq. (25)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DISTANCE: Final = 8
 POSE: Final = 9
 """First of x, y and the heading."""
 ENCOUNTERS: Final = 12
-"""First of what is counted of walkers: distance, time in personal space, time to collision."""
+"""First of the walkers' measures: distance, time in personal space, time to collision."""
 
 
 class EpisodeArrays(NamedTuple):
@@ -50,29 +50,20 @@ class EpisodeArrays(NamedTuple):
     clearances: NDArray[np.float64]
     """Distance of the robots' rims from the nearest obstacle or wall [m], ``[N]``."""
     ways: NDArray[np.float64]
-    """What is left of the way to the goal, as the progress is measured, now and before the last
-    time step [m], ``[2, N]``."""
+    """The rest of the path to the goal, as the progress is measured, now and before the last time
+    step [m], ``[2, N]``."""
 
 
 @njit
 def judge(
     episodes: EpisodeArrays,
     worlds: BatchArrays,
-    running: NDArray[np.bool_],
-    trails: NDArray[np.float64],
-    rules: tuple[float, float, float, float],
+    running: NDArray[np.bool_],  # have moved, [N]
+    trails: NDArray[np.float64],  # positions of the episode [m], [N, steps, 2]
+    rules: tuple[float, float, float, float],  # robot, collision, goal radius [m], time_step [s]
     max_steps: int,
 ) -> None:
-    """Take in where robots have moved: lengths, distances, and whether an episode ended.
-
-    Args:
-        episodes: The episodes.
-        worlds: The room of each robot.
-        running: Which robots have moved, ``[N]``.
-        trails: Where the positions of the episode go [m], ``[N, steps, 2]``.
-        rules: Radius of the robot, collision distance, radius of the goal [m]; time step [s].
-        max_steps: Time limit in time steps.
-    """
+    """Update lengths, distances and flags of the robots that have moved."""
     radius, collision_distance, goal_radius, time_step = rules
     motions, numbers, flags = episodes.motions, episodes.numbers, episodes.flags
     for robot in range(motions.shape[0]):
@@ -102,18 +93,11 @@ def judge(
 
 @njit
 def settle(
-    episodes: EpisodeArrays, running: NDArray[np.bool_], payments: tuple[float, float, float]
+    episodes: EpisodeArrays,
+    running: NDArray[np.bool_],  # have moved, [N]
+    payments: tuple[float, float, float],  # for the goal, a collision, a meter of approach
 ) -> bool:
-    """Add the terms of Eq. (25), as :func:`mpfa_envs.navigation_reward` gives them, and stop.
-
-    Args:
-        episodes: The episodes; the first rows of their numbers are added to.
-        running: Which robots have moved, ``[N]``; those whose episode has ended are taken out.
-        payments: Rewards for the goal, for a collision, and per meter of approach.
-
-    Returns:
-        Whether any robot still runs.
-    """
+    """Add the terms of Eq. (25), stop ended episodes, and tell whether any robot still runs."""
     numbers, flags = episodes.numbers, episodes.flags
     left = False
     for robot in range(running.shape[0]):
@@ -136,15 +120,7 @@ def settle(
 def outcomes(
     episodes: EpisodeArrays, moving: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Read what a step has given.
-
-    Args:
-        episodes: The episodes.
-        moving: Which robots took part, ``[N]``.
-
-    Returns:
-        Rewards, terminations and truncations, ``[N]``; zero and false for the others.
-    """
+    """Rewards, terminations and truncations, ``[N]``; zero and false for robots at rest."""
     robots = moving.shape[0]
     rewards = np.zeros(robots)
     terminated, truncated = np.zeros(robots, np.bool_), np.zeros(robots, np.bool_)
@@ -159,14 +135,10 @@ def outcomes(
 
 
 @njit
-def measure_ways(episodes: EpisodeArrays, running: NDArray[np.bool_], fields: FieldArrays) -> None:
-    """Measure what is left of the way to the goal along the shortest path.
-
-    Args:
-        episodes: The episodes; their ways are changed.
-        running: Which robots have moved, ``[N]``.
-        fields: Ways to each robot's goal.
-    """
+def measure_remaining(
+    episodes: EpisodeArrays, running: NDArray[np.bool_], fields: FieldArrays
+) -> None:
+    """Measure the rest of the shortest path to the goal for the robots that have moved."""
     for robot in range(running.shape[0]):
         if running[robot]:
             nx, ny = fields.shapes[robot, 0], fields.shapes[robot, 1]

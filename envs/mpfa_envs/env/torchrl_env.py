@@ -165,19 +165,19 @@ class NavigationTorchEnv(EnvBase):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Load a state as TorchRL has it: nothing of the robots, and empty in this class.
+        """Load a state of TorchRL's, which is empty in this class.
 
-        TorchRL's creators and collectors hand such states on without the observations that belong
-        to them. Where the robots are is in the state of :attr:`env`.
+        TorchRL's creators and collectors pass such states on without the observations that belong
+        to them. The state of the robots is that of :attr:`env`.
 
         Args:
             state_dict: What ``state_dict()`` gave.
             strict: Whether it must have all keys and no other, and to warn that the robots do not
                 move.
-            assign: As in :meth:`torch.nn.Module.load_state_dict`.
+            assign: Passed on to TorchRL.
 
         Returns:
-            Which keys do not match.
+            The keys that do not match.
         """
         if strict:
             warnings.warn(
@@ -188,7 +188,7 @@ class NavigationTorchEnv(EnvBase):
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def _mask(self, tensordict: TensorDictBase | None, key: str) -> NDArray[np.bool_] | None:
-        """Which robots an entry of the input names; None: all."""
+        """Robots that an entry of the input names; None: all."""
         mask = None if tensordict is None else tensordict.get(key, None)
         return None if mask is None else mask.reshape(-1).cpu().numpy()
 
@@ -249,11 +249,7 @@ class NavigationTorchEnv(EnvBase):
         return tensor if self.device is None else tensor.to(self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Release the physics servers; a second call does nothing.
-
-        Args:
-            raise_if_closed: Accepted for TorchRL's sake.
-        """
+        """Release the physics servers; a second call does nothing, whatever raise_if_closed is."""
         self.env.close()
         if not self.is_closed:
             super().close(raise_if_closed=raise_if_closed)
@@ -271,8 +267,7 @@ def make_navigation_env(
     """Build the navigation task for TorchRL.
 
     Args:
-        world: As in :class:`~mpfa_envs.VectorNavigationEnv`: a world, several, or the name of a
-            generator.
+        world: A world, several, or the name of a generator.
         num_envs: Number of robots; None: one, without a batch dimension.
         parallel: Run each robot in a process of its own, all in one world or in the worlds of one
             generator.

@@ -15,19 +15,20 @@ from gymnasium.vector.utils import batch_space
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.env.episodes import Episode, EpisodeSource, WorldChoice
-from mpfa_envs.env.infos import final_infos, gather_infos
-from mpfa_envs.env.live_view import LiveView
-from mpfa_envs.env.options import (
+from mpfa_envs.env.inputs import (
+    check_alike,
+    read_generators,
     read_mask,
     read_reset_mask,
     read_seed,
     read_tasks,
     spawn_generators,
 )
-from mpfa_envs.env.robots import RobotBatch
-from mpfa_envs.env.state import check_alike, describe, read_generators
+from mpfa_envs.env.live_view import LiveView
+from mpfa_envs.env.robots import FLAGS, NUMBERS, RobotBatch
 from mpfa_envs.env.step_loops import outcomes
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _EMPTY = World(name="empty")
+_MASKS = tuple(f"_{name}" for name in INFO_TYPES)
+_INFO_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 
 
 class VectorNavigationEnv(
@@ -43,15 +46,15 @@ class VectorNavigationEnv(
     """Many robots drive to goals by lidar, each in a world of its own and without the others.
 
     It is :class:`~mpfa_envs.NavigationEnv` N times, with the same observations, actions, rewards,
-    ends and infos, and a robot drives the same trajectory in it; but all are moved, sensed and
-    rewarded together by compiled loops, some thirty times as fast.
+    ends and infos, and a robot drives the same trajectory in it; but compiled loops move, sense and
+    reward all robots together, some thirty times as fast.
 
     It follows gymnasium's conventions for vector environments: arrays have the robots as their
     first axis, ``infos`` holds an array for each key and a mask ``_key`` beside it, and
-    ``autoreset_mode`` says when an episode that has ended gives way to the next.
+    ``autoreset_mode`` says when the next episode follows one that has ended.
 
-    Robot i draws from a source of randomness of its own, made of the seed and i alone: its episodes
-    are the same for any number of robots and in any process.
+    Robot i has its own source of randomness, made of the seed and i alone: its episodes are the
+    same for any number of robots and in any process.
 
     Args:
         num_envs: Number of robots N.
@@ -115,7 +118,7 @@ class VectorNavigationEnv(
             )
         self.autoreset_mode = autoreset_mode
         self.lidar = self.config.make_lidar()
-        """What the robots see by, in an empty world."""
+        """The robots' lidar, in an empty world."""
         self._source = EpisodeSource(
             world,
             self.num_envs,
@@ -144,8 +147,8 @@ class VectorNavigationEnv(
 
     @property
     def worlds_refused(self) -> int:
-        """Worlds of the generator that had no task and were drawn anew."""
-        return self._source.refused
+        """Number of worlds of the generator that were rejected, as they had no task."""
+        return self._source.rejected
 
     @property
     def tasks(self) -> list[Task | None]:
@@ -199,22 +202,11 @@ class VectorNavigationEnv(
         return room, self._source.check_task(room, start, goal)
 
     def trail(self, index: int) -> list[tuple[float, float]]:
-        """Positions (x, y) of a robot's episode so far [m].
-
-        Args:
-            index: Number of the robot.
-        """
+        """Positions (x, y) of a robot's episode so far [m]."""
         return self._batch.trail(index)
 
     def walkers(self, index: int) -> NDArray[np.float64]:
-        """The walkers around a robot: (x, y), their speeds in both directions, and their radii.
-
-        Args:
-            index: Number of the robot.
-
-        Returns:
-            Shape ``[K, 5]`` [m, m/s, m].
-        """
+        """The walkers around a robot: (x, y), velocities and radii, ``[K, 5]`` [m, m/s, m]."""
         return self._batch.walkers.of(index)
 
     def set_seed(self, seed: int | Sequence[int | None]) -> None:
@@ -270,7 +262,7 @@ class VectorNavigationEnv(
         seeded = [rng if wanted else None for rng, wanted in zip(seeded, chosen, strict=True)]
         rngs = self._generators(seeded)
         renewed = [index for index in robots if seeded[index] is not None]
-        episodes = self._source.draw(robots, rngs, given, renewed)
+        episodes = self._source.sample(robots, rngs, given, renewed)
         self._rngs = rngs
         self._begin(robots, episodes)
         self._begun = True
@@ -320,7 +312,7 @@ class VectorNavigationEnv(
         infos: dict[str, Any] = {}
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            infos = final_infos(self._batch.observations, self._infos(ended), ended)
+            infos = self._final_infos(ended)
             self._begin_next(ended)
             self._batch.sense(ended, self._rngs)
         infos = self._infos(None) | infos
@@ -329,7 +321,7 @@ class VectorNavigationEnv(
     def _begin_next(self, waiting: NDArray[np.bool_]) -> None:
         """Start the next episodes of the robots that wait for them."""
         if robots := np.flatnonzero(waiting).tolist():
-            self._begin(robots, self._source.draw(robots, self._rngs))
+            self._begin(robots, self._source.sample(robots, self._rngs))
 
     def _begin(self, robots: Sequence[int], episodes: Sequence[Episode]) -> None:
         """Start the next episodes of some robots."""
@@ -337,8 +329,29 @@ class VectorNavigationEnv(
             self._batch.begin(index, episode, self._rngs[index])
 
     def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """The infos of the chosen robots, or of all."""
-        return gather_infos(*self.info_tables, chosen)
+        """The infos of the chosen robots, or of all: an array for each key, and its mask."""
+        # Rows of one table, as copies one by one would take longer than all the rest.
+        masks = np.empty((len(_MASKS), self.num_envs), dtype=np.bool_)
+        masks[:] = True if chosen is None else chosen
+        flags, numbers = self.info_tables
+        return dict(zip(_INFO_KEYS, (*flags, *numbers, *masks), strict=True))
+
+    def _final_infos(self, ended: NDArray[np.bool_]) -> dict[str, Any]:
+        """The last observations and infos of the robots whose episodes have ended, ``[N]``."""
+        seen = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(ended).tolist():
+            seen[index] = self._batch.observations[index].copy()
+        infos = self._infos(ended)
+        return {"final_obs": seen, "_final_obs": ended, "final_info": infos, "_final_info": ended}
+
+    def _describe(self) -> dict[str, Any]:
+        """Plain values by name: the arguments that decide what happens next."""
+        return {
+            "num_envs": self.num_envs,
+            **self.config.describe(),
+            **self._source.describe(),
+            "autoreset_mode": self.autoreset_mode.value,
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Give all that the environment needs to go on elsewhere in the middle of episodes.
@@ -348,7 +361,7 @@ class VectorNavigationEnv(
             on wheels also what was driven in each episode.
         """
         return {
-            "arguments": describe(self, self._source),
+            "arguments": self._describe(),
             "rngs": [rng.bit_generator.state for rng in self._rngs],
             "begun": self._begun,
             "source": self._source.state_dict(),
@@ -368,7 +381,7 @@ class VectorNavigationEnv(
             ValueError: If it is of an environment with other arguments, the first of which is
                 named, or no state; nothing has changed then.
         """
-        state = check_alike(state, describe(self, self._source))
+        state = check_alike(state, self._describe())
         rngs = read_generators(state.get("rngs"), self.num_envs, begun=state["begun"])
         worlds = self._source.read(state["source"])
         self._batch.load_state_dict(state["batch"])
@@ -392,6 +405,6 @@ class VectorNavigationEnv(
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the physics server; keyword arguments are not used."""
-        # gymnasium 1.2 also closes what was never built, as its arguments were refused.
+        # gymnasium 1.2 also closes an environment whose arguments were rejected.
         if hasattr(self, "_batch"):
             self._batch.drives.close()

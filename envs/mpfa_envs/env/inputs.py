@@ -1,4 +1,4 @@
-"""What the reset of a vector environment asks for, checked before anything changes."""
+"""Checks of what reset() and load_state_dict() are given, before anything changes."""
 
 from __future__ import annotations
 
@@ -20,19 +20,7 @@ _KEYS: Final = ("reset_mask", "tasks", "worlds")
 
 
 def read_mask(name: str, mask: NDArray[np.bool_] | None, robots: int) -> NDArray[np.bool_]:
-    """Read which robots are meant.
-
-    Args:
-        name: What messages call it.
-        mask: ``[N]``; None: all.
-        robots: Number of robots.
-
-    Returns:
-        A mask of its own.
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """A copy of a mask of robots, ``[N]``; None means all."""
     if mask is None:
         return np.ones(robots, dtype=np.bool_)
     if not isinstance(mask, np.ndarray) or mask.shape != (robots,) or mask.dtype != np.bool_:
@@ -41,18 +29,7 @@ def read_mask(name: str, mask: NDArray[np.bool_] | None, robots: int) -> NDArray
 
 
 def read_reset_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[np.bool_]:
-    """Read which robots start.
-
-    Args:
-        options: The options of a reset.
-        robots: Number of robots.
-
-    Returns:
-        All, or those of ``"reset_mask"``, ``[N]``.
-
-    Raises:
-        ValueError: If there is a key that no option has, or the mask is none or empty.
-    """
+    """Robots that start, ``[N]``: all, or those of ``"reset_mask"``."""
     if not isinstance(options, Mapping | None):
         raise ValueError(f"options must be a dictionary or None, got {options!r}")
     for key in options or ():
@@ -67,23 +44,10 @@ def read_reset_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[n
 def read_tasks(
     options: Mapping[str, Any] | None,
     robots: int,
-    world_of: Callable[[int], World | None],
-    check: Callable[[World, Task | None], Task | None],
+    world_of: Callable[[int], World | None],  # that a robot stays in; None: a generator's
+    check: Callable[[World, Task | None], Task | None],  # rejects what cannot be driven
 ) -> list[tuple[World, Task | None] | None]:
-    """Read the worlds and the tasks that the options fix.
-
-    Args:
-        options: The options of a reset.
-        robots: Number of robots.
-        world_of: Gives the world that a robot drives in anyway, or None where that changes.
-        check: Refuses a world or a task that cannot be driven.
-
-    Returns:
-        World and task for each robot: no task where only the world is fixed, None where nothing is.
-
-    Raises:
-        ValueError: If there are not as many as robots, or a task cannot be driven.
-    """
+    """World and task for each robot: None where nothing is fixed, no task for a world alone."""
     worlds, tasks = (_read_list(options, key, robots) for key in ("worlds", "tasks"))
     found: list[tuple[World, Task | None] | None] = []
     for robot, (choice, task) in enumerate(zip(worlds, tasks, strict=True)):
@@ -117,19 +81,7 @@ def _read_list(options: Mapping[str, Any] | None, key: str, robots: int) -> Sequ
 def read_seed(
     seed: int | Sequence[int | None] | None, robots: int
 ) -> Sequence[np.random.Generator | None]:
-    """Make a source of randomness for each robot.
-
-    Args:
-        seed: One for all, from which each robot's is made with its number; one for each robot; or
-            None.
-        robots: Number of robots.
-
-    Returns:
-        The sources; None where the old one goes on.
-
-    Raises:
-        ValueError: If a seed is negative, or there are not as many as robots.
-    """
+    """A source of randomness for each robot; None where the old one goes on."""
     if seed is None:
         return [None] * robots
     if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
@@ -141,5 +93,39 @@ def read_seed(
 
 
 def spawn_generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:
-    """Make a source of randomness for each robot that does not depend on how many there are."""
+    """A source of randomness for each robot that does not depend on how many there are."""
     return [np.random.default_rng(child) for child in sequence.spawn(robots)]
+
+
+def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Reject a state of an environment with other arguments than the expected ones."""
+    parts = {"arguments": Mapping, "source": Mapping, "batch": Mapping, "begun": bool}
+    if not isinstance(state, Mapping) or not all(
+        isinstance(state.get(part), kind) for part, kind in parts.items()
+    ):
+        raise ValueError(
+            f"state must be what state_dict() gave, with {tuple(parts)}, got another value"
+        )
+    found = state["arguments"]
+    for name, value in expected.items():
+        # States did not always describe all of them.
+        if name in found and found[name] != value:
+            raise ValueError(
+                f"state must be of an environment with {name} = {value!r}, got one with "
+                f"{found[name]!r}"
+            )
+    return state
+
+
+def read_generators(states: object, robots: int, *, begun: bool) -> list[np.random.Generator]:
+    """Make each robot's source of randomness again; before the first reset there may be none."""
+    counts = (robots,) if begun else (0, robots)
+    if not isinstance(states, Sequence) or len(states) not in counts:
+        raise ValueError(f"rngs of the state must have {robots} entries, got {states!r}")
+    generators = [np.random.default_rng(0) for _ in states]
+    for generator, state in zip(generators, states, strict=True):
+        try:
+            generator.bit_generator.state = state
+        except (TypeError, ValueError, KeyError, OverflowError) as error:
+            raise ValueError(f"rngs of the state must be of PCG64, got {state!r}") from error
+    return generators
