@@ -33,7 +33,7 @@ def test_a_band_is_the_interval_of_the_mean_of_runs() -> None:
     np.testing.assert_allclose(high, expected.high)
 
 
-def test_a_mean_ends_with_the_shortest_run_and_begins_with_the_last_one() -> None:
+def test_a_mean_spans_the_steps_that_all_runs_have() -> None:
     curves = [([0, 10, 30], [0.0, 1.0, 1.0]), ([5, 20], [0.5, 0.5])]
     steps, mean, _, _ = seed_band(curves)
     assert steps.tolist() == [5, 10, 20]
@@ -61,7 +61,7 @@ def test_the_median_of_the_runs_is_marked_on_the_level(tmp_path: Path) -> None:
     assert abs(np.median(columns) / width - 0.54) < 0.06
 
 
-def test_of_a_few_runs_each_is_a_line_and_no_band_fills_the_panel(tmp_path: Path) -> None:
+def test_a_few_runs_are_lines_without_a_band(tmp_path: Path) -> None:
     curves = [(STEPS, np.full(11, height)) for height in (0.2, 0.5, 0.8)]
     inks = {}
     for band in ("interval", "runs"):
@@ -84,7 +84,7 @@ def test_of_a_few_runs_each_is_a_line_and_no_band_fills_the_panel(tmp_path: Path
         ({"one": [([0, 0], [0.0, 1.0])]}, "steps of a run must rise"),
     ],
 )
-def test_runs_that_are_none_are_refused(runs: dict, message: str, tmp_path: Path) -> None:
+def test_bad_runs_are_rejected(runs: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         plot_seeds(runs, tmp_path / "no.png")
     assert not (tmp_path / "no.png").exists()

@@ -65,13 +65,13 @@ def test_a_rate_has_the_interval_of_wilson() -> None:
     assert (interval.value, interval.low, interval.high) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_rate_of_one_has_an_interval_that_is_not_a_point() -> None:
+def test_the_interval_of_a_rate_of_one_has_a_width() -> None:
     interval = wilson([True] * 100)
     assert interval.high == 1.0
     assert 0.95 < interval.low < 0.97
 
 
-def test_the_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
+def test_the_bootstrap_interval_covers_the_mean_at_its_level() -> None:
     rng = np.random.default_rng(0)
     covered = 0
     for _ in range(200):
@@ -98,7 +98,7 @@ def test_outcomes_sum_to_one_and_times_count_successes_alone() -> None:
     assert summary["spl"].value == pytest.approx(0.375)
 
 
-def test_no_results_are_refused() -> None:
+def test_no_results_are_rejected() -> None:
     with pytest.raises(ValueError, match="results must hold at least one episode"):
         summarize([])
 
@@ -113,7 +113,7 @@ def test_spl_is_the_shortest_path_over_the_driven_one(
 
 
 @pytest.mark.parametrize("envs_at_once", [1, 4])
-def test_turning_to_the_goal_succeeds_in_the_empty_world_and_circling_never_does(
+def test_turning_to_the_goal_succeeds_and_circling_never_does(
     envs_at_once: int,
 ) -> None:
     settings = {"episodes": 10, "seed": 1, "physics": "kinematic", "envs_at_once": envs_at_once}
@@ -145,14 +145,14 @@ def test_several_worlds_give_rows_that_name_theirs() -> None:
     assert list(asdict(both[0]))[-4] == "world"
 
 
-def test_the_time_limit_of_a_generator_is_not_that_of_the_world_after_it() -> None:
+def test_each_world_has_its_own_time_limit() -> None:
     policy = steering_policy(max_steps=20)
     _, last = evaluate(policy, ["bars:test", "A"], episodes=1)
     assert [last] == evaluate(policy, "A", episodes=1)
     assert last.timeout and last.time_s == pytest.approx(2.0)
 
 
-def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
+def test_a_policys_env_arguments_hold_unless_others_are_given(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made: list[VectorNavigationEnv] = []
@@ -175,7 +175,7 @@ def test_a_policy_senses_and_acts_as_it_learned_to_unless_told_otherwise(
     assert [each.config.collision_distance for each in (first, second)] == [0.105, 0.3]
 
 
-def test_a_trajectory_starts_at_the_start_and_ends_at_the_goal() -> None:
+def test_a_trajectory_leads_from_start_to_goal() -> None:
     tasks = world_tasks("A", episodes=5, seed=2)
     trails: dict[int, list[tuple[float, float]]] = {}
 
@@ -204,7 +204,7 @@ def test_the_test_worlds_of_a_generator_have_four_tasks_each() -> None:
     ]  # fmt: skip
 
 
-def test_tasks_of_generators_have_150_seconds_and_those_of_barn_100() -> None:
+def test_generators_have_150_seconds_and_barn_100() -> None:
     names = {"bars:test": 1500, "mazes:validation": 1500, "barn": 1000, "A": None}
     assert {name: world_tasks(name, episodes=1)[0].max_steps for name in names} == names
     found = evaluate(circle, "rooms:test", episodes=1, physics="kinematic", max_steps=20)
@@ -218,7 +218,7 @@ def test_a_time_limit_is_in_seconds_whatever_the_time_step() -> None:
         assert found.timeout and found.time_s == pytest.approx(100.0)
 
 
-def test_a_task_has_the_same_walkers_and_noise_beside_whatever_tasks_it_is_driven() -> None:
+def test_walkers_and_noise_of_a_task_ignore_the_other_tasks() -> None:
     given: dict[str, Any] = {"physics": "kinematic", "lidar": {"noise": 0.05}, "max_steps": 100}
     crowd = world_tasks("crowd:test", episodes=6)
     alone = run_tasks(steer, crowd, **given)
@@ -229,7 +229,7 @@ def test_a_task_has_the_same_walkers_and_noise_beside_whatever_tasks_it_is_drive
 
 
 @pytest.mark.parametrize("name", ["bars", "bars:train", "bras:test"])
-def test_what_stands_for_no_tasks_is_refused(name: str) -> None:
+def test_a_name_without_tasks_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match=f"world must be .*got '{name}'"):
         world_tasks(name)
 
@@ -263,7 +263,7 @@ def test_a_single_action_is_two_numbers(action: NDArray[np.float64]) -> None:
         evaluate(lambda _: action, "A", episodes=1, physics="kinematic")
 
 
-def test_a_task_that_the_robot_cannot_drive_is_named_before_any_is_driven() -> None:
+def test_an_undrivable_task_is_named_before_any_is_driven() -> None:
     wide = replace(resolve_robot("turtlebot2"), name="wide", radius=0.45)
     tasks, driven = world_tasks("bars:test", episodes=40), 0
 
@@ -277,7 +277,7 @@ def test_a_task_that_the_robot_cannot_drive_is_named_before_any_is_driven() -> N
     assert driven == 0
 
 
-def test_what_the_tasks_decide_is_refused_as_an_argument() -> None:
+def test_arguments_that_the_tasks_decide_are_rejected() -> None:
     for name, value in (("world", "B"), ("num_envs", 3), ("autoreset_mode", "next_step")):
         with pytest.raises(ValueError, match=f"{name} must be left to the tasks"):
             run_tasks(steer, world_tasks("A", episodes=1), **{name: value})

@@ -116,7 +116,7 @@ def test_the_same_policy_gives_the_same_bytes(tmp_path: Path) -> None:
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-def test_what_is_no_network_or_senses_something_else_is_not_written(tmp_path: Path) -> None:
+def test_a_policy_of_other_layers_or_senses_is_not_exported(tmp_path: Path) -> None:
     cells = {name: getattr(Binning(), name) for name in Binning.__dataclass_fields__}
     table = Policy([Table(values=np.zeros((Binning().cells, 2), np.float32), **cells)])
     for policy, message in (
@@ -145,7 +145,7 @@ def test_what_is_no_network_or_senses_something_else_is_not_written(tmp_path: Pa
         ({"observation": {"size": 12}, "lidar": {}}, "the card has no 'sectors'"),
     ],
 )
-def test_a_card_that_does_not_fit_is_refused(
+def test_a_card_that_does_not_fit_is_rejected(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     file = exported(tmp_path)
@@ -154,7 +154,7 @@ def test_a_card_that_does_not_fit_is_refused(
         load_policy(file)
 
 
-def test_weights_that_lie_in_another_file_are_refused(
+def test_weights_that_lie_in_another_file_are_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import onnx

@@ -87,12 +87,12 @@ def test_observations_may_have_any_batch(shape: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (23,), (24, 5)])
-def test_observations_of_another_size_are_refused(shape: tuple[int, ...]) -> None:
+def test_observations_of_another_size_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"observation must have shape \[\.\.\., 24\], got"):
         make_policy()(np.zeros(shape, np.float32))
 
 
-def test_a_file_gives_back_the_policy_its_card_and_its_arguments(tmp_path: Path) -> None:
+def test_a_file_restores_policy_card_and_arguments(tmp_path: Path) -> None:
     policy = make_policy()
     assert save_policy(policy, tmp_path) == tmp_path / "policy.npz"
     assert [path.name for path in tmp_path.iterdir()] == ["policy.npz"]
@@ -142,7 +142,7 @@ def test_every_flipped_bit_is_noticed_or_changes_nothing(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("length", [0, 1, 100, 5000, -1, -200])
-def test_a_truncated_file_is_refused_by_name(tmp_path: Path, length: int) -> None:
+def test_a_truncated_file_is_rejected_by_name(tmp_path: Path, length: int) -> None:
     file = save_policy(make_policy(), tmp_path)
     file.write_bytes(file.read_bytes()[:length])
     with pytest.raises(PolicyFileError, match=r"policy\.npz holds no policy, or is damaged"):
@@ -177,7 +177,7 @@ LAYER = {"0.weight": np.zeros((2, 24), np.float32), "0.bias": np.zeros(2, np.flo
         (packed(about=np.array([object()])), "allow_pickle=False"),
     ],
 )
-def test_a_foreign_file_is_refused_with_the_reason(
+def test_a_foreign_file_is_rejected_with_the_reason(
     tmp_path: Path, content: bytes, message: str
 ) -> None:
     file = tmp_path / "foreign.npz"
@@ -187,7 +187,7 @@ def test_a_foreign_file_is_refused_with_the_reason(
     assert "foreign.npz" in str(caught.value)
 
 
-def test_a_file_that_unpacks_to_much_is_refused_unread(
+def test_a_file_that_unpacks_to_much_is_rejected_unread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mpfa_envs.policies.files._LARGEST", 1000)

@@ -33,7 +33,7 @@ def pixel(picture: np.ndarray, x: float, y: float) -> tuple[int, ...]:
     return tuple(picture[row, column].tolist())
 
 
-def test_a_picture_shows_the_room_the_goal_the_robot_and_its_trail() -> None:
+def test_a_picture_shows_room_goal_robot_and_trail() -> None:
     env = paper_env(world="B", physics="kinematic", render_mode="rgb_array")
     env.reset(options={"start": (-1.0, 0.5, 0.0), "goal": (1.6, 2.6)})
     for _ in range(30):
@@ -69,7 +69,7 @@ def test_trajectories_have_the_color_of_their_outcome() -> None:
     np.testing.assert_allclose(pixel(picture, 2.5, -2.97), OUTCOMES["collision"][:3], atol=90)
 
 
-def test_walkers_are_shown_where_they_are_beside_the_ways() -> None:
+def test_walkers_are_shown_beside_the_paths() -> None:
     walkers = np.array([[1.0, 2.0, 0.3, 0.0, 0.25]])
     empty, walked = (render_trajectories("A", [], [], [], walkers=each) for each in (None, walkers))
     assert pixel(walked, 1.0, 1.85) != pixel(empty, 1.0, 1.85)
@@ -103,12 +103,12 @@ def test_a_narrow_world_has_its_whole_legend_below_it() -> None:
         (([[(0, 0)]], [(0, 0)], ["lost"]), "outcomes must be among .*got 'lost'"),
     ],
 )
-def test_bad_lists_are_refused(arguments: tuple[list, ...], message: str) -> None:
+def test_bad_lists_are_rejected(arguments: tuple[list, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         render_trajectories(WORLDS["A"], *arguments)
 
 
-def test_a_bad_size_is_refused() -> None:
+def test_a_bad_size_is_rejected() -> None:
     with pytest.raises(ValueError, match="size must be an integer of at least 32, got 3"):
         render_trajectories("A", [], [], [], size=3)
 
@@ -138,7 +138,7 @@ def test_a_goal_is_surrounded_by_the_disc_that_reaches_it() -> None:
         assert pixel(picture, 2.5, 0.3 + outside) == FLOOR[:3]
 
 
-def test_a_failure_ends_in_a_cross_or_in_a_hollow_square() -> None:
+def test_a_failure_ends_in_a_cross_or_hollow_square() -> None:
     ways = [[(-4, 0), (0, 0)]] * 2
     crossed, squared = (
         render_trajectories("A", ways[:1], [(4.0, 4.0)], [outcome])

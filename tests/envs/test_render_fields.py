@@ -16,7 +16,7 @@ from mpfa_envs.render import (
     samples,
     viridis,
 )
-from mpfa_envs.render.values import way_of
+from mpfa_envs.render.values import arc_of
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import LINES
 from tests.envs.test_render import pixel
@@ -24,7 +24,7 @@ from tests.envs.test_render import pixel
 GOAL = (3.0, 3.0)
 
 
-def test_what_is_sensed_in_a_room_is_what_an_episode_begins_with() -> None:
+def test_the_observations_of_a_room_are_first_observations_of_episodes() -> None:
     how = {"memory": "map", "history": 1, "closeness_distance": 0.4}
     poses, observations = observe_room("B", goal=GOAL, heading=0.7, spacing=1.1, **how)
     env = NavigationEnv(world="B", physics="kinematic", **how)
@@ -76,9 +76,9 @@ def test_an_arrow_shows_where_the_action_leads() -> None:
 
 def test_an_arc_is_as_long_as_the_robot_drives() -> None:
     robot = ROBOTS["turtlebot2"]
-    straight = way_of(robot, (1.0, 2.0, np.pi / 2), np.array([1.0, 1.0]), seconds=2.0)
+    straight = arc_of(robot, (1.0, 2.0, np.pi / 2), np.array([1.0, 1.0]), seconds=2.0)
     assert straight[-1] == pytest.approx((1.0, 3.0))
-    arc = np.array(way_of(robot, (0.0, 0.0, 0.0), np.array([-1.0, 1.0]), seconds=1.0, points=99))
+    arc = np.array(arc_of(robot, (0.0, 0.0, 0.0), np.array([-1.0, 1.0]), seconds=1.0, points=99))
     assert np.hypot(*np.diff(arc, axis=0).T).sum() == pytest.approx(0.275, rel=1e-3)
     assert arc[-1, 1] > 0.1
 
@@ -93,7 +93,7 @@ def test_an_arc_is_as_long_as_the_robot_drives() -> None:
         ({"heading": "north", "values": lambda seen: seen[:, 0]}, "heading must be"),
     ],
 )
-def test_bad_fields_are_refused(arguments: dict, message: str) -> None:
+def test_bad_fields_are_rejected(arguments: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         render_values("A", goal=GOAL, **{"spacing": 2.0, **arguments})
 
@@ -167,7 +167,7 @@ def test_samples_may_be_numbers_of_transitions() -> None:
         ((np.zeros((2, 2)), [1.0, 1.0], [0.5]), "sampled must be 2 counts or the numbers"),
     ],
 )
-def test_samples_that_do_not_fit_are_refused(arrays: tuple, message: str) -> None:
+def test_samples_that_do_not_fit_are_rejected(arrays: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         render_samples("A", *arrays)
 
@@ -190,7 +190,7 @@ def ahead(observations: np.ndarray) -> np.ndarray:
     return np.ones((len(observations), 2), np.float32)
 
 
-def test_a_film_has_a_picture_of_each_decision_and_the_end() -> None:
+def test_a_film_shows_each_decision_and_the_end() -> None:
     task = world_tasks("A", episodes=1)[0]
     seen: list[int] = []
 
@@ -206,7 +206,7 @@ def test_a_film_has_a_picture_of_each_decision_and_the_end() -> None:
     np.testing.assert_array_equal(bare.frames[2], film.frames[2][:, :480])
 
 
-def test_a_long_film_has_fewer_pictures_a_second_and_its_end() -> None:
+def test_a_long_film_has_fewer_pictures_and_its_end() -> None:
     task = world_tasks("A", episodes=1)[0]
     how = {"traces": False, "physics": "kinematic", "max_steps": 30, "action_repeat": 1}
     every = film_episode(lambda seen: -ahead(seen), task, most=40, **how)

@@ -95,7 +95,7 @@ def test_the_window_knows_the_keys_that_are_held() -> None:
     window.close()
 
 
-def test_a_picture_of_another_size_has_a_window_of_its_size() -> None:
+def test_a_picture_of_another_size_resizes_the_window() -> None:
     window, rng = Window("test", fps=1000), np.random.default_rng(0)
     for height, width in ((40, 60), (50, 30)):
         picture = rng.integers(0, 256, (height, width, 3), np.uint8)
@@ -116,7 +116,7 @@ def test_a_window_that_the_user_closes_shows_nothing_more(how: str) -> None:
     assert pygame.display.get_surface() is None
 
 
-def test_without_pygame_the_way_out_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pygame_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     env = NavigationEnv(physics="kinematic", render_mode="human")
     with pytest.raises(DependencyNotInstalled, match=r"pip install 'torchrl-mpfa\[live\]'"):

@@ -212,21 +212,15 @@ class TaskConfig:
             for each in fields(self)
             if each.name not in ("robot", "reward", "progress_scale", "lidar")
         }
-        robot, lidar, payments = (
-            asdict(self.robot),
-            self.make_lidar(),
-            payments_of(self.reward_function),
-        )
+        robot = asdict(self.robot)
         described["robot"] = robot.pop("name")
         described.update({f"robot.{name}": float(value) for name, value in robot.items()})
         # None without, as states had it before there was any.
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
-        if payments is None:
-            described["reward"] = "a function of your own"
-        else:
-            described |= {
-                "reward": "navigation_reward",
-                **dict(zip(_PAYMENTS, payments, strict=True)),
-            }
+        described["reward"] = "a function of your own"
+        if payments := payments_of(self.reward_function):
+            described["reward"] = "navigation_reward"
+            described.update(zip(_PAYMENTS, payments, strict=True))
+        lidar = self.make_lidar()
         described.update(rays=lidar.angles.size, sectors=lidar.sectors)
         return described | {f"lidar.{name}": getattr(lidar, name) for name in _OF_THE_LIDAR}

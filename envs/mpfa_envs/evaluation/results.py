@@ -1,4 +1,4 @@
-"""What evaluation episodes gave, and rates and means of them with their intervals."""
+"""Results of evaluation episodes, and rates and means of them with their intervals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 ENCOUNTERS = ("walker_distance", "intrusion_time", "time_to_collision")
-"""What is told of walkers, in the info of an environment and of an episode."""
+"""The measures of walkers in the info of an environment and in a result."""
 _LEVEL = 0.95
 _RESAMPLES = 2000
 
@@ -42,7 +42,7 @@ class EpisodeResult:
     decision_s: float = field(default=0.0, compare=False)
     """Mean wall-clock time of an action [s]; its share where several robots act together."""
     world: str = ""
-    """Where it was."""
+    """Name of the world."""
     walker_distance: float | None = None
     """Least distance between the robot's rim and a walker's [m]; None where nobody walks."""
     intrusion_time: float | None = None
@@ -53,7 +53,7 @@ class EpisodeResult:
 
     @property
     def outcome(self) -> Literal["success", "collision", "timeout"]:
-        """How it ended, in a word."""
+        """Its end in a word."""
         if self.success:
             return "success"
         return "collision" if self.collision else "timeout"
@@ -127,19 +127,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
 
 
 def wilson(outcomes: Sequence[bool]) -> Interval:
-    """A rate with Wilson's 95 % interval.
-
-    Args:
-        outcomes: Of each trial; at least one.
-
-    Returns:
-        The rate and its interval.
-
-    Examples:
-        >>> interval = wilson([True] * 181 + [False] * 19)
-        >>> round(interval.low, 3), round(interval.high, 3)
-        (0.856, 0.938)
-    """
+    """A rate with Wilson's 95 % interval; at least one outcome."""
     from scipy.stats import binomtest
 
     test = binomtest(sum(outcomes), len(outcomes))
@@ -148,20 +136,7 @@ def wilson(outcomes: Sequence[bool]) -> Interval:
 
 
 def bootstrap(values: Sequence[float], rng: np.random.Generator) -> Interval:
-    """A mean with its 95 % percentile bootstrap interval.
-
-    Args:
-        values: The sample; without values all is NaN, with one its interval is.
-        rng: Source of the resamples.
-
-    Returns:
-        The mean and its interval.
-
-    Examples:
-        >>> interval = bootstrap([3.0, 4.0, 5.0, 6.0], np.random.default_rng(0))
-        >>> interval.value, 3.0 <= interval.low < 4.5 < interval.high <= 6.0
-        (4.5, True)
-    """
+    """A mean with its 95 % percentile bootstrap interval; NaN for too few values."""
     from scipy import stats
 
     if len(values) < 2:

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     """All that a policy must be: a function from observation to action."""
 
 ENVS_AT_ONCE = 64
-"""How many episodes run together by default, if the policy is known to take many observations."""
+"""Episodes that run together by default, if the policy is known to take many observations."""
 
 
 @runtime_checkable
 class Driver(Protocol):
-    """What may know more than the robot senses: it sees the environment that the robot is in."""
+    """A policy with privileged access to the environment that the robot is in."""
 
     def begin(self, env: VectorNavigationEnv, robot: int) -> None:
         """Get ready for an episode.
@@ -53,7 +53,7 @@ class Driver(Protocol):
 
         Args:
             env: Where the robots are, ``env.poses``.
-            robots: Numbers of the N robots that are under way.
+            robots: Numbers of the N robots whose episodes are running.
             observations: What they sense, ``[N, O]``.
 
         Returns:
@@ -62,12 +62,7 @@ class Driver(Protocol):
 
 
 class Blind:
-    """A policy as a :class:`Driver`: it sees the observations and nothing else.
-
-    Args:
-        policy: From observations to actions.
-        alone: Whether it takes a single observation.
-    """
+    """A policy as a :class:`Driver`, which sees the observations alone."""
 
     def __init__(self, policy: Action, *, alone: bool = False) -> None:
         self.policy = policy
@@ -101,12 +96,7 @@ class Blind:
 
 
 def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
-    """A policy, or what is one already, as a :class:`Driver`.
-
-    Args:
-        policy: Either.
-        alone: Whether a policy takes a single observation.
-    """
+    """A policy, or a driver, as a :class:`Driver`."""
     return policy if isinstance(policy, Driver) else Blind(policy, alone=alone)
 
 
@@ -125,7 +115,7 @@ def evaluate(
 
     Args:
         policy: A :class:`~mpfa_envs.Policy`, any function from observation to action, or a
-            :class:`Driver`, see :func:`run_tasks`.
+            :class:`Driver`.
         world: What :func:`~mpfa_envs.world_tasks` takes: a world, or ``"bars:test"``, the test
             worlds of a generator; or several of these.
         episodes: Number of tasks in each; None: 200 in a world, 400 in the worlds of a generator.
@@ -180,8 +170,8 @@ def run_tasks(
     """Drive every task once.
 
     Args:
-        policy: From observations, ``[N, O]``, to actions, ``[N, A]``, for the N episodes that are
-            under way; with ``envs_at_once=1`` from one observation, ``[O]``, to one action.
+        policy: From observations, ``[N, O]``, to actions, ``[N, A]``, for the N running episodes;
+            with ``envs_at_once=1`` from one observation, ``[O]``, to one action.
         tasks: Tasks with their worlds.
         envs_at_once: How many episodes run together, which changes no result of a
             :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
@@ -189,7 +179,7 @@ def run_tasks(
             :class:`~mpfa_envs.DynamicWindow`, else one at a time.
         progress_bar: Whether to show one.
         on_end: Called at the end of every episode with the environment, the number of the robot,
-            whose ``env.trail(robot)`` is the way that it took, and that of the task.
+            whose path is ``env.trail(robot)``, and that of the task.
         **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`; ``max_steps``
             counts where a task has no time limit of its own.
 
@@ -233,7 +223,7 @@ def run_tasks(
 
 
 def _check(env: VectorNavigationEnv, tasks: Sequence[WorldTask], numbers: Sequence[int]) -> None:
-    """Refuse tasks that the robot cannot drive."""
+    """Reject tasks that the robot cannot drive."""
     for number in numbers:
         world, task, *_ = tasks[number]
         try:

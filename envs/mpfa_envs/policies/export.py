@@ -36,8 +36,8 @@ _MEANINGS: Final = {
     "goal_distance": "d / distance",
     "linear_speed": "forward speed / linear_speed, within +- speed_bound",
     "angular_speed": "turning speed / angular_speed, left positive, within +- speed_bound",
-    "way_direction": "cosine and sine of the direction of the way on the map, in the robot's frame",
-    "way_length": "length of the way / distance, at most way_bound",
+    "way_direction": "cosine and sine of the path's direction on the map, in the robot's frame",
+    "way_length": "length of the path / distance, at most way_bound",
     "lidar_history": "lidar of earlier decisions, the newest first; at the start the first one",
 }
 _FRAMES: Final = {
@@ -56,7 +56,7 @@ def export_policy(
     """Write a policy as an ONNX file, and its card beside it.
 
     The file computes in double precision, as :class:`~mpfa_envs.Policy` does, and takes and gives
-    single precision; or with ``quantize`` in eight bits, its scales found anew in each call.
+    single precision; or with ``quantize`` in eight bits, its scales found again in each call.
 
     Args:
         policy: The policy.
@@ -97,18 +97,7 @@ def export_policy(
 
 
 def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-    """What the card of a policy says, but for its file.
-
-    Args:
-        policy: The policy.
-        results: How well it drives.
-
-    Returns:
-        Plain values.
-
-    Raises:
-        CardError: If the policy does not sense what its ``env_arguments`` say.
-    """
+    """The card of a policy as plain values, without its file."""
     config = TaskConfig(**policy.env_arguments)
     lidar = config.make_lidar()
     robot = config.robot
@@ -165,20 +154,7 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
 
 
 def onnx_content(layers: Sequence[Layer], observation_size: int, *, quantize: bool) -> bytes:
-    """The content of an ONNX file with some layers.
-
-    Args:
-        layers: The layers in their order.
-        observation_size: O, of the input ``[N, O]``.
-        quantize: Whether to round the weights to eight bits.
-
-    Returns:
-        The bytes, the same for the same layers.
-
-    Raises:
-        CardError: If a layer is a table.
-        ImportError: If there is no onnx.
-    """
+    """The bytes of an ONNX file with some layers, the same for the same layers."""
     try:
         import onnx
         from onnx import TensorProto, helper
@@ -208,11 +184,7 @@ def onnx_content(layers: Sequence[Layer], observation_size: int, *, quantize: bo
 
 
 class _Graph:
-    """Nodes one after the other, and their weights.
-
-    Args:
-        precision: What it computes in.
-    """
+    """Nodes one after the other, and their weights."""
 
     def __init__(self, precision: type[np.float32] | type[np.float64]) -> None:
         from onnx import TensorProto

@@ -18,7 +18,7 @@ from mpfa_envs.policies.onnx_policy import OnnxPolicy
 from mpfa_envs.policies.policy import Policy, PolicyFileError
 
 FILE_NAME: Final = "policy.npz"
-"""What the file is called in the folder of a run."""
+"""Name of the file in the folder of a run."""
 _FORMAT: Final = 1
 _ABOUT: Final = "about"
 """The entry with all that is not a weight: JSON as bytes."""
@@ -106,7 +106,7 @@ def _load(file: Path) -> Policy:
         return _read(read_file(file, _LARGEST))
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no policy at {file}") from None
-    # A damaged archive fails in many ways: a wrong checksum, header, length, number, password.
+    # A damaged archive raises many errors: a wrong checksum, header, length, number, password.
     except Exception as error:
         raise PolicyFileError(f"{file} holds no policy, or is damaged: {error}") from error
 

@@ -175,18 +175,7 @@ KINDS: Final[Mapping[str, Callable[..., Layer]]] = {
 
 
 def check_layers(layers: Sequence[Layer]) -> tuple[int, int]:
-    """Check that layers fit together.
-
-    Args:
-        layers: Layers in their order.
-
-    Returns:
-        Number of inputs of the first and of outputs of the last.
-
-    Raises:
-        ValueError: If the first is neither linear nor a table, two do not fit, or a weight is not
-            finite.
-    """
+    """Check that layers fit together; numbers of inputs and outputs."""
     if not layers or not isinstance(layers[0], Linear | Table):
         raise ValueError("layers must begin with a linear layer or a table")
     size: int | None = None
@@ -210,19 +199,7 @@ def arrays_of(layer: Layer) -> dict[str, NDArray[np.float32]]:
 
 
 def from_torch(modules: Iterable[Any]) -> list[Layer]:
-    """Copy the layers of a PyTorch network.
-
-    Args:
-        modules: ``Linear``, ``LayerNorm``, ``ReLU``, ``Tanh`` and ``Identity``. Behind the last
-            ``Tanh`` there may be a module of any class that maps each action to its bounds,
-            ``center + half * action``.
-
-    Returns:
-        The layers, without ``Identity``.
-
-    Raises:
-        ValueError: If a module is something else.
-    """
+    """Copy the layers of a PyTorch network, without ``Identity``."""
     from torch import nn
 
     layers: list[Layer] = []

@@ -17,16 +17,7 @@ if TYPE_CHECKING:
 
 
 class OnnxPolicy(Policy):
-    """An exported policy; onnxruntime computes it.
-
-    Args:
-        path: The ONNX file; its card lies beside it.
-
-    Raises:
-        FileNotFoundError: If the file or its card is missing.
-        ImportError: If there is no onnxruntime.
-        PolicyFileError: If one of them is damaged, or they do not fit.
-    """
+    """An exported policy with its card beside it; onnxruntime computes it."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         try:

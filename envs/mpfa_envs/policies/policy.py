@@ -24,7 +24,7 @@ class Policy:
     """A network that chooses actions, in NumPy alone.
 
     Args:
-        layers: The layers in their order, see :mod:`mpfa_envs.policies.layers`.
+        layers: The layers in their order (:mod:`mpfa_envs.policies.layers`).
         card: Plain values that say what it is: how it was trained, what it can do.
         env_arguments: Arguments of :class:`~mpfa_envs.NavigationEnv` under which it senses and
             acts as it learned to: robot, physics, time limit, action repeat, closeness distance.
@@ -67,14 +67,15 @@ class Policy:
         Args:
             layers: ``Linear``, ``LayerNorm``, ``ReLU`` and ``Tanh``, and at the end what maps to
                 the bounds of actions, where those are not [-1, 1].
-            card: As in :class:`Policy`.
-            env_arguments: As in :class:`Policy`.
+            card: Of the policy.
+            env_arguments: Of the policy.
 
         Returns:
             The policy. It does not change when the network learns on.
 
         Raises:
-            ValueError: If a layer is of another kind, or as in :class:`Policy`.
+            ValueError: If a layer is of another kind, or the card or the arguments are no plain
+                values.
         """
         return cls(from_torch(layers), card=card, env_arguments=env_arguments)
 

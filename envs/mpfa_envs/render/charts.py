@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Curve = tuple[Any, Any]
 """Steps and values of one run, each of shape ``[T]``."""
 Band = Literal["interval", "runs"]
-"""What surrounds a mean: its 95 % interval for other runs, or each run."""
+"""The band around a mean: its 95 % interval for other runs, or each run."""
 
 _LEVEL = 0.95
 
@@ -48,12 +48,12 @@ def plot_seeds(
     Args:
         runs: Curves of the seeds of each method, by name.
         path: The PNG file.
-        xlabel: What steps are.
-        ylabel: What values are.
+        xlabel: Label of the steps.
+        ylabel: Label of the values.
         level: The level; None: no marks.
         band: ``"interval"``: Student's 95 % interval of the mean; ``"runs"``: each run as a thin
             line, for so few of them that an interval says little. A single run has neither.
-        limits: What values lie within, which cuts the band; None: anything.
+        limits: Bounds of the values, which cut the band; None: none.
         title: Of the chart.
 
     Raises:
@@ -88,10 +88,10 @@ def draw_seeds(
 
     Args:
         axis: The axes.
-        runs: As in :func:`plot_seeds`.
-        level: As in :func:`plot_seeds`.
-        band: As in :func:`plot_seeds`.
-        limits: As in :func:`plot_seeds`.
+        runs: Curves of the seeds of each method, by name.
+        level: The level; None: no marks.
+        band: ``"interval"`` or ``"runs"``.
+        limits: Bounds of the values, which cut the band; None: none.
         places: Number of each method's color; None: in their order.
     """
     if not any(runs.values()):
@@ -122,22 +122,7 @@ def draw_seeds(
 
 
 def seed_band(curves: Sequence[Curve]) -> tuple[Array, Array, Array, Array]:
-    """Steps, mean and the ends of its 95 % interval of some runs, each of shape ``[T]``.
-
-    Args:
-        curves: Steps and values of each run.
-
-    Returns:
-        At all steps of all runs to the end of the shortest, from the latest beginning.
-
-    Raises:
-        ValueError: As :func:`plot_seeds`.
-
-    Examples:
-        >>> steps, mean, low, high = seed_band([([0, 4], [0, 4]), ([0, 2, 4], [2, 2, 2])])
-        >>> steps.tolist(), mean.tolist()
-        ([0.0, 2.0, 4.0], [1.0, 2.0, 3.0])
-    """
+    """Steps, mean and the ends of its 95 % interval of runs where all have values, ``[T]``."""
     checked = [_checked(curve) for curve in curves]
     first = max(steps[0] for steps, _ in checked)
     last = min(steps[-1] for steps, _ in checked)
@@ -197,7 +182,7 @@ def plot_histograms(
             of number by its name, as ``torchrl_mpfa.ReplayHistory.histograms()`` gives them.
         path: The PNG file.
         columns: Panels in a row.
-        xlabel: What steps are.
+        xlabel: Label of the steps.
 
     Raises:
         ValueError: If there is nothing to plot, or arrays of a history do not fit together.
@@ -248,7 +233,7 @@ def plot_histograms(
 
 
 def _ends(times: Array) -> Array:
-    """Where the columns of a heat map begin and end, in the middle between two times."""
+    """Edges of the columns of a heat map, in the middle between two times."""
     middles = (times[1:] + times[:-1]) / 2
     width = float(np.diff(times).mean()) if len(times) > 1 else 1.0
     return np.concatenate(([times[0] - width / 2], middles, [times[-1] + width / 2]))
@@ -264,17 +249,7 @@ def _medians(edges: Array, shares: Array) -> Array:
 def new_figure(
     rows: int = 1, columns: int = 1, *, panel: tuple[float, float] = (7.0, 4.0), **kwargs: Any
 ) -> tuple[Any, list[Any]]:
-    """A figure of matplotlib and its axes, row by row.
-
-    Args:
-        rows: Panels below each other.
-        columns: Panels beside each other.
-        panel: Width and height of a panel [inch].
-        **kwargs: Passed to matplotlib.
-
-    Returns:
-        Figure and axes.
-    """
+    """A figure of matplotlib and its axes, row by row; a panel has a size [inch]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -287,14 +262,7 @@ def new_figure(
 def finish(
     figure: Any, axes: Iterable[Any], path: str | os.PathLike[str], *, dpi: int = 120
 ) -> None:
-    """Give axes their grids, and write their figure to a file whose folder is made.
-
-    Args:
-        figure: The figure.
-        axes: Those that get a grid.
-        path: The PNG file.
-        dpi: Pixels of an inch.
-    """
+    """Give axes their grids, and write their figure to a PNG file whose folder is made."""
     for axis in axes:
         axis.grid(alpha=0.3)
     file = Path(path)
@@ -303,14 +271,7 @@ def finish(
 
 
 def look(place: int) -> dict[str, str]:
-    """Color of a line by its number, and another dash once all colors are taken.
-
-    Args:
-        place: Number of the line, from zero.
-
-    Returns:
-        Arguments of matplotlib's ``plot``.
-    """
+    """Color of the line of a number, and another dash once all colors are taken."""
     color = "#" + "".join(f"{channel:02x}" for channel in LINES[place % len(LINES)])
     return {"color": color, "linestyle": ("-", "--", ":", "-.")[place // len(LINES) % 4]}
 

@@ -1,4 +1,4 @@
-"""An episode as pictures, with what the robot sees, thinks and does."""
+"""An episode as pictures, with the robot's scans, speeds and values."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def film_episode(
         episode: The task and its world.
         values: From observations, ``[1, O]``, to their value, ``[1]``, such as Q.
         traces: Whether speeds and values are beside the picture.
-        most: How many pictures to take at most, and a last one: of a long episode every second
+        most: Greatest number of pictures, besides the last one: of a long episode every second
             step, every fourth, and so on.
         seed: Of the lidar's noise and the walkers.
         **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
@@ -104,13 +104,13 @@ class Moment(NamedTuple):
     """One decision of an episode, or its end."""
 
     env: VectorNavigationEnv
-    """Where the robot is, which can render it."""
+    """The environment, which can render it."""
     step: int
     """Decisions before."""
     observations: NDArray[np.float32]
-    """What it senses, ``[1, O]``."""
+    """The observation, ``[1, O]``."""
     wheels: tuple[float, float] | None
-    """What it decides, speeds of the left and the right wheel [m/s]; None at the end."""
+    """The decision, speeds of the left and the right wheel [m/s]; None at the end."""
     info: dict[str, Any]
     """As the environment gives it, arrays of length one."""
 
@@ -121,10 +121,10 @@ def drive_episode(
     """Drive one episode decision by decision.
 
     Args:
-        policy: As in :func:`film_episode`.
+        policy: As for :func:`film_episode`.
         episode: The task and its world.
         seed: Of the lidar's noise and the walkers.
-        **env_arguments: As in :func:`film_episode`.
+        **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Yields:
         Each decision before it is carried out, and the end.
@@ -156,16 +156,7 @@ def drive_episode(
 def panels_of(
     wheels: Sequence[tuple[float, float]], worth: Sequence[float], *, step_time: float
 ) -> list[Panel]:
-    """The panels of an episode: the value, if it is known, and the speeds of the wheels.
-
-    Args:
-        wheels: Speeds of the left and the right wheel at each step [m/s].
-        worth: Values at each step and at the end; empty: not known.
-        step_time: Time of a step [s].
-
-    Returns:
-        The panels, the last speeds twice: the last picture shows where they led.
-    """
+    """The panels of an episode: values, if they are known, and wheel speeds [m/s]."""
     left, right = zip(*[*wheels, wheels[-1]], strict=True)
     last = max(round(_RECENT / step_time), 2)
     speeds = Panel("wheels [m/s]", {"left": left, "right": right}, last)

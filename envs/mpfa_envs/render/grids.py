@@ -23,24 +23,13 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _ROBOTS: Final = 64
-"""Places that are looked at together; each may need a map."""
+"""Places that are observed together; each may need a map."""
 Heading = float | Literal["goal"]
-"""Where robots face [rad], or that each of them faces the goal."""
+"""Heading of all robots [rad], or that each of them faces the goal."""
 
 
 def cell_centers(world: World, spacing: float) -> Array:
-    """Centers of the square cells that fill a room.
-
-    Args:
-        world: The room.
-        spacing: Side of a cell [m].
-
-    Returns:
-        Positions (x, y) [m], row by row from below, ``[N, 2]``.
-
-    Raises:
-        ValueError: If the spacing is not positive.
-    """
+    """Centers (x, y) of square cells that fill a room, row by row from below [m], ``[N, 2]``."""
     check_positive("spacing", spacing)
     room = world.room
     sides = []
@@ -63,8 +52,8 @@ def observe_room(
 
     Args:
         world: A name, the path of a YAML file or a world.
-        goal: Where it should go (x, y) [m].
-        heading: Where it faces [rad]; ``"goal"``: the goal, from everywhere.
+        goal: Position (x, y) [m].
+        heading: Direction of its front [rad]; ``"goal"``: towards the goal, from everywhere.
         spacing: Distance between two places [m].
         **env_arguments: Fields of :class:`~mpfa_envs.TaskConfig`, those that the policy was trained
             with: ``policy.env_arguments``.
@@ -116,14 +105,7 @@ def observe_room(
 
 
 def fill_cells(canvas: Canvas, centers: Array, spacing: float, shares: Array) -> None:
-    """Color cells by values from 0 to 1.
-
-    Args:
-        canvas: The picture of the room.
-        centers: Of the cells (x, y) [m], ``[N, 2]``.
-        spacing: Side of a cell [m].
-        shares: Their values, ``[N]``.
-    """
+    """Color cells with centers ``[N, 2]`` [m] by shares from 0 to 1, ``[N]``."""
     half = spacing / 2
     for (x, y), color in zip(centers.tolist(), viridis(shares).tolist(), strict=True):
         canvas.rectangle(x - half, y - half, x + half, y + half, fill=(*color, 255))

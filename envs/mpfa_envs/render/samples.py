@@ -1,4 +1,4 @@
-"""Where in a room the transitions of a buffer are, and which of them are replayed."""
+"""The positions of a buffer's transitions in a room, and how often each is replayed."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def render_samples(
 
 
 def _checked(positions: Any, priorities: Any, sampled: Any) -> tuple[Array, Array, Array]:
-    """Positions, priorities and counts, refused if they do not fit together."""
+    """Positions, priorities and counts, rejected if they do not fit together."""
     places = np.asarray(positions, dtype=np.float64)
     if places.ndim != 2 or places.shape[1] != 2 or not len(places):
         raise ValueError(f"positions must have shape [N, 2] and N > 0, got {places.shape}")

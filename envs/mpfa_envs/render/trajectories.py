@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 Outcome = Literal["success", "collision", "timeout"]
-"""How an episode ended."""
+"""The end of an episode."""
 Trajectories = Sequence["Sequence[Point] | NDArray[np.float64]"]
 """Positions of each episode, each of shape ``[steps, 2]`` [m]."""
 
@@ -101,7 +101,7 @@ def render_methods(
     """Render the paths of several methods side by side, the same episodes in every panel.
 
     Args:
-        world: As in :func:`render_trajectories`.
+        world: A name, the path of a YAML file or a world.
         trajectories: Positions of each episode, by method.
         goals: Goal of each episode (x, y) [m]; all methods drive the same tasks.
         outcomes: How each episode ended, by method.
@@ -119,9 +119,9 @@ def render_methods(
 
     Examples:
         >>> from mpfa_envs.render import render_methods
-        >>> ways = {"slow": [[(0, 0), (1, 1)]], "fast": [[(0, 0), (2, 3)]]}
+        >>> paths = {"slow": [[(0, 0), (1, 1)]], "fast": [[(0, 0), (2, 3)]]}
         >>> ends = {"slow": ["timeout"], "fast": ["success"]}
-        >>> render_methods("A", ways, [(2, 3)], ends).shape
+        >>> render_methods("A", paths, [(2, 3)], ends).shape
         (388, 728, 3)
     """
     if not trajectories or set(trajectories) != set(outcomes):
@@ -130,13 +130,13 @@ def render_methods(
             f"{sorted(trajectories)} and {sorted(outcomes)}"
         )
     world = resolve_world(world)
-    for name, ways in trajectories.items():
-        _check(ways, goals, outcomes[name])
+    for name, paths in trajectories.items():
+        _check(paths, goals, outcomes[name])
     shown = _spaced(range(len(goals)), check_count("most", most))
     panels = [
         _panel(
             world,
-            ways,
+            paths,
             goals,
             outcomes[name],
             shown,
@@ -145,7 +145,7 @@ def render_methods(
             goal_radius=goal_radius,
             size=size,
         )
-        for name, ways in trajectories.items()
+        for name, paths in trajectories.items()
     ]
     return tiled(panels, columns=columns)
 
@@ -181,7 +181,7 @@ def _spaced(numbers: Sequence[int], count: int) -> list[int]:
 
 
 def _check(trajectories: Trajectories, goals: Sequence[Point], outcomes: Sequence[Outcome]) -> None:
-    """Refuse lists that do not fit together."""
+    """Reject lists that do not fit together."""
     if not len(trajectories) == len(goals) == len(outcomes):
         raise ValueError(
             "trajectories, goals and outcomes must have one entry per episode, got "
@@ -209,7 +209,7 @@ def _panel(
     canvas = Canvas(world, size=size, footer=HEIGHT, least_width=strip_width(entries))
     for walker in () if walkers is None else walkers.tolist():
         canvas.walker(walker)
-    ways = {n: [(float(x), float(y)) for x, y in trajectories[n]] for n in shown}
+    paths = {n: [(float(x), float(y)) for x, y in trajectories[n]] for n in shown}
     with canvas.layer():
         for x, y in {(float(goals[n][0]), float(goals[n][1])): n for n in shown}:
             canvas.disc(x, y, goal_radius, fill=GOAL_AREA, outline=GOAL_EDGE)
@@ -217,22 +217,22 @@ def _panel(
     order = sorted(shown, key=lambda n: outcomes[n] != "success")
     for n in order:
         with canvas.layer():
-            canvas.line(ways[n], OUTCOMES[outcomes[n]], 1.6)
+            canvas.line(paths[n], OUTCOMES[outcomes[n]], 1.6)
     for n in order:
         canvas.disc(*goals[n], 0.09, fill=GOAL, outline=ROBOT_FRONT)
-        if ways[n]:
-            canvas.disc(*ways[n][0], 0.11, fill=ROBOT_FRONT)
-            canvas.ring(*ways[n][0], 0.09, TRAIL)
+        if paths[n]:
+            canvas.disc(*paths[n][0], 0.11, fill=ROBOT_FRONT)
+            canvas.ring(*paths[n][0], 0.09, TRAIL)
     for n in order:
-        if ways[n] and outcomes[n] != "success":
+        if paths[n] and outcomes[n] != "success":
             mark = canvas.cross if outcomes[n] == "collision" else canvas.square
-            mark(*ways[n][-1], (*OUTCOMES[outcomes[n]][:3], 255))
+            mark(*paths[n][-1], (*OUTCOMES[outcomes[n]][:3], 255))
     write_strip(canvas, entries)
     return canvas.pixels()
 
 
 def _legend(title: str, outcomes: Sequence[str], shown: int) -> list[Entry]:
-    """The title, how many episodes ended in each way, and how many paths there are of them."""
+    """The title, the number of episodes with each outcome, and of paths in the picture."""
     keys: list[Entry] = [
         Key(f"{name} {count}", (*color[:3], 255), _MARKS[name])
         for name, color in OUTCOMES.items()

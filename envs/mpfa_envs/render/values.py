@@ -1,4 +1,4 @@
-"""What a critic thinks a room is worth, and what an actor does there."""
+"""A critic's values of the places of a room, and an actor's actions there."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Observations = NDArray[np.float32]
 
 _ARROW_TIME = 1.0
-"""An arrow is as long as the way of so much time [s]."""
+"""An arrow is as long as the path of so much time [s]."""
 
 
 def render_values(
@@ -45,9 +45,9 @@ def render_values(
 ) -> NDArray[np.uint8]:
     """Render a value and the actions of a policy all over a room, for one goal.
 
-    In every cell stands a robot that faces the same way and has not moved. The cell has the color
-    of its value, the scale leaves out the highest and lowest two per cent; an arrow is the way that
-    the robot would go in the next second.
+    In every cell stands a robot that has not moved; all face one direction. The cell has the color
+    of its value, the scale leaves out the highest and lowest two per cent; an arrow is the path
+    that the robot would take in the next second.
 
     Args:
         world: A name, the path of a YAML file or a world.
@@ -108,12 +108,12 @@ def render_values(
             raise ValueError(f"actions must have shape {(len(poses), 2)}, got {chosen.shape}")
         robot = resolve_robot(env_arguments.get("robot", "turtlebot2"))
         for pose, action in zip(poses.tolist(), chosen, strict=True):
-            draw_arrow(canvas, way_of(robot, pose, action, seconds=_ARROW_TIME))
+            draw_arrow(canvas, arc_of(robot, pose, action, seconds=_ARROW_TIME))
     write_strip(canvas, entries)
     return canvas.pixels()
 
 
-def way_of(
+def arc_of(
     robot: RobotModel,
     pose: tuple[float, float, float],
     action: NDArray[np.float64],
@@ -121,32 +121,21 @@ def way_of(
     seconds: float,
     points: int = 9,
 ) -> list[Point]:
-    """The arc that a robot drives while it holds an action.
-
-    Args:
-        robot: The robot.
-        pose: Where it begins (x, y, heading) [m, m, rad].
-        action: Speeds of its wheels, ``[2]``, in [-1, 1].
-        seconds: For how long [s].
-        points: Positions on the arc.
-
-    Returns:
-        Positions (x, y) [m], the first one that of the pose.
-    """
+    """Positions (x, y) of the arc that a robot drives while it holds an action [m]."""
     left, right = robot.wheel_speeds(action.astype(np.float32))
     speed, turn = (left + right) / 2, (right - left) / robot.wheel_base
     x, y, heading = pose
-    way = []
+    path = []
     for time in np.linspace(0.0, seconds, points).tolist():
         half = turn * time / 2
         chord = speed * time * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
-        way.append((x + chord * math.cos(heading + half), y + chord * math.sin(heading + half)))
-    return way
+        path.append((x + chord * math.cos(heading + half), y + chord * math.sin(heading + half)))
+    return path
 
 
-def draw_arrow(canvas: Canvas, way: list[Point]) -> None:
-    """Draw a way with a head at its end, white with a dark edge: it is seen on every color."""
-    (x, y), (before_x, before_y) = way[-1], way[-2]
+def draw_arrow(canvas: Canvas, path: list[Point]) -> None:
+    """Draw a path with a head at its end, white with a dark edge: it shows on every color."""
+    (x, y), (before_x, before_y) = path[-1], path[-2]
     angle = math.atan2(y - before_y, x - before_x)
     tip, wings = canvas.at(x, y), []
     for side in (2.6, -2.6):
@@ -156,6 +145,6 @@ def draw_arrow(canvas: Canvas, way: list[Point]) -> None:
             (tip[0] + reach * math.cos(angle + side), tip[1] - reach * math.sin(angle + side))
         )
     for color, width in ((TEXT, 4.0), (ROBOT_FRONT, 1.6)):
-        canvas.line(way, color, width)
+        canvas.line(path, color, width)
         edge = round(2 * FINE) if color is TEXT else 0
         canvas.draw.polygon([tip, *wings], fill=color, outline=color, width=edge)

@@ -1,1 +1,1 @@
-"""One moment of an episode, drawn without a display or in a live window."""
+"""One moment of an episode as a picture, without a display, or in a live window."""

@@ -1,4 +1,4 @@
-"""What pictures of a world from above are made on, without a display."""
+"""The canvas of pictures of a world from above, without a display."""
 
 from __future__ import annotations
 
@@ -43,14 +43,7 @@ _BORDER: Final = 0.2
 
 
 class Canvas:
-    """A picture of a world to draw on in meters.
-
-    Args:
-        world: The world.
-        size: Longer side of the picture [px].
-        footer: Height of a strip for text below [px].
-        least_width: Of the picture [px]; a narrower world has white on either side.
-    """
+    """A picture of a world, its longer side ``size`` [px], to draw on in meters."""
 
     def __init__(self, world: World, *, size: int, footer: int = 0, least_width: int = 0) -> None:
         if isinstance(size, bool) or not isinstance(size, int) or size < 32:
@@ -89,7 +82,7 @@ class Canvas:
                 self.line(leg, ROUND, 1.2)
 
     def obstacles(self, world: World) -> None:
-        """Draw what stands in a room, above what was drawn before."""
+        """Draw the obstacles of a room."""
         for box in world.boxes:
             self.rectangle(
                 box.x_min, box.y_min, box.x_max, box.y_max, fill=OBSTACLE, outline=OBSTACLE_EDGE

@@ -26,7 +26,7 @@ Mark = Literal["box", "cross", "square", "ring"]
 
 
 class Key(NamedTuple):
-    """What a color means."""
+    """The meaning of a color."""
 
     label: str
     color: Color
@@ -34,11 +34,11 @@ class Key(NamedTuple):
 
     @property
     def width(self) -> float:
-        """In fine pixels."""
+        """Width in fine pixels."""
         return _BEFORE_LABEL + font().getlength(self.label) + _AFTER_LABEL
 
     def write(self, canvas: Canvas, x: float, middle: float) -> None:
-        """Write it where it begins."""
+        """Write it from ``x`` on."""
         r = 5 * FINE
         box = [(x, middle - r), (x + 2 * r, middle + r)]
         center = x + r
@@ -56,7 +56,7 @@ class Key(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """What the colors of viridis mean."""
+    """The meaning of the colors of viridis."""
 
     name: str
     low: float
@@ -64,7 +64,7 @@ class Scale(NamedTuple):
 
     @property
     def width(self) -> float:
-        """In fine pixels."""
+        """Width in fine pixels."""
         words = sum(font().getlength(each) + 5 * FINE for each in self._words())
         return words + _BAR + _AFTER_LABEL
 
@@ -72,7 +72,7 @@ class Scale(NamedTuple):
         return f"{self.name}:", f"{self.low:.3g}", f"{self.high:.3g}"
 
     def write(self, canvas: Canvas, x: float, middle: float) -> None:
-        """Write it where it begins."""
+        """Write it from ``x`` on."""
         name, low, high = self._words()
         x = _write(canvas, x, middle, name) + 5 * FINE
         x = _write(canvas, x, middle, low) + 5 * FINE
@@ -83,33 +83,33 @@ class Scale(NamedTuple):
 
 
 class Title(NamedTuple):
-    """What the picture shows."""
+    """The title of a picture."""
 
     text: str
 
     @property
     def width(self) -> float:
-        """In fine pixels."""
+        """Width in fine pixels."""
         length: float = font().getlength(self.text)
         return length + _AFTER_TITLE
 
     def write(self, canvas: Canvas, x: float, middle: float) -> None:
-        """Write it where it begins."""
+        """Write it from ``x`` on."""
         _write(canvas, x, middle, self.text)
 
 
 class Facing(NamedTuple):
-    """Where all robots of a picture face."""
+    """The heading of all robots of a picture."""
 
     heading: float
 
     @property
     def width(self) -> float:
-        """In fine pixels."""
+        """Width in fine pixels."""
         return _BEFORE_LABEL + 6 * FINE + font().getlength("all face this way") + _AFTER_LABEL
 
     def write(self, canvas: Canvas, x: float, middle: float) -> None:
-        """Write it where it begins."""
+        """Write it from ``x`` on."""
         r = 8 * FINE
         canvas.draw.ellipse([(x, middle - r), (x + 2 * r, middle + r)], fill=ROBOT)
         arrow = [
@@ -128,7 +128,7 @@ Entry = Facing | Key | Scale | Title
 
 
 def strip_width(entries: Sequence[Entry]) -> int:
-    """How wide a picture must be for its strip [px]."""
+    """Least width of a picture for its strip [px]."""
     return math.ceil((_MARGIN + sum(entry.width for entry in entries)) / FINE)
 
 
@@ -146,7 +146,7 @@ def titled(title: str, *others: Entry) -> list[Entry]:
 
 
 def _write(canvas: Canvas, x: float, middle: float, text: str) -> float:
-    """Write at fine pixels, centered in height; returns where it ends."""
+    """Write at fine pixels, centered in height; give the end."""
     canvas.draw.text((x, middle), text, fill=TEXT, font=font(), anchor="lm")
     end: float = x + font().getlength(text)
     return end

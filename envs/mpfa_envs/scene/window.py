@@ -15,19 +15,9 @@ if TYPE_CHECKING:
 
 
 class Window:
-    """Shows pictures at a steady pace, and tells which keys are held.
+    """A window that opens with the first picture, and tells which keys are held."""
 
-    It opens with the first picture and takes its size. Without a screen, ``SDL_VIDEODRIVER=dummy``
-    lets it run and show nothing.
-
-    Args:
-        title: Of the window.
-        fps: Pictures a second; :meth:`show` waits until the next one is due.
-
-    Raises:
-        DependencyNotInstalled: If there is no pygame.
-        ValueError: If ``fps`` is not positive.
-    """
+    # Without a screen, SDL_VIDEODRIVER=dummy lets it run and show nothing.
 
     def __init__(self, title: str, *, fps: float) -> None:
         try:
@@ -52,14 +42,7 @@ class Window:
         """Whether the user closed it, or pressed Escape; it shows nothing more then."""
 
     def show(self, picture: NDArray[np.uint8]) -> bool:
-        """Show a picture when it is due.
-
-        Args:
-            picture: Shape ``[height, width, 3]``.
-
-        Returns:
-            Whether the window is still open.
-        """
+        """Show a picture, ``[height, width, 3]``, when due; tell whether the window is open."""
         if self.closed:
             return False
         pygame = self._pygame
