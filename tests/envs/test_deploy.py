@@ -67,7 +67,7 @@ def test_it_senses_what_the_environment_senses(tmp_path: Path, arguments: dict[s
     env.close()
 
 
-def test_its_command_is_the_action_as_wheel_speeds_and_as_a_twist(tmp_path: Path) -> None:
+def test_a_command_is_the_action_as_wheel_speeds_and_twist(tmp_path: Path) -> None:
     file = exported(tmp_path)
     pilot, policy = Pilot.load(file), mpfa_envs.load_policy(file)
     env = NavigationEnv(world="C", closeness_distance=0.23, physics="kinematic")
@@ -80,7 +80,7 @@ def test_its_command_is_the_action_as_wheel_speeds_and_as_a_twist(tmp_path: Path
     assert command[2:] == pytest.approx(((left + right) / 2, (right - left) / 0.23))
 
 
-def test_a_slower_robot_drives_the_same_arcs_at_a_slower_pace(tmp_path: Path) -> None:
+def test_a_slower_robot_drives_the_same_arcs_more_slowly(tmp_path: Path) -> None:
     file = exported(tmp_path)
     fast, slow = Pilot.load(file), Pilot.load(file, robot="burger")
     pace = 0.22 / 0.5
@@ -94,7 +94,7 @@ def test_a_slower_robot_drives_the_same_arcs_at_a_slower_pace(tmp_path: Path) ->
     assert (found.right - found.left) / 0.16 == pytest.approx(found.angular)
 
 
-def test_a_map_is_forgotten_with_the_goal_and_looked_at_anew_when_it_moves(tmp_path: Path) -> None:
+def test_a_new_goal_clears_the_map_unlike_a_moved_one(tmp_path: Path) -> None:
     pilot = Pilot.load(exported(tmp_path, 27, memory="map"))
     ahead = Scan(-math.pi / 2, math.pi / 90, np.full(91, 1.0))
     free = Scan(-math.pi / 2, math.pi / 90, np.full(91, math.inf))
@@ -110,20 +110,20 @@ def test_a_map_is_forgotten_with_the_goal_and_looked_at_anew_when_it_moves(tmp_p
     assert pilot.observe(free, *still)[26] == pytest.approx(0.4)
 
 
-def test_a_goal_beyond_the_map_is_refused_as_soon_as_the_map_is_known(tmp_path: Path) -> None:
+def test_a_goal_beyond_a_known_map_is_rejected(tmp_path: Path) -> None:
     pilot = Pilot.load(exported(tmp_path, 27, memory="map"), map_size=10.0)
     free = Scan(-math.pi / 2, math.pi / 90, np.full(91, math.inf))
-    refused = r"goal must be on the map, 10 m \(map_size\) around \(1.00, 0.00\), got "
-    with pytest.raises(ValueError, match=refused + r"\(6.10, 0.00\)"):
+    rejected = r"goal must be on the map, 10 m \(map_size\) around \(1.00, 0.00\), got "
+    with pytest.raises(ValueError, match=rejected + r"\(6.10, 0.00\)"):
         pilot.begin((6.1, 0.0), map_center=(1.0, 0.0))
     assert pilot.goal is None
     pilot.begin((6.1, 0.0))
     for _ in range(2):
-        with pytest.raises(ValueError, match=refused):
+        with pytest.raises(ValueError, match=rejected):
             pilot.decide(free, (1.0, 0.0, 0.0), (0.0, 0.0))
     pilot.begin((5.9, 0.0))
     pilot.decide(free, (1.0, 0.0, 0.0), (0.0, 0.0))
-    with pytest.raises(ValueError, match=refused + r"\(0.00, -5.10\)"):
+    with pytest.raises(ValueError, match=rejected + r"\(0.00, -5.10\)"):
         pilot.move_goal((0.0, -5.1))
     assert pilot.goal == (5.9, 0.0)
     pilot.decide(free, (4.0, 0.0, 0.0), (0.0, 0.0))  # The map stays where it began.
@@ -140,7 +140,7 @@ def own_robot(wheel_base: float, slowest: float) -> RobotModel:
 
 
 @pytest.mark.parametrize("robot", ["turtlebot2", "turtlebot4", "burger", own_robot(0.35, -0.5)])
-def test_no_wheel_is_told_a_speed_that_it_does_not_have(robot: str | RobotModel) -> None:
+def test_no_wheel_exceeds_its_speed_range(robot: str | RobotModel) -> None:
     scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))
     for action in ((-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, -1.0)):
         pilot = Pilot(card(), lambda _, a=action: np.array([a], np.float32), robot=robot)
@@ -151,7 +151,7 @@ def test_no_wheel_is_told_a_speed_that_it_does_not_have(robot: str | RobotModel)
             assert own.min_wheel_speed - spare <= speed <= own.max_wheel_speed + spare
 
 
-def test_a_robot_that_cannot_drive_the_sharpest_arcs_is_refused() -> None:
+def test_a_robot_too_coarse_for_the_sharpest_arcs_is_rejected() -> None:
     message = "a wheel of own would turn at -0.0557 m/s, its min_wheel_speed is 0.0: train a policy"
     with pytest.raises(CardError, match=message):
         Pilot(card(), lambda _: np.zeros((1, 2), np.float32), robot=own_robot(0.35, 0.0))
@@ -201,14 +201,14 @@ def test_a_decision_takes_a_few_milliseconds_at_most(tmp_path: Path) -> None:
         ({"map_size": math.inf}, "map_size must be a finite number, got inf"),
     ],
 )
-def test_what_does_not_fit_the_card_is_refused(
+def test_what_does_not_fit_the_card_is_rejected(
     tmp_path: Path, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         Pilot.load(exported(tmp_path), **options)
 
 
-def test_numbers_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
+def test_bad_numbers_are_rejected_by_name(tmp_path: Path) -> None:
     pilot = Pilot.load(exported(tmp_path))
     scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))
     with pytest.raises(ValueError, match="goal must be given to begin"):
@@ -228,7 +228,7 @@ def test_numbers_that_are_none_are_refused_by_name(tmp_path: Path) -> None:
         broken.decide(scan, *still)
 
 
-def test_a_network_of_another_size_is_refused(tmp_path: Path) -> None:
+def test_a_network_of_another_size_is_rejected(tmp_path: Path) -> None:
     from mpfa_envs.deploy import Network
 
     _, content = read_exported(exported(tmp_path))

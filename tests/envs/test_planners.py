@@ -55,7 +55,7 @@ def places(grid: FreeGrid, count: int, seed: int = 0) -> list[tuple[float, float
 
 @pytest.mark.parametrize("world", ["D", "bars-3", "mazes-3"])
 @pytest.mark.parametrize("name", SEARCHES)
-def test_a_path_is_as_long_as_the_way_of_the_grid(name: str, world: str) -> None:
+def test_a_path_is_as_long_as_that_of_the_grid(name: str, world: str) -> None:
     room = resolve_world(world)
     grid = FreeGrid(room, distance=0.25, resolution=0.2)
     ends = places(grid, 12)
@@ -88,13 +88,13 @@ def test_a_search_leaves_the_graph_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("world", ["A", "B", "D"])
-def test_ants_find_a_way_within_a_tenth_of_the_shortest(world: str) -> None:
+def test_ants_find_a_path_within_a_tenth_of_the_shortest(world: str) -> None:
     grid = FreeGrid(WORLDS[world], distance=0.25, resolution=0.25)
     ends = places(grid, 6, seed=1)
     for start, goal in zip(ends[:3], ends[3:], strict=True):
         path = AntColony(iterations=20)(grid, start, goal)
         assert path is not None
-        # From the nearest cell the way may be longer by the gaps, which the shortest avoids.
+        # From the nearest cell the path may be longer by the gaps, which the shortest avoids.
         assert path_length(grid, path) <= 1.1 * grid.length(start, goal) + grid.resolution
 
 
@@ -112,7 +112,7 @@ def test_ants_learn_from_one_another() -> None:
     assert lengths[0.2] < lengths[0.0]
 
 
-def test_a_way_of_the_ants_has_no_loop_and_is_the_best_of_all_iterations() -> None:
+def test_ants_give_the_best_path_of_all_iterations_without_loops() -> None:
     grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
     starts, neighbors, _ = grid.moves
     number = {tuple(cell): at for at, cell in enumerate(grid.cells.tolist())}
@@ -129,7 +129,7 @@ def test_a_way_of_the_ants_has_no_loop_and_is_the_best_of_all_iterations() -> No
     assert lengths == sorted(lengths, reverse=True)
 
 
-def test_ants_of_a_seed_find_one_way_and_those_of_another_another() -> None:
+def test_a_seed_of_the_ants_decides_their_path() -> None:
     grid = FreeGrid(WORLDS["D"], distance=0.25, resolution=0.25)
     first, again, other = (
         AntColony(ants=4, iterations=2, seed=seed)(grid, (-4.0, -4.0), (4.0, 4.0))
@@ -146,14 +146,14 @@ def test_ants_stop_after_the_iteration_in_which_time_is_up() -> None:
 
 
 @pytest.mark.parametrize("search", [astar_path, dijkstra_path, AntColony(ants=3, iterations=2)])
-def test_without_a_way_there_is_no_path(search: Search) -> None:
+def test_a_blocked_goal_has_no_path(search: Search) -> None:
     divided = FreeGrid(DIVIDED, distance=0.25)
     assert search(divided, (-1.0, 0.0), (1.0, 0.0)) is None
     assert search(FreeGrid(FULL, distance=0.25), (0.0, 0.0), (0.1, 0.0)) is None
 
 
 @pytest.mark.parametrize("search", [astar_path, dijkstra_path, AntColony(ants=3, iterations=2)])
-def test_a_goal_in_the_cell_of_the_start_has_a_path(search: Search) -> None:
+def test_a_goal_in_the_starts_cell_has_a_path(search: Search) -> None:
     path = search(FreeGrid(WORLDS["A"], distance=0.25), (0.01, 0.02), (0.04, 0.03))
     assert path is not None
     assert (path[0], path[-1]) == ((0.01, 0.02), (0.04, 0.03))
@@ -168,7 +168,7 @@ def test_a_goal_in_the_cell_of_the_start_has_a_path(search: Search) -> None:
         ({"time_limit": 0.0}, r"time_limit must be positive, got 0\.0"),
     ],
 )
-def test_a_colony_that_cannot_be_is_refused(arguments: dict[str, float], message: str) -> None:
+def test_bad_colony_arguments_are_rejected(arguments: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         AntColony(**arguments)  # type: ignore[arg-type]
 
@@ -186,7 +186,7 @@ def test_pursuit_drives_on_the_arc_to_the_point_ahead() -> None:
     assert right == pytest.approx(TURTLEBOT.max_wheel_speed)
 
 
-def test_pursuit_goes_on_turning_the_way_that_it_turned_to_a_point_behind() -> None:
+def test_pursuit_keeps_its_side_for_a_point_behind() -> None:
     grid = FreeGrid(WORLDS["A"], distance=0.25)
     for side in (1.0, -1.0):
         pursuit = PurePursuit([(0.0, 0.0), (-3.0, side * 1e-3)], TURTLEBOT, grid)
@@ -226,7 +226,7 @@ def test_the_follower_reaches_goals_on_wheels() -> None:
     assert sum(result.success for result in results) >= 3
 
 
-def test_paths_do_not_depend_on_how_many_robots_drive_at_once() -> None:
+def test_paths_do_not_depend_on_the_number_of_robots() -> None:
     tasks = world_tasks("D", episodes=4) + world_tasks("B", episodes=3)
     arguments = {"physics": "kinematic", "max_steps": 150}
     alone, together = (
@@ -244,7 +244,7 @@ def test_a_planner_keeps_less_where_nothing_keeps_its_clearance() -> None:
     path, grid = MapPlanner(dijkstra_path).plan(gap, (-1.0, 0.0), (1.0, 0.0))
     assert len(path) > 2
     assert grid.distance < 0.25
-    # Where there is no way at all it tries its luck.
+    # Where there is no path at all it tries its luck.
     straight, _ = MapPlanner(dijkstra_path).plan(DIVIDED, (-1.0, 0.0), (1.0, 0.0))
     assert straight == [(-1.0, 0.0), (1.0, 0.0)]
 
@@ -275,7 +275,7 @@ def test_an_action_takes_its_share_of_the_time_of_all(monkeypatch: pytest.Monkey
     assert [(result.plan_s, result.decision_s) for result in results] == [(1.0, 0.25)] * 4
 
 
-def test_a_driver_is_told_of_each_episode_with_its_world_and_task() -> None:
+def test_a_driver_sees_each_episodes_world_and_task() -> None:
     begun: list[tuple[str, tuple[float, float]]] = []
 
     class Told:
@@ -319,8 +319,6 @@ def test_a_policy_is_a_driver_that_sees_the_observation_alone() -> None:
         ("dwa", {"robot": "burgr"}, "robot must be .*did you mean 'burger'"),
     ],
 )
-def test_a_planner_that_there_is_not_is_refused(
-    name: str, arguments: dict[str, str], message: str
-) -> None:
+def test_an_unknown_planner_is_rejected(name: str, arguments: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_planner(name, **arguments)  # type: ignore[arg-type]

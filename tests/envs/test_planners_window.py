@@ -40,7 +40,7 @@ def observation(
 
 
 def with_wall_ahead(seen: np.ndarray, distance: float) -> np.ndarray:
-    """The same with a wall across the way, at a distance from the robot's center [m]."""
+    """The same with a wall across the path, at a distance from the robot's center [m]."""
     angles = np.pi * (0.5 - (np.arange(18) + 0.5) / 18)
     ranges = np.minimum(distance / np.maximum(np.cos(angles), 1e-9), 10.0)
     seen = seen.copy()
@@ -68,7 +68,7 @@ def test_arcs_are_those_that_the_robot_drives() -> None:
             assert gaps[: len(arc) // 2].max() < 0.03
 
 
-def test_wheel_speeds_stay_in_the_window_and_in_what_the_robot_can() -> None:
+def test_wheel_speeds_stay_in_the_window_and_their_range() -> None:
     window = DynamicWindow(acceleration=0.5, decision=0.2)
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -79,7 +79,7 @@ def test_wheel_speeds_stay_in_the_window_and_in_what_the_robot_can() -> None:
         assert min(chosen) >= 0.05 - 1e-6 and max(chosen) <= 0.5 + 1e-6
 
 
-def test_in_the_open_it_drives_straight_at_the_goal_and_turns_to_one_beside_it() -> None:
+def test_in_the_open_it_turns_and_drives_to_the_goal() -> None:
     window = DynamicWindow()
     left, right = speeds(window(observation(goal=(3.0, 0.0), left=0.5, right=0.5)))
     assert left == right == pytest.approx(0.5)
@@ -96,7 +96,7 @@ def test_it_turns_from_a_wall_that_hides_the_goal() -> None:
     assert abs(right - left) > 0.1
 
 
-def test_without_a_free_arc_it_takes_the_one_that_gets_farthest() -> None:
+def test_without_a_free_arc_it_takes_the_longest() -> None:
     window = DynamicWindow()
     seen = observation()
     # Posts all around at 0.35 m: only how far an arc gets tells them apart.
@@ -152,7 +152,7 @@ def test_it_sees_the_observation_and_nothing_else() -> None:
     assert np.array_equal(DynamicWindow()(np.array(seen)[order]), np.array(chosen)[order])
 
 
-def test_with_a_map_it_follows_the_way_and_not_the_goal() -> None:
+def test_with_a_map_it_follows_the_path_to_the_goal() -> None:
     window = DynamicWindow(memory="map")
     seen = np.append(observation(goal=(2.0, 2.0)), [0.6, -0.8, 0.5]).astype(np.float32)
     left, right = speeds(window(seen))
@@ -212,19 +212,19 @@ def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, float], mes
         DynamicWindow(**arguments)  # type: ignore[arg-type]
 
 
-def test_observations_of_another_size_are_refused() -> None:
+def test_observations_of_another_size_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"shape \[..., 24\], got \(27,\)"):
         DynamicWindow()(np.zeros(27, np.float32))
 
 
-def test_observations_that_are_no_numbers_are_refused() -> None:
+def test_observations_that_are_no_numbers_are_rejected() -> None:
     seen = observation()
     seen[3] = np.nan
     with pytest.raises(ValueError, match="observation must be finite"):
         DynamicWindow()(seen)
 
 
-def test_with_few_speeds_and_slow_wheels_the_nearest_speeds_are_kept() -> None:
+def test_few_speeds_of_slow_wheels_include_the_nearest() -> None:
     # The speeds of a wheel are 0.05, 0.2, 0.35 and 0.5 m/s, and none is within 0.02 m/s of it.
     window = DynamicWindow(samples=4, acceleration=0.1)
     chosen = speeds(window(observation(goal=(0.0, 3.0), left=0.3, right=0.25)))

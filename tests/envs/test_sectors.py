@@ -1,4 +1,4 @@
-"""Scans of any kind as sectors: as a plain loop reads them, or refused."""
+"""Scans of any kind as sectors: as a plain loop reads them, or rejected."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_sector_between_two_rays_has_the_nearer_one() -> None:
     assert set(found.tolist()) == set(np.arange(1.0, 14.0).tolist())
 
 
-def test_sectors_out_of_view_are_refused_or_have_the_range_that_one_says() -> None:
+def test_sectors_out_of_view_need_a_given_range() -> None:
     scan = Scan(-math.pi / 3, math.pi / 180, np.full(121, 1.0))
     with pytest.raises(ScanError, match="the scan does not reach the sector at 85 degrees"):
         Sectors(card()).read(scan)
@@ -80,7 +80,7 @@ def test_sectors_out_of_view_are_refused_or_have_the_range_that_one_says() -> No
     assert found[[0, 1, 16, 17]].tolist() == [4.0] * 4 and found[3:15].tolist() == [1.0] * 12
 
 
-def test_sectors_without_a_valid_ray_are_refused_or_free() -> None:
+def test_sectors_without_a_valid_ray_are_rejected_or_free() -> None:
     ranges = np.full(360, 2.0)
     ranges[180:190] = 0.0  # From 0 to 9 degrees, to the left.
     scan = Scan(-math.pi, math.pi / 180, ranges, range_min=0.1)
@@ -92,7 +92,7 @@ def test_sectors_without_a_valid_ray_are_refused_or_free() -> None:
 
 @pytest.mark.parametrize("silent", ["refuse", "far"])
 @pytest.mark.parametrize("near", [0.05, 0.119, -math.inf])
-def test_what_is_too_near_to_be_measured_is_as_near_as_can_be(near: float, silent: str) -> None:
+def test_returns_too_near_to_measure_have_the_least_range(near: float, silent: str) -> None:
     ranges = np.full(360, 2.0)
     ranges[181:188] = near  # From 1 to 7 degrees, to the left; at 8 and 9 there is a wall.
     scan = Scan(-math.pi, math.pi / 180, ranges, range_min=0.12, range_max=3.5)
@@ -102,7 +102,7 @@ def test_what_is_too_near_to_be_measured_is_as_near_as_can_be(near: float, silen
 
 
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (-0.1, 0.05, math.pi / 2)])
-def test_around_the_robot_too_near_is_no_distance_and_silence_is_none(
+def test_around_the_robot_too_near_is_zero_and_silence_nan(
     mount: tuple[float, float, float],
 ) -> None:
     ranges = np.array([1.0, 0.45, 0.3, -math.inf, 0.0, math.nan, -1.0, math.inf, 20.0])
@@ -162,14 +162,14 @@ def test_a_sensor_off_the_center_has_invalid_sectors_as_well(
     ("least", "most"),
     [(0.1, 0.0), (0.1, -1.0), (5.0, 1.0), (-0.1, 8.0), (math.nan, 8.0), (0.1, math.nan)],
 )
-def test_limits_that_would_make_walls_free_are_refused(least: float, most: float) -> None:
+def test_limits_that_would_make_walls_free_are_rejected(least: float, most: float) -> None:
     scan = Scan(-math.pi, math.pi / 180, np.full(360, 0.2), least, most)
     with pytest.raises(ScanError, match=f"range_min must be .* range_max, got {least} and {most}"):
         Sectors(card(), silent="far").read(scan)
 
 
 @pytest.mark.parametrize("broken", [0.0, math.nan, -math.inf])
-def test_a_lidar_that_measures_nothing_valid_is_not_one_that_sees_free_space(broken: float) -> None:
+def test_a_scan_without_valid_rays_is_not_free_space(broken: float) -> None:
     scan = Scan(-math.pi, math.pi / 180, np.full(360, broken), range_min=0.1)
     with pytest.raises(ScanError, match="none of the scan's 360 rays is valid"):
         Sectors(card(), silent="far").read(scan)
@@ -185,6 +185,6 @@ def test_a_lidar_that_measures_nothing_valid_is_not_one_that_sees_free_space(bro
         (Scan(0.0, -1.0, [1.0] * 9), "must go round once at most, got 9 in steps of -1.0 rad"),
     ],
 )
-def test_what_is_no_scan_is_refused(scan: Scan, message: str) -> None:
+def test_bad_scans_are_rejected(scan: Scan, message: str) -> None:
     with pytest.raises(ScanError, match=message):
         Sectors(card()).read(scan)

@@ -55,7 +55,7 @@ def in_the_environment(physics: str, count: int, world: str) -> list[bool]:
     return [result.success for result in results]
 
 
-def test_on_exact_arcs_it_succeeds_where_it_does_in_the_environment(tmp_path: Path) -> None:
+def test_on_exact_arcs_it_succeeds_as_in_the_environment(tmp_path: Path) -> None:
     found = ends(tmp_path, "kinematic", 5, rays=54, world="test")
     assert [end == "arrived" for end in found] == in_the_environment("kinematic", 5, "test")
 
@@ -66,7 +66,7 @@ def test_twenty_drives_on_wheels_succeed_as_in_the_environment(tmp_path: Path) -
     assert [end == "arrived" for end in found] == in_the_environment("wheels", 20, "test")
 
 
-def test_the_simulated_robot_obeys_for_as_long_as_it_is_told() -> None:
+def test_the_simulated_robot_obeys_until_the_timeout() -> None:
     robot = SimulatedRobot("A", physics="kinematic", command_timeout=0.3)
     robot.obey(0.4, 0.5)
     for _ in range(10):
@@ -116,6 +116,6 @@ def test_it_touches_what_it_meets_until_it_is_placed_elsewhere() -> None:
         ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
     ],
 )
-def test_a_robot_that_cannot_be_is_refused(options: dict[str, object], message: str) -> None:
+def test_bad_robot_arguments_are_rejected(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SimulatedRobot("A", **{"physics": "kinematic", **options})  # type: ignore[arg-type]

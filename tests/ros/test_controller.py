@@ -76,7 +76,7 @@ def test_a_clock_that_jumps_back_brings_a_new_decision() -> None:
     assert len(asked) == 2
 
 
-def test_without_a_goal_it_says_nothing_and_after_one_it_stops_once() -> None:
+def test_it_stops_once_after_a_goal_and_then_is_silent() -> None:
     controller, asked = make()
     controller.see(scan(), 10.0)
     controller.feel((0.0, 0.0, 0.0), STILL, 10.0)
@@ -89,7 +89,7 @@ def test_without_a_goal_it_says_nothing_and_after_one_it_stops_once() -> None:
     assert len(asked) == 1
 
 
-def test_at_the_goal_it_stops_once_and_sets_out_for_the_next() -> None:
+def test_at_the_goal_it_stops_once_and_takes_the_next() -> None:
     controller, asked = ready((3.45, 0.2, 0.0))
     controller.tick(10.0)
     controller.feel((3.6, 0.2, 0.0), (0.5, 0.0), 10.1)
@@ -129,7 +129,7 @@ def test_what_comes_from_the_future_is_stale() -> None:
     assert reasons(controller, [10.0]) == ["stale scan: nan s old"]
 
 
-def test_a_scan_a_little_ahead_of_the_clock_is_driven_by() -> None:
+def test_a_scan_slightly_ahead_of_the_clock_is_used() -> None:
     controller, _ = ready()
     controller.see(scan(), 10.1)
     assert reasons(controller, [10.0]) == ["driving"]
@@ -188,7 +188,7 @@ def test_a_wall_is_not_touched_however_late_scans_are(robot: str, every: int, de
     assert wall - x - pilot.robot.radius < 0.1
 
 
-def test_a_scan_that_ages_stops_it_before_what_it_showed_is_reached() -> None:
+def test_an_aging_scan_stops_it_before_the_obstacle() -> None:
     controller, _ = ready(stop_distance=0.05, scan_timeout=5.0, odometry_timeout=5.0)
     controller.see(scan(0.18 + 0.3), 10.0)
     # At 0.5 m/s 0.05 m remain after 0.5 s; the next check would come 0.05 s later.
@@ -203,14 +203,14 @@ def test_a_scan_that_ages_stops_it_before_what_it_showed_is_reached() -> None:
 
 
 @pytest.mark.parametrize("late", [0.0, 0.05, 0.15, 0.2])
-def test_a_late_scan_is_entered_in_the_map_where_it_was_taken(late: float) -> None:
+def test_a_late_scan_enters_the_map_where_it_was_taken(late: float) -> None:
     pytest.importorskip("numba", reason="maps need Numba")
     pilot = Pilot(
         card(memory="map", observation_size=27), lambda seen: np.zeros((1, 2), np.float32)
     )
     entered = []
-    assert pilot._way is not None
-    sense = pilot._way.sense
+    assert pilot._map is not None
+    sense = pilot._map.sense
 
     def noting(pose: Any, goal: Any, points: Any) -> np.ndarray:
         angles = points.angles + pose[2]
@@ -219,10 +219,10 @@ def test_a_late_scan_is_entered_in_the_map_where_it_was_taken(late: float) -> No
         entered.append((x, pose[1] + points.ranges[nearest] * math.sin(angles[nearest])))
         return sense(pose, goal, points)
 
-    pilot._way.sense = noting  # type: ignore[method-assign]
+    pilot._map.sense = noting  # type: ignore[method-assign]
     controller = Controller(pilot)
     controller.aim((9.0, 0.0))
-    # It turns to the left at 2 rad/s, over the direction in which headings begin anew.
+    # It turns to the left at 2 rad/s, over the direction in which headings begin again.
     for step in range(4):
         time = 10.0 + 0.1 * step
         heading = math.remainder(3.0 + 2.0 * (time - 10.0), math.tau)
@@ -328,7 +328,7 @@ def test_a_goal_that_no_observation_holds_is_rejected() -> None:
     assert not asked
 
 
-def test_a_corrected_goal_is_driven_to_and_none_is_not_made_up() -> None:
+def test_a_goal_can_be_corrected_only_if_there_is_one() -> None:
     controller, asked = ready()
     controller.correct_goal((0.0, 4.0))
     controller.tick(10.0)
@@ -365,7 +365,7 @@ def test_an_action_that_is_not_finite_stops_it() -> None:
         ({"check_period": 0.0}, "check_period must be positive, got 0.0"),
     ],
 )
-def test_limits_that_are_none_are_refused(options: dict[str, float], message: str) -> None:
+def test_bad_limits_are_rejected(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(**options)
 

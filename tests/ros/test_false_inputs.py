@@ -105,7 +105,7 @@ def test_it_stops_for_what_is_too_near_for_its_sensor(
     assert loop.controller.pilot.goal is not None
 
 
-def test_a_stop_distance_beyond_the_blind_zone_needs_no_valid_rays() -> None:
+def test_stopping_beyond_the_blind_zone_needs_no_valid_rays() -> None:
     loop = Loop(world=POST)
     loop.controller = Controller(loop.controller.pilot, stop_distance=0.3)
 
@@ -119,7 +119,7 @@ def test_a_stop_distance_beyond_the_blind_zone_needs_no_valid_rays() -> None:
     assert loop.stands and loop.told[-1] == "obstacle"
 
 
-def test_a_ray_that_may_hide_something_is_told_with_what_helps() -> None:
+def test_the_message_of_a_hiding_ray_says_what_helps() -> None:
     loop = Loop()
     order = loop.run(
         0.1, lambda scan, _: scan._replace(range_min=0.45, ranges=[3.0, math.nan] * 180)
@@ -142,7 +142,7 @@ def test_a_scan_that_repeats_itself_stops_it_until_it_changes() -> None:
     assert loop.run(0.2).reason == "driving"
 
 
-def test_a_repeated_scan_counts_from_when_it_came_first_for_what_is_near() -> None:
+def test_a_repeated_scan_counts_from_its_first_time_for_obstacles() -> None:
     loop = Loop(start=(14.0, 0.0, 0.0), goal=(14.9, 0.0))
     loop.controller.pilot.card = card(goal_radius=0.01)
     loop.run(0.8)
@@ -151,7 +151,7 @@ def test_a_repeated_scan_counts_from_when_it_came_first_for_what_is_near() -> No
     assert loop.stands and loop.robot.motion.x < 14.78
 
 
-def test_scans_that_are_alike_because_it_stands_do_not_stop_it() -> None:
+def test_equal_scans_while_standing_do_not_stop_it() -> None:
     standing = [True]
     loop = Loop(lambda seen: ahead(seen) * (-1.0 if standing else 1.0), learned=still_wheels())
     loop.run(3.0)
@@ -161,7 +161,7 @@ def test_scans_that_are_alike_because_it_stands_do_not_stop_it() -> None:
     assert loop.robot.motion.x > -1.0 and set(loop.told) == {"driving"}
 
 
-def test_scans_that_are_alike_because_nothing_is_there_do_not_stop_it() -> None:
+def test_equal_scans_of_free_space_do_not_stop_it() -> None:
     loop = Loop(world=World(name="field", size=(60.0, 60.0)), max_range=10.0)
     loop.run(6.0)
     assert loop.robot.motion.x > 0.9 and set(loop.told) == {"driving"}
@@ -222,7 +222,7 @@ def test_odometry_that_contradicts_the_wheels_gives_up_the_goal(
 
 
 @pytest.mark.parametrize("speeds", [(-1e9, 0.0), (1e9, 0.0), (0.5, -40.0)])
-def test_speeds_that_cannot_be_stop_it_as_long_as_they_are_told(
+def test_impossible_speeds_stop_it_while_they_last(
     speeds: tuple[float, float],
 ) -> None:
     loop = Loop()
@@ -233,7 +233,7 @@ def test_speeds_that_cannot_be_stop_it_as_long_as_they_are_told(
     assert loop.told[-1] == "driving"
 
 
-def test_odometry_of_a_robot_that_is_told_to_turn_or_to_stand_does_not_stand_still() -> None:
+def test_turning_or_standing_on_order_does_not_count_as_stalled() -> None:
     loop = Loop(lambda _: np.array([[-1.0, 1.0]], np.float32), learned=still_wheels(-0.5))
     loop.run(5.0)
     assert set(loop.told) == {"driving"}
@@ -271,7 +271,7 @@ def failing(result: Any) -> Any:
     ],
     ids=["raises", "nothing", "empty", "three", "nan", "inf"],
 )
-def test_a_policy_that_fails_stops_it_for_good_and_is_told_once(result: Any, reason: str) -> None:
+def test_a_failing_policy_stops_it_and_is_reported_once(result: Any, reason: str) -> None:
     loop = Loop(failing(result))
     orders: list[Order] = []
     tick = loop.controller.tick

@@ -31,7 +31,7 @@ def parameters(module: str) -> dict[str, object]:
     raise AssertionError(module)
 
 
-def test_the_launch_file_starts_the_node_with_arguments_that_it_declares() -> None:
+def test_the_launch_file_passes_arguments_that_the_node_declares() -> None:
     root = ElementTree.parse(FOLDER / "launch" / "turtlebot.launch.xml").getroot()
     declared = {each.get("name") for each in root.iter("arg")}
     command = next(root.iter("executable")).get("cmd") or ""
@@ -46,7 +46,7 @@ def test_the_launch_file_starts_the_node_with_arguments_that_it_declares() -> No
 
 
 @pytest.mark.parametrize("file", sorted((FOLDER / "launch").glob("*.yaml")), ids=lambda f: f.stem)
-def test_a_robots_parameters_are_the_nodes_and_fit_the_shipped_policies(file: Path) -> None:
+def test_parameter_files_fit_the_node_and_the_shipped_policies(file: Path) -> None:
     values = yaml.safe_load(file.read_text(encoding="utf-8"))["mpfa_policy"]["ros__parameters"]
     known = parameters("policy_node.py")
     assert {name: type(value) for name, value in values.items()} == {
@@ -65,7 +65,7 @@ def test_parameters_are_addressed_to_the_node_by_its_name() -> None:
         assert set(yaml.safe_load(file.read_text(encoding="utf-8"))) == {name}
 
 
-def test_commands_in_the_docs_name_files_arguments_and_parameters_that_exist() -> None:
+def test_commands_in_the_docs_name_what_exists() -> None:
     root = ElementTree.parse(FOLDER / "launch" / "turtlebot.launch.xml").getroot()
     declared = {each.get("name") for each in root.iter("arg")}
     launches = re.findall(r"ros2 launch (\S+)((?: \w+:=\S+)+)", DOCS)

@@ -113,7 +113,7 @@ def policy(tmp_path: Path) -> Path:
     return export_policy(load_policy(SHIPPED), tmp_path / "policy.onnx")
 
 
-def test_the_policy_node_stops_on_a_stale_scan_and_at_its_end(bench: Bench, policy: Path) -> None:
+def test_the_node_stops_on_stale_scans_and_at_its_end(bench: Bench, policy: Path) -> None:
     scans = bench.node.create_publisher(LaserScan, "scan", qos_profile_sensor_data)
     odometry = bench.node.create_publisher(Odometry, "odom", 10)
     sees = True
@@ -149,7 +149,7 @@ def test_the_policy_node_stops_on_a_stale_scan_and_at_its_end(bench: Bench, poli
 
 
 @pytest.mark.slow
-def test_twenty_drives_on_wheels_in_real_processes_succeed_as_in_the_environment(
+def test_twenty_drives_in_real_processes_succeed_as_in_the_environment(
     bench: Bench, policy: Path
 ) -> None:
     want = evaluate(load_policy(SHIPPED), "test", episodes=20, physics="wheels")

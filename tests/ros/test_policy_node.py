@@ -152,9 +152,7 @@ def test_a_check_that_fails_stops_the_robot_and_is_logged(
     assert feed(node, world, 10.05) == STANDS
 
 
-def test_a_transform_that_grows_old_stops_it_until_there_is_a_new_one(
-    module: Any, world: World
-) -> None:
+def test_an_old_transform_stops_it_until_a_new_one_comes(module: Any, world: World) -> None:
     world.transform = transform(10.0)
     node = driving(module, world, "map")
     assert feed(node, world, 10.9) == DRIVES
@@ -184,7 +182,7 @@ def test_without_stamps_a_transform_ages_from_when_it_last_came(module: Any, wor
 
 
 @pytest.mark.parametrize("frame", ["odom", "map"])
-def test_a_goal_before_the_first_odometry_is_set_out_for_once_it_is_there(
+def test_a_goal_before_the_first_odometry_waits_for_it(
     module: Any, world: World, frame: str
 ) -> None:
     world.transform = transform(10.0)
@@ -237,7 +235,7 @@ def test_a_rate_of_zero_is_rejected(module: Any, world: World) -> None:
         module.PolicyNode()
 
 
-def test_a_goal_that_was_given_up_is_not_taken_up_again(module: Any, world: World) -> None:
+def test_an_abandoned_goal_is_not_taken_up_again(module: Any, world: World) -> None:
     world.transform = transform(10.0)
     node = driving(module, world, "map")
     node._on_odometry(odometry(10.05, x=3.0))

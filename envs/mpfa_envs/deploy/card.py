@@ -44,10 +44,10 @@ class CardError(ValueError):
 
 @dataclass(frozen=True)
 class Card:
-    """What a robot must know of a policy in order to run it.
+    """The facts about a policy that a robot needs in order to run it.
 
     The angles of the lidar's sectors and the scales of the observation are those of
-    :class:`~mpfa_envs.NavigationEnv`; a card with others is refused.
+    :class:`~mpfa_envs.NavigationEnv`; a card with others is rejected.
     """
 
     observation_size: int
@@ -57,13 +57,13 @@ class Card:
     field_of_view: float
     """Angle that the sectors cover, which the robot's front halves [degrees]."""
     reduction: str
-    """What a sector reports of its rays: ``min``, ``median``, or ``single``, the middle one."""
+    """The range of a sector by its rays: ``min``, ``median``, or ``single``, the middle one."""
     max_range: float
-    """What a sector reports that meets nothing [m]."""
+    """Range of a sector that meets nothing [m]."""
     closeness_distance: float
     """A range of this or less has closeness one [m]."""
     memory: str
-    """``map``: it senses the way over a map that it makes; or ``none``."""
+    """``map``: it senses the path over a map that it makes; or ``none``."""
     history: int
     """Earlier scans that it senses."""
     robot: RobotModel
@@ -75,7 +75,7 @@ class Card:
     env_arguments: Mapping[str, Any]
     """Arguments of :class:`~mpfa_envs.NavigationEnv` under which it learned."""
     training: Mapping[str, Any]
-    """How it was trained."""
+    """Facts about its training."""
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Card:
@@ -139,7 +139,7 @@ class Card:
 
 
 def card_file(path: str | os.PathLike[str]) -> Path:
-    """Where the card of an ONNX file lies: beside it, ``policy.json`` for ``policy.onnx``."""
+    """Path of the card of an ONNX file, ``policy.json`` beside ``policy.onnx``."""
     return Path(path).with_suffix(".json")
 
 
@@ -185,11 +185,7 @@ def _read(path: Path, what: str, most: int) -> bytes:
 
 
 def check_finite(name: str, values: Any, size: int) -> tuple[float, ...]:
-    """So many finite numbers.
-
-    Raises:
-        ValueError: If there are more or fewer, or one is not finite.
-    """
+    """Read so many finite numbers."""
     found = tuple(check_number(name, value) for value in values)
     if len(found) != size:
         raise ValueError(f"{name} must be {size} numbers, got {len(found)}")

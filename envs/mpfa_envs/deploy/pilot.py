@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mpfa_envs.deploy.way import Way
+    from mpfa_envs.deploy.map_path import MapPath
 
 _WIDER: Final = 0.01
 """By how much a robot may be wider than that of the training [m]."""
@@ -31,7 +31,7 @@ _BEYOND: Final = 0.02
 
 
 class Command(NamedTuple):
-    """What the robot should do until the next decision."""
+    """Speeds until the next decision."""
 
     left: float
     """Speed of the left wheel [m/s]."""
@@ -55,11 +55,11 @@ class Pilot:
         robot: What drives, a name or a :class:`~mpfa_envs.RobotModel`; None: the robot that the
             policy learned with.
         pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can.
-        mount: Where the lidar is, see :class:`~mpfa_envs.deploy.Sectors`.
+        mount: Position of the lidar, as for :class:`~mpfa_envs.deploy.Sectors`.
         unseen: As there.
         silent: As there.
-        map_size: Side of the map of a policy that has one [m], a square around where the robot is
-            when it begins; the way leads through it alone.
+        map_size: Side of the map of a policy that has one [m], a square around the robot's first
+            position; the path leads through it alone.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -104,7 +104,7 @@ class Pilot:
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
         self._map_size = check_positive("map_size", map_size)
-        self._way = self._make_way(self._map_size)
+        self._map = self._make_map(self._map_size)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
@@ -136,7 +136,7 @@ class Pilot:
 
     @property
     def goal(self) -> tuple[float, float] | None:
-        """Where it drives to (x, y) [m]."""
+        """The goal (x, y) [m]; None without."""
         return self._goal
 
     def begin(
@@ -162,7 +162,7 @@ class Pilot:
         self._goal = None
 
     def move_goal(self, goal: tuple[float, float]) -> None:
-        """Correct the goal on the way: what was seen is still true.
+        """Correct the goal while driving: what was seen is still true.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
@@ -176,8 +176,8 @@ class Pilot:
         if (goal := _pair("goal", goal)) != self._goal:
             self._check_on_map(goal, self._center)
             self._goal = goal
-            if self._way is not None:
-                self._way.look_anew()
+            if self._map is not None:
+                self._map.look_again()
 
     def arrived(self, pose: tuple[float, float, float]) -> bool:
         """Whether a pose is at the goal, as the training counted it."""
@@ -191,7 +191,7 @@ class Pilot:
         *,
         scan_pose: tuple[float, float, float] | None = None,
     ) -> NDArray[np.float32]:
-        """What the policy senses, once for each decision.
+        """Build the policy's observation, once for each decision.
 
         Args:
             scan: What the lidar has measured.
@@ -217,14 +217,14 @@ class Pilot:
         center = self._center or (x, y)
         self._check_on_map(self._goal, center)
         ranges, points = self.sectors.read(scan)
-        way = None
-        if self._way is not None:
+        path = None
+        if self._map is not None:
             if self._fresh:
-                self._way.begin(center)
+                self._map.begin(center)
                 self._center = center
             if taken is not None and taken != (x, y, heading):
                 points = points.seen_from((x, y, heading), taken, card.max_range)
-            way = self._way.sense((x, y, heading), self._goal, points)
+            path = self._map.sense((x, y, heading), self._goal, points)
         robot = card.robot
         observe_all(
             np.array([[x, y, heading, linear / self.pace, angular / self.pace]]),
@@ -235,7 +235,7 @@ class Pilot:
             ranges[None],
             False,
             (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
-            np.zeros((0, 3)) if way is None else way[None],
+            np.zeros((0, 3)) if path is None else path[None],
             card.sectors,
             card.history,
             self._observation,
@@ -251,7 +251,7 @@ class Pilot:
         *,
         scan_pose: tuple[float, float, float] | None = None,
     ) -> Command:
-        """Choose what to do for the next :attr:`period`.
+        """Choose the speeds for the next :attr:`period`.
 
         Args:
             scan: As in :meth:`observe`.
@@ -276,8 +276,8 @@ class Pilot:
         return Command(linear - turn, linear + turn, linear, angular)
 
     def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
-        """Refuse a goal beyond the map, over which ways lead back, once its center is known."""
-        if self._way is None or center is None:
+        """Reject a goal beyond the map, once its center is known."""
+        if self._map is None or center is None:
             return
         if max(abs(goal[0] - center[0]), abs(goal[1] - center[1])) > 0.5 * self._map_size:
             raise ValueError(
@@ -285,15 +285,15 @@ class Pilot:
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
 
-    def _make_way(self, size: float) -> Way | None:
+    def _make_map(self, size: float) -> MapPath | None:
         """The map, if the policy has one; compiled before the first decision is due."""
         if self.card.memory != "map":
             return None
-        from mpfa_envs.deploy.way import Way
+        from mpfa_envs.deploy.map_path import MapPath
 
-        way = Way(self.card, size=size)
-        way.warm_up()
-        return way
+        path = MapPath(self.card, size=size)
+        path.warm_up()
+        return path
 
 
 def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:

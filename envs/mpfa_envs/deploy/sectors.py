@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from mpfa_envs.deploy.card import Card
 
 Silent = Literal["refuse", "far"]
-"""What to make of a sector whose rays have all measured nothing valid."""
+"""Reading of a sector without a valid ray: the scan is rejected, or nothing is there."""
 _EDGE = 1e-4
 """By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
 _NEAR = 0.08
 """Returns up to this beyond the least valid range may be too near for the next scan [m]."""
 _TURNS = 1.05
-"""How often the rays may go round: those of some drivers overlap a little."""
+"""Turns that the rays may cover: those of some drivers overlap a little."""
 
 
 class ScanError(ValueError):
@@ -30,7 +30,7 @@ class ScanError(ValueError):
 
 
 class Scan(NamedTuple):
-    """What a planar lidar has measured, as ``sensor_msgs/LaserScan`` puts it.
+    """The measurements of a planar lidar, as in ``sensor_msgs/LaserScan``.
 
     A range of ``range_max`` or more, infinity too, has met nothing. One between 0 and
     ``range_min``, and minus infinity, has met something nearer than the sensor can measure. Zero,
@@ -55,13 +55,13 @@ class _Rays(NamedTuple):
     directions: NDArray[np.float64]
     """Directions in [-π, π) [rad], ``[R]``."""
     valid: NDArray[np.bool_]
-    """Which of them have told something, ``[R]``."""
+    """Whether they have measured something, ``[R]``."""
     step: float
     """Angle from ray to ray [rad]."""
 
 
 class Points(NamedTuple):
-    """What was measured, around the robot's center."""
+    """Measured points around the robot's center."""
 
     angles: NDArray[np.float64]
     """Directions in the robot's frame, in [-π, π] [rad], ``[P]``."""
@@ -75,7 +75,7 @@ class Points(NamedTuple):
         taken: tuple[float, ...],
         max_range: float,
     ) -> Points:
-        """What was met, around where the robot is now.
+        """Give the points that were met, around the robot's present pose.
 
         Args:
             pose: Where it is (x, y, heading) [m, m, rad].
@@ -104,13 +104,13 @@ class Sectors:
         card: Of the policy.
         mount: Position (x, y) of the sensor and direction of its x axis in the robot's frame
             [m, m, rad].
-        unseen: Range to report for sectors outside of the scan's field of view [m]; None refuses
+        unseen: Range to report for sectors outside of the scan's field of view [m]; None rejects
             such a scan.
-        silent: What to do where no ray of a sector is valid: ``"refuse"`` the scan, or hold that
-            nothing is there, ``"far"``, for a lidar that reports 0 or NaN for it. As such a lidar
+        silent: Reading of a sector without a valid ray: ``"refuse"`` rejects the scan, ``"far"``
+            holds that nothing is there, for a lidar that reports 0 or NaN for it. As such a lidar
             may report the same for what is too near, a return within 0.08 m of ``range_min`` then
-            stays where it was until its ray is valid again. A scan without any valid ray is refused
-            in both.
+            stays where it was until its ray is valid again. A scan without any valid ray is
+            rejected in both.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -237,10 +237,8 @@ class Sectors:
         distances: NDArray[np.float64],
         near: float,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Add the near returns of earlier scans where a lidar has fallen silent since.
-
-        They keep their directions, so that reading a scan twice is reading it once.
-        """
+        """Add near returns of earlier scans where a lidar has fallen silent since."""
+        # They keep their directions, so that reading a scan twice is reading it once.
         held_angles, held = self._near
         if held.size:
             off = np.abs(_wrapped(rays.directions - held_angles[:, None]))

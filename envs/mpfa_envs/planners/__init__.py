@@ -37,7 +37,7 @@ PLANNERS: Final[Mapping[str, str]] = MappingProxyType(
         "dwa": "the dynamic window approach, which sees the observation alone",
     }
 )
-"""What each of the planners is, by name."""
+"""The planners by name, each in a sentence."""
 _COARSE: Final = 0.2
 """Side of the ants' cells [m]: a walk over twice as many steps tells them little more."""
 
@@ -54,7 +54,7 @@ def make_planner(
     Args:
         name: One of :data:`PLANNERS`.
         robot: What drives.
-        memory: Of the dynamic window: whether it sees the way on the robot's map.
+        memory: Of the dynamic window: whether it sees the path on the robot's map.
         seed: Of the ant colony.
 
     Returns:

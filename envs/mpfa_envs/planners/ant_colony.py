@@ -1,4 +1,4 @@
-"""An ant colony that looks for a short way on the grid of a known world."""
+"""An ant colony that searches for a short path on the grid of a known world."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class AntColony:
     :math:`\tau_{ij}\,\eta_{ij}^{\beta}`, where :math:`\tau` is the pheromone of the move and
     :math:`\eta_{ij} = e^{-(l_{ij} + h_j - h_i) / r}` falls with the detour of the move, of length
     :math:`l`: :math:`h` is the straight line to the goal, :math:`r` the side of a cell. An ant
-    without such a neighbor goes back the way it came, so that each one arrives if there is a way.
-    Loops are cut off its way wherever a later cell is next to an earlier one. Then the pheromone
-    :math:`\tau \leftarrow (1 - \rho)\,\tau` evaporates and the shortest way so far, in every other
+    without such a neighbor goes back the way it came, so that each one arrives if there is a path.
+    Loops are cut off its path wherever a later cell is next to an earlier one. Then the pheromone
+    :math:`\tau \leftarrow (1 - \rho)\,\tau` evaporates and the shortest path so far, in every other
     iteration the shortest of the iteration, gets :math:`\rho` on each of its moves; it stays
     between a least value and one. That is the max-min ant system of Stützle and Hoos (2000,
     https://doi.org/10.1016/S0167-739X(00)00043-1) on a grid, with moves taken back.
@@ -43,9 +43,9 @@ class AntColony:
         ants: Number of ants.
         iterations: Number of iterations.
         evaporation: Share ρ of the pheromone that evaporates in an iteration.
-        greed: Exponent β of the way ahead.
+        greed: Exponent β of the path ahead.
         least_pheromone: What a move keeps, of at most one.
-        seed: Seed of the ants' choices; the same way is found each time.
+        seed: Seed of the ants' choices; the same path is found each time.
         time_limit: No iteration begins later than this [s]. It is a guard: a search that it ends
             depends on the speed of the machine.
 
@@ -81,7 +81,7 @@ class AntColony:
         self.time_limit = check_positive("time_limit", time_limit)
 
     def __call__(self, grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-        """Find a way, see :class:`~mpfa_envs.planners.Search`."""
+        """Find a path, as a :class:`~mpfa_envs.planners.Search`."""
         ends = time.perf_counter() + self.time_limit
         if not grid.free.any():
             return None
@@ -94,10 +94,10 @@ class AntColony:
         pheromone = np.ones_like(lengths)
         best: tuple[float, list[int]] = math.inf, []
         for iteration in range(self.iterations):
-            ways = self._walk(neighbors, pheromone * visibility, first, last, rng)
-            if not ways:
+            paths = self._walk(neighbors, pheromone * visibility, first, last, rng)
+            if not paths:
                 return None
-            measured = [_measured(_without_loops(way, neighbors), grid) for way in ways]
+            measured = [_measured(_without_loops(path, neighbors), grid) for path in paths]
             found = min(measured)
             best = min(best, found)
             pheromone *= 1.0 - self.evaporation
@@ -115,7 +115,7 @@ class AntColony:
         last: int,
         rng: np.random.Generator,
     ) -> list[list[int]]:
-        """Let the ants walk; the ways of those that arrive, without what they took back."""
+        """Let the ants walk; the paths of those that arrive, without what they took back."""
         count, ants = len(neighbors), self.ants
         # One more cell, where no ant may go, stands for the neighbors that a cell lacks.
         visited = np.zeros((ants, count + 1), dtype=np.bool_)
@@ -140,17 +140,17 @@ class AntColony:
             going = walking[moves]
             stacks[going, depths[going]] = to[moves]
             visited[going, to[moves]] = True
-            # Back at the start with nowhere to go, there is no way.
+            # Back at the start with nowhere to go, there is no path.
             lost = depths[walking] < 0
             walking = walking[~lost & ~(moves & (to == last))]
         arrived = np.flatnonzero((depths >= 0) & (stacks[np.arange(ants), depths] == last))
         return [stacks[ant, : depths[ant] + 1].tolist() for ant in arrived]
 
     def _mark(
-        self, pheromone: NDArray[np.float64], neighbors: NDArray[np.int64], way: list[int]
+        self, pheromone: NDArray[np.float64], neighbors: NDArray[np.int64], path: list[int]
     ) -> None:
-        """Put pheromone on the moves of a way."""
-        cells, following = np.array(way[:-1], dtype=np.int64), np.array(way[1:], dtype=np.int64)
+        """Put pheromone on the moves of a path."""
+        cells, following = np.array(path[:-1], dtype=np.int64), np.array(path[1:], dtype=np.int64)
         pheromone[cells, (neighbors[cells] == following[:, None]).argmax(axis=1)] += (
             self.evaporation
         )
@@ -166,10 +166,8 @@ def _positions(grid: FreeGrid) -> NDArray[np.float64]:
 
 
 def _moves_of_cells(grid: FreeGrid) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Neighbors of each cell and lengths of the moves [m], ``[cells, 16]``.
-
-    A neighbor that a cell lacks has the number of cells as its number, infinitely far away.
-    """
+    """Neighbors of each cell and lengths of the moves [m], ``[cells, 16]``."""
+    # A neighbor that a cell lacks has the number of cells as its number, infinitely far away.
     starts, neighbors, lengths = grid.moves
     count = len(starts) - 1
     rows = np.repeat(np.arange(count), np.diff(starts))
@@ -181,17 +179,17 @@ def _moves_of_cells(grid: FreeGrid) -> tuple[NDArray[np.int64], NDArray[np.float
     return numbers, steps
 
 
-def _without_loops(way: list[int], neighbors: NDArray[np.int64]) -> list[int]:
-    """Go from each cell of a way straight to the last of its cells that is a neighbor."""
-    place = {cell: number for number, cell in enumerate(way)}
-    short, at = [way[0]], 0
-    while at < len(way) - 1:
-        at = max(place.get(cell, 0) for cell in neighbors[way[at]].tolist())
-        short.append(way[at])
+def _without_loops(path: list[int], neighbors: NDArray[np.int64]) -> list[int]:
+    """Go from each cell of a path straight to the last of its cells that is a neighbor."""
+    place = {cell: number for number, cell in enumerate(path)}
+    short, at = [path[0]], 0
+    while at < len(path) - 1:
+        at = max(place.get(cell, 0) for cell in neighbors[path[at]].tolist())
+        short.append(path[at])
     return short
 
 
-def _measured(way: list[int], grid: FreeGrid) -> tuple[float, list[int]]:
-    """Length of a way [m], and the way."""
-    steps = np.diff(_positions(grid)[way], axis=0)
-    return float(np.hypot(*steps.T).sum()), way
+def _measured(path: list[int], grid: FreeGrid) -> tuple[float, list[int]]:
+    """Length of a path [m], and the path."""
+    steps = np.diff(_positions(grid)[path], axis=0)
+    return float(np.hypot(*steps.T).sum()), path

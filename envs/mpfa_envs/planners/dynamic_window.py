@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 _STEP: Final = 0.1
 """Distance of the places on an arc that are looked at [m]."""
-_WAY: Final = 1.0
-"""How far away a way is followed at most [m]: its direction is known for little more."""
+_ALONG: Final = 1.0
+"""Greatest distance for which a path is followed [m]: its direction is known for little more."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WindowScore:
-    """What an arc is judged by: weights of terms in [0, 1], and where these end.
+    """Weights of the terms of an arc's score, each in [0, 1], and their ends.
 
-    Chosen on validation worlds, see ``docs/planners.md``.
+    Chosen on validation worlds.
     """
 
     heading: float = 1.0
-    """Weight of driving towards the goal, or along the way on the robot's map."""
+    """Weight of driving towards the goal, or along the path on the robot's map."""
     clearance: float = 0.15
     """Weight of the distance from what the lidar meets."""
     speed: float = 0.1
@@ -60,7 +60,7 @@ class DynamicWindow:
     turn round.
 
     The lidar looks ahead and nothing is remembered: it does not leave a pocket. With
-    ``memory="map"`` the heading is that of the way on the robot's map, which leads out.
+    ``memory="map"`` the heading is that of the path on the robot's map, which leads out.
 
     Args:
         robot: Whose wheels are driven.
@@ -209,11 +209,11 @@ class DynamicWindow:
         return np.sqrt(squares.min(axis=2)) - self.robot.radius
 
     def _heading(self, row: NDArray[np.float64], arcs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How much nearer to its target each arc comes, from 0 to 1, ``[K]``."""
+        """Approach of each arc to its target, from 0 to 1, ``[K]``."""
         parts = self._parts
         if self.memory == "map":
             direction = row[parts["way_direction"]]
-            distance = min(float(row[parts["way_length"]][0]) * DISTANCE_SCALE, _WAY)
+            distance = min(float(row[parts["way_length"]][0]) * DISTANCE_SCALE, _ALONG)
         else:
             direction = row[parts["goal_direction"]]
             distance = float(row[parts["goal_distance"]][0]) * DISTANCE_SCALE

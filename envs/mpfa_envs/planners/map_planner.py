@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 _LEAST_CLEARANCE: Final = 0.02
-"""What a path keeps where there is none with the wanted clearance [m]."""
+"""Clearance of a path where there is none with the wanted one [m]."""
 _FINE: Final = 0.05
 """Side of a cell of the grid that is made then [m]."""
 
@@ -94,8 +94,8 @@ class MapPlanner:
 
         Args:
             env: Whose poses are read.
-            robots: Numbers of the N robots that are under way.
-            observations: What they sense, ``[N, O]``; not read.
+            robots: Numbers of the N robots whose episodes are running.
+            observations: Their observations, ``[N, O]``; not read.
 
         Returns:
             Actions, ``[N, 2]``.

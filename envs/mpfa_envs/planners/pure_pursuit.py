@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 _SPACING: Final = 0.05
 """Distance of the points that a path is made of [m]."""
 _WINDOW: Final = 2.0
-"""How far ahead on the path the robot's place is looked for [m]."""
+"""Length of the path ahead that is searched for the robot's place [m]."""
 _BESIDE: Final = math.radians(60.0)
 """A point farther to the side than this is turned to on the tightest circle [rad]."""
 _BEHIND: Final = math.radians(120.0)
 """A point farther to the side than this is behind the robot [rad]."""
 _RIM: Final = 0.03
-"""What the robot's rim keeps from obstacles if it can [m]."""
+"""Clearance that the robot's rim keeps if it can [m]."""
 _ARC: Final = 0.5
 """Length of the arcs that are looked at [m]."""
 _CURVATURES: Final = 41
@@ -139,10 +139,7 @@ class PurePursuit:
         return self._side * self._tightest
 
     def _nearest_free(self, x: float, y: float, heading: float, wanted: float) -> float:
-        """The curvature nearest to the wanted one whose arc is free [1/m].
-
-        If none is, that of the arc that is free for longest.
-        """
+        """The curvature nearest to the wanted one whose arc is free [1/m], or free for longest."""
         cosine, sine = math.cos(heading), math.sin(heading)
         across, up = self._arcs[..., 0], self._arcs[..., 1]
         rooms = self._clearances(x + across * cosine - up * sine, y + across * sine + up * cosine)

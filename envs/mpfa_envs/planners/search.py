@@ -1,4 +1,4 @@
-"""Shortest ways on the grid of a known world, by two libraries' graph searches."""
+"""Shortest paths on the grid of a known world, by two libraries' graph searches."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _GOAL: Final = -2
 
 
 class Search(Protocol):
-    """Finds a way between two positions over the free cells of a grid."""
+    """Finds a path between two positions over the free cells of a grid."""
 
     def __call__(self, grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-        """Find a way.
+        """Find a path.
 
         Args:
             grid: The grid.
@@ -36,12 +36,12 @@ class Search(Protocol):
 
         Returns:
             Positions from the start to the goal, with centers of cells between them [m]; None if
-            there is no way.
+            there is no path.
         """
 
 
 def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-    """Find a shortest way with SciPy's Dijkstra, see :class:`Search`.
+    """Find a shortest path with SciPy's Dijkstra, as a :class:`Search`.
 
     Examples:
         >>> from mpfa_envs import WORLDS, FreeGrid
@@ -55,7 +55,7 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
         return None
     graph = grid.graph_to(goal)
     last = graph.shape[0] - 1
-    # From the goal, as every move leads both ways; what is before a cell is next on its way.
+    # From the goal, as every move leads both ways; what is before a cell is next on its path.
     lengths, following = dijkstra(graph, indices=[last], return_predecessors=True)
     length, cell = min((lengths[0, cell] + gap, cell) for cell, gap in grid.cells_around(start))
     if math.isinf(length):
@@ -68,10 +68,10 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
 
 
 def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-    """Find a shortest way with NetworkX's A*, see :class:`Search`.
+    """Find a shortest path with NetworkX's A*, as a :class:`Search`.
 
-    What is left of a way is estimated by the straight line, measured as short as moves are: it is
-    never overestimated, so that the way is a shortest one.
+    The rest of a path is estimated by the straight line, measured as short as moves are: it is
+    never overestimated, so that the path is a shortest one.
 
     Examples:
         >>> from mpfa_envs import WORLDS, FreeGrid
@@ -127,7 +127,7 @@ def centers(grid: FreeGrid, cells: list[int]) -> list[Point]:
 
 
 def path_length(grid: FreeGrid, path: list[Point]) -> float:
-    """Measure a way as :meth:`~mpfa_envs.FreeGrid.length` does.
+    """Measure a path as :meth:`~mpfa_envs.FreeGrid.length` does.
 
     Args:
         grid: The grid.

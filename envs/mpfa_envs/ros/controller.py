@@ -1,4 +1,13 @@
-"""What the policy's node does: when it decides, and when it stops."""
+"""The decisions and the stops of the policy's node.
+
+The robot stands still, and says so, while there is no goal, scan or odometry, while one of the two
+is older than it may be (or from the future), while something where it drives is nearer to its rim
+than the stop distance, or will be before the next check, and whenever a number cannot be true or a
+scan does not tell enough. A scan that repeats itself while the robot moves grows older. The goal
+stays, and the robot drives on once the reason is gone. Odometry that jumps or stands still gives up
+the goal, whose place is then unknown, and so does a policy that fails. Without a goal the node
+publishes one stop and then nothing, so that others may drive.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +26,7 @@ _EARLY: Final = 0.2
 
 
 class Order(NamedTuple):
-    """What to publish."""
+    """The speeds to publish."""
 
     linear: float
     """Forward speed [m/s]."""
@@ -28,35 +37,16 @@ class Order(NamedTuple):
 
 
 class Controller:
-    """Drives to a goal by an exported policy, and stops where it should not.
-
-    It stands still, and says so, while there is no goal, scan or odometry, while one of the two is
-    older than it may be (or from the future), while something where it drives is nearer to the
-    robot's rim than the stop distance, or will be before the next check, and whenever a number
-    cannot be true or a scan does not tell enough. A scan that repeats itself while the robot moves
-    grows older. The goal stays, and it drives on once the reason is gone. Odometry that jumps or
-    stands still gives up the goal, whose place is then unknown, and so does a policy that fails.
-    Without a goal it publishes one stop and then nothing, so that others may drive.
-
-    Args:
-        pilot: The policy.
-        stop_distance: Clearance of the robot's rim at or below which it stops [m].
-        scan_timeout: Oldest scan that it drives by [s].
-        odometry_timeout: Oldest odometry [s].
-        check_period: Longest time from one :meth:`tick` to the next [s].
-
-    Raises:
-        ValueError: If an argument is out of its range.
-    """
+    """Drives to a goal by an exported policy, and stops where it should not."""
 
     def __init__(
         self,
         pilot: Pilot,
         *,
-        stop_distance: float = 0.05,
-        scan_timeout: float = 0.5,
-        odometry_timeout: float = 0.5,
-        check_period: float = 0.05,
+        stop_distance: float = 0.05,  # clearance of the rim at or below which it stops [m]
+        scan_timeout: float = 0.5,  # oldest scan that it drives by [s]
+        odometry_timeout: float = 0.5,  # [s]
+        check_period: float = 0.05,  # longest time from one tick() to the next [s]
     ) -> None:
         if check_number("stop_distance", stop_distance) < 0.0:
             raise ValueError(f"stop_distance must not be negative, got {stop_distance}")
@@ -75,39 +65,19 @@ class Controller:
         self._told = True
 
     def see(self, scan: Scan, time: float) -> None:
-        """Take a scan.
-
-        Args:
-            scan: What the lidar has measured.
-            time: When [s].
-        """
+        """Take a scan of some time [s]."""
         self._sight.take(scan, time, self._track)
 
     def feel(
         self, pose: tuple[float, float, float], speeds: tuple[float, float], time: float
     ) -> None:
-        """Take odometry.
-
-        Args:
-            pose: Of the robot (x, y, heading) [m, m, rad].
-            speeds: Forward and turning speed [m/s, rad/s].
-            time: When [s].
-
-        Poses farther apart than the robot drives give up the goal, ``odometry jumped``, and so does
-        a pose that stays when the robot is told to drive, ``odometry stands still``.
-        """
+        """Take odometry: pose (x, y, heading), forward and turning speed, time [m, rad, s]."""
         lost = self._track.take(Felt(pose, speeds, time), self._ordered)
         if lost and self.pilot.goal is not None:
             self.aim(None, lost)
 
     def aim(self, goal: tuple[float, float] | None, reason: str = "no goal") -> None:
-        """Set out for a goal, or give up the one there is.
-
-        Args:
-            goal: Position (x, y) in the frame of the odometry [m]; None: stand still. One that the
-                pilot rejects gives up the goal, too.
-            reason: Why there is none.
-        """
+        """Set out for a goal (x, y) in the odometry's frame [m], or stop for a reason."""
         self._command, self._told = None, False
         self._idle, self._held = reason, ""
         # Where the goal is, is meant by the odometry from now on.
@@ -121,11 +91,7 @@ class Controller:
                 self._idle = str(error)
 
     def correct_goal(self, goal: tuple[float, float]) -> None:
-        """The goal in the frame of the odometry, which has drifted; NaN gives up the goal.
-
-        Args:
-            goal: Position (x, y) [m].
-        """
+        """The goal in the frame of the odometry, which has drifted; NaN gives up the goal."""
         if self.pilot.goal is not None:
             try:
                 self.pilot.move_goal(goal)
@@ -133,28 +99,17 @@ class Controller:
                 self.aim(None, str(error))
 
     def hold(self, reason: str) -> None:
-        """Stand still for a reason that is known elsewhere, until told that it is gone.
-
-        Args:
-            reason: Why; empty: no longer. A new goal is not held.
-        """
+        """Stand still for a reason known elsewhere, until it is empty or the goal is new."""
         self._held = reason
 
     def tick(self, now: float) -> Order | None:
-        """Say what to publish now; to be asked at each scan, and some times a second besides.
-
-        Args:
-            now: The time, of the clock that scans and odometry are stamped by [s].
-
-        Returns:
-            What to publish; None: nothing.
-        """
+        """What to publish now, at a time [s], if anything; to be called some times a second."""
         order = self._choose(now)
         self._ordered = 0.0 if order is None else order.linear
         return order
 
     def _choose(self, now: float) -> Order | None:
-        """What to publish; None: nothing."""
+        """The order of a moment [s]; None: nothing to publish."""
         if self.pilot.goal is None:
             if self._told:
                 return None

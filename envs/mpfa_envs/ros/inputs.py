@@ -19,9 +19,9 @@ Pose = tuple[float, float, float]
 _AHEAD: Final = 0.15
 """By how much a stamp may be ahead of the clock [s]: simulated clocks tick some tenths late."""
 _MEMORY: Final = 1.0
-"""How long odometry is remembered [s]; a longer timeout of scans keeps it as long as that."""
+"""Time for which odometry is kept [s], unless the timeout of scans is longer."""
 _SLACK: Final = 0.2, 0.5
-"""How far a pose may move and turn besides what the robot drives [m, rad], as where wheels slip."""
+"""Slack of a pose's motion and turn over what the robot drives [m, rad], as where wheels slip."""
 _MOVED: Final = 0.05, 0.1
 """A robot that has come this far, or has turned by this, sees something else [m, rad]."""
 _LAG: Final = 0.25
@@ -29,7 +29,7 @@ _LAG: Final = 0.25
 _PUSHED: Final = 0.5
 """Of how far a robot is told to drive, it has moved before this [m]."""
 _GAP: Final = 0.5
-"""What a longer time between two odometries counts as [s]."""
+"""Longest time between two odometries that counts [s]."""
 
 
 class Seen(NamedTuple):
@@ -57,15 +57,7 @@ class Felt(NamedTuple):
 
 
 class Sight:
-    """The last scan.
-
-    A scan whose every number is that of the scan before is that scan again once the robot has
-    moved: it ages. Where nothing is in reach, scans are alike.
-
-    Args:
-        pilot: Whose lidar and robot these are.
-        stop_distance: Clearance of the robot's rim at or below which it stops [m].
-    """
+    """The last scan, and whether it repeats the one before."""
 
     def __init__(self, pilot: Pilot, stop_distance: float) -> None:
         self._sectors = pilot.sectors
@@ -108,6 +100,7 @@ class Sight:
 
     def _repeats(self, scan: Scan, time: float, points: Points, track: Track) -> bool:
         """Whether the robot has moved since the first scan with these numbers."""
+        # Where nothing is in reach, scans are alike.
         # A copy: who reuses an array does not repeat a scan.
         ranges = np.array(scan.ranges, dtype=np.float64)
         met = bool((points.ranges < self._sectors.card.max_range).any())
@@ -119,10 +112,8 @@ class Sight:
         return track.last is not None and _moved(self._from, track.last.pose)
 
     def _hidden(self, scan: Scan) -> str:
-        """Why a ray in front that is not valid cannot be driven by; empty if it can.
-
-        It may be what is too near. That matters where the robot does not stop before that.
-        """
+        """Why a ray in front that is not valid cannot be driven by; empty if it can."""
+        # It may be too near to measure, which matters where the robot does not stop before that.
         x, y, _ = self._sectors.mount
         blind = scan.range_min + math.hypot(max(x, 0.0), y)
         if blind <= self._free:
@@ -134,12 +125,7 @@ class Sight:
 
 
 class Track:
-    """The odometry of the last second.
-
-    Args:
-        robot: Whose wheels it is about.
-        memory: For how long to remember it at least [s].
-    """
+    """The odometry of the last second, or of ``memory`` if that is longer [s]."""
 
     def __init__(self, robot: RobotModel, memory: float) -> None:
         # Twice what the wheels can, turning on the spot.
@@ -153,11 +139,7 @@ class Track:
         """Of numbers that are finite."""
 
     def take(self, felt: Felt, ordered: float) -> str:
-        """Take odometry, and the forward speed that was ordered last [m/s].
-
-        Returns:
-            Why its poses are not to be trusted any more; empty if they are.
-        """
+        """Take odometry and the last order [m/s]; tell why its poses cannot be trusted."""
         self._finite = all(map(math.isfinite, (*felt.pose, *felt.speeds, felt.time)))
         if not self._finite:
             return ""
@@ -230,7 +212,7 @@ class Track:
         return abs(turned) > self._limits[1] * passed + _SLACK[1]
 
     def _jump(self, felt: Felt, past: tuple[Felt, ...]) -> str:
-        """How it has come farther than the wheels do since one of some poses; empty if not."""
+        """The jump of a pose that the wheels cannot make since earlier ones; empty without."""
         for each in past:
             moved, turned = math.dist(felt.pose[:2], each.pose[:2]), felt.pose[2] - each.pose[2]
             passed = max(felt.time - each.time, 0.0)
@@ -241,7 +223,7 @@ class Track:
         return ""
 
     def _stall(self, felt: Felt, ordered: float) -> str:
-        """How far it was told to drive while it stood; empty if it does as it is told."""
+        """The distance ordered while it stood; empty if it moves as it is told."""
         self._pushed += abs(ordered) * min(max(felt.time - self._past[-1].time, 0.0), _GAP)
         if not ordered or self._from is None or _moved(self._from, felt.pose):
             self._pushed, self._from = 0.0, felt.pose

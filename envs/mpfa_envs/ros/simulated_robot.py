@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Motion(NamedTuple):
-    """Where a robot is and how it moves."""
+    """Pose and speeds of a robot."""
 
     x: float
     """Position [m]."""
@@ -38,33 +38,7 @@ class Motion(NamedTuple):
 
 
 class SimulatedRobot:
-    """What drives in :class:`~mpfa_envs.NavigationEnv`, seen as robots are: speeds in, scans out.
-
-    Args:
-        world: Where it is, as there.
-        robot: As there.
-        physics: As there.
-        time_step: Duration of a step [s].
-        rays: Rays of its lidar, equal parts of the field.
-        field: Directions of the first and of the last ray [rad].
-        max_range: A ray that meets nothing within this distance reports infinity [m].
-        noise: Standard deviation of the ranges [m].
-        command_timeout: It stands still when it was told nothing for so long [s].
-        seed: Of the noise.
-
-    Raises:
-        ImportError: If there is no PyBullet and physics is ``"wheels"``.
-        ValueError: If an argument is out of its range.
-
-    Examples:
-        >>> from mpfa_envs.ros.simulated_robot import SimulatedRobot
-        >>> robot = SimulatedRobot("A", physics="kinematic")
-        >>> robot.place((0.0, 0.0, 0.0))
-        >>> robot.obey(0.5, 0.0)
-        >>> robot.step()
-        >>> robot.motion.x, len(robot.scan().ranges)
-        (0.05, 360)
-    """
+    """The robot of the environments, driven as real robots are: speeds in, scans out."""
 
     def __init__(
         self,
@@ -74,10 +48,10 @@ class SimulatedRobot:
         physics: Physics = "wheels",
         time_step: float = 0.1,
         rays: int = 360,
-        field: tuple[float, float] = (-math.pi, math.pi - math.tau / 360),
-        max_range: float = 10.0,
-        noise: float = 0.0,
-        command_timeout: float = 0.5,
+        field: tuple[float, float] = (-math.pi, math.pi - math.tau / 360),  # of the rays [rad]
+        max_range: float = 10.0,  # beyond, a ray reports infinity [m]
+        noise: float = 0.0,  # of the ranges [m]
+        command_timeout: float = 0.5,  # stands still without orders for so long [s]
         seed: int = 0,
     ) -> None:
         self.world = resolve_world(world)
@@ -107,14 +81,7 @@ class SimulatedRobot:
         self.place((0.0, 0.0, 0.0))
 
     def place(self, start: tuple[float, float, float]) -> None:
-        """Put it at rest somewhere else.
-
-        Args:
-            start: Pose (x, y, heading) [m, m, rad].
-
-        Raises:
-            ValueError: If it is not finite.
-        """
+        """Put it at rest at a pose (x, y, heading) [m, m, rad]."""
         x, y, heading = check_finite("start", start, 3)
         heading = math.remainder(heading, math.tau)
         self._drives.place(0, x, y, heading)
@@ -126,17 +93,11 @@ class SimulatedRobot:
 
     @property
     def motion(self) -> Motion:
-        """Where it is and how it moves."""
+        """Its pose and speeds."""
         return Motion(*self._motions[0].tolist())
 
     def obey(self, linear: float, angular: float) -> None:
-        """Take speeds of the body, which hold until others come, or none for a while.
-
-        Args:
-            linear: Forward [m/s].
-            angular: Turning to the left [rad/s]. Wheels that would be too fast are as fast as they
-                can; a speed that is not finite is zero.
-        """
+        """Take speeds of the body, forward and to the left [m/s, rad/s], to hold for a while."""
         told = linear, angular
         self._told = told if all(map(math.isfinite, told)) else (0.0, 0.0)
         self._told_at = self.time
@@ -156,7 +117,7 @@ class SimulatedRobot:
         self.touched = self.touched or clearance <= self.robot.radius
 
     def scan(self) -> Scan:
-        """What the lidar, at the robot's center, measures."""
+        """Measure with the lidar at the robot's center."""
         x, y, heading, *_ = self.motion
         (first, last), far = self._field, self._lidar.max_range
         heading += 0.5 * (first + last)

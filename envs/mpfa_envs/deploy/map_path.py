@@ -1,4 +1,4 @@
-"""The map that a robot makes and the way over it, for policies that sense one; needs Numba."""
+"""The map that a robot makes and the path over it, for policies that sense one; needs Numba."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class _Rays:
-    """What :class:`~mpfa_envs.MapMemory` needs of a lidar whose rays change from scan to scan."""
+    """Rays for :class:`~mpfa_envs.MapMemory` that change from scan to scan."""
 
     def __init__(self, max_range: float) -> None:
         self.angles = np.zeros(1)
@@ -26,22 +26,14 @@ class _Rays:
 
 
 class _Square:
-    """What it needs of a world."""
+    """A room for it of which only the size is known."""
 
     def __init__(self, side: float) -> None:
         self.size = side, side
 
 
-class Way:
-    """A map around a place, empty at first.
-
-    Args:
-        card: Of the policy.
-        size: Side of the map, a square [m].
-
-    Raises:
-        ImportError: If there is no Numba.
-    """
+class MapPath:
+    """A square map around a place, of a side [m], and the path over it to the goal."""
 
     def __init__(self, card: Card, *, size: float) -> None:
         # Without it the loops over the map would run, a thousand times too slowly.
@@ -61,27 +53,18 @@ class Way:
         self.begin((0.0, 0.0))
         self.sense((0.0, 0.0, 0.0), (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
 
-    def look_anew(self) -> None:
-        """The goal has moved: no way to it is known."""
+    def look_again(self) -> None:
+        """The goal has moved: no path to it is known."""
         self._memory.arrays.costs[0] = UNKNOWN
 
     def sense(
         self, pose: tuple[float, float, float], goal: tuple[float, float], points: Points
     ) -> NDArray[np.float64]:
-        """Enter what was met, and find the way.
-
-        Args:
-            pose: Of the robot (x, y, heading) [m, m, rad].
-            goal: Where it should go (x, y) [m].
-            points: What the lidar has met.
-
-        Returns:
-            Direction (x, y) in the robot's frame and length of the way [m], ``[3]``.
-        """
+        """Enter points; direction (x, y) in the robot's frame and length of the path, ``[3]``."""
         motion = np.zeros((1, 5))
         motion[0, :2], motion[0, 2] = np.subtract(pose[:2], self._center), pose[2]
         goals = np.subtract(goal, self._center)[None]
         directions = np.stack((np.cos(points.angles), np.sin(points.angles)))
-        ways = self._memory.remember(motion, goals, points.ranges[None], directions=directions)
-        found: NDArray[np.float64] = ways[0]
+        paths = self._memory.remember(motion, goals, points.ranges[None], directions=directions)
+        found: NDArray[np.float64] = paths[0]
         return found
