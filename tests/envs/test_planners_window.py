@@ -212,15 +212,15 @@ def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, float], mes
         DynamicWindow(**arguments)  # type: ignore[arg-type]
 
 
-def test_observations_of_another_size_are_rejected() -> None:
-    with pytest.raises(ValueError, match=r"shape \[..., 24\], got \(27,\)"):
-        DynamicWindow()(np.zeros(27, np.float32))
-
-
-def test_observations_that_are_no_numbers_are_rejected() -> None:
-    seen = observation()
-    seen[3] = np.nan
-    with pytest.raises(ValueError, match="observation must be finite"):
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        (np.zeros(27, np.float32), r"shape \[..., 24\], got \(27,\)"),
+        (np.full(24, np.nan, np.float32), "observation must be finite"),
+    ],
+)
+def test_bad_observations_are_rejected(seen: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DynamicWindow()(seen)
 
 

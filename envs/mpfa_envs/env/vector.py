@@ -1,4 +1,4 @@
-"""The navigation task for many robots at once, each in a world of its own."""
+"""The navigation task for many robots at once, each in its own world."""
 
 from __future__ import annotations
 

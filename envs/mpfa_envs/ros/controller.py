@@ -103,7 +103,7 @@ class Controller:
         self._held = reason
 
     def tick(self, now: float) -> Order | None:
-        """What to publish now, at a time [s], if anything; to be called some times a second."""
+        """The order to publish at a time [s], if any; to be called some times a second."""
         order = self._choose(now)
         self._ordered = 0.0 if order is None else order.linear
         return order

@@ -85,7 +85,7 @@ def viridis(shares: Any) -> NDArray[np.uint8]:
 
 
 def shares_of(values: Any, low: float, high: float) -> NDArray[np.float64]:
-    """Where values lie between two ends, from 0 to 1; in the middle if the ends are the same."""
+    """Places of values between two ends, from 0 to 1; 0.5 if the ends are the same."""
     spread = high - low
     numbers = np.asarray(values, dtype=np.float64)
     return (numbers - low) / spread if spread > 0.0 else np.full(numbers.shape, 0.5)
