@@ -33,8 +33,6 @@ from navigation.worlds import parse_worlds
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(p.relative_to(ROOT) for p in ROOT.glob("docs/**/*.md"))]
-OLD = "first_study.md"
-"""Its commands are those of an old commit, as it says."""
 OTHERS = ("make", "pip", "python3", "ray", "ros2", "source", "wandb")
 """Programs that are not ours."""
 SHELL = (
@@ -81,7 +79,7 @@ def scripts(text: str) -> Iterator[str]:
 
 def commands() -> list[tuple[str, ...]]:
     """Words after ``python`` of all commands on the pages, each once."""
-    texts = [(ROOT / page).read_text(encoding="utf-8") for page in PAGES if OLD not in str(page)]
+    texts = [(ROOT / page).read_text(encoding="utf-8") for page in PAGES]
     code = "".join(f"({block.replace('.venv/bin/', '')})\n" for t in texts for block in scripts(t))
     shell = subprocess.run(["sh", "-c", SHELL + code], capture_output=True, text=True, check=False)
     assert (shell.returncode, shell.stderr) == (0, "")

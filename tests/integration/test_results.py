@@ -14,8 +14,8 @@ from navigation.report import study_pages
 pytestmark = pytest.mark.usefixtures("tables_alone")
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = {
-    "results": "paper_task.md",
-    "results/first": "first_study.md",
+    "results": "results/paper_task.md",
+    "results/first": "results/paper_task.md",
 }
 
 
@@ -43,7 +43,7 @@ def test_the_tables_of_the_further_runs_are_made_of_their_rows(runs: str, tmp_pa
     found = [line for line in text.splitlines() if line.startswith("| ddpg | mpfa_per |")]
     # How it ended, how fast it learned, and when it first had each of two rates of success.
     assert len(found) == 4
-    assert missing("\n".join(found), "paper_task.md") == []
+    assert missing("\n".join(found), "results/paper_task.md") == []
 
 
 def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_the_table_of_all_nine_runs_is_made_of_the_rows_of_three_folders(tmp_pat
     assert "| ddpg/mpfa_per | 9 | success |" in test
     # Outcomes of single runs are in the tables of their folders.
     intervals = test[test.index("|  | runs |") :]
-    assert missing(intervals, "paper_task.md") == []
+    assert missing(intervals, "results/paper_task.md") == []
 
 
 def test_the_pages_of_the_study_are_made_of_its_rows(
