@@ -1,7 +1,7 @@
 """TD7's rule of which policy a run keeps: held fixed, assessed by whole episodes, by their worst.
 
 Fujimoto et al. 2023, "For SALE: State-Action Representation Learning for Deep Reinforcement
-Learning", https://arxiv.org/abs/2306.02451, read from the authors' code; ``docs/kept_policy.md``
+Learning", https://arxiv.org/abs/2306.02451, read from the authors' code; ``docs/tuning.md``
 says what is different with many robots.
 """
 
