@@ -16,16 +16,16 @@ from mpfa_envs.checks import check_number
 PROGRESS_SCALE: Final = 5.0
 """ε_p of Eq. (25), reward per meter of approach [1/m]; the paper names no value.
 
-With 15 the way pays more than the arrival, so that a place near the goal is worth less than one
+With 15 the path pays more than the arrival, so that a place near the goal is worth less than one
 far away, and a critic that is a little too smooth would rather circle than arrive.
 """
 
 
 class StepOutcome(NamedTuple):
-    """What a reward may look at after one step."""
+    """Results of one step, which a reward depends on."""
 
     previous_distance: float
-    """Way to the goal before the step, straight or as ``progress`` measures it [m]."""
+    """Distance to the goal before the step, straight or as ``progress`` measures it [m]."""
     distance: float
     """The same after the step [m]."""
     success: bool
@@ -47,7 +47,7 @@ class RewardTerms(NamedTuple):
     collision: float = 0.0
     progress: float = 0.0
     other: float = 0.0
-    """What a reward of your own adds beside the paper's three terms."""
+    """Your own reward beside the paper's three terms."""
 
     @property
     def total(self) -> float:
@@ -102,20 +102,7 @@ def navigation_reward(
 def resolve_reward(
     reward: RewardFunction | None, *, progress: str, progress_scale: float
 ) -> RewardFunction:
-    """Find the function that rewards a task.
-
-    Args:
-        reward: One of the user's; None: Eq. (25).
-        progress: What an approach is measured by; ``"none"``: Eq. (25) does not pay it, whatever
-            its scales are.
-        progress_scale: ε_p of Eq. (25) unless a function is given [1/m].
-
-    Returns:
-        The function.
-
-    Raises:
-        ValueError: If it cannot be called, or Eq. (25) is to pay what is no number.
-    """
+    """Find the function that rewards a task."""
     if reward is None:
         return partial(
             navigation_reward, progress_scale=0.0 if progress == "none" else progress_scale
@@ -129,24 +116,7 @@ def resolve_reward(
 
 
 def read_terms(terms: Any) -> RewardTerms:
-    """Read what a reward function gave.
-
-    Args:
-        terms: The goal's, the collision's, the progress's and other reward.
-
-    Returns:
-        The same as floats.
-
-    Raises:
-        ValueError: If they are not four finite numbers.
-
-    Examples:
-        >>> from mpfa_envs.tasks.reward import read_terms
-        >>> read_terms(1.0)
-        Traceback (most recent call last):
-        ...
-        ValueError: reward must give RewardTerms of four finite numbers, got 1.0
-    """
+    """Read what a reward function gave."""
     try:
         goal, collision, progress, other = terms
         # It takes no text, which float would read as a number.
@@ -159,18 +129,7 @@ def read_terms(terms: Any) -> RewardTerms:
 
 
 def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
-    """Read what Eq. (25) pays.
-
-    Args:
-        reward: A reward function.
-
-    Returns:
-        Rewards for the goal, for a collision and per meter of approach; None if the function is
-        neither :func:`~mpfa_envs.navigation_reward` nor a ``functools.partial`` of it by keywords.
-
-    Raises:
-        ValueError: If a keyword is not one of its own, or its value no finite number.
-    """
+    """Read what Eq. (25) pays."""
     function = reward.func if isinstance(reward, partial) else reward
     if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
         return None

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 GOAL_CLEARANCE = 0.5
 """No goal lies nearer to an obstacle or a wall than this [m]."""
 _GRID_SLACK = 0.04
-"""A way on a grid keeps so much less than the distance that it was made for, at most [m]."""
+"""A grid path may fall short of its clearance by at most this [m]."""
 _AROUND = [(math.cos(turn), math.sin(turn)) for turn in np.arange(16) * math.tau / 16]
-"""Directions in which it is looked for what reaches a goal."""
+"""Directions in which points near a goal are tested for reachability."""
 _STARTS = 60
 _GOALS_PER_START = 50
 _ATTEMPTS = 1000
@@ -125,7 +125,7 @@ def _sample_points(
             if not (detour and planner.is_straight(start, goal)):
                 return task
             straight = straight or task
-    if straight is not None:  # Nothing in this world stands in anyone's way.
+    if straight is not None:  # No task in this world needs a detour.
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
@@ -135,28 +135,13 @@ def _sample_points(
 
 def check_task(
     world: World,
-    options: Mapping[str, Any],
+    options: Mapping[str, Any],  # start (x, y, heading) [m, m, rad] and goal (x, y) [m]
     *,
-    collision_distance: float,
-    goal_radius: float,
-    radius: float,
+    collision_distance: float,  # [m]
+    goal_radius: float,  # [m]
+    radius: float,  # [m]
 ) -> Task:
-    """Read a task from the options of a reset.
-
-    Args:
-        world: The room and its obstacles.
-        options: ``{"start": (x, y, heading), "goal": (x, y)}`` [m, m, rad].
-        collision_distance: Distance of the center from an obstacle that is a collision [m].
-        goal_radius: Distance that reaches the goal [m].
-        radius: Radius of the robot [m].
-
-    Returns:
-        The task.
-
-    Raises:
-        ValueError: If the keys or the numbers are wrong, the start is a collision or at the goal,
-            no path leads to the goal, or none without a collision to where it is reached.
-    """
+    """Read a task from the options of a reset."""
     if set(options) != {"start", "goal"}:
         raise ValueError(f"options must have the keys 'start' and 'goal', got {sorted(options)}")
     numbers: dict[str, list[float]] = {}
@@ -186,7 +171,7 @@ def check_task(
     kept = max(radius, collision_distance - _GRID_SLACK)
     if kept > radius and not _can_be_won(world, kept, (x, y), goal, goal_radius):
         raise ValueError(
-            f"goal must be within reach of the start {(x, y)} by a way that keeps "
+            f"goal must be within reach of the start {(x, y)} by a path that keeps "
             f"collision_distance = {collision_distance} m from obstacles and walls, got {goal}"
         )
     return Task((x, y, heading), goal)
@@ -199,7 +184,7 @@ def _can_be_won(
     goal: tuple[float, float],
     goal_radius: float,
 ) -> bool:
-    """Tell whether a way that keeps the distance leads to the goal, or near enough to reach it."""
+    """Tell whether a path that keeps the distance leads to the goal, or near enough to reach it."""
     # A goal may lie nearer to a wall than a robot comes, and is reached from beside it then.
     around = [
         (goal[0] + share * goal_radius * across, goal[1] + share * goal_radius * up)

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 TASKS_PER_WORLD: Final = 4
 """In each world of a generator."""
 _STANDARD_TIME_STEP: Final = 0.1
-"""What time limits are counted in [s]."""
+"""Unit of time limits [s]."""
 GENERATED_MAX_STEPS: Final = 1500
-"""Time limit in the worlds of a generator, of which some have ways of 40 m."""
+"""Time limit in the worlds of a generator, of which some have paths of 40 m."""
 BARN_MAX_STEPS: Final = 1000
 """The benchmark's 100 s."""
 _IN_A_WORLD: Final = 200
