@@ -8,6 +8,7 @@ import numpy as np
 import pybullet
 
 from mpfa_envs.robots.simulation import Simulation
+from tests.envs.shapes import convex_parts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,8 +46,8 @@ class BulletWorld(Simulation):
             )
             self._add_fixed(shape, cylinder.x, cylinder.y)
         for polygon in world.polygons:
-            for part in polygon.convex_parts:
-                corners = [[x, y, z] for z in (-_HEIGHT / 2, _HEIGHT / 2) for x, y in part]
+            for part in convex_parts(polygon):
+                corners = [[x, y, z] for z in (-_HEIGHT / 2, _HEIGHT / 2) for x, y in part.vertices]
                 shape = pybullet.createCollisionShape(
                     pybullet.GEOM_MESH, vertices=corners, physicsClientId=self.client
                 )

@@ -168,22 +168,6 @@ class Polygon:
         """Whether the footprint has no dents."""
         return _is_convex(self.vertices)
 
-    @property
-    def convex_parts(self) -> list[tuple[Point, ...]]:
-        """The polygon itself, or if it has dents the triangles and the rest that make it up.
-
-        Ears are cut off one by one: corners that bulge, with no other vertex in their triangle.
-        """
-        left = list(self.vertices)
-        parts: list[tuple[Point, ...]] = []
-        while not _is_convex(tuple(left)):
-            ear = next((i for i in range(len(left)) if _is_ear(left, i)), None)
-            if ear is None:  # Vertices in one line are left, which have no area.
-                return parts
-            parts.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
-            del left[ear]
-        return [*parts, tuple(left)]
-
 
 Shape = Box | Cylinder | Polygon
 """Anything that can stand in a world."""
@@ -226,25 +210,6 @@ def _is_simple(edges: list[tuple[float, float, float, float]]) -> bool:
             elif _meet(edges[i], edges[j]):
                 return False
     return True
-
-
-def _is_ear(vertices: list[Point], at: int) -> bool:
-    """Tell whether a vertex can be cut off, with the line between its neighbors all inside."""
-    a, b, c = vertices[at - 1], vertices[at], vertices[(at + 1) % len(vertices)]
-    if _turn(a, b, c) <= 0.0:
-        return False
-    return not any(
-        vertex not in (a, b, c)
-        and _turn(a, b, vertex) >= 0.0
-        and _turn(b, c, vertex) >= 0.0
-        and _turn(c, a, vertex) >= 0.0
-        for vertex in vertices
-    )
-
-
-def _turn(a: Point, b: Point, c: Point) -> float:
-    """Positive if c lies to the left of the line from a to b."""
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
