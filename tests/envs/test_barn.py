@@ -32,7 +32,7 @@ def test_the_task_can_be_solved_with_something_to_spare(index: int) -> None:
     assert math.isfinite(field.lengths[i, j])
 
 
-def test_a_world_is_asked_for_by_its_name_and_driven_in() -> None:
+def test_a_world_is_found_by_its_name() -> None:
     world = resolve_world("barn-12")
     assert world == barn_world(12) and world.name == "barn-12"
     env = NavigationEnv(world="barn-0", physics="kinematic")
@@ -43,7 +43,7 @@ def test_a_world_is_asked_for_by_its_name_and_driven_in() -> None:
 
 
 @pytest.mark.parametrize("index", [-1, 20, True, 1.5])
-def test_a_world_that_there_is_not_is_refused(index: object) -> None:
+def test_an_unknown_index_of_a_world_is_rejected(index: object) -> None:
     with pytest.raises(ValueError, match="index must be"):
         barn_world(index)
     with pytest.raises(ValueError, match="'barn-0' to 'barn-19'"):

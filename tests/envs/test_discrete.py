@@ -41,7 +41,7 @@ def test_the_specs_of_the_transformed_environment_hold(num_envs):
 
 
 @pytest.mark.parametrize("place", range(len(WHEEL_PAIRS)))
-def test_a_choice_drives_as_the_wheel_speeds_that_it_stands_for(place):
+def test_a_choice_drives_as_its_wheel_speeds(place):
     plain, discrete = (
         NavigationTorchEnv(num_envs=2, world="A", physics="kinematic") for _ in range(2)
     )
@@ -59,7 +59,7 @@ def test_a_choice_drives_as_the_wheel_speeds_that_it_stands_for(place):
     assert torch.equal(*seen)
 
 
-def test_the_mirror_image_of_a_choice_is_the_choice_with_the_wheels_swapped():
+def test_a_mirrored_choice_has_its_wheels_swapped():
     choices = torch.eye(len(WHEEL_PAIRS), dtype=torch.long)
     mirrored = Mirror(pairs=WHEEL_PAIRS).action(choices).argmax(-1).tolist()
     assert [WHEEL_PAIRS[place] for place in mirrored] == [(b, a) for a, b in WHEEL_PAIRS]
@@ -86,7 +86,7 @@ def test_the_mirror_image_of_a_choice_is_the_choice_with_the_wheels_swapped():
         ([1.0, 0.5], "pairs"),
     ],
 )
-def test_pairs_that_cannot_be_are_refused(pairs, word):
+def test_impossible_pairs_are_rejected(pairs, word):
     with pytest.raises(ValueError, match=word):
         DiscreteWheels(pairs)
 
@@ -132,7 +132,7 @@ def test_a_cell_is_that_of_a_plain_loop():
         {"observation_size": 23},
     ],
 )
-def test_bins_that_cannot_be_are_refused(wrong):
+def test_impossible_bins_are_rejected(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Binning(**wrong)
 
@@ -145,7 +145,7 @@ def table(**more):
 
 
 @pytest.mark.parametrize("kind", ["table", "linear"])
-def test_a_policy_that_chooses_is_saved_and_drives_its_best_pair(tmp_path, kind):
+def test_a_saved_policy_of_choices_drives_its_best_pair(tmp_path, kind):
     rng = np.random.default_rng(2)
     first = table()
     if kind == "linear":
@@ -170,12 +170,12 @@ def test_a_policy_that_chooses_is_saved_and_drives_its_best_pair(tmp_path, kind)
         ([table(), table()], "first"),
     ],
 )
-def test_layers_that_do_not_fit_are_refused(layers, word):
+def test_layers_that_do_not_fit_are_rejected(layers, word):
     with pytest.raises(ValueError, match=word):
         Policy(layers)
 
 
-def test_a_file_whose_table_does_not_fit_its_bins_is_refused(tmp_path):
+def test_a_file_whose_table_does_not_fit_its_bins_is_rejected(tmp_path):
     good = table()
     file = save_policy(Policy([good]), tmp_path)
     text = file.read_bytes()

@@ -108,7 +108,7 @@ def test_a_field_is_near_to_the_exact_planner(name: str) -> None:
     assert min(errors) > -0.015 and max(errors) < 0.03 and abs(np.mean(errors)) < 0.015
 
 
-def test_a_wall_is_walked_around_and_a_closed_one_is_not() -> None:
+def test_a_path_leads_around_a_wall_but_not_a_closed_one() -> None:
     goal = (3.0, 3.0)
     field = DistanceField(FreeGrid(DOOR, distance=0.3), goal)
     exact = PathPlanner(DOOR, radius=0.3).length((-3.0, 3.0), goal)
@@ -118,7 +118,7 @@ def test_a_wall_is_walked_around_and_a_closed_one_is_not() -> None:
     assert cut.lengths[i, j] == math.inf and math.isfinite(cut.at(-3.0, 3.0))
 
 
-def test_cells_without_a_way_take_what_is_nearest() -> None:
+def test_cells_without_a_path_take_the_nearest_length() -> None:
     grid = FreeGrid(MIXED, distance=0.2)
     field = DistanceField(grid, (-0.5, 2.0))
     known = np.argwhere(np.isfinite(field.lengths))
@@ -142,7 +142,7 @@ def test_positions_are_read_bilinearly() -> None:
     assert field.at(x + 0.03, y + 0.04) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_goal_off_the_free_cells_is_reached_from_the_nearest_one() -> None:
+def test_a_goal_off_the_free_cells_is_reached_from_the_nearest() -> None:
     field = DistanceField(FreeGrid(WORLDS["B"], distance=0.25), (0.0, 3.75))
     i, j = field.grid.index(0.0, 3.2)
     assert field.lengths[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
@@ -160,7 +160,7 @@ def test_a_goal_off_the_free_cells_is_reached_from_the_nearest_one() -> None:
         ({"distance": 0.25, "resolution": 0.001}, "at most 4000000 cells"),
     ],
 )
-def test_a_grid_that_cannot_be_is_refused(arguments: dict[str, float], message: str) -> None:
+def test_an_impossible_grid_is_rejected(arguments: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FreeGrid(WORLDS["A"], **arguments)
 
@@ -230,7 +230,7 @@ def test_the_same_generator_gives_the_same_task() -> None:
         (World(name="closet", size=(0.5, 0.5)), {"distance": 0.3}, "'closet' has no start and"),
     ],
 )
-def test_a_task_that_cannot_be_is_refused(
+def test_an_impossible_task_is_rejected(
     place: World | FreeGrid, arguments: dict[str, float], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

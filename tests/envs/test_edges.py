@@ -11,7 +11,7 @@ from mpfa_envs import Box, NavigationEnv, Task, VectorNavigationEnv, World
 from mpfa_envs.worlds.plain import world_to_plain
 
 
-def test_the_seed_of_a_reset_is_that_of_the_robots_that_it_starts() -> None:
+def test_a_seed_of_a_reset_seeds_the_robots_that_it_starts() -> None:
     env, twin = (VectorNavigationEnv(2, world="B", physics="kinematic") for _ in range(2))
     first, second = np.array([True, False]), np.array([False, True])
     env.reset(seed=0)
@@ -23,7 +23,7 @@ def test_the_seed_of_a_reset_is_that_of_the_robots_that_it_starts() -> None:
     assert env.tasks[0] != twin.tasks[0]
 
 
-def test_a_world_that_replaces_one_without_a_task_is_kept_for_as_many_episodes() -> None:
+def test_a_replacement_world_is_kept_for_as_many_episodes() -> None:
     env = VectorNavigationEnv(1, world="clutter", physics="kinematic", episodes_per_world=3)
     env.reset(seed=0)
     state = env.state_dict()
@@ -38,7 +38,7 @@ def test_a_world_that_replaces_one_without_a_task_is_kept_for_as_many_episodes()
 
 
 @pytest.mark.parametrize("many", [True, False])
-def test_a_goal_that_is_reached_in_the_last_time_step_is_no_time_limit(many: bool) -> None:
+def test_a_goal_reached_in_the_last_step_is_no_timeout(many: bool) -> None:
     task = Task((0.0, 0.0, 0.0), (2.02, 0.0))
     ends = []
     for max_steps in (500, 31, 30):  # The goal is 1.52 m away, and a step is 0.05 m.

@@ -75,7 +75,7 @@ def test_what_may_never_end_is_not_read(
         ("b.yaml", f"{MAP}free_thresh: 0.196\n", partial(save_world, WORLDS["B"]), "world"),
     ],
 )
-def test_nothing_but_its_own_kind_is_replaced_unless_that_is_asked_for(
+def test_a_file_replaces_only_its_own_kind_without_overwrite(
     name: str, content: str, save: Callable[..., object], what: str, tmp_path: Path
 ) -> None:
     path = tmp_path / name

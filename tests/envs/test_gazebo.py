@@ -37,7 +37,7 @@ def write(folder, content, head="", name="room.world"):
     return path
 
 
-def test_a_world_of_the_benchmark_is_the_same_by_its_file_and_by_its_numbers(tmp_path):
+def test_a_benchmark_world_is_the_same_by_file_and_numbers(tmp_path):
     expected = barn_world(3)
     models = "".join(
         model(CYLINDER, f"{c.x + BARN_CENTER[0]:.6f} {c.y + BARN_CENTER[1]:.6f} 0 0 -0 0")
@@ -154,14 +154,14 @@ def test_what_is_left_out_is_counted(tmp_path):
         (model(SPECK, "0 0 0 0 0 0.3"), 5, "polygon must have an area"),
     ],
 )
-def test_a_bad_file_is_refused_with_the_line_and_the_reason(content, line, reason, tmp_path):
+def test_a_bad_file_is_rejected_with_line_and_reason(content, line, reason, tmp_path):
     with pytest.raises(WorldFileError, match=reason) as caught:
         load_gazebo_world(write(tmp_path, content))
     assert f"room.world:{line}: " in str(caught.value)
 
 
 @pytest.mark.parametrize("encoding", ["foo", "utf-7", "idna", "hex"])
-def test_an_encoding_that_is_none_is_refused(encoding, tmp_path):
+def test_an_unknown_encoding_is_rejected(encoding, tmp_path):
     path = write(tmp_path, model(CYLINDER))
     path.write_text(path.read_text().replace("?>", f" encoding='{encoding}'?>"))
     with pytest.raises(WorldFileError, match=r"room.world:1: is not XML"):
@@ -175,7 +175,7 @@ def test_a_compressed_file_of_line_ends_is_read_soon(tmp_path):
     assert time.process_time() - start < 2.0
 
 
-def test_entities_are_refused_before_they_grow(tmp_path):
+def test_entities_are_rejected_before_they_grow(tmp_path):
     head = '<!DOCTYPE x [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;&a;">]>\n'
     with pytest.raises(WorldFileError, match="must not have a document type"):
         load_gazebo_world(write(tmp_path, "&b;", head))
@@ -184,7 +184,7 @@ def test_entities_are_refused_before_they_grow(tmp_path):
         load_gazebo_world(write(tmp_path, model(CYLINDER), outside))
 
 
-def test_other_files_and_rooms_that_are_too_small_are_refused(tmp_path):
+def test_other_files_and_too_small_rooms_are_rejected(tmp_path):
     with pytest.raises(WorldFileError, match="cannot be read"):
         load_gazebo_world(tmp_path / "none.world")
     flipped = bytearray(gzip.compress(b"<sdf/>" * 50 + bytes(range(256))))

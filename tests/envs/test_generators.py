@@ -70,7 +70,7 @@ def test_a_task_is_found_in_each_of_hundreds_of_worlds(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_planner_finds_the_way_of_each_task(name: str) -> None:
+def test_the_planner_finds_the_path_of_each_task(name: str) -> None:
     pairs = generator_tasks(name, "validation", worlds=3, tasks=2)
     assert len(pairs) == 6 and len({world.name for world, _ in pairs}) == 3
     for world, task in pairs:
@@ -164,7 +164,7 @@ def test_a_world_can_be_asked_for_by_its_name(name: str, ending: str) -> None:
     "name",
     ["bars", "bars-", "bars--1", "bars-1.5", "bars-a", "bars-train-1", "bars-1@2", "barz-1", "-1"],
 )
-def test_a_name_that_is_no_world_is_refused(name: str) -> None:
+def test_a_name_of_no_world_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match=r"world must be .*'NAME-SEED'.* got '"):
         resolve_world(name)
 
@@ -178,18 +178,18 @@ def test_a_name_that_is_no_world_is_refused(name: str) -> None:
         (("bars", 3 * 10**9), "seed must be at most 2999999999, got 3000000000"),
     ],
 )
-def test_a_world_that_cannot_be_is_refused(arguments: tuple[str, int], message: str) -> None:
+def test_an_impossible_world_is_rejected(arguments: tuple[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         generate_world(*arguments)
 
 
-def test_an_impossible_difficulty_is_refused() -> None:
+def test_an_impossible_difficulty_is_rejected() -> None:
     for difficulty in (-0.1, 1.1, "hard", float("nan")):
         with pytest.raises(ValueError, match="difficulty must be"):
             generate_world("bars", 1, difficulty=difficulty)
 
 
-def test_splits_and_counts_out_of_range_are_refused() -> None:
+def test_splits_and_counts_out_of_range_are_rejected() -> None:
     with pytest.raises(ValueError, match="split must be one of"):
         world_seed("tests", 1)
     with pytest.raises(ValueError, match="index must be at most 999999999, got 1000000000"):
@@ -202,7 +202,7 @@ def test_splits_and_counts_out_of_range_are_refused() -> None:
 
 # A harder crowd has more walkers.
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "crowd"])
-def test_difficulty_means_more_obstacles_in_the_way(name: str) -> None:
+def test_difficulty_means_more_obstacles(name: str) -> None:
     def free_share(difficulty: float) -> float:
         grids = [
             FreeGrid(generate_world(name, seed, difficulty=difficulty), distance=0.25)
@@ -215,7 +215,7 @@ def test_difficulty_means_more_obstacles_in_the_way(name: str) -> None:
     assert shares[2] > 0.1
 
 
-def test_a_world_that_cannot_be_driven_is_drawn_anew_and_not_for_ever(
+def test_a_world_without_a_task_is_sampled_again_but_not_forever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = []
@@ -243,7 +243,7 @@ def gap(one: Box, other: Box) -> float:
 
 
 @pytest.mark.parametrize(("difficulty", "boxes", "passage"), [(0, 8, 1.1), (0.5, 13, 0.9)])
-def test_between_any_two_things_in_rooms_there_is_a_passage_or_none_at_all(
+def test_obstacles_of_rooms_touch_or_leave_a_passage(
     difficulty: float, boxes: int, passage: float
 ) -> None:
     touching = [0, 0, 0, 0]
@@ -275,7 +275,7 @@ def test_every_place_of_a_maze_can_be_reached(difficulty: float) -> None:
     assert np.mean(wider) < (0.3 if difficulty == 1.0 else 0.75)
 
 
-def test_hard_mazes_have_dead_ends_and_easy_ones_ways_around() -> None:
+def test_hard_mazes_have_dead_ends_and_easy_ones_detours() -> None:
     def walls(difficulty: float) -> float:
         worlds = [generate_world("mazes", seed, difficulty=difficulty) for seed in range(10)]
         return sum(w.covered_area / (w.size[0] * w.size[1]) for w in worlds)
@@ -283,7 +283,7 @@ def test_hard_mazes_have_dead_ends_and_easy_ones_ways_around() -> None:
     assert walls(1.0) > 1.5 * walls(0.0)
 
 
-def test_a_field_has_a_way_from_one_end_to_the_other() -> None:
+def test_a_field_has_a_path_from_end_to_end() -> None:
     counts = []
     for seed in range(40):
         world = generate_world("fields", seed, difficulty=seed / 39)
@@ -301,7 +301,7 @@ def test_a_field_has_a_way_from_one_end_to_the_other() -> None:
     assert 60 < sum(counts) / 40 < 300
 
 
-def test_halls_have_obstacles_at_any_angle_and_are_as_large_as_20_m() -> None:
+def test_halls_are_up_to_20_m_with_obstacles_at_any_angle() -> None:
     worlds = [generate_world("halls", seed) for seed in range(40)]
     sides = [side for world in worlds for side in world.size]
     assert 10.0 <= min(sides) < 11.0 and 19.0 < max(sides) <= 20.0
@@ -327,7 +327,7 @@ def test_mixed_worlds_are_of_all_kinds() -> None:
     assert min(kinds.values()) > 8
 
 
-def test_a_crowd_has_two_to_ten_walkers_six_unless_told_otherwise() -> None:
+def test_a_crowd_has_two_to_ten_walkers_six_by_default() -> None:
     numbers = {
         at: {len(generate_world("crowd", seed, difficulty=at).walkers) for seed in range(8)}
         for at in (0.0, 0.5, 1.0, None)
@@ -362,7 +362,7 @@ def pillars(source: random.Random, difficulty: float) -> World:
     return World(name="pillars", cylinders=(pillar,))
 
 
-def test_a_generator_of_ones_own_stands_wherever_a_built_in_one_does() -> None:
+def test_a_registered_generator_works_like_a_built_in_one() -> None:
     register_generator("pillars", pillars)
     worlds = split_worlds("pillars", "validation", 2)
     assert [world.name for world in worlds] == ["pillars-validation-0", "pillars-validation-1"]
@@ -395,7 +395,7 @@ def test_built_in_generators_and_worlds_cannot_be_replaced(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "Pillars", "two words", "pillars-7", "pillars2"])
-def test_names_that_worlds_could_not_have_are_refused(name: str) -> None:
+def test_names_that_worlds_cannot_have_are_rejected(name: str) -> None:
     with pytest.raises(ValueError, match=f"name must be lower-case letters a to z, got {name!r}"):
         register_generator(name, pillars)
 
@@ -405,7 +405,7 @@ def test_what_cannot_be_called_is_no_generator() -> None:
         register_generator("pillars", None)  # type: ignore[arg-type]
 
 
-def test_rooms_beyond_the_bounds_of_the_observations_are_refused() -> None:
+def test_rooms_beyond_the_bounds_of_observations_are_rejected() -> None:
     register_generator("long", lambda source, difficulty: World(name="long", size=(60.0, 3.0)))
     with pytest.raises(ValueError, match=r"world 'long-.*' must be at most 50 m .* got 60\.07 m"):
         VectorNavigationEnv(1, world="long", physics="kinematic")

@@ -106,7 +106,7 @@ def test_rays_along_the_cells_edges_meet_what_they_point_at():
     np.testing.assert_allclose(lidar.cast(0.25, 0.25, math.pi / 2).min(), 2.25)
 
 
-def test_one_robot_and_many_sense_and_drive_the_same_in_a_map(scattered):
+def test_one_robot_and_many_behave_alike_in_a_map(scattered):
     world = scattered[0]
     env = NavigationEnv(world=world, physics="kinematic", progress="shortest_path", history=1)
     many = VectorNavigationEnv(
@@ -127,7 +127,7 @@ def test_one_robot_and_many_sense_and_drive_the_same_in_a_map(scattered):
     assert info["sim_time"] > 0.5
 
 
-def test_robots_in_one_map_share_it_and_maps_without_robots_go(scattered):
+def test_robots_share_a_map_and_unused_maps_go(scattered):
     world = scattered[0]
     other = World(name="other", size=(4.0, 4.0), occupancy=OccupancyGrid(cells((20, 20)), 0.2))
     again = world_from_plain(world_to_plain(world))
@@ -182,7 +182,7 @@ def test_shapes_become_cells_that_cover_them_and_little_more(name, tmp_path):
     assert gaps.min() >= -0.1 * math.sqrt(2)
 
 
-def test_the_image_is_upside_down_and_the_origin_is_its_lower_left_corner(tmp_path):
+def test_the_origin_of_an_image_is_its_lower_left_corner(tmp_path):
     shades = np.full((20, 40), 254, dtype=np.uint8)
     shades[0, 10] = 0  # At the top.
     world = World.from_map(write_map(tmp_path, shades))
@@ -205,7 +205,7 @@ def test_what_lies_around_the_free_cells_is_cut_off(tmp_path):
     assert whole.occupancy.occupied.sum() == 20
 
 
-def test_what_map_saver_marks_as_unknown_is_not_made_free_by_its_own_threshold(tmp_path):
+def test_unknown_cells_of_map_saver_are_not_free(tmp_path):
     shades = np.full((140, 160), 205, dtype=np.uint8)
     shades[20:120, 20:140] = 0  # A building with walls of one cell, and a margin of 1 m around it.
     shades[21:119, 21:139] = 254
@@ -284,7 +284,7 @@ def test_images_may_have_comments_and_be_text(kind, tmp_path):
         ({"resolution": "!!python/object:os.system x"}, 2, None),
     ],
 )
-def test_a_bad_map_is_refused_with_the_line_and_the_reason(changes, line, reason, tmp_path):
+def test_a_bad_map_is_rejected_with_line_and_reason(changes, line, reason, tmp_path):
     shades = np.full((3, 4), 254, dtype=np.uint8)
     with pytest.raises(WorldFileError, match=reason) as caught:
         World.from_map(write_map(tmp_path, shades, **changes))
@@ -292,7 +292,7 @@ def test_a_bad_map_is_refused_with_the_line_and_the_reason(changes, line, reason
     assert f"map.yaml:{wrong}: " in str(caught.value)
 
 
-def test_images_that_are_huge_broken_or_full_are_refused(tmp_path):
+def test_huge_broken_or_full_images_are_rejected(tmp_path):
     path = write_map(tmp_path, None)
     for side, reason in ((5000, "at most 16000000 pixels"), (100_000, "exceeds limit")):
         (tmp_path / "map.pgm").write_bytes(f"P5\n{side} {side}\n255\n".encode())
@@ -308,7 +308,7 @@ def test_images_that_are_huge_broken_or_full_are_refused(tmp_path):
         World.from_map(path, unknown="maybe")
 
 
-def test_bad_grids_and_worlds_are_refused_before_they_are_made(scattered, tmp_path):
+def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_path):
     world = scattered[0]
     with pytest.raises(ValueError, match="occupied must be an array"):
         OccupancyGrid(np.zeros((3, 3)), 0.1)
@@ -328,7 +328,7 @@ def test_bad_grids_and_worlds_are_refused_before_they_are_made(scattered, tmp_pa
         OccupancyGrid.from_plain(plain)
 
 
-def test_cells_in_buckets_find_the_ways_of_dijkstra_to_the_bit():
+def test_cells_in_buckets_find_dijkstras_paths_to_the_bit():
     grid = FreeGrid(WORLDS["D"], distance=0.25)
     around = grid.cells_around((0.3, 0.2))
     seeds = np.array([grid.cells[cell] for cell, _ in around])
@@ -342,7 +342,7 @@ def test_cells_in_buckets_find_the_ways_of_dijkstra_to_the_bit():
     np.testing.assert_array_equal(near, np.where(expected <= 3.0, expected, math.inf))
 
 
-def test_ways_in_a_map_are_those_among_boxes_in_their_place(scattered):
+def test_paths_in_a_map_equal_those_among_its_boxes(scattered):
     grids = [FreeGrid(world, distance=0.18) for world in scattered]
     rng = np.random.default_rng(2)
     free = grids[0].cells

@@ -104,7 +104,7 @@ def test_noisy_robots_go_on_to_the_bit(physics):
     other.close()
 
 
-def test_a_state_of_other_noise_is_refused_and_one_from_before_there_was_any_is_not():
+def test_only_a_state_of_other_noise_is_rejected():
     env = VectorNavigationEnv(1, noise=ALL, **KINEMATIC)
     quiet = VectorNavigationEnv(1, **KINEMATIC)
     env.reset(seed=0)
@@ -129,7 +129,7 @@ def test_latency_counts_time_steps_and_not_decisions():
     np.testing.assert_allclose(places(late)[:, 0] + 4.0, [0.0, 0.0, 0.05, 0.15, 0.25], atol=1e-12)
 
 
-def test_a_slipping_wheel_loses_the_share_that_is_said_and_odometry_does_not_see_it():
+def test_a_wheel_slips_by_its_share_unseen_by_odometry():
     seen, infos = drive(RobotNoise(slip=0.2), np.ones((60, 2)), action_repeat=1)
     told, driven = 0.05 * 60, infos[-1]["path_length"]
     assert driven == pytest.approx(0.8 * told, rel=0.03)
@@ -140,7 +140,7 @@ def test_a_slipping_wheel_loses_the_share_that_is_said_and_odometry_does_not_see
     assert abs(infos[-1]["heading"]) > 1e-3
 
 
-def test_drift_scales_ways_and_turns_alike_throughout_an_episode():
+def test_drift_scales_paths_and_turns_alike_throughout_an_episode():
     motion = NoisyMotion(RobotNoise(drift=0.05), 4000, wheel_base=0.23, time_step=0.1)
     rng = np.random.default_rng(0)
     for robot in range(4000):
@@ -227,7 +227,7 @@ def test_twice_the_noise_is_twice_each():
         (3, "noise must be a RobotNoise or hold arguments of it, got 3"),
     ],
 )
-def test_wrong_noise_is_refused(noise, reason):
+def test_wrong_noise_is_rejected(noise, reason):
     for make in (NavigationEnv, lambda **kwargs: VectorNavigationEnv(1, **kwargs)):
         with pytest.raises(ValueError, match=reason):
             make(noise=noise, **KINEMATIC)

@@ -46,7 +46,7 @@ def test_a_walker_keeps_off_each_kind_of_obstacle(shapes: dict[str, tuple[object
     assert across < 0.6 * free[0]
 
 
-def test_what_stands_is_on_the_left_of_its_edges_and_the_room_on_the_right_of_the_walls() -> None:
+def test_obstacles_lie_left_of_their_edges_and_the_room_right() -> None:
     world = World(
         name="full",
         boxes=(Box(0.5, -0.5, 1.5, 0.5),),
@@ -65,7 +65,7 @@ def test_what_stands_is_on_the_left_of_its_edges_and_the_room_on_the_right_of_th
     assert math.pi * 0.25 < cylinder < 1.05 * math.pi * 0.25
 
 
-def test_a_robot_that_comes_is_avoided_and_one_that_leaves_is_not() -> None:
+def test_only_an_approaching_robot_is_avoided() -> None:
     world = World(name="free", walkers=(AVOIDER,))
     wanted = np.array([1.0, 0.0])
     for heading, avoided in ((math.pi, True), (0.0, False)):
@@ -74,7 +74,7 @@ def test_a_robot_that_comes_is_avoided_and_one_that_leaves_is_not() -> None:
         assert (np.hypot(*(found - wanted)) > 0.05) == avoided
 
 
-def test_a_velocity_that_leads_into_a_wall_is_not_driven_and_one_that_leads_off_is(
+def test_a_velocity_into_a_wall_is_not_driven(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     velocity = [0.0, 0.0]

@@ -35,20 +35,20 @@ def around_a_corner(radius: float) -> float:
     return 2 * tangent + 2 * radius * turn + 2.0
 
 
-def test_a_free_line_is_the_path_and_its_length_is_exact() -> None:
+def test_a_free_line_is_the_path_with_exact_length() -> None:
     planner = PathPlanner(WORLDS["A"], radius=0.18)
     assert planner.find((0.0, 0.0), (3.0, 4.0)) == [(0.0, 0.0), (3.0, 4.0)]
     assert planner.length((0.0, 0.0), (3.0, 4.0)) == 5.0
 
 
 @pytest.mark.parametrize("radius", [0.05, 0.18, 0.35])
-def test_the_way_around_a_box_is_within_a_percent_of_the_optimum(radius: float) -> None:
+def test_the_path_around_a_box_is_optimal_within_a_percent(radius: float) -> None:
     optimum = around_a_corner(radius)
     length = PathPlanner(BLOCK, radius=radius).length((-3.0, 0.0), (3.0, 0.0))
     assert optimum - 1e-9 <= length <= 1.01 * optimum
 
 
-def test_the_way_around_a_cylinder_is_within_a_percent_of_the_optimum() -> None:
+def test_the_path_around_a_cylinder_is_optimal_within_a_percent() -> None:
     world = World(name="pillar", cylinders=(Cylinder(0.0, 0.0, 1.0),))
     reach = 1.18
     optimum = 2 * math.sqrt(9 - reach**2) + reach * (math.pi - 2 * math.acos(reach / 3))
@@ -88,7 +88,7 @@ def test_there_is_no_path_from_within_a_margin() -> None:
     assert PathPlanner(BLOCK, radius=0.18).find((-1.1, 0.0), (3.0, 0.0)) is None
 
 
-def test_a_bad_radius_is_refused() -> None:
+def test_a_bad_radius_is_rejected() -> None:
     with pytest.raises(ValueError, match="radius must be positive, got 0"):
         PathPlanner(BLOCK, radius=0)
 
@@ -101,7 +101,7 @@ def as_polygon(box: Box, turn: float = 0.0) -> Polygon:
     return Polygon(tuple((cosine * x - sine * y, sine * x + cosine * y) for x, y in corners))
 
 
-def test_a_polygon_in_the_shape_of_a_box_is_passed_as_the_box() -> None:
+def test_a_rectangular_polygon_is_passed_like_a_box() -> None:
     world = World(name="same", polygons=tuple(as_polygon(box) for box in WORLDS["test"].boxes))
     boxes = PathPlanner(WORLDS["test"], radius=0.3)
     polygons = PathPlanner(world, radius=0.3)
@@ -120,7 +120,7 @@ def test_a_turned_box_is_passed_at_the_same_length(turn: float) -> None:
     assert optimum - 1e-9 <= length <= 1.01 * optimum
 
 
-def test_no_point_of_a_path_around_polygons_comes_nearer_than_the_margin() -> None:
+def test_a_path_around_polygons_keeps_the_margin() -> None:
     rng = np.random.default_rng(1)
     for seed in (3, 8):
         world = generate_world("halls", seed, difficulty=0.8)
@@ -167,7 +167,7 @@ def test_paths_among_hundreds_of_cylinders_take_no_minutes() -> None:
         env.reset(options={"start": task.start, "goal": (0.0, 7.45)})
 
 
-def test_two_places_that_a_ring_of_cylinders_parts_have_no_path() -> None:
+def test_a_closed_ring_of_cylinders_leaves_no_path() -> None:
     angles = np.linspace(0.0, math.tau, 80, endpoint=False)
     ring = tuple(Cylinder(2 * math.cos(a), 2 * math.sin(a), 0.08) for a in angles)
     world = World(name="ring", cylinders=ring)
@@ -176,7 +176,7 @@ def test_two_places_that_a_ring_of_cylinders_parts_have_no_path() -> None:
     assert around == pytest.approx(2 * math.sqrt(9 - 2.26**2) + 2.26 * 1.706, rel=0.02)
 
 
-def test_tasks_are_sampled_in_a_corridor_with_no_place_for_the_usual_goal() -> None:
+def test_tasks_are_sampled_in_a_narrow_corridor() -> None:
     world = World(name="corridor", size=(8.0, 0.9))
     env = NavigationEnv(world=world, physics="kinematic")
     for seed in range(3):

@@ -74,12 +74,12 @@ def test_only_a_polygon_without_dents_is_convex() -> None:
         (tuple((math.cos(i * 2.513), math.sin(i * 2.513)) for i in range(5)), "does not cross"),
     ],
 )
-def test_a_shape_that_is_no_polygon_is_refused(vertices: object, message: str) -> None:
+def test_a_shape_that_is_no_polygon_is_rejected(vertices: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Polygon(vertices)
 
 
-def test_a_polygon_outside_of_the_room_is_refused() -> None:
+def test_a_polygon_outside_of_the_room_is_rejected() -> None:
     with pytest.raises(ValueError, match="polygons must lie in the room"):
         polygon_world(Polygon(((4.0, 0.0), (5.1, 0.0), (4.0, 1.0))))
 
@@ -181,7 +181,7 @@ def test_in_a_polygon_all_ranges_are_zero() -> None:
         np.testing.assert_array_equal(lidar.cast(*place, 0.7), 0.0)
 
 
-def test_a_ray_along_an_edge_of_a_polygon_is_no_number_problem() -> None:
+def test_a_ray_along_an_edge_has_a_finite_range() -> None:
     world = polygon_world(Polygon(((1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0))))
     with np.errstate(all="raise", under="ignore"):
         ranges = Lidar(world, sectors=1, reduction="single").scan(0.0, 0.0, 0.0)

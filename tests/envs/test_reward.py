@@ -63,7 +63,7 @@ def two_robots(**arguments: object) -> float:
         (RewardTerms(progress=math.nan), "got RewardTerms.*nan"),
     ],
 )
-def test_a_reward_that_gives_no_four_finite_numbers_is_refused(step, terms, shown) -> None:
+def test_a_reward_without_four_finite_numbers_is_rejected(step, terms, shown) -> None:
     with pytest.raises(ValueError, match=f"reward must give RewardTerms of four .*{shown}"):
         step(reward=lambda outcome: terms)
 
@@ -74,7 +74,7 @@ def test_any_four_numbers_are_the_terms_of_a_reward(step) -> None:
 
 
 @pytest.mark.parametrize("make", [NavigationEnv, partial(VectorNavigationEnv, 2)])
-def test_a_bad_payment_of_the_equation_is_named_before_anything_is_built(make) -> None:
+def test_a_bad_payment_is_rejected_before_anything_is_built(make) -> None:
     reward = partial(navigation_reward, goal_reward=math.inf)
     with pytest.raises(ValueError, match="goal_reward must be a finite number, got inf"):
         make(reward=reward)

@@ -83,6 +83,6 @@ def test_a_bad_walker_in_a_file_is_named_with_its_line(
         (lambda: World(name="many", walkers=(Walker(),) * 101), "walkers must be at most 100, got"),
     ],
 )
-def test_a_bad_walker_is_refused(make: Callable[[], object], message: str) -> None:
+def test_a_bad_walker_is_rejected(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()

@@ -38,7 +38,7 @@ def plain_starts(world: World, rng: np.random.Generator) -> list[tuple[float, fl
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_walkers_start_at_the_first_place_that_will_do_or_at_the_farthest(seed: int) -> None:
+def test_walkers_start_at_the_first_suitable_or_farthest_place(seed: int) -> None:
     rng = np.random.default_rng(seed)
     states, _ = start_walkers(FULL, (0.5, -0.5), rng)
     other = np.random.default_rng(seed)

@@ -19,7 +19,7 @@ def batch_with(state: list[float]) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("way", ["load", "begin"])
-def test_the_room_that_a_walker_had_does_not_lead_it_through_a_wall_elsewhere(way: str) -> None:
+def test_a_walker_does_not_cross_a_wall_of_another_world(way: str) -> None:
     batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
     batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
     middle = batch.read(batch_with([0.0, 0.0, 1.0, 0.0]), [HALL])
@@ -57,7 +57,7 @@ def test_a_map_is_shown_no_walker_by_a_noisy_lidar_either() -> None:
     assert seen < 0.02 * met  # A thousandth is beyond three deviations.
 
 
-def test_a_state_that_is_nowhere_is_refused_before_anything_changes() -> None:
+def test_a_bad_state_is_rejected_before_anything_changes() -> None:
     batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
     batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
     before = batch.of(0)

@@ -91,7 +91,7 @@ def test_straight_walkers_run_into_nothing_and_never_stop_for_long(seed: int) ->
     assert (np.hypot(seen[..., 2], seen[..., 3]) - speeds).max() < 1e-9
 
 
-def test_a_walker_bounces_off_a_thin_wall_however_long_a_time_step_is() -> None:
+def test_a_walker_bounces_off_a_thin_wall_in_any_time_step() -> None:
     wall = Box(-0.01, -2.0, 0.01, 2.0)
     world = World(name="halves", size=(8.0, 4.0), boxes=(wall,), walkers=(Walker(speed=2.0),))
     batch = batch_of(world, time_step=1.0)
@@ -99,7 +99,7 @@ def test_a_walker_bounces_off_a_thin_wall_however_long_a_time_step_is() -> None:
     assert (np.sign(walk(batch, 300)[:, 0, 0]) == side).all()
 
 
-def test_a_walker_is_on_its_round_where_its_speed_brings_it() -> None:
+def test_a_walker_goes_its_round_at_its_speed() -> None:
     batch = batch_of(BUSY)
     corners = np.array([*ROUND, ROUND[0]])
     ends = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
@@ -121,7 +121,7 @@ def test_a_walker_is_on_its_round_where_its_speed_brings_it() -> None:
         assert np.hypot(*states[5, 2:4]) == pytest.approx(0.5)
 
 
-def test_walkers_start_apart_from_the_robot_and_elsewhere_in_each_episode() -> None:
+def test_walkers_start_elsewhere_each_episode_away_from_the_robot() -> None:
     batch = WalkerBatch(WorldBatch([BUSY]), radius=0.18, time_step=0.1)
     rng, places = np.random.default_rng(0), []
     for _ in range(50):
@@ -171,7 +171,7 @@ def assert_same_episode(world: World, seed: int, **arguments: object) -> set[str
     [{}, {"lidar": {"noise": 0.02}, "memory": "map"}, {"progress": "shortest_path"}],
     ids=lambda arguments: "-".join(arguments) or "defaults",
 )
-def test_a_robot_among_walkers_drives_the_same_episodes_in_both_environments(
+def test_a_robot_among_walkers_drives_alike_in_both_environments(
     arguments: dict[str, object],
 ) -> None:
     ends = set().union(*(assert_same_episode(BUSY, seed, **arguments) for seed in range(2)))
@@ -196,7 +196,7 @@ POLITE = replace(
 )
 
 
-def test_who_avoids_others_runs_into_nobody_who_does_and_gets_around() -> None:
+def test_walkers_that_avoid_each_other_do_not_collide() -> None:
     pytest.importorskip("pyrvo", reason="an extra")
     seen = walk(batch_of(POLITE), 1500)
     assert min(POLITE.clearances(step[:4, :2]).min() for step in seen) > 0.18
@@ -208,7 +208,7 @@ def test_who_avoids_others_runs_into_nobody_who_does_and_gets_around() -> None:
     assert np.hypot(seen[:, :4, 2], seen[:, :4, 3]).max() < 0.401
 
 
-def test_who_avoids_others_goes_around_a_robot_that_stands_in_the_way() -> None:
+def test_a_walker_that_avoids_others_goes_around_the_robot() -> None:
     pytest.importorskip("pyrvo", reason="an extra")
     there_and_back = Walker(behavior="orca", waypoints=((-3.0, 0.01), (3.0, 0.01)))
     lane = World(name="lane", walkers=(there_and_back,))
@@ -224,7 +224,7 @@ def test_who_avoids_others_goes_around_a_robot_that_stands_in_the_way() -> None:
     assert min(places) < -2.0 and max(places) > 2.0
 
 
-def test_who_avoids_others_is_alike_in_both_environments_and_comes_back_from_a_state() -> None:
+def test_orca_walkers_are_alike_in_both_environments_and_resume() -> None:
     pytest.importorskip("pyrvo", reason="an extra")
     assert_same_episode(POLITE, 1)
     given: dict[str, Any] = {"world": POLITE, "physics": "kinematic"}
@@ -296,7 +296,7 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
     assert not (rows[0] & ~rows[1]).any()
 
 
-def test_what_follows_a_saved_state_is_the_same_to_the_bit() -> None:
+def test_a_restored_state_continues_to_the_bit() -> None:
     few = replace(BUSY, name="few", walkers=BUSY.walkers[3:5])
 
     def make(worlds: list[World]) -> VectorNavigationEnv:
@@ -357,7 +357,7 @@ def plain_time(x: float, y: float, speed_x: float, speed_y: float, reach: float)
     return float(times[np.argmax(near)]) if near.any() else 10.0
 
 
-def test_the_time_to_collision_is_the_first_at_which_the_discs_overlap() -> None:
+def test_the_time_to_collision_is_the_first_overlap() -> None:
     rng, found = np.random.default_rng(0), []
     for _ in range(300):
         x, y, speed_x, speed_y = (rng.uniform(-1.0, 1.0, 4) * (3.0, 3.0, 1.0, 1.0)).tolist()
@@ -399,7 +399,7 @@ def test_encounters_are_counted_over_an_episode() -> None:
             assert info["time_to_collision"] == pytest.approx(least, abs=1.1e-3)
 
 
-def test_without_walkers_nobody_is_met() -> None:
+def test_without_walkers_there_are_no_encounters() -> None:
     env = VectorNavigationEnv(1, world=STANDING, physics="kinematic")
     env.reset(seed=0)
     infos = env.step(np.ones((1, 2)))[-1]
@@ -408,7 +408,7 @@ def test_without_walkers_nobody_is_met() -> None:
     assert env.walkers(0).shape == (0, 5)
 
 
-def test_results_and_their_means_tell_of_walkers_where_there_are_any() -> None:
+def test_results_tell_of_walkers_if_there_are_any() -> None:
     given: dict[str, Any] = {"physics": "kinematic", "max_steps": 60}
     results = evaluate(lambda seen: np.ones(2), ["A", BUSY], episodes=6, **given)
     assert all(found.walker_distance is None for found in results[:6])

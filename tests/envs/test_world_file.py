@@ -128,7 +128,7 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
         ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),
     ],
 )
-def test_a_bad_file_is_refused_with_its_line(
+def test_a_bad_file_is_rejected_with_its_line(
     text: str, line: int, message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "bad.yaml"
@@ -140,14 +140,14 @@ def test_a_bad_file_is_refused_with_its_line(
 
 
 @pytest.mark.parametrize("open_, close", [("[", "]"), ("{a: ", "}"), ("- ", "")])
-def test_a_file_that_is_nested_deeply_is_refused(open_: str, close: str, tmp_path: Path) -> None:
+def test_a_deeply_nested_file_is_rejected(open_: str, close: str, tmp_path: Path) -> None:
     path = tmp_path / "deep.yaml"
     path.write_text("size: " + open_ * 2000 + close * 2000)
     with pytest.raises(WorldFileError, match=r"deep.yaml.*(nested too deeply|is not YAML)"):
         load_world(path)
 
 
-def test_a_file_that_is_too_long_is_refused_unread(tmp_path: Path) -> None:
+def test_a_too_long_file_is_rejected_unread(tmp_path: Path) -> None:
     path = tmp_path / "long.yaml"
     path.write_text("#" * 1_000_001)
     with pytest.raises(WorldFileError, match=r"long.yaml: .* has more than 1000000 bytes"):
@@ -167,7 +167,7 @@ FENCES = "\n".join(
         (FENCES, "is too large to find a point 0.5 m|has no point 0.5 m"),
     ],
 )
-def test_a_large_region_without_room_is_refused_soon(
+def test_a_large_region_without_room_is_rejected_soon(
     boxes: str, message: str, tmp_path: Path
 ) -> None:
     region = "start:\n  - {x_min: -99, x_max: 99, y_min: -400, y_max: 400}\n"

@@ -61,7 +61,7 @@ def test_clearance_is_the_distance_to_the_nearest_face() -> None:
         (lambda: World(name="x", occupancy=3), "occupancy must be an OccupancyGrid, got 3"),
     ],
 )
-def test_a_bad_shape_is_refused(make: object, message: str) -> None:
+def test_a_bad_shape_is_rejected(make: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -102,7 +102,7 @@ def test_starts_and_goals_keep_their_margins(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["B", "C", "D"])
-def test_a_detour_has_something_in_its_way(name: str) -> None:
+def test_a_detour_has_an_obstacle_on_its_line(name: str) -> None:
     world, rng = WORLDS[name], np.random.default_rng(0)
     planner = planner_for(world, 0.25)
     for chance, low, high in ((1.0, 1.0, 1.0), (0.5, 0.6, 0.95), (0.0, 0.3, 0.8)):
@@ -120,7 +120,7 @@ def test_a_world_without_detours_has_tasks_all_the_same() -> None:
         sample_task(world, np.random.default_rng(0), collision_distance=0.25, detour_chance=1.0)
 
 
-def test_evaluation_pairs_are_reproducible_and_a_longer_list_starts_the_same() -> None:
+def test_a_longer_list_of_evaluation_pairs_starts_the_same() -> None:
     assert evaluation_pairs("test", 5, seed=1) == evaluation_pairs("test", 8, seed=1)[:5]
     assert evaluation_pairs("test", 5, seed=1) != evaluation_pairs("test", 5, seed=2)
     for n in (0, True, 1.5):
@@ -161,14 +161,12 @@ def test_regions_hold_the_starts_and_the_goals() -> None:
         ),
     ],
 )
-def test_a_world_without_a_task_is_an_error_and_not_an_endless_search(
-    world: World, message: str
-) -> None:
+def test_a_world_without_a_task_raises_an_error(world: World, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         NavigationEnv(world=world, physics="kinematic")
 
 
-def test_equal_worlds_are_one_key_and_a_renamed_one_is_another() -> None:
+def test_equal_worlds_are_one_key_a_renamed_one_another() -> None:
     one, same = (World(name="x", boxes=(Box(0, 0, 1, 1),)) for _ in range(2))
     assert one == same and hash(one) == hash(same) and {one: 1}[same] == 1
     other = one.renamed("y")
@@ -177,7 +175,7 @@ def test_equal_worlds_are_one_key_and_a_renamed_one_is_another() -> None:
     assert hash(World(name="x")) != hash(one)
 
 
-def test_a_task_is_refused_whose_way_is_too_narrow_for_the_collision_distance() -> None:
+def test_a_task_with_a_too_narrow_path_is_rejected() -> None:
     gap = World(name="gap", boxes=(Box(-0.1, -5.0, 0.1, -0.2), Box(-0.1, 0.2, 0.1, 5.0)))
     task = {"start": (-2.0, 0.0, 0.0), "goal": (2.0, 0.0)}
     with (
@@ -189,7 +187,7 @@ def test_a_task_is_refused_whose_way_is_too_narrow_for_the_collision_distance() 
         env.reset(options=task)
 
 
-def test_a_goal_beside_a_wall_is_a_task_as_its_radius_is_reached() -> None:
+def test_a_goal_beside_a_wall_can_be_reached() -> None:
     task = {"start": (0.0, 0.0, 0.0), "goal": (4.8, 0.0)}
     with NavigationEnv(physics="kinematic", collision_distance=0.35) as env:
         env.reset(options=task)
@@ -198,7 +196,7 @@ def test_a_goal_beside_a_wall_is_a_task_as_its_radius_is_reached() -> None:
     assert ended[4]["success"]
 
 
-def test_a_world_of_lists_equals_one_of_tuples_and_can_be_driven_in() -> None:
+def test_a_world_of_lists_equals_one_of_tuples() -> None:
     parts = {
         "size": (8.0, 9.0),
         "boxes": (Box(0, 0, 1, 1),),
@@ -212,7 +210,7 @@ def test_a_world_of_lists_equals_one_of_tuples_and_can_be_driven_in() -> None:
         env.reset(seed=0)
 
 
-def test_equal_worlds_have_one_hash_after_one_came_from_another_process() -> None:
+def test_equal_worlds_have_one_hash_across_processes() -> None:
     code = (
         "import pickle, sys\n"
         "from mpfa_envs import Walker, World\n"
