@@ -19,6 +19,7 @@ def njit(function: _Function) -> _Function:
     """Compile a function of numbers and arrays, and keep the code on disk where that can be."""
     # Arithmetic is not reordered, and a division by zero gives infinity or NaN as in NumPy. Where
     # there is no Numba the loop stays as it is, with the same results.
+    # The compiled function releases the interpreter's lock.
     if numba is None:
         return function
     decorate = partial(numba.njit, nogil=True, error_model="numpy")

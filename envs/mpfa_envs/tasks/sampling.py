@@ -229,7 +229,7 @@ def evaluation_pairs(
     collision_distance: float | Literal["contact"] | None = None,
     min_goal_distance: float = 2.0,
 ) -> list[Task]:
-    """Sample a fixed list of tasks, the same for everyone who asks with the same arguments.
+    """Sample a fixed list of tasks, the same for everyone with the same arguments.
 
     Args:
         world: A name, the path of a YAML file or a world.

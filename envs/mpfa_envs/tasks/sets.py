@@ -63,7 +63,7 @@ def world_tasks(
     seed: int = 0,
     robot: str | RobotModel = "turtlebot2",
 ) -> list[WorldTask]:
-    """Make the tasks that a name stands for, the same for everyone who asks for them.
+    """Make the tasks that a name stands for, the same for everyone.
 
     Args:
         name: A world, as in :class:`~mpfa_envs.NavigationEnv`, with tasks of

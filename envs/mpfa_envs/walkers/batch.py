@@ -98,7 +98,7 @@ class WalkerBatch:
         self,
         motions: NDArray[np.float64],  # [N, 5]
         running: NDArray[np.bool_],  # [N]
-        counts: NDArray[np.float64],  # [m] [s]
+        counts: NDArray[np.float64],  # Gap [m], time near, to collision [s], [3, N]
     ) -> None:
         """Take in how near the walkers are to robots that have moved."""
         if self.present:

@@ -116,7 +116,7 @@ class WorldBatch:
             self._set_grid(robot, world.occupancy)
 
     def _set_grid(self, robot: int, grid: OccupancyGrid) -> None:
-        """Let a robot drive in a map, which it shares with whoever does so already."""
+        """Let a robot drive in a map, which it shares with others in the same one."""
         grids = self._grids
         if grid not in grids:
             used = {int(number) for number in self._rooms.grid_of if number >= 0}

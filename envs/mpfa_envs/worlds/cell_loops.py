@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 def cast_at_cells(
     x: float,  # [m]
     y: float,  # [m]
-    beams: NDArray[np.float64],
+    beams: NDArray[np.float64],  # Cosine, sine, and one over each, none zero, [4, rays]
     gaps: NDArray[np.uint8],  # [columns, rows]
     resolution: float,  # [m]
     max_range: float,  # [m]
     row: NDArray[np.float64],  # [rays] [m]
 ) -> bool:
-    """Shorten the rays that meet an occupied cell."""
+    """Shorten the rays that meet an occupied cell; tell whether the sensor is in one."""
     columns, rows = gaps.shape
     # In cells from the lower left corner.
     u, v = x / resolution + 0.5 * columns, y / resolution + 0.5 * rows

@@ -187,7 +187,7 @@ class _Reader(NodeReader):
             raise self.error(node, text) from error
 
     def _check_size(self, node: yaml.Node, size: tuple[int, int], resolution: float) -> None:
-        """Refuse an image that is too large, before it is read."""
+        """Reject an image that is too large, before it is read."""
         if size[0] * size[1] > MOST_CELLS or max(size) > LONGEST_SIDE:
             raise self.error(
                 node,

@@ -120,7 +120,7 @@ class World:
         self._check_walkers()
 
     def _check_kinds(self) -> None:
-        """Refuse fields of another kind, and make tuples of lists, as worlds are keys."""
+        """Reject fields of another kind, and make tuples of lists, as worlds are keys."""
         if not isinstance(self.name, str):
             raise ValueError(f"name must be text, got {self.name!r}")
         size = tuple(self.size) if isinstance(self.size, Iterable) else ()
@@ -139,7 +139,7 @@ class World:
             raise ValueError(f"occupancy must be an OccupancyGrid, got {self.occupancy!r}")
 
     def _check_walkers(self) -> None:
-        """Refuse walkers that have no room."""
+        """Reject walkers that have no room."""
         if len(self.walkers) > MOST_WALKERS:
             raise ValueError(f"walkers must be at most {MOST_WALKERS}, got {len(self.walkers)}")
         for walker in self.walkers:
