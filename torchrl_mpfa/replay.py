@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ReplayBuffer, Transition
+from torchrl.data import ReplayBuffer, RoundRobinWriter, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
@@ -172,16 +172,19 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     def _write(self, data: TensorDictBase) -> Tensor:
         if self.dim_extend > 0:
             data = self._transpose(data)
-        self._storage.admit(data)
         writer = self._writer
-        # Only the first write, which allocates the storage, can still fail.
-        place = [] if self._storage.initialized else _place(writer)
+        in_a_ring = isinstance(writer, RoundRobinWriter)
+        if not in_a_ring:
+            # It may hand on some of them only, and takes note of them before the storage does.
+            self._storage.check(data)
+        place = (writer._cursor, writer._write_count) if in_a_ring else None
         try:
             with torch.no_grad():
                 index: Tensor = writer.extend(data)
         except BaseException:
-            for key, value in place:
-                setattr(writer, key, value)
+            if place is not None:
+                # It moves on before the storage checks what it is to write.
+                writer._cursor, writer._write_count = place
             raise
         self._sampler.extend(index)
         return index
@@ -423,10 +426,3 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def _load_prefetch_state(self, path: Path) -> None:
         """Nothing: TorchRL would unpickle it."""
-
-
-def _place(writer: Any) -> list[tuple[str, int]]:
-    """Where a writer is, as far as TorchRL's writers in a ring keep it."""
-    return [
-        (key, getattr(writer, key)) for key in ("_cursor", "_write_count") if hasattr(writer, key)
-    ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +30,6 @@ _CLOCK = "_signals_clock"
 """Entry of a state: the count of writes as it is now, not as it was."""
 
 
-@dataclass(frozen=True)
-class _Admitted:
-    """Transitions that were checked, and what is to be written of them."""
-
-    data: Any
-    rows: Tensor | None
-    """Their rows of the signal table; None if they have no entries that could be read."""
-    pairs: Pairs | None
-    """Entries of the storage with what goes there; None if TorchRL has to find them."""
-
-
 class SignalStorageMixin:
     """Adds a :class:`~torchrl_mpfa.SignalTable` to a TorchRL storage.
 
@@ -58,15 +46,18 @@ class SignalStorageMixin:
     #: Set by a buffer whose sampler fuses: a write without reward or signal is refused.
     needs_signals = False
     _allow_nonfinite: Sequence[NestedKey] = ()
-    _admitted: _Admitted | None = None
     _schema: Schema | None = None
     _all_slots: Tensor | None = None
 
-    def admit(self, data: Any) -> None:
+    def check(self, data: Any) -> tuple[Tensor | None, Pairs | None]:
         """Check transitions that are about to be written; nothing is changed.
 
         Args:
             data: Transitions, batch size ``[B]``, or ``[T, B]`` for a storage of two dimensions.
+
+        Returns:
+            Their rows of the signal table, or None if they have no entries that could be read; and
+            the entries of the storage with what goes there, or None if TorchRL has to find them.
 
         Raises:
             KeyError: If an entry is missing or unknown, or a reward or signal that the sampler
@@ -74,7 +65,20 @@ class SignalStorageMixin:
             ValueError: If shape or dtype of an entry are not those in the storage, or a number is
                 not finite.
         """
-        self._admitted = self._check(data)
+        if not is_tensor_collection(data):
+            return None, None
+        lead = min(self.ndim, data.ndim)
+        pairs = None
+        if isinstance(data, TensorDictBase):
+            self._check_shape(data)
+            schema = self._known_schema()
+            if schema is not None:
+                pairs = schema.check(data, lead, whole=self.strict)
+            elif self.strict:
+                check_finite_entries(data, lead, self._allow_nonfinite)
+        rows = self.signal_table.read(data, data.shape[:lead].numel())
+        self._check_known(rows)
+        return rows, pairs
 
     def get(self, index: Any) -> Any:
         """Read transitions; all slots come as a tensordict that shares their tensors."""
@@ -87,15 +91,13 @@ class SignalStorageMixin:
         """Write transitions and reset the signals of their slots.
 
         Raises:
-            KeyError: See :meth:`admit`.
-            ValueError: See :meth:`admit`.
+            KeyError: See :meth:`check`.
+            ValueError: See :meth:`check`.
         """
-        admitted, self._admitted = self._admitted, None
-        if admitted is None or admitted.data is not data:
-            admitted = self._check(_as_batch(data))
+        rows, pairs = self.check(_as_batch(data))
         size = len(self)  # type: ignore[arg-type]
         try:
-            if not (set_cursor and self._write(cursor, admitted.data, admitted.pairs)):
+            if not (set_cursor and self._write(cursor, data, pairs)):
                 super().set(cursor, data, set_cursor=set_cursor)  # type: ignore[misc]
                 self._schema = None
         except BaseException:
@@ -105,7 +107,7 @@ class SignalStorageMixin:
         if self.max_size > self.signal_table.capacity:
             self.signal_table.grow(self.max_size)
         table, slots = self.signal_table, self._slots(cursor)
-        table.write(slots, table.blank(len(slots)) if admitted.rows is None else admitted.rows)
+        table.write(slots, table.blank(len(slots)) if rows is None else rows)
         table.size = len(self)  # type: ignore[arg-type]
 
     @contextmanager
@@ -149,22 +151,6 @@ class SignalStorageMixin:
                 entry.copy_(before)
             raise
         self.signal_table.rewrite(rows)
-
-    def _check(self, data: Any) -> _Admitted:
-        if not is_tensor_collection(data):
-            return _Admitted(data, None, None)
-        lead = min(self.ndim, data.ndim)
-        pairs = None
-        if isinstance(data, TensorDictBase):
-            self._check_shape(data)
-            schema = self._known_schema()
-            if schema is not None:
-                pairs = schema.check(data, lead, whole=self.strict)
-            elif self.strict:
-                check_finite_entries(data, lead, self._allow_nonfinite)
-        rows = self.signal_table.read(data, data.shape[:lead].numel())
-        self._check_known(rows)
-        return _Admitted(data, rows, pairs)
 
     def _check_known(self, rows: Tensor) -> None:
         """Refuse rows of the signal table that lack what the sampler needs."""
@@ -218,12 +204,8 @@ class SignalStorageMixin:
             and self._schema.only_tensors
         ):
             return False
-        index, place = data.get(INDEX_KEY, None), self._schema.index
-        if (index is None) != (place is None):
+        if (data.get(INDEX_KEY, None) is None) != (self._schema.index is None):
             return False
-        if place is not None and pairs[-1][0] is not place:
-            # The writer has put it there after the check.
-            pairs = [*pairs, (place, index)]
         device = cursor.device
         if any(value.device != device or stored.device != device for stored, value in pairs):
             return False
@@ -369,9 +351,9 @@ class SignalStorageMixin:
         self.signal_table.load_state_dict(state["_signals"])
 
     def __getstate__(self) -> Any:
-        # What is worked out from the data is worked out anew from its copy.
+        # What is worked out from the data is worked out again from its copy.
         state: Any = super().__getstate__()
-        return {**state, "_schema": None, "_admitted": None}
+        return {**state, "_schema": None}
 
 
 def _check_format(found: Any) -> None:
