@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,10 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
 from torchrl_mpfa.dumps import new_dump, open_dump
-from torchrl_mpfa.replay_state import (
-    check_batch_size,
-    check_generator_state,
-    check_sampler_state,
-    check_writer_state,
-)
 from torchrl_mpfa.replay_writes import FollowedReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.tree import TreeSampler
+from torchrl_mpfa.saved import Entry, check_entries, count, generator
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
@@ -359,23 +355,35 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         return found
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
+        """Reject a state that does not fit, before anything changes.
 
         Raises:
             KeyError: If the state of a part or an entry of it is missing.
             ValueError: If a part cannot be restored from its state.
         """
-        for key in ("_storage", "_sampler", "_writer", "_transforms", "_batch_size", "_rng"):
-            if key not in state_dict:
-                raise KeyError(f"{key!r} is missing in the saved buffer")
-        check_sampler_state(self.sampler, state_dict["_sampler"])
+        own = ("_storage", "_sampler", "_writer", "_transforms")
+        batch_size = Entry(
+            "_batch_size",
+            lambda size: size is None or (type(size) is int and size >= 1),
+            "positive or None",
+        )
+        check_entries("buffer", state_dict, [*map(Entry, own), batch_size, generator("_rng")])
+        found = state_dict["_sampler"]
+        if hasattr(self.sampler, "check_state"):
+            self.sampler.check_state(found)
+        elif isinstance(found, Mapping) and "_kind" in found:
+            # One of TorchRL's own has no check, and would leave out what it lacks.
+            raise ValueError(
+                f"the saved sampler is {found['_kind']!r}, this one a {type(self.sampler).__name__}"
+            )
         self._storage.check_state(state_dict["_storage"])
-        size = self._storage._max_size_along_dim0 if self._storage.ndim == 1 else None
         # A writer of data that no one may write has no cursor, nor has its state.
         if hasattr(self._writer, "_cursor"):
-            check_writer_state(state_dict["_writer"], None if size is None else size())
-        check_batch_size(state_dict["_batch_size"])
-        check_generator_state(state_dict["_rng"])
+            slots = self._storage._max_size_along_dim0() if self._storage.ndim == 1 else None
+            last = None if slots is None else slots - 1
+            check_entries("writer", state_dict["_writer"], [count("_cursor", high=last)])
+            if "_write_count" in state_dict["_writer"]:
+                check_entries("writer", state_dict["_writer"], [count("_write_count")])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore storage, signals, priorities, writer and generator.

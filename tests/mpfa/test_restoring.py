@@ -157,13 +157,25 @@ def seal_again(folder):
 
 
 SPOILS = [
-    (spoil_capacity, ValueError, "max_capacity of the saved sampler is 25, of this one 24"),
-    (spoil_signals, ValueError, r"signals of the saved sampler are \['novelty', 'td_error'\]"),
-    (spoil_format, ValueError, "format of the saved sampler is 99"),
-    (spoil_table_capacity, ValueError, "capacity of the saved signals is 25, of this storage 24"),
-    (spoil_table_names, ValueError, r"names of the saved signals is \['td_error'\]"),
-    (spoil_table_format, ValueError, "format of the saved signals is 7, this version reads 1"),
-    (drop_table, KeyError, "the saved storage has no signals"),
+    (spoil_capacity, ValueError, "'_max_capacity' of the saved sampler must be 24, got 25"),
+    (
+        spoil_signals,
+        ValueError,
+        r"'_signals' of the saved sampler must be .*, got \['novelty', 'td_error'\]",
+    ),
+    (
+        spoil_format,
+        ValueError,
+        "'_format' of the saved sampler must be 2, which this version reads, got 99",
+    ),
+    (spoil_table_capacity, ValueError, "'capacity' of the saved signals must be 24, got 25"),
+    (spoil_table_names, ValueError, r"'names' of the saved signals must be .*, got \['td_error'\]"),
+    (
+        spoil_table_format,
+        ValueError,
+        "'_signals_format' of the saved storage must be 1, which .*, got 7",
+    ),
+    (drop_table, KeyError, "'_signals' is missing in the saved storage"),
 ]
 
 
@@ -204,7 +216,9 @@ def test_a_buffer_of_other_signals_is_refused(tmp_path):
         sampler=MPFASampler(24, signals=["td_error"]),
         batch_size=6,
     )
-    with pytest.raises(ValueError, match=r"signals of the saved sampler are \['action_gradient',"):
+    with pytest.raises(
+        ValueError, match=r"of the saved sampler must be \['td_error'\], got \['action_gradient',"
+    ):
         other.load_state_dict(first.state_dict())
 
 

@@ -18,7 +18,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.states import refuse
+from torchrl_mpfa.saved import wrong
 from torchrl_mpfa.selection import Draw
 
 Part = Literal["uniform", "prioritized", "inverse"]
@@ -129,7 +129,7 @@ class LA3PSampler(SignalSampler):
         super().check_state(state_dict)
         shares = state_dict["_sum_tree"][~state_dict["_priorities"].isnan()]
         if not bool((shares > 0).all()):
-            refuse("_sum_tree", "positive where something was written", 0.0)
+            raise wrong("sampler", "_sum_tree", "positive where something was written", 0.0)
 
 
 def split_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.states import check_tensor
 from torchrl_mpfa.samplers.weighing import Weighing
+from torchrl_mpfa.saved import Entry
 from torchrl_mpfa.storages.table import SignalTable
 
 _NO_LEAF = float("inf")
@@ -88,9 +88,14 @@ class CappedSampler(SignalSampler):
         """Everything that the next batches depend on; tensors and plain values only."""
         return {**super().state_dict(), "_spent": self._spent.clone()}
 
+    def _entries(self) -> list[Entry]:
+        return [
+            *super()._entries(),
+            Entry("_spent", dtype=torch.bool, shape=(self._max_capacity,)),
+        ]
+
     def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        spent = check_tensor(state, "_spent", torch.bool, self._max_capacity)
-        return super()._saved_leaves(state, written).masked_fill(spent[written], 0.0)
+        return super()._saved_leaves(state, written).masked_fill(state["_spent"][written], 0.0)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

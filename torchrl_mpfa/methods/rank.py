@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.states import check_count, check_tensor, refuse
+from torchrl_mpfa.saved import Entry, count
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
@@ -104,20 +104,19 @@ class RankSampler(SignalSampler):
         """Everything that the next batches depend on; tensors and plain values only."""
         return {**super().state_dict(), "_order": self._order.clone(), "_written": self._written}
 
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
-
-        Raises:
-            ValueError: If an entry is missing, of another sampler, or not what it must be.
-        """
-        super().check_state(state_dict)
-        check_count(state_dict, "_written")
+    def _entries(self) -> list[Entry]:
+        most = self._max_capacity
+        order = Entry(
+            "_order",
+            lambda found: len(found) <= most and bool((found.diff() >= 0).all()),
+            f"at most {most} rising numbers",
+            dtype=torch.double,
+            shape=(None,),
+        )
+        return [*super()._entries(), order, count("_written")]
 
     def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        order = check_tensor(state, "_order", torch.double, None)
-        if len(order) > self._max_capacity or not bool((order.diff() >= 0).all()):
-            refuse("_order", f"at most {self._max_capacity} rising numbers", f"{len(order)} others")
-        return _share_in(order, state["_priorities"][written], alpha=state["_alpha"])
+        return _share_in(state["_order"], state["_priorities"][written], alpha=state["_alpha"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

@@ -33,7 +33,8 @@ from torchrl_mpfa.losses.trust import (
     POLICY_WEIGHT,
 )
 from torchrl_mpfa.methods.acting import actions_of
-from torchrl_mpfa.samplers.states import check_count, check_number, refuse
+from torchrl_mpfa.samplers.states import check_sampler
+from torchrl_mpfa.saved import count, number
 from torchrl_mpfa.selection import Draw
 
 LEAST_SIGMA = 0.2
@@ -111,15 +112,12 @@ class RememberingSampler(RandomSampler):
         return {"_policy_weight": self.policy_weight, "_batches": self.batches}
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
+        """Reject a state that does not fit, before anything changes.
 
         Raises:
             ValueError: If an entry is missing or not what it must be.
         """
-        check_number(state_dict, "_policy_weight")
-        if state_dict["_policy_weight"] > 1:
-            refuse("_policy_weight", "in [0, 1]", state_dict["_policy_weight"])
-        check_count(state_dict, "_batches")
+        check_sampler(state_dict, [number("_policy_weight", high=1.0), count("_batches")])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

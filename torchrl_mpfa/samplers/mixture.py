@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.states import entry, refuse
 from torchrl_mpfa.samplers.tree import TreeSampler
+from torchrl_mpfa.saved import Entry
 
 
 class MixtureSampler(SignalSampler):
@@ -152,18 +152,23 @@ class MixtureSampler(SignalSampler):
         parts = {name: part.state_dict() for name, part in self._parts.items()}
         return {**super().state_dict(), "_parts": parts}
 
+    def _entries(self) -> list[Entry]:
+        names = sorted(self._parts)
+        words = f"a tree for each of {names}"
+        return [
+            *super()._entries(),
+            Entry("_parts", lambda p: isinstance(p, Mapping) and sorted(p) == names, words),
+        ]
+
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
+        """Reject a state that does not fit, before anything changes.
 
         Raises:
             ValueError: If an entry is missing, of another sampler, or not what it must be.
         """
         super().check_state(state_dict)
-        parts = entry(state_dict, "_parts")
-        if not isinstance(parts, Mapping) or sorted(parts) != sorted(self._parts):
-            refuse("_parts", f"a tree for each of {sorted(self._parts)}", parts)
         for name, part in self._parts.items():
-            part.check_state(parts[name])
+            part.check_state(state_dict["_parts"][name])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

@@ -1,4 +1,4 @@
-"""What a sampler that goes by age must know: which transition is the newest."""
+"""Uniform sampling by a sampler that knows which transition is the newest."""
 
 from __future__ import annotations
 
@@ -9,9 +9,22 @@ from typing import Any
 import torch
 from torchrl.data import RandomSampler
 
-from torchrl_mpfa.samplers.states import entry, refuse
+from torchrl_mpfa.samplers.states import check_sampler
+from torchrl_mpfa.saved import Entry
 
 _FILE = "newest.json"
+_NEWEST = Entry(
+    "_newest",
+    lambda newest: (
+        newest is None
+        or (
+            isinstance(newest, list)
+            and len(newest) > 0
+            and all(type(p) is int and p >= 0 for p in newest)
+        )
+    ),
+    "None, or a place for each dimension",
+)
 
 
 class NewestSampler(RandomSampler):
@@ -67,17 +80,12 @@ class NewestSampler(RandomSampler):
         return {**super().state_dict(), "_newest": self._newest}
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
+        """Reject a state that does not fit, before anything changes.
 
         Raises:
             ValueError: If the newest slot is missing or none.
         """
-        newest = entry(state_dict, "_newest")
-        if newest is None:
-            return
-        whole = isinstance(newest, list) and newest
-        if not whole or not all(type(place) is int and place >= 0 for place in newest):
-            refuse("_newest", "None, or a place for each dimension", newest)
+        check_sampler(state_dict, [_NEWEST])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -97,7 +105,7 @@ class NewestSampler(RandomSampler):
         (folder / _FILE).write_text(json.dumps(self._newest), encoding="utf-8")
 
     def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read a saved sampler and refuse it as :meth:`check_state` does."""
+        """Read a saved sampler and reject it as :meth:`check_state` does."""
         state = {"_newest": json.loads((Path(path) / _FILE).read_text(encoding="utf-8"))}
         self.check_state(state)
         return state

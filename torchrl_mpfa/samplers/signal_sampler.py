@@ -20,19 +20,19 @@ from torchrl_mpfa.positive import level_of, one_sided
 from torchrl_mpfa.samplers.binding import signal_table_of
 from torchrl_mpfa.samplers.rows import check_signals, write_signals
 from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
-from torchrl_mpfa.samplers.states import entry
 from torchrl_mpfa.samplers.statistics import batch_statistics
 from torchrl_mpfa.samplers.tree import TreeSampler, in_dimensions_of
 from torchrl_mpfa.samplers.weighing import (
     Weighing,
     boost_factor,
-    check_counted,
-    check_weighing,
     count_anew,
+    counted_entries,
     counted_state,
     entries_of,
+    weighing_entries,
     weights_of,
 )
+from torchrl_mpfa.saved import Entry, exactly
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.storages.table import SignalTable
@@ -400,18 +400,14 @@ class SignalSampler(TreeSampler):
             **counted_state(self._weighing, self.adjustments),
         }
 
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
-
-        Raises:
-            ValueError: If an entry is missing, of another sampler, or not what it must be.
-        """
-        super().check_state(state_dict)
+    def _entries(self) -> list[Entry]:
         names = sorted(self._names)
-        if (found := entry(state_dict, "_signals")) != names:
-            raise ValueError(f"signals of the saved sampler are {found}, of this one {names}")
-        check_weighing(state_dict, names)
-        check_counted(state_dict, self.adjustments)
+        return [
+            *super()._entries(),
+            exactly("_signals", names),
+            *weighing_entries(names),
+            *counted_entries(self.adjustments),
+        ]
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.

@@ -1,4 +1,4 @@
-"""Saving and loading of a sampler; a state that does not fit is refused before it is loaded."""
+"""Saving and loading of a sampler; a state that does not fit is rejected before it is loaded."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from torchrl_mpfa.saved import Entry, check_entries, exactly, number, wrong
 from torchrl_mpfa.saving import load_safely, save_atomically
 
 FORMAT = 2
@@ -43,14 +44,42 @@ class SavedTrees(PrioritizedSampler):
         }
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
+        """Reject a state that does not fit, before anything changes.
 
         Raises:
             ValueError: If an entry is missing, of another sampler, or not what it must be.
         """
-        check_tree_state(state_dict, kind=self.KIND, capacity=self._max_capacity)
+        check_sampler(state_dict, self._entries())
         written = ~state_dict["_priorities"].isnan()
-        check_leaves(state_dict, written, self._saved_leaves(state_dict, written))
+        words = "false where nothing was written"
+        check_sampler(state_dict, [Entry("_learned", lambda found: written | ~found, words)])
+        _check_leaves(state_dict, written, self._saved_leaves(state_dict, written))
+
+    def _entries(self) -> list[Entry]:
+        """What each entry of a saved state must be."""
+        slots = self._max_capacity
+        each_slot: dict[str, Any] = {"dtype": torch.double, "shape": (slots,)}
+        return [
+            exactly("_format", FORMAT, ", which this version reads"),
+            exactly("_kind", self.KIND),
+            exactly("_max_capacity", slots),
+            *(number(name) for name in ("_alpha", "_beta", "_eps")),
+            number("_highest", optional=True),
+            Entry(
+                "_highest_slot",
+                lambda slot: slot is None or (isinstance(slot, int) and 0 <= slot < slots),
+                f"a slot in [0, {slots})",
+            ),
+            Entry(
+                "_priorities",
+                lambda found: found.isnan() | ((found >= 0) & (found < math.inf)),
+                "finite and not negative",
+                **each_slot,
+            ),
+            Entry("_learned", dtype=torch.bool, shape=(slots,)),
+            Entry("_sum_tree", **each_slot),
+            Entry("_min_tree", **each_slot),
+        ]
 
     def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
         """What written slots of a saved state are sampled in proportion to, shape ``[M]``."""
@@ -92,7 +121,7 @@ class SavedTrees(PrioritizedSampler):
         (path / "sampler_metadata.json").write_text(text, encoding="utf-8")
 
     def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read a saved sampler and refuse it as :meth:`check_state` does."""
+        """Read a saved sampler and reject it as :meth:`check_state` does."""
         state: dict[str, Any] = load_safely(Path(path) / "sampler.pt")
         self.check_state(state)
         return state
@@ -106,108 +135,19 @@ class SavedTrees(PrioritizedSampler):
         self.load_state_dict(self.check_dump(path))
 
 
-def check_tree_state(state: Mapping[str, Any], *, kind: str, capacity: int) -> None:
-    """Refuse a state that is not that of such a sampler.
-
-    Args:
-        state: The saved state.
-        kind: Kind of the sampler that is to load it.
-        capacity: Its capacity ``N``.
-
-    Raises:
-        ValueError: If an entry is missing, of another sampler, or not what it must be.
-    """
-    if not isinstance(state, Mapping):
-        raise ValueError(f"the saved sampler must be a mapping, got {type(state).__name__}")
-    if (found := state.get("_format")) != FORMAT:
-        raise ValueError(f"format of the saved sampler is {found}, this version has {FORMAT}")
-    if (found := entry(state, "_kind")) != kind:
-        raise ValueError(f"the saved sampler is {found!r}, this one {kind!r}")
-    if (found := entry(state, "_max_capacity")) != capacity:
-        raise ValueError(f"max_capacity of the saved sampler is {found}, of this one {capacity}")
-    for name in ("_alpha", "_beta", "_eps"):
-        check_number(state, name)
-    if entry(state, "_highest") is not None:
-        check_number(state, "_highest")
-    slot = entry(state, "_highest_slot")
-    if slot is not None and not (isinstance(slot, int) and 0 <= slot < capacity):
-        refuse("_highest_slot", f"a slot in [0, {capacity})", slot)
-    priorities = check_tensor(state, "_priorities", torch.double, capacity)
-    written = ~priorities.isnan()
-    check_values(state, "_priorities", written, high=math.inf)
-    learned = check_tensor(state, "_learned", torch.bool, capacity)
-    if bool((learned & ~written).any()):
-        refuse("_learned", "false where nothing was written", True)
-    for name in ("_sum_tree", "_min_tree"):
-        check_tensor(state, name, torch.double, capacity)
+def check_sampler(state: Any, entries: list[Entry]) -> None:
+    """Reject the state of a sampler that is not as described."""
+    check_entries("sampler", state, entries, missing=ValueError)
 
 
-def check_leaves(state: Mapping[str, Any], written: Tensor, leaves: Tensor) -> None:
-    """Refuse trees that do not belong to their priorities.
-
-    Args:
-        state: The saved state.
-        written: Which slots are written, shape ``[N]``.
-        leaves: What follows from the priorities of those, shape ``[M]``; 0 where a slot is left
-            out of the sampling, and has no lowest share either.
-
-    Raises:
-        ValueError: If they do not, or have no finite sum.
-    """
+def _check_leaves(state: Mapping[str, Any], written: Tensor, leaves: Tensor) -> None:
+    """Reject trees that do not follow from the priorities, with leaf 0 where none is sampled."""
     for name, counts in (("_sum_tree", leaves >= 0), ("_min_tree", leaves > 0)):
         found = state[name][written]
         # The power of a number may differ in its last bits by what stands beside it.
-        wrong = counts & ~found.isclose(leaves, rtol=1e-9, atol=0.0) | ~(found >= 0)
-        if bool(wrong.any()):
-            wanted = f"{leaves[wrong][0].item()}, as follows from '_priorities'"
-            refuse(name, wanted, found[wrong][0].item())
+        bad = counts & ~found.isclose(leaves, rtol=1e-9, atol=0.0) | ~(found >= 0)
+        if bool(bad.any()):
+            wanted = f"{leaves[bad][0].item()}, as follows from '_priorities'"
+            raise wrong("sampler", name, wanted, found[bad][0].item())
     if not bool(leaves.sum() < math.inf):
-        refuse("_sum_tree", "of finite sum", math.inf)
-
-
-def entry(state: Mapping[str, Any], name: str) -> Any:
-    """An entry of the state, which must be there."""
-    if name not in state:
-        raise ValueError(f"{name!r} is missing in the saved sampler")
-    return state[name]
-
-
-def check_number(state: Mapping[str, Any], name: str) -> None:
-    """Refuse what is not a finite number of at least zero."""
-    value = entry(state, name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
-        refuse(name, "a finite number of at least 0", value)
-
-
-def check_count(state: Mapping[str, Any], name: str) -> None:
-    """Refuse what is not an integer of at least zero."""
-    value = entry(state, name)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        refuse(name, "an integer of at least 0", value)
-
-
-def check_tensor(
-    state: Mapping[str, Any], name: str, dtype: torch.dtype, length: int | None
-) -> Tensor:
-    """An entry that must be a tensor of one dimension, and of this length if one is given."""
-    value = entry(state, name)
-    if not isinstance(value, Tensor):
-        refuse(name, "a tensor", value)
-    fits = value.ndim == 1 and value.dtype is dtype and length in (None, len(value))
-    if not fits:
-        wanted = f"{dtype} of shape [{'M' if length is None else length}]"
-        refuse(name, wanted, f"{value.dtype} of shape {[*value.shape]}")
-    return value
-
-
-def check_values(state: Mapping[str, Any], name: str, where: Tensor, *, high: float) -> None:
-    """Refuse values that are negative, not a number, or not below a bound."""
-    values = state[name][where]
-    wrong = ~((values >= 0) & (values < high))
-    if bool(wrong.any()):
-        refuse(name, "finite and not negative", values[wrong][0].item())
-
-
-def refuse(name: str, wanted: str, found: object) -> NoReturn:
-    """Raise the error of an entry that is not what it must be."""
-    raise ValueError(f"{name!r} of the saved sampler must be {wanted}, got {found!r}")
+        raise wrong("sampler", "_sum_tree", "of finite sum", math.inf)

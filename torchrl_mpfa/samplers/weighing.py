@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_mpfa.adjustment import Adjustment, PositiveBoost
 from torchrl_mpfa.checks import check_finite
 from torchrl_mpfa.fusion import Fusion
-from torchrl_mpfa.samplers.states import check_count, check_number, entry, refuse
+from torchrl_mpfa.saved import Entry, count, number
 from torchrl_mpfa.storages.table import SignalTable
 
 _COUNT_REFRESH = 1 / 16
@@ -116,23 +116,6 @@ def weights_of(fusion: Fusion, names: Sequence[str], table: SignalTable, index: 
     return weights.to(torch.double)
 
 
-def check_weighing(state: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Refuse a saved state whose weights are not those of these signals.
-
-    Raises:
-        ValueError: If an entry is missing or not what it must be.
-    """
-    weights = entry(state, "_weights")
-    if not isinstance(weights, Mapping) or (weights and sorted(weights) != sorted(names)):
-        refuse("_weights", f"empty, or one number for each of {sorted(names)}", weights)
-    for name in weights:
-        check_number(weights, name)
-    check_count(state, "_weighed_at")
-    mean = entry(state, "_mean_reward")
-    if not (isinstance(mean, int | float) and math.isfinite(mean)):
-        refuse("_mean_reward", "a finite number", mean)
-
-
 def boost_factor(weighing: Weighing | None, adjustments: Sequence[Adjustment]) -> dict[str, float]:
     """The factor of Eq. (22) as it is now, by its name in the log; nothing without a boost."""
     counted = () if weighing is None else weighing.counted
@@ -155,22 +138,34 @@ def counted_state(weighing: Weighing | None, adjustments: Sequence[Adjustment]) 
     }
 
 
-def check_counted(state: Mapping[str, Any], adjustments: Sequence[Adjustment]) -> None:
-    """Refuse a saved state whose counts are not those of these adjustments.
-
-    Raises:
-        ValueError: If an entry is missing or not what it must be.
-    """
+def counted_entries(adjustments: Sequence[Adjustment]) -> list[Entry]:
+    """What the entries of :func:`counted_state` must be."""
     asking = [asks(each) for each in adjustments]
     if not any(asking):
-        return
-    counted = entry(state, "_counted")
-    fits = isinstance(counted, list) and (
-        not counted
-        or [isinstance(value, Tensor) and bool(value.isfinite().all()) for value in counted]
-        == asking
-    )
-    if not fits:
-        refuse("_counted", f"empty, or finite numbers for {sum(asking)} adjustments", counted)
-    check_count(state, "_counted_writes")
-    check_count(state, "_learned_since")
+        return []
+
+    def holds(counted: Any) -> bool:
+        finite = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
+        return isinstance(counted, list) and (not counted or finite == asking)
+
+    words = f"empty, or finite numbers for {sum(asking)} adjustments"
+    return [Entry("_counted", holds, words), count("_counted_writes"), count("_learned_since")]
+
+
+def weighing_entries(names: Sequence[str]) -> list[Entry]:
+    """What the saved weights of signals must be."""
+
+    def holds(weights: Any) -> bool:
+        if not isinstance(weights, Mapping) or (weights and sorted(weights) != sorted(names)):
+            return False
+        return all(number(name).holds(value) for name, value in weights.items())
+
+    return [
+        Entry("_weights", holds, f"empty, or one number for each of {sorted(names)}"),
+        count("_weighed_at"),
+        Entry(
+            "_mean_reward",
+            lambda mean: isinstance(mean, int | float) and math.isfinite(mean),
+            "a finite number",
+        ),
+    ]

@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.dumps import open_dump, seal_dump
+from torchrl_mpfa.saved import Entry, check_entries, exactly
 from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
 from torchrl_mpfa.storages.states import (
@@ -257,17 +258,15 @@ class SignalStorageMixin:
         foreign = "_signals" not in state and "_signals_format" not in state
         if not foreign:
             self._check_signals(state)
-        for key in ("_storage", "_len", "initialized"):
-            if key not in state:
-                raise KeyError(f"{key!r} is missing in the saved storage")
+        check_entries("storage", state, map(Entry, ("_storage", "_len", "initialized")))
         rows = None if foreign else state["_signals"]["size"]
         length = check_length(state["_len"], self.max_size, rows)
-        found = state["initialized"]
-        if not isinstance(found, bool) or found < bool(length):
-            raise ValueError(
-                f"'initialized' of the saved storage must be true with rows, got {found!r} with "
-                f"{length}"
-            )
+        filled = Entry(
+            "initialized",
+            lambda found: isinstance(found, bool) and found >= bool(length),
+            f"true with {length} rows",
+        )
+        check_entries("storage", state, [filled])
         self._check_data(state["_storage"], length)
         if not foreign:
             signals: dict[str, Any] = state["_signals"]
@@ -277,9 +276,11 @@ class SignalStorageMixin:
         return signals
 
     def _check_signals(self, state: dict[str, Any]) -> None:
-        if "_signals" not in state:
-            raise KeyError("the saved storage has no signals: '_signals' is missing")
-        _check_format(state.get("_signals_format"))
+        known = [
+            exactly("_signals_format", _FORMAT, ", which this version reads"),
+            Entry("_signals"),
+        ]
+        check_entries("storage", state, known)
         self.signal_table.check_state(state["_signals"])
         # What was saved before there were clocks has none.
         if state.get(_CLOCK) not in (None, [state["_signals"]["writes"]]):
@@ -328,10 +329,11 @@ class SignalStorageMixin:
         """Read the saved signals, and refuse the folder as :meth:`check_state` does a state."""
         path = open_dump(path)
         if not (path / _FILE).exists():
-            raise KeyError(f"the saved storage has no signals: {path / _FILE} is missing")
+            raise KeyError(f"'_signals' is missing in the saved storage: no {path / _FILE}")
         state: dict[str, Any] = load_safely(path / _FILE)
         self._check_signals(state)
-        length, is_tree = read_metadata(path, self.max_size, state["_signals"]["size"])
+        found, is_tree = read_metadata(path)
+        length = check_length(found, self.max_size, state["_signals"]["size"])
         if not is_tree:
             self._check_data(TensorDict.load_memmap(path, allow_pickle=False), length)
         return state
@@ -354,11 +356,6 @@ class SignalStorageMixin:
         # What is worked out from the data is worked out again from its copy.
         state: Any = super().__getstate__()
         return {**state, "_schema": None}
-
-
-def _check_format(found: Any) -> None:
-    if found != _FORMAT:
-        raise ValueError(f"format of the saved signals is {found}, this version reads {_FORMAT}")
 
 
 def _as_index(cursor: Any, capacity: int) -> Tensor:

@@ -1,10 +1,11 @@
-"""What a saved storage must be to be loaded, checked before anything is."""
+"""Saved data of a storage: the check before they are loaded, and the signals read from them."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,44 +14,23 @@ from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_mpfa.saved import Entry, check_entries, count, wrong
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
 
 
+def read_metadata(folder: Path) -> tuple[int, bool]:
+    """TorchRL's notes in a folder: the number of filled slots, and whether data are a pytree."""
+    found = json.loads((folder / "storage_metadata.json").read_text(encoding="utf-8"))
+    return found["len"], bool(found["is_pytree"])
+
+
 def check_length(found: Any, max_size: int, signals: int | None) -> int:
-    """Refuse a number of filled slots that cannot be.
-
-    Args:
-        found: The saved number.
-        max_size: Capacity of the storage.
-        signals: Number of filled slots in the saved signals; None if there are none.
-
-    Returns:
-        The number.
-
-    Raises:
-        ValueError: If it is not in the range, or not that of the signals.
-    """
-    if type(found) is not int or not 0 <= found <= max_size:
-        raise ValueError(f"'_len' of the saved storage must be in [0, {max_size}], got {found!r}")
+    """The saved number of filled slots, which must be that of the signals where there are any."""
+    check_entries("storage", {"_len": found}, [count("_len", high=max_size)])
     if signals is not None and found != signals:
         raise ValueError(f"the saved storage has {found} rows, its signals {signals}")
-    return found
-
-
-def read_metadata(folder: Path, max_size: int, signals: int) -> tuple[int, bool]:
-    """What TorchRL wrote about a storage to a folder.
-
-    Args:
-        folder: The folder.
-        max_size: Capacity of the storage.
-        signals: Number of filled slots in the saved signals.
-
-    Returns:
-        The number of filled slots, checked as above, and whether the data are no tensordict.
-    """
-    found = json.loads((folder / "storage_metadata.json").read_text(encoding="utf-8"))
-    return check_length(found["len"], max_size, signals), bool(found["is_pytree"])
+    return int(found)
 
 
 def check_data_state(
@@ -62,7 +42,7 @@ def check_data_state(
     max_size: int,
     allow_nonfinite: Sequence[NestedKey] | None,
 ) -> None:
-    """Refuse saved data of another form than those in a storage.
+    """Reject saved data that a storage cannot take.
 
     Args:
         data: The saved data, as a tensor, a tensordict or its state.
@@ -77,31 +57,28 @@ def check_data_state(
         ValueError: If an entry is unknown, of another shape or dtype, or not finite.
     """
     saved, mine = _leaves(data), _leaves(stored)
-    if length and not saved:
-        raise ValueError(f"the saved storage has {length} rows and no data")
-    if mine and saved:
-        for name in mine:
-            if name not in saved:
-                raise KeyError(f"entry {name!r} is missing in the saved storage")
+    if not saved:
+        if length:
+            raise ValueError(f"the saved storage has {length} rows and no data")
+        return
     for name, value in saved.items():
         if mine and name not in mine:
-            raise ValueError(f"entry {name!r} of the saved storage is not in this one")
-        form = (mine[name].shape, mine[name].dtype) if mine else (value.shape, value.dtype)
-        if (value.shape, value.dtype) != form:
-            raise ValueError(
-                f"entry {name!r} of the saved storage has shape {[*value.shape]} and dtype "
-                f"{value.dtype}, that of this one {[*form[0]]} and {form[1]}"
-            )
-        if math.prod(value.shape[:ndim]) != max_size:
-            raise ValueError(
-                f"entry {name!r} of the saved storage has shape {[*value.shape]}, which is not "
-                f"{max_size} slots"
-            )
-        if allow_nonfinite is not None and value.is_floating_point():
-            allowed = {".".join(as_path(key)) for key in allow_nonfinite}
-            filled = value.reshape(max_size, -1)[:length]
-            if name not in allowed and not _all_finite(filled):
-                raise ValueError(f"entry {name!r} of the saved storage must be finite")
+            raise ValueError(f"{name!r} of the saved storage is not in this one")
+        if not mine and math.prod(value.shape[:ndim]) != max_size:
+            words = f"of {max_size} slots"
+            raise wrong("storage", name, words, f"shape {[*value.shape]}")
+    may = set(saved if allow_nonfinite is None else (".".join(as_path(k)) for k in allow_nonfinite))
+
+    def finite(value: Tensor) -> bool | Tensor:
+        filled = value.reshape(max_size, -1)[:length]
+        return math.isfinite(filled.sum().item()) or filled.isfinite()
+
+    entries = []
+    for name, like in (mine or saved).items():
+        entry = Entry(name, wanted="finite", dtype=like.dtype, shape=tuple(like.shape))
+        free = name in may or not like.is_floating_point()
+        entries.append(entry if free else replace(entry, holds=finite))
+    check_entries("storage", saved, entries)
 
 
 def signals_of_data(table: SignalTable, data: Any, length: int) -> dict[str, Any]:
@@ -146,10 +123,6 @@ def rows_of_data(table: SignalTable, data: Any, length: int) -> Tensor:
         if (name := ".".join(as_path(key))) in leaves
     }
     return table.read(entries, length) if length else table.blank(0)
-
-
-def _all_finite(value: Tensor) -> bool:
-    return math.isfinite(value.sum().item()) or bool(value.isfinite().all())
 
 
 def _leaves(data: Any) -> dict[str, Tensor]:

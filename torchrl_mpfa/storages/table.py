@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_mpfa.saved import Entry, check_entries, count, exactly
 from torchrl_mpfa.signals import Signal, as_signals
 
 
@@ -190,45 +191,43 @@ class SignalTable:
         }
 
     def check_state(self, state: dict[str, Any]) -> None:
-        """Refuse a state that does not belong to this table, before anything changes.
+        """Reject a state that does not belong to this table, before anything changes.
 
         Raises:
             KeyError: If an entry is missing.
             ValueError: If capacity or signals differ, or a value cannot be.
         """
-        for word in ("capacity", "names", "size", "writes", "rows"):
-            if word not in state:
-                raise KeyError(f"{word!r} is missing in the saved signals")
-        for word, mine in (("capacity", self.capacity), ("names", self.names)):
-            if state[word] != mine:
-                raise ValueError(
-                    f"{word} of the saved signals is {state[word]}, of this storage {mine}"
-                )
-        size, writes, rows = state["size"], state["writes"], state["rows"]
-        if type(size) is not int or not 0 <= size <= self.capacity:
-            raise ValueError(
-                f"size of the saved signals must be in [0, {self.capacity}], got {size}"
-            )
-        if type(writes) is not int or writes < 0:
-            raise ValueError(f"writes of the saved signals must not be negative, got {writes}")
-        shape = (size, self.rows.shape[1])
-        if not isinstance(rows, Tensor) or rows.shape != shape or rows.dtype is not torch.double:
-            raise ValueError(f"rows of the saved signals must be double of shape {[*shape]}")
-        self._check_rows(rows, writes)
+        plain = [
+            exactly("capacity", self.capacity),
+            exactly("names", self.names),
+            count("size", high=self.capacity),
+            count("writes"),
+        ]
+        check_entries("signals", state, plain)
+        shape = (state["size"], self.rows.shape[1])
+        check_entries("signals", state, [Entry("rows", dtype=torch.double, shape=shape)])
+        columns = dict(zip(self._columns(), state["rows"].unbind(1), strict=True))
+        check_entries("signals", columns, self._column_entries(state["writes"]))
 
-    def _check_rows(self, rows: Tensor, writes: int) -> None:
-        signals = rows[:, : self.reward_column]
-        counts, times = rows[:, self.count_column], rows[:, self.time_column]
-        # Of what is not known yet there is NaN.
-        if not (signals.isnan() | ((signals >= 0) & (signals < math.inf))).all():
-            raise ValueError("the saved signals must be finite and not negative")
-        if rows[:, self.reward_column].isinf().any():
-            raise ValueError("the saved rewards must be finite")
-        if not ((counts >= 0) & (counts < math.inf) & (times >= 0) & (times < writes)).all():
-            raise ValueError(
-                f"replay counts of the saved signals must be finite and not negative, times of "
-                f"writing in [0, {writes})"
-            )
+    def _columns(self) -> list[str]:
+        return [*self.names, "signed reward", "replay count", "time of writing"]
+
+    def _column_entries(self, writes: int) -> list[Entry]:
+        """What the saved numbers of each column must be, of which NaN is not known yet."""
+        *signals, reward, replays, times = self._columns()
+
+        def below(high: float, found: Tensor) -> Tensor:
+            return (found >= 0) & (found < high)
+
+        return [
+            *(
+                Entry(name, lambda v: v.isnan() | below(math.inf, v), "finite and not negative")
+                for name in signals
+            ),
+            Entry(reward, lambda v: ~v.isinf(), "finite"),
+            Entry(replays, lambda v: below(math.inf, v), "finite and not negative"),
+            Entry(times, lambda v: below(writes, v), f"in [0, {writes})"),
+        ]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
