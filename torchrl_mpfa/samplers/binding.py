@@ -11,20 +11,7 @@ from torchrl_mpfa.storages.table import SignalTable
 
 
 def signal_table_of(storage: Storage, signals: Sequence[Signal], capacity: int) -> SignalTable:
-    """The signals of a storage, after a check that they fit a sampler.
-
-    Args:
-        storage: The storage.
-        signals: What the sampler fuses.
-        capacity: The sampler's capacity ``N``.
-
-    Returns:
-        The signals.
-
-    Raises:
-        TypeError: If the storage keeps no signals.
-        ValueError: If its capacity or its signals are not those of the sampler.
-    """
+    """The signals of a storage, which must fit the signals and the capacity of a sampler."""
     table = getattr(storage, "signal_table", None)
     if not isinstance(table, SignalTable):
         raise TypeError(

@@ -20,23 +20,10 @@ def write_signals(
     signals: Mapping[str, Tensor],
     learned: Learned,
     *,
-    live: Tensor | None,
-    sizes: Sequence[int],
+    live: Tensor | None,  # Which are still in the buffer, [B]; None: all.
+    sizes: Sequence[int],  # Of the batches, each of which is given its priorities by itself.
 ) -> None:
-    """Write the learned signals of batches in copies of their rows; the table stays as it is.
-
-    Args:
-        rows: Rows of the transitions that are still in the buffer, shape ``[M, C]``.
-        table: The table that they are of.
-        signals: Signals by name, each of shape ``[B]`` or ``[B, 1]``.
-        learned: Those that must be there. What makes a priority of one sees the rows of one batch.
-        live: Which transitions are still in the buffer, shape ``[B]``; None: all.
-        sizes: How many of each batch are.
-
-    Raises:
-        KeyError: If a signal is missing.
-        ValueError: If one has not one real number per transition.
-    """
+    """Write learned signals in copies ``[M, C]`` of the live rows; the table stays as it is."""
     count = len(rows) if live is None else len(live)
     for name, priority_of in learned.items():
         if name not in signals:
@@ -58,17 +45,7 @@ def write_signals(
 
 
 def check_signals(chosen: Tensor, names: Sequence[str], learned: Learned) -> None:
-    """Refuse signals that cannot be fused.
-
-    Args:
-        chosen: Signals, shape ``[B, K]``.
-        names: Their names.
-        learned: Which of them the loss learns.
-
-    Raises:
-        KeyError: If the stored transitions lack one.
-        ValueError: If one is negative or not finite.
-    """
+    """Reject signals ``[B, K]`` that cannot be fused: missing, negative or not finite."""
     if len(chosen) == 0:
         return
     # A NaN makes both of these NaN, so that one pass finds whatever is wrong.

@@ -57,19 +57,7 @@ def batch_statistics(
     last_batch: tuple[Tensor, Tensor] | None,
     positive_above: Level,
 ) -> dict[str, float]:
-    """Statistics of the buffer and of the last batch; see ``docs/metrics.md``.
-
-    Args:
-        names: Names of the ``K`` fused signals.
-        weights: Their weights at the last count; empty before it.
-        fusion: Where the weights come from; its ``entropies`` are given if it has any.
-        table: Signals of every slot.
-        last_batch: Slots and importance weights last sampled, each of shape ``[B]``.
-        positive_above: What the reward of a positive transition exceeds.
-
-    Returns:
-        Plain numbers by name.
-    """
+    """Statistics of the buffer and of the last batch by name; see ``docs/metrics.md``."""
     found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
     if table.size == 0:
         return found

@@ -63,25 +63,11 @@ def count_anew(
     priority: Callable[[Weighing], Tensor],
     *,
     learned: int,
-    always: bool,
+    always: bool,  # Whatever has changed.
 ) -> Weighing:
-    """Have the adjustments count the buffer if enough of it changed since they last did.
-
-    Both what is written and what is learned from changes it. With a sixteenth between two counts a
-    row that is learned from costs as much as sixteen that are read, whatever the capacity.
-
-    Args:
-        weighing: The present one.
-        last: The one before it; None at first.
-        adjustments: The adjustments.
-        table: Signals of every slot.
-        priority: Gives the fused priorities of all filled slots, shape ``[N]``.
-        learned: Transitions that are learned from now.
-        always: Whether to count whatever has changed.
-
-    Returns:
-        The weighing with what was counted, now or last.
-    """
+    """Have the adjustments count the buffer again if enough of it changed since they last did."""
+    # Both what is written and what is learned from changes it. With a sixteenth between two
+    # counts a row that is learned from costs as much as sixteen that are read, at any capacity.
     if not any(map(asks, adjustments)):
         return weighing
     if last is not None and last.counted:
@@ -104,11 +90,7 @@ def count_anew(
 
 
 def weights_of(fusion: Fusion, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
-    """The weights that a fusion gives, in double precision, shape ``[K]``.
-
-    Raises:
-        ValueError: If they have another shape, or one is negative or not finite.
-    """
+    """The weights that a fusion gives, checked, in double precision, shape ``[K]``."""
     weights = fusion.weights(names, table, index)
     if weights.shape != (len(names),):
         raise ValueError(f"fusion must give {len(names)} weights, got shape {[*weights.shape]}")
