@@ -19,17 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from mpfa_envs import (
-    PAPER_TASK,
-    WORLDS,
-    Lidar,
-    NavigationEnv,
-    PathPlanner,
-    World,
-    evaluation_pairs,
-    render_trajectories,
-)
-from mpfa_envs.render import tiled
+from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, World
+from mpfa_envs.paths.planner import PathPlanner
+from mpfa_envs.render import render_trajectories, tiled
+from mpfa_envs.tasks.sampling import evaluation_pairs
 from tests.envs.bullet_world import BulletWorld
 
 ROUNDS = 5

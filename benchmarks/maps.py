@@ -15,11 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs import FreeGrid, Lidar, OccupancyGrid, Task, World, sample_task_on_grid
+from mpfa_envs import Lidar, Task, World
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.planner import shortest_length
+from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.sensing.lidar_loops import cast_rays
 from mpfa_envs.worlds.batch import BatchArrays, WorldBatch
 from mpfa_envs.worlds.clearance_loops import clearance_at
+from mpfa_envs.worlds.occupancy import OccupancyGrid
 
 SIDE, ROOM, CELL = 2000, 160, 0.05
 ROBOTS = 4

@@ -24,13 +24,13 @@ from benchmarks.timing import (
 from torchrl_mpfa import (
     ACTION_GRADIENT,
     TD_ERROR,
-    Draw,
     Learner,
     MPFASampler,
     SignalReplayBuffer,
     SignalTensorStorage,
     run_updates,
 )
+from torchrl_mpfa.selection import Draw
 
 BATCH_SIZE = 256
 OBSERVATION_SIZE = 24

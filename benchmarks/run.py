@@ -21,7 +21,7 @@ from pathlib import Path
 
 from benchmarks import environment, loss, method_steps, replay, training, vector, worlds
 from benchmarks.timing import Entry
-from torchrl_mpfa import write_text_atomically
+from torchrl_mpfa.saving import write_text_atomically
 
 LATEST = Path(__file__).with_name("latest.json")
 

@@ -18,19 +18,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.timing import Call, Entry, entry, take_turns
-from mpfa_envs import (
-    GENERATORS,
-    DistanceField,
-    FreeGrid,
-    NavigationEnv,
-    PathPlanner,
-    World,
-    barn_world,
-    generate_world,
-    render_trajectories,
-    sample_task_on_grid,
-)
-from mpfa_envs.render import tiled
+from mpfa_envs import GENERATORS, NavigationEnv, World, generate_world
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.paths.planner import PathPlanner
+from mpfa_envs.paths.tasks import sample_task_on_grid
+from mpfa_envs.render import render_trajectories, tiled
+from mpfa_envs.worlds.barn import barn_world
 
 DISTANCE = 0.25
 """What ways keep from obstacles: a TurtleBot2's radius and 0.07 m [m]."""

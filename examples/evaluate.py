@@ -34,15 +34,8 @@ import navigation.extra  # noqa: F401
 # isort: split
 import pandas as pd
 
-from mpfa_envs import (
-    GENERATORS,
-    PLANNERS,
-    EpisodeResult,
-    Policy,
-    RobotNoise,
-    load_policy,
-    make_planner,
-)
+from mpfa_envs import GENERATORS, PLANNERS, Policy, RobotNoise, load_policy, make_planner
+from mpfa_envs.evaluation.results import EpisodeResult
 from navigation import files
 from navigation.environments import check_physics
 from navigation.evaluating import (

@@ -32,7 +32,7 @@ def run_updates(
 ) -> tuple[dict[str, Tensor], TensorDictBase]:
     """Make the updates of one iteration.
 
-    With :func:`~torchrl_mpfa.one_batch` the batches of all updates are sampled in one call, and
+    With ``one_batch`` the batches of all updates are sampled in one call, and
     their priorities are written in one at the end; of a transition that was sampled twice the last
     update counts. Any other selection, and a sampler whose batches are more than rows drawn one by
     one (stratified, with the newest transition in each), is asked update by update, and priorities

@@ -7,9 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mpfa_envs import (
-    DynamicWindow,
-    EpisodeResult,
-    MapPlanner,
     Policy,
     RobotNoise,
     VectorNavigationEnv,
@@ -18,6 +15,8 @@ from mpfa_envs import (
     summarize,
     world_tasks,
 )
+from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.planners import DynamicWindow, MapPlanner
 from navigation.worlds import worlds_label
 
 Drivable = Policy | MapPlanner | DynamicWindow

@@ -11,8 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mpfa_envs import EpisodeResult, Policy, World, WorldTask, render_trajectories
-from mpfa_envs.render import film_episode, render_values, tiled, write_animation
+from mpfa_envs import Policy, World, WorldTask
+from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.render import (
+    film_episode,
+    render_trajectories,
+    render_values,
+    tiled,
+    write_animation,
+)
 from navigation.evaluating import Drivable, Drives
 
 Values = Callable[[NDArray[np.float32]], NDArray[np.float64]]

@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from mpfa_envs import BARN_WORLDS, DistanceField, FreeGrid, NavigationEnv, barn_task, barn_world
+from mpfa_envs import NavigationEnv
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world
 
 
 def test_there_are_twenty_worlds_from_open_to_narrow() -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from mpfa_envs import (
     WORLDS,
-    DynamicWindow,
     Lidar,
     Mirror,
     NavigationEnv,
@@ -17,13 +16,13 @@ from mpfa_envs import (
     RobotNoise,
     VectorNavigationEnv,
     evaluate,
-    evaluation_pairs,
-    generator_tasks,
     make_navigation_env,
-    split_worlds,
     world_tasks,
 )
+from mpfa_envs.generators import generator_tasks, split_worlds
+from mpfa_envs.planners import DynamicWindow
 from mpfa_envs.policies.layers import Linear
+from mpfa_envs.tasks.sampling import evaluation_pairs
 
 MANY = 2**31
 

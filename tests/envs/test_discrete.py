@@ -12,20 +12,19 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from mpfa_envs import (
-    WHEEL_PAIRS,
-    Binning,
     DiscreteWheels,
     Mirror,
     NavigationTorchEnv,
     Policy,
-    PolicyFileError,
     RandomMirror,
     load_policy,
-    observation_slices,
     save_policy,
 )
 from mpfa_envs.policies.layers import Choice, Linear, Table
-from mpfa_envs.robots.discrete import mirrored_places
+from mpfa_envs.policies.policy import PolicyFileError
+from mpfa_envs.robots.discrete import WHEEL_PAIRS, mirrored_places
+from mpfa_envs.sensing.binning import Binning
+from mpfa_envs.sensing.observation import observation_slices
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])

@@ -6,19 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from mpfa_envs import (
-    WORLDS,
-    Box,
-    Cylinder,
-    DistanceField,
-    FreeGrid,
-    PathPlanner,
-    Polygon,
-    World,
-    generate_world,
-    sample_task_on_grid,
-)
-from mpfa_envs.paths.tasks import has_task
+from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, generate_world
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.paths.planner import PathPlanner
+from mpfa_envs.paths.tasks import has_task, sample_task_on_grid
 
 MIXED = World(
     name="mixed",

@@ -12,18 +12,16 @@ import pytest
 from numpy.typing import NDArray
 
 from mpfa_envs import (
-    EpisodeResult,
     Policy,
     TaskConfig,
     VectorNavigationEnv,
     evaluate,
     load_policy,
     run_tasks,
-    spl,
     summarize,
     world_tasks,
 )
-from mpfa_envs.evaluation.results import bootstrap, wilson
+from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, spl, wilson
 from mpfa_envs.policies.layers import Linear, Tanh
 from mpfa_envs.robots.model import resolve_robot
 

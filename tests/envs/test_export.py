@@ -12,17 +12,11 @@ import pytest
 
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
-from mpfa_envs import (
-    EpisodeResult,
-    Policy,
-    PolicyFileError,
-    evaluate,
-    export_policy,
-    load_policy,
-    save_policy,
-)
+from mpfa_envs import Policy, evaluate, export_policy, load_policy, save_policy
 from mpfa_envs.deploy import CardError, Pilot
+from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.policies.layers import Choice, Linear, ReLU, Scale, Table, Tanh
+from mpfa_envs.policies.policy import PolicyFileError
 from mpfa_envs.sensing.binning import Binning
 from tests.envs.exported import ENV_ARGUMENTS, SHIPPED, exported, make_policy
 

@@ -13,10 +13,8 @@ import pytest
 from mpfa_envs import (
     WORLDS,
     Policy,
-    PolicyFileError,
     World,
     WorldFileError,
-    load_gazebo_world,
     load_policy,
     load_world,
     save_policy,
@@ -24,6 +22,8 @@ from mpfa_envs import (
 )
 from mpfa_envs.deploy.card import CardError, read_exported
 from mpfa_envs.policies.layers import Linear
+from mpfa_envs.policies.policy import PolicyFileError
+from mpfa_envs.worlds.gazebo import load_gazebo_world
 
 POLICY = Policy([Linear(np.ones((2, 24), np.float32), np.zeros(2, np.float32))])
 TEXT = "root:x:0:0:root:/root:/bin/bash\n"

@@ -6,15 +6,10 @@ import time
 
 import pytest
 
-from mpfa_envs import (
-    Box,
-    NavigationEnv,
-    WorldFileError,
-    barn_task,
-    barn_world,
-    load_gazebo_world,
-)
+from mpfa_envs import Box, NavigationEnv, WorldFileError
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.worlds.barn import barn_task, barn_world
+from mpfa_envs.worlds.gazebo import load_gazebo_world
 
 BARN_CENTER = (-2.25, 7.0)
 SPECK = "<box><size>1e-200 1e-200 1</size></box>"

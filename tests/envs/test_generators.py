@@ -17,20 +17,18 @@ from mpfa_envs import (
     GENERATORS,
     Box,
     Cylinder,
-    FreeGrid,
     NavigationEnv,
-    PathPlanner,
     VectorNavigationEnv,
     World,
     evaluate,
     generate_world,
-    generator_tasks,
     register_generator,
-    sample_task_on_grid,
-    split_worlds,
-    world_seed,
 )
+from mpfa_envs.generators import generator_tasks, split_worlds, world_seed
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.paths.planner import PathPlanner
+from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.worlds.plain import walker_to_plain
 
 NAMES = list(GENERATORS)

@@ -10,13 +10,8 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from mpfa_envs import (
-    Mirror,
-    NavigationEnv,
-    VectorNavigationEnv,
-    make_navigation_env,
-    observation_slices,
-)
+from mpfa_envs import Mirror, NavigationEnv, VectorNavigationEnv, make_navigation_env
+from mpfa_envs.sensing.observation import observation_slices
 
 NAMES = ["B", "D"]
 PARTS = observation_slices(history=3)

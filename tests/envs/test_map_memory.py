@@ -9,19 +9,11 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from mpfa_envs import (
-    Box,
-    Lidar,
-    MapMemory,
-    NavigationEnv,
-    VectorNavigationEnv,
-    World,
-    generate_world,
-    observation_slices,
-)
+from mpfa_envs import Box, Lidar, NavigationEnv, VectorNavigationEnv, World, generate_world
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import WAY
-from mpfa_envs.sensing.map_memory import RESOLUTION
+from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
+from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.shapes import random_shapes
 
 ROBOT = ROBOTS["turtlebot2"]

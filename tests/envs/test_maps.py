@@ -12,19 +12,18 @@ from mpfa_envs import (
     ROBOTS,
     WORLDS,
     Box,
-    DistanceField,
-    FreeGrid,
     Lidar,
     NavigationEnv,
-    OccupancyGrid,
     VectorNavigationEnv,
     World,
     WorldFileError,
     load_world,
     save_world,
 )
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.field_loops import path_lengths
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
+from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 
 GOOD = {

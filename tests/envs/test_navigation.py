@@ -14,7 +14,6 @@ from gymnasium.utils.env_checker import check_env
 
 import mpfa_envs
 from mpfa_envs import (
-    INFO_TYPES,
     OBSERVATION,
     PAPER_TASK,
     ROBOTS,
@@ -25,6 +24,7 @@ from mpfa_envs import (
     TaskConfig,
     World,
 )
+from mpfa_envs.sensing.observation import INFO_TYPES
 from tests.envs.paper import paper_env
 
 STRAIGHT = {"start": (0.0, 0.0, 0.0), "goal": (2.98, 0.0)}

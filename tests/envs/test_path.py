@@ -7,21 +7,11 @@ import time
 import numpy as np
 import pytest
 
-from mpfa_envs import (
-    WORLDS,
-    Box,
-    Cylinder,
-    NavigationEnv,
-    PathPlanner,
-    Polygon,
-    World,
-    barn_task,
-    barn_world,
-    evaluation_pairs,
-    generate_world,
-)
+from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, World, generate_world
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.paths.planner import is_small, shortest_length
+from mpfa_envs.paths.planner import PathPlanner, is_small, shortest_length
+from mpfa_envs.tasks.sampling import evaluation_pairs
+from mpfa_envs.worlds.barn import barn_task, barn_world
 
 BLOCK = World(name="block", boxes=(Box(-1.0, -2.0, 1.0, 2.0),))
 

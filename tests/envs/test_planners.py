@@ -13,8 +13,6 @@ import pytest
 from mpfa_envs import (
     WORLDS,
     Box,
-    FreeGrid,
-    MapPlanner,
     NavigationEnv,
     VectorNavigationEnv,
     World,
@@ -25,8 +23,10 @@ from mpfa_envs import (
 )
 from mpfa_envs.evaluation.runs import as_driver
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners import (
     AntColony,
+    MapPlanner,
     PurePursuit,
     Search,
     astar_path,

@@ -8,17 +8,11 @@ import time
 import numpy as np
 import pytest
 
-from mpfa_envs import (
-    Box,
-    Driver,
-    DynamicWindow,
-    NavigationEnv,
-    World,
-    evaluate,
-    observation_slices,
-)
-from mpfa_envs.planners import WindowScore
+from mpfa_envs import Box, NavigationEnv, World, evaluate
+from mpfa_envs.evaluation.runs import Driver
+from mpfa_envs.planners import DynamicWindow, WindowScore
 from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.sensing.observation import observation_slices
 
 TURTLEBOT = ROBOTS["turtlebot2"]
 PARTS = observation_slices()

@@ -13,8 +13,9 @@ import pytest
 import torch
 from torch import nn
 
-from mpfa_envs import Policy, PolicyFileError, load_policy, save_policy
+from mpfa_envs import Policy, load_policy, save_policy
 from mpfa_envs.policies.layers import Linear
+from mpfa_envs.policies.policy import PolicyFileError
 
 ENV_ARGUMENTS = {"robot": "turtlebot2", "physics": "kinematic", "action_repeat": 2}
 

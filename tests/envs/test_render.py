@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, render_trajectories
+from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World
 from mpfa_envs.render import (
     FLOOR,
     GOAL,
@@ -16,6 +16,7 @@ from mpfa_envs.render import (
     TRAIL,
     WALL,
     render_methods,
+    render_trajectories,
     shown_episodes,
     tiled,
     viridis,

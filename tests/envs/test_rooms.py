@@ -13,15 +13,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
 
 import mpfa_envs
-from mpfa_envs import (
-    INFO_TYPES,
-    ROOMS_TASK,
-    NavigationEnv,
-    VectorNavigationEnv,
-    World,
-    generate_world,
-    generator_tasks,
-)
+from mpfa_envs import ROOMS_TASK, NavigationEnv, VectorNavigationEnv, World, generate_world
+from mpfa_envs.generators import generator_tasks
+from mpfa_envs.sensing.observation import INFO_TYPES
 
 ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)
 

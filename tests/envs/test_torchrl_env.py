@@ -20,13 +20,9 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from mpfa_envs import (
-    INFO_TYPES,
-    NavigationEnv,
-    NavigationTorchEnv,
-    evaluation_pairs,
-    make_navigation_env,
-)
+from mpfa_envs import NavigationEnv, NavigationTorchEnv, make_navigation_env
+from mpfa_envs.sensing.observation import INFO_TYPES
+from mpfa_envs.tasks.sampling import evaluation_pairs
 
 
 @pytest.mark.parametrize("num_envs", [None, 3])

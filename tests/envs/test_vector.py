@@ -17,7 +17,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import mpfa_envs
 from mpfa_envs import (
-    INFO_TYPES,
     PAPER_TASK,
     WORLDS,
     Box,
@@ -28,6 +27,7 @@ from mpfa_envs import (
     World,
     navigation_reward,
 )
+from mpfa_envs.sensing.observation import INFO_TYPES
 from tests.envs.plain_robot import PlainRobot
 from tests.envs.shapes import random_shapes
 

@@ -12,8 +12,6 @@ from mpfa_envs import (
     GENERATORS,
     WORLDS,
     Box,
-    DistanceField,
-    FreeGrid,
     NavigationEnv,
     Task,
     VectorNavigationEnv,
@@ -21,6 +19,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.generators import generate_world
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
 
 GENERATOR_IDS = [each for each in ENV_IDS if each.split("-")[1] not in WORLDS]
 

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from mpfa_envs import (
-    INFO_TYPES,
     Box,
     Cylinder,
     Lidar,
-    MapMemory,
     NavigationEnv,
     Polygon,
     VectorNavigationEnv,
@@ -26,6 +24,8 @@ from mpfa_envs import (
 )
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import WALKER
+from mpfa_envs.sensing.map_memory import MapMemory
+from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.walkers.loops import time_to_collision
 from mpfa_envs.walkers.starts import start_walkers

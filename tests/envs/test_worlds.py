@@ -9,18 +9,9 @@ import sys
 import numpy as np
 import pytest
 
-from mpfa_envs import (
-    WORLDS,
-    Box,
-    Cylinder,
-    NavigationEnv,
-    Polygon,
-    Walker,
-    World,
-    evaluation_pairs,
-    sample_task,
-)
+from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, Walker, World
 from mpfa_envs.paths.planner import planner_for
+from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
 
 
 def test_clearance_is_the_distance_to_the_nearest_face() -> None:

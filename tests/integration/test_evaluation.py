@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 import evaluate
-from mpfa_envs import GENERATORS, EpisodeResult, load_policy, save_policy, world_tasks
+from mpfa_envs import GENERATORS, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
+from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.render import film_episode
 from navigation import files
 from navigation.evaluating import summary_row

@@ -26,7 +26,6 @@ from torchrl_mpfa import (
     MPFASampler,
     Signal,
     SignalDDPGLoss,
-    SignalLoss,
     SignalMemmapStorage,
     SignalSACLoss,
     SignalSampler,
@@ -50,6 +49,7 @@ from torchrl_mpfa.configs import (
     SignalTensorStorageConfig,
     StochasticActorConfig,
 )
+from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
 
 pytestmark = [

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from tests.methods.replays import make_buffer, make_transitions
-from torchrl_mpfa.methods import CombinedSampler
+from torchrl_mpfa.methods.cer import CERSampler
 
 
 def make_combined(capacity, batch_size, filled):
-    return make_buffer(CombinedSampler(), capacity, batch_size, filled=filled)
+    return make_buffer(CERSampler(), capacity, batch_size, filled=filled)
 
 
 def test_the_newest_transition_is_in_every_batch_across_the_wrap():

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from tests.methods.replays import seeded
 from torchrl_mpfa.learners.base import make_optimizer
-from torchrl_mpfa.methods import Curiosity, intrinsic_reward
+from torchrl_mpfa.methods.curiosity import Curiosity, intrinsic_reward
 
 
 def make_batch(count=64, *, seed=0, shift=0.0):

@@ -7,7 +7,8 @@ import torch
 
 from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.methods import GeometricSampler, geometric_age, make_replay
+from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.methods.geometric import GeometricSampler, geometric_age
 
 SAMPLES = 40_000
 

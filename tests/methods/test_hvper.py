@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from tests.methods.replays import make_buffer, make_transitions, seeded
-from torchrl_mpfa import BatchFacts, SignalSampler
-from torchrl_mpfa.methods import (
+from torchrl_mpfa import SignalSampler
+from torchrl_mpfa.adjustment import BatchFacts
+from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
-    ReplayPenalty,
+    HVPERPenalty,
     relative_error,
     relative_value,
     value_schedule,
@@ -41,7 +42,7 @@ def test_priorities_are_those_of_the_formula(fraction):
         EPS,
         signals=[RELATIVE_VALUE, RELATIVE_ERROR],
         fusion=value_schedule(),
-        adjustments=[ReplayPenalty(penalty=KAPPA, floor=EPS)],
+        adjustments=[HVPERPenalty(penalty=KAPPA, floor=EPS)],
     )
     buffer = make_buffer(sampler, 6, 9, signals=[RELATIVE_VALUE, RELATIVE_ERROR])
     sampler.anneal(fraction)
@@ -80,7 +81,7 @@ def test_value_and_error_are_between_zero_and_one():
 
 def test_of_equal_transitions_the_more_often_replayed_has_the_lower_priority():
     facts = BatchFacts(torch.zeros(3), torch.tensor([1.0, 10.0, 100.0]), torch.arange(3))
-    found = ReplayPenalty()(torch.full((3,), 0.5), facts)
+    found = HVPERPenalty()(torch.full((3,), 0.5), facts)
     assert found[0] > found[1] > found[2] >= EPS
 
 
@@ -133,9 +134,9 @@ def test_what_was_overwritten_meanwhile_is_none_of_its_batch():
 
 def test_what_is_out_of_range_is_refused():
     with pytest.raises(ValueError, match="penalty must be finite and not negative, got -1"):
-        ReplayPenalty(penalty=-1)
+        HVPERPenalty(penalty=-1)
     with pytest.raises(ValueError, match="floor must be positive"):
-        ReplayPenalty(floor=0)
+        HVPERPenalty(floor=0)
     with pytest.raises(ValueError, match=r"final_share must be in \[0, 1\], got 2"):
         value_schedule(final_share=2)
     with pytest.raises(ValueError, match=r"fraction must be in \[0, 1\], got 1.5"):

@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal, kl_divergence
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_mpfa import make_actor
-from torchrl_mpfa.methods import LowestDivergence, gaussian_divergence
+from torchrl_mpfa.methods.klper import KLPERSelection, gaussian_divergence
 
 
 def seeded(seed):
@@ -62,7 +62,7 @@ class Elsewhere:
 def test_the_policy_may_be_on_another_device_than_the_batch():
     action = torch.tensor([0.0, 0.5]).repeat_interleave(4).unsqueeze(1).expand(8, 2)
     batch = TensorDict({"observation": torch.rand(8, 3), "action": action}, [8])
-    chosen = LowestDivergence(Elsewhere(), batches=2, sigma=0.2)(batch)
+    chosen = KLPERSelection(Elsewhere(), batches=2, sigma=0.2)(batch)
     assert torch.equal(chosen["action"], torch.zeros(4, 2))
 
 
@@ -117,14 +117,14 @@ def test_the_batch_of_the_current_policy_is_chosen(best):
     policy = make_actor(6, 2, width=16)
     shifts = [0.7, 0.7, 0.7]
     shifts[best] = 0.0
-    batch = LowestDivergence(policy, sigma=0.2)(sampled(policy, shifts))
+    batch = KLPERSelection(policy, sigma=0.2)(sampled(policy, shifts))
     assert batch["number"].tolist() == list(range(64 * best, 64 * (best + 1)))
 
 
 def test_the_present_noise_is_asked_for_at_each_batch():
     policy = make_actor(6, 2, width=16)
     asked = iter([0.2, 0.7])
-    select = LowestDivergence(policy, batches=2, sigma=lambda: next(asked))
+    select = KLPERSelection(policy, batches=2, sigma=lambda: next(asked))
     wide = sampled(policy, [0.0, 0.0], sigma=0.7)
     shifted = sampled(policy, [0.4, 0.4], sigma=0.1)
     both = torch.cat([shifted[:64], wide[64:]])
@@ -136,7 +136,7 @@ def test_of_what_a_buffer_draws_one_batch_is_left_with_its_index():
     policy = make_actor(6, 2, width=16)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=30)
     buffer.extend(sampled(policy, [0.0, 0.5]))
-    batch = LowestDivergence(policy, batches=3, sigma=0.2)(buffer.sample())
+    batch = KLPERSelection(policy, batches=3, sigma=0.2)(buffer.sample())
     assert batch.batch_size == (10,)
     assert batch["number"].equal(batch["index"])
 
@@ -144,10 +144,10 @@ def test_of_what_a_buffer_draws_one_batch_is_left_with_its_index():
 def test_wrong_arguments_are_refused_by_name():
     policy = make_actor(6, 2, width=16)
     with pytest.raises(ValueError, match="batches must be a positive 31-bit integer, got 0"):
-        LowestDivergence(policy, batches=0, sigma=0.2)
+        KLPERSelection(policy, batches=0, sigma=0.2)
     with pytest.raises(ValueError, match="sigma must be finite"):
-        LowestDivergence(policy, sigma=-1.0)
+        KLPERSelection(policy, sigma=-1.0)
     with pytest.raises(ValueError, match="64 transitions cannot make 3 equal batches"):
-        LowestDivergence(policy, sigma=0.2)(sampled(policy, [0.0]))
+        KLPERSelection(policy, sigma=0.2)(sampled(policy, [0.0]))
     with pytest.raises(ValueError, match="variance must be positive"):
         gaussian_divergence(torch.zeros(4, 2), variance=0.0)

@@ -5,13 +5,13 @@ import torch
 
 from tests.methods.replays import make_buffer, make_transitions, set_signals
 from torchrl_mpfa import FixedFusion, ScaledFusion
-from torchrl_mpfa.methods import CappedSampler
+from torchrl_mpfa.methods.mw import MWSampler
 
 SIGNALS = ["reward", "td_error"]
 
 
 def make_capped(capacity, batch_size, cap, *, filled=None):
-    sampler = CappedSampler(
+    sampler = MWSampler(
         capacity,
         0.6,
         0.4,

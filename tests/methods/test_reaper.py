@@ -8,7 +8,8 @@ from tensordict import TensorDict
 
 from tests.methods.replays import assert_shares, seeded, set_signals
 from torchrl_mpfa import SignalSampler, SignalTensorStorage
-from torchrl_mpfa.methods import ReaPERSampler, make_replay, reliability
+from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.methods.reaper import ReaPERSampler, reliability
 
 OMEGA, ALPHA, EPS = 0.4, 0.8, 0.05
 

@@ -17,14 +17,8 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.learners.gradients import Gradients
 from torchrl_mpfa.losses.trust import Trust, trusted_loss
-from torchrl_mpfa.methods import (
-    RememberForget,
-    RememberingSampler,
-    importance_ratio,
-    loss_options,
-    make_replay,
-)
-from torchrl_mpfa.methods.ref_er import next_weight
+from torchrl_mpfa.methods import loss_options, make_replay
+from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, importance_ratio, next_weight
 
 COUNT = 200
 
@@ -163,7 +157,7 @@ def test_the_weight_moves_as_its_rule_says_and_the_policy_is_held_once_too_many_
 @pytest.mark.parametrize("rate", [0.0003, 0.1])
 def test_the_weight_starts_next_to_zero_and_no_step_is_longer_than_what_is_left(rate):
     """The authors' rule in plain steps, up from their start and down from the end."""
-    weight = RememberingSampler().policy_weight
+    weight = ReFERSampler().policy_weight
     assert weight == 1e-4
     for far in [0.0] * 200 + [1.0] * 200:
         up = far <= 0.1
@@ -263,7 +257,7 @@ def test_sac_is_held_and_set_free_as_well():
 
 @pytest.mark.parametrize("way", ["state", "folder"])
 def test_the_weight_is_saved(way, tmp_path):
-    first, second = (make_buffer(RememberingSampler(), 9, 2) for _ in range(2))
+    first, second = (make_buffer(ReFERSampler(), 9, 2) for _ in range(2))
     first.sampler.policy_weight, first.sampler.batches = 0.25, 7
     if way == "state":
         second.load_state_dict(first.state_dict())
@@ -278,7 +272,7 @@ def test_the_weight_is_saved(way, tmp_path):
 
 
 def test_a_buffer_that_is_emptied_begins_with_the_first_weight():
-    buffer = make_buffer(RememberingSampler(), 9, 2)
+    buffer = make_buffer(ReFERSampler(), 9, 2)
     buffer.sampler.policy_weight, buffer.sampler.batches = 0.25, 7
     buffer.empty()
     assert (buffer.sampler.policy_weight, buffer.sampler.batches) == (1e-4, 7)
@@ -289,11 +283,11 @@ def test_what_is_missing_or_out_of_range_is_named():
         make_replay("ref_er")
     policy = make_actor(6, 2, width=8)
     with pytest.raises(ValueError, match=r"far_share must be in \[0, 1\], got 2"):
-        RememberForget(policy, far_share=2)
+        ReFERSelection(policy, far_share=2)
     with pytest.raises(ValueError, match="cutoff must be positive and finite, got 0"):
-        RememberForget(policy, cutoff=0)
-    with pytest.raises(TypeError, match="buffer must have a RememberingSampler"):
-        next(RememberForget(policy)(make_buffer(make_replay("ddpg").buffer.sampler, 5, 2)))
+        ReFERSelection(policy, cutoff=0)
+    with pytest.raises(TypeError, match="buffer must have a ReFERSampler"):
+        next(ReFERSelection(policy)(make_buffer(make_replay("ddpg").buffer.sampler, 5, 2)))
     replay = make_replay("ref_er", policy=policy, capacity=10, batch_size=4)
     assert replay.entries == ("behavior_mean", "behavior_sigma")
     rows = make_transitions(10)

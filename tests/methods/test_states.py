@@ -5,8 +5,9 @@ import torch
 
 from tests.methods.replays import make_transitions, seeded
 from tests.mpfa.transitions import same
-from torchrl_mpfa import MPFASampler, TreeSampler
+from torchrl_mpfa import MPFASampler
 from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.samplers import TreeSampler
 
 METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer", "geometric"]
 

@@ -7,8 +7,8 @@ import torch
 
 from tests import oracles
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import Adjustment, BatchFacts, PositiveBoost, PositiveDecay
-from torchrl_mpfa.adjustment import boost_positive, decay_factor, decay_threshold
+from torchrl_mpfa import Adjustment, PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import BatchFacts, boost_positive, decay_factor, decay_threshold
 
 
 def facts(rewards, counts=None):

@@ -17,7 +17,8 @@ from torchrl_mpfa.cliffwalk import (
     oracle_updates,
     updates_to_convergence,
 )
-from torchrl_mpfa.methods import RankSampler, make_replay
+from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.testing import check_prioritization
 
 
@@ -151,7 +152,7 @@ class Reversed(SignalSampler):
         return super()._leaf(1.0 / priority)
 
 
-@pytest.mark.parametrize("kind", [SignalSampler, RankSampler])
+@pytest.mark.parametrize("kind", [SignalSampler, RankPERSampler])
 def test_a_sampler_that_works_passes_the_check(kind):
     check_prioritization(lambda capacity: kind(capacity, 0.6, 0.4, 1e-3), seeds=1)
 

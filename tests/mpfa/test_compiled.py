@@ -7,15 +7,9 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from tests.mpfa.losses import BOUNDS, GAMMA, differentiate_at_once, make_batch, make_networks
-from torchrl_mpfa import (
-    DDPGLearner,
-    Draw,
-    TD3Learner,
-    load_safely,
-    make_ddpg_loss,
-    make_td3_loss,
-    save_atomically,
-)
+from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
+from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.selection import Draw
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 

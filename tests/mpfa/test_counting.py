@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from tests.methods.replays import make_buffer, make_transitions, seeded, set_signals
 from torchrl_mpfa import PositiveBoost, SignalSampler
 from torchrl_mpfa.adjustment import adaptive_boost
-from torchrl_mpfa.methods import METHODS, PriorityFloor, make_replay
-from torchrl_mpfa.methods.lap import running_bend
+from torchrl_mpfa.methods import METHODS, make_replay
+from torchrl_mpfa.methods.lap import LAPFloor, running_bend
 from torchrl_mpfa.testing import check_adjustment
 
 
@@ -205,8 +205,8 @@ def test_a_target_that_cannot_be_is_refused_and_the_parts_pass_the_checks():
     with pytest.raises(ValueError, match=r"boost must be at least 1 with a target_share, got 0\.5"):
         PositiveBoost(boost=0.5, target_share=0.3)
     with pytest.raises(ValueError, match=r"quantile must be in \[0, 1\], got 1.5"):
-        PriorityFloor(quantile=1.5)
-    for part in (PositiveBoost(target_share=0.5), PriorityFloor(quantile=0.5)):
+        LAPFloor(quantile=1.5)
+    for part in (PositiveBoost(target_share=0.5), LAPFloor(quantile=0.5)):
         check_adjustment(part)
     assert METHODS["mpfa_adaptive"].boost_target == 0.5
 

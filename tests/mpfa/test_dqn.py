@@ -10,15 +10,15 @@ from tensordict import TensorDict
 
 from torchrl_mpfa import (
     DQNLearner,
-    Draw,
     Learner,
-    QLearner,
     SignalDQNLoss,
+    TabularQLearner,
     make_value_network,
-    make_value_table,
     run_updates,
 )
 from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.networks import make_value_table
+from torchrl_mpfa.selection import Draw
 
 ACTIONS, SIZE, GAMMA, SCALE = 5, 4, 0.9, 0.1
 
@@ -120,7 +120,7 @@ def cell_of(observation):
 
 @pytest.mark.parametrize("importance", [True, False])
 def test_an_update_of_the_table_is_that_of_a_plain_dict(importance):
-    learner = QLearner(
+    learner = TabularQLearner(
         make_value_table(cell_of, 3, ACTIONS), lr=0.5, gamma=GAMMA, importance=importance
     )
     table = {(cell, action): 0.0 for cell in range(3) for action in range(ACTIONS)}
@@ -146,7 +146,7 @@ def test_an_update_of_the_table_is_that_of_a_plain_dict(importance):
 def learners():
     return [
         DQNLearner(SignalDQNLoss(network()), lr=0.01),
-        QLearner(make_value_table(cell_of, 3, ACTIONS)),
+        TabularQLearner(make_value_table(cell_of, 3, ACTIONS)),
     ]
 
 
@@ -282,13 +282,13 @@ def test_learners_refuse_what_is_anothers():
     with pytest.raises(TypeError, match="SignalDQNLoss"):
         DQNLearner(network())
     with pytest.raises(TypeError, match="make_value_table"):
-        QLearner(network())
+        TabularQLearner(network())
     with pytest.raises(ValueError, match="lr"):
-        QLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.0)
+        TabularQLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.0)
 
 
 def test_the_rate_of_a_table_is_the_fraction_that_it_is_told():
-    learner = QLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
+    learner = TabularQLearner(make_value_table(cell_of, 3, ACTIONS), lr=0.5)
     row = transitions(1).exclude("priority_weight")
     row["next", "reward"][:], row["next", "terminated"][:] = 8.0, True
     for fraction, expected in ((1.0, 4.0), (0.25, 4.0 + 0.125 * 4.0), (0.0, 4.5)):

@@ -9,13 +9,8 @@ from torchrl.data import TensorDictMaxValueWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
 from tests.mpfa.transitions import make_buffer, same, seeded, snapshot, train_rounds
-from torchrl_mpfa import (
-    MPFASampler,
-    SignalMemmapStorage,
-    SignalReplayBuffer,
-    SignalTensorStorage,
-    TreeSampler,
-)
+from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa.samplers import TreeSampler
 
 CAPACITY = 8
 

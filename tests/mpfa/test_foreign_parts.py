@@ -25,8 +25,8 @@ from torchrl_mpfa import (
     ScheduledFusion,
     SignalSampler,
     SignalTensorStorage,
-    TreeSampler,
 )
+from torchrl_mpfa.samplers import TreeSampler
 
 
 @pytest.mark.parametrize("key", ["td_error", "unknown"])

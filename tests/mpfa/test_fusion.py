@@ -7,7 +7,7 @@ import torch
 
 from tests import oracles
 from tests.mpfa.transitions import make_transitions, seeded
-from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion, SignalTable
+from torchrl_mpfa import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.fusion import (
     binary_entropy,
     entropy_weights,
@@ -15,6 +15,7 @@ from torchrl_mpfa.fusion import (
     positive_entropy,
     reward_entropy,
 )
+from torchrl_mpfa.storages import SignalTable
 
 NAMES = ["td_error", "action_gradient", "reward"]
 

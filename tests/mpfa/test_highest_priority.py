@@ -5,8 +5,9 @@ import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.mpfa.transitions import make_buffer, make_transitions, seeded, write_signals
-from torchrl_mpfa import FixedFusion, SignalReplayBuffer, SignalTensorStorage, TreeSampler
+from torchrl_mpfa import FixedFusion, SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.methods import make_replay
+from torchrl_mpfa.samplers import TreeSampler
 
 
 def make_plain(capacity, **kwargs):

@@ -14,7 +14,9 @@ from torchrl_mpfa import (
     SignalSampler,
     SignalTensorStorage,
 )
-from torchrl_mpfa.methods import CappedSampler, LA3PSampler, RankSampler
+from torchrl_mpfa.methods.la3p import LA3PSampler
+from torchrl_mpfa.methods.mw import MWSampler
+from torchrl_mpfa.methods.rank_per import RankPERSampler
 
 
 def filled(sampler, rows=200):
@@ -37,10 +39,10 @@ def learn(buffer):
     ("kind", "options"),
     [
         (SignalSampler, {}),
-        (RankSampler, {}),
+        (RankPERSampler, {}),
         (MixtureSampler, {"signals": ["reward", "td_error"]}),
         (LA3PSampler, {}),
-        (CappedSampler, {"replay_cap": 2}),
+        (MWSampler, {"replay_cap": 2}),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -52,7 +54,7 @@ def test_the_weights_of_all_transitions_are_those_that_batches_have(kind, option
     torch.testing.assert_close(weights[index].float(), found["priority_weight"])
     spent = getattr(buffer.sampler, "_spent", torch.zeros(200, dtype=torch.bool))
     assert torch.equal(weights.isnan(), spent)
-    assert spent.any() == (kind is CappedSampler)
+    assert spent.any() == (kind is MWSampler)
     assert kind is LA3PSampler or weights[~spent].unique().numel() > 10
 
 

@@ -12,7 +12,6 @@ from tests.mpfa.transitions import same
 from torchrl_mpfa import (
     DDPGLearner,
     DQNLearner,
-    Draw,
     SACLearner,
     SignalDQNLoss,
     TD3Learner,
@@ -21,6 +20,7 @@ from torchrl_mpfa import (
     make_td3_loss,
     make_value_network,
 )
+from torchrl_mpfa.selection import Draw
 
 TRACED = {"compile": {"backend": "eager"}}
 # The function itself: what is traced is refused by the same lines, which one test says.

@@ -8,8 +8,9 @@ from tensordict import TensorDict
 from torchrl.data import ImmutableDatasetWriter
 
 from tests.mpfa.transitions import make_buffer, make_transitions, same, snapshot, train_rounds
-from torchrl_mpfa import SignalReplayBuffer, SignalSampler, SignalTensorStorage, TreeSampler
-from torchrl_mpfa.methods import RankSampler
+from torchrl_mpfa import SignalReplayBuffer, SignalSampler, SignalTensorStorage
+from torchrl_mpfa.methods.rank_per import RankPERSampler
+from torchrl_mpfa.samplers import TreeSampler
 
 
 @pytest.fixture
@@ -201,11 +202,11 @@ def test_signals_that_cannot_be_are_refused(pair, column, wrong):
 @pytest.mark.parametrize(
     ("mine", "theirs"),
     [
-        (SignalSampler, RankSampler),
-        (RankSampler, SignalSampler),
+        (SignalSampler, RankPERSampler),
+        (RankPERSampler, SignalSampler),
         (SignalSampler, TreeSampler),
-        (RankSampler, TreeSampler),
-        (TreeSampler, RankSampler),
+        (RankPERSampler, TreeSampler),
+        (TreeSampler, RankPERSampler),
     ],
 )
 def test_the_state_of_another_sampler_is_refused(mine, theirs):

@@ -14,7 +14,6 @@ from torchrl.objectives import ValueEstimators
 from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
 from torchrl_mpfa import (
     SignalDDPGLoss,
-    SignalLoss,
     SignalSACLoss,
     SignalTD3Loss,
     make_actor,
@@ -24,6 +23,7 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     make_td3_loss,
 )
+from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.losses.functional import pal_distance
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.

@@ -19,14 +19,8 @@ from hypothesis.stateful import (
 from tensordict import TensorDict
 
 from tests.mpfa.transitions import same, seeded, snapshot, write_signals
-from torchrl_mpfa import (
-    MPFASampler,
-    SignalMemmapStorage,
-    SignalReplayBuffer,
-    SignalTensorStorage,
-    load_safely,
-    save_atomically,
-)
+from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa.saving import load_safely, save_atomically
 
 CAPACITY = 7
 

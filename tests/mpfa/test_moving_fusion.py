@@ -3,7 +3,8 @@
 import pytest
 
 from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
-from torchrl_mpfa import Annealed, FixedFusion, Fusion, ScaledFusion, ScheduledFusion
+from torchrl_mpfa import FixedFusion, Fusion, ScaledFusion, ScheduledFusion
+from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.storages.table import SignalTable
 
 NAMES = ["td_error", "reward"]

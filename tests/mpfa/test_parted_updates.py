@@ -10,13 +10,13 @@ from tests.mpfa.losses import BOUNDS, make_batch, make_networks
 from tests.mpfa.transitions import same
 from torchrl_mpfa import (
     DDPGLearner,
-    Draw,
     SACLearner,
     TD3Learner,
     make_ddpg_loss,
     make_sac_loss,
     make_td3_loss,
 )
+from torchrl_mpfa.selection import Draw
 
 # The function that torch.compile makes one program of, which it is not asked to: it takes seconds.
 PURE = {"compile": {"disable": True}}

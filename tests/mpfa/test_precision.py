@@ -8,7 +8,7 @@ from torchrl.data import LazyTensorStorage
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import TreeSampler
+from torchrl_mpfa.samplers import TreeSampler
 
 
 def filled(sampler, count, *, spread=3.0):

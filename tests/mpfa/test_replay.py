@@ -27,8 +27,8 @@ from torchrl_mpfa import (
     SignalReplayBuffer,
     SignalSampler,
     SignalTensorStorage,
-    TreeSampler,
 )
+from torchrl_mpfa.samplers import TreeSampler
 
 
 def leaves(buffer):

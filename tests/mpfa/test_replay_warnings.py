@@ -6,7 +6,8 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.transforms import Compose, DoubleToFloat, MultiStepTransform
 
 from tests.mpfa.transitions import make_buffer, make_transitions, write_signals
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage, TreeSampler
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa.samplers import TreeSampler
 
 PRIORITIZED = {
     "fused": MPFASampler,

@@ -17,15 +17,9 @@ from tests.mpfa.transitions import (
     snapshot,
     train_rounds,
 )
-from torchrl_mpfa import (
-    MPFASampler,
-    SignalMemmapStorage,
-    SignalReplayBuffer,
-    SignalTensorStorage,
-    load_safely,
-    save_atomically,
-)
+from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.dumps import seal_dump
+from torchrl_mpfa.saving import load_safely, save_atomically
 
 ROUNDS = 100
 

@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from tests.mpfa.losses import make_batch
 from tests.mpfa.sac_networks import critics_of, make_learner, make_networks
 from tests.mpfa.transitions import make_buffer, seeded
-from torchrl_mpfa import Draw, Learner, SACLearner, make_sac_loss
+from torchrl_mpfa import Learner, SACLearner, make_sac_loss
+from torchrl_mpfa.selection import Draw
 
 
 def test_the_target_may_average_over_earlier_critics():

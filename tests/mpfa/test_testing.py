@@ -13,16 +13,11 @@ from torchrl_mpfa import (
     ScheduledFusion,
     SignalSampler,
 )
-from torchrl_mpfa.methods import (
-    RELATIVE_ERROR,
-    RELATIVE_VALUE,
-    CappedSampler,
-    LA3PSampler,
-    PriorityFloor,
-    RankSampler,
-    ReplayPenalty,
-    value_schedule,
-)
+from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE, HVPERPenalty, value_schedule
+from torchrl_mpfa.methods.la3p import LA3PSampler
+from torchrl_mpfa.methods.lap import LAPFloor
+from torchrl_mpfa.methods.mw import MWSampler
+from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
 
 
@@ -34,8 +29,8 @@ from torchrl_mpfa.testing import check_adjustment, check_fusion, check_sampler
         PositiveDecay(),
         PositiveDecay(position="rank"),
         PositiveDecay(position="count", positive_above=1.0),
-        PriorityFloor(1.0),
-        ReplayPenalty(),
+        LAPFloor(1.0),
+        HVPERPenalty(),
     ],
 )
 def test_our_adjustments_pass(adjustment):
@@ -65,8 +60,8 @@ def test_our_fusions_pass(fusion, signals):
         lambda: MPFASampler(40, stratified=True, max_priority_within_buffer=False),
         lambda: SignalSampler(40, 0.6, 0.4, 0.05, dtype=torch.double),
         lambda: SignalSampler(40, 0.0, 0.4),
-        lambda: RankSampler(40, 0.7, 0.5, 0.05),
-        lambda: CappedSampler(40, 0.6, 0.4, 0.05, replay_cap=1000),
+        lambda: RankPERSampler(40, 0.7, 0.5, 0.05),
+        lambda: MWSampler(40, 0.6, 0.4, 0.05, replay_cap=1000),
         lambda: LA3PSampler(40, 0.4, 0.0, 0.01),
     ],
     ids=["mpfa", "stratified", "double", "uniform", "rank", "capped", "la3p"],

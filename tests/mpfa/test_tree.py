@@ -11,8 +11,10 @@ from torchrl.data.replay_buffers.scheduler import LinearScheduler
 
 from tests import oracles
 from tests.mpfa.transitions import make_transitions, same, seeded
-from torchrl_mpfa import MixtureSampler, TreeSampler
-from torchrl_mpfa.methods import LA3PSampler, RankSampler
+from torchrl_mpfa import MixtureSampler
+from torchrl_mpfa.methods.la3p import LA3PSampler
+from torchrl_mpfa.methods.rank_per import RankPERSampler
+from torchrl_mpfa.samplers import TreeSampler
 
 
 def filled(sampler, count, capacity):
@@ -280,7 +282,7 @@ def states_of(sampler):
     return {key: value for key, value in sampler.state_dict().items() if key != "_highest_slot"}
 
 
-@pytest.mark.parametrize("kind", [TreeSampler, RankSampler, LA3PSampler, MixtureSampler])
+@pytest.mark.parametrize("kind", [TreeSampler, RankPERSampler, LA3PSampler, MixtureSampler])
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [

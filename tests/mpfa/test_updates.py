@@ -11,17 +11,16 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa import (
     DDPGLearner,
-    Draw,
     MPFASampler,
     SignalReplayBuffer,
     SignalTensorStorage,
     make_actor,
     make_critic,
     make_ddpg_loss,
-    one_batch,
     run_updates,
 )
 from torchrl_mpfa.methods import METHODS, loss_options, make_replay
+from torchrl_mpfa.selection import Draw, one_batch
 
 OBSERVATION, ACTION = 5, 2
 MANY, BATCH, UPDATES = 4000, 16, 4

@@ -75,7 +75,7 @@ class StochasticActorConfig(ActorConfig):
 
 @dataclass
 class SignalLossConfig(LossConfig):
-    """What the configurations of the losses share; see :class:`~torchrl_mpfa.SignalLoss`."""
+    """What the configurations of the losses share; see :class:`~torchrl_mpfa.losses.SignalLoss`."""
 
     actor_network: Any = None
     gamma: float = 0.99

@@ -3,7 +3,7 @@
 from torchrl_mpfa.learners.base import ActorCriticLearner, Learner
 from torchrl_mpfa.learners.compiled import CompilableLearner
 from torchrl_mpfa.learners.ddpg import DDPGLearner
-from torchrl_mpfa.learners.dqn import DQNLearner, QLearner
+from torchrl_mpfa.learners.dqn import DQNLearner, TabularQLearner
 from torchrl_mpfa.learners.sac import SACLearner
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.learners.td3 import TD3Learner
@@ -15,7 +15,7 @@ __all__ = [
     "DQNLearner",
     "Learner",
     "MultiTensorSoftUpdate",
-    "QLearner",
     "SACLearner",
     "TD3Learner",
+    "TabularQLearner",
 ]

@@ -170,7 +170,7 @@ class DQNLearner:
         self.updates = state_dict["updates"]
 
 
-class QLearner:
+class TabularQLearner:
     r"""Q learning (Watkins 1989) of a table, from batches of any replay.
 
     Each transition of a batch has a TD error :math:`\delta_i = r_i + \gamma \max_a Q(s'_i, a) -
@@ -180,7 +180,7 @@ class QLearner:
     ``make_replay("cer", batch_size=1)``.
 
     Args:
-        policy: The table with its cells, out of :func:`~torchrl_mpfa.make_value_table`.
+        policy: The table with its cells, out of :func:`~torchrl_mpfa.networks.make_value_table`.
         lr: Learning rate.
         gamma: Discount, in [0, 1].
         importance: Whether importance weights, where a batch has them, scale the TD errors.
@@ -191,9 +191,9 @@ class QLearner:
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from torchrl_mpfa import make_value_table
+        >>> from torchrl_mpfa.networks import make_value_table
         >>> policy = make_value_table(lambda seen: (seen[..., 0] > 0.5).long(), 2, 3)
-        >>> learner = QLearner(policy, lr=0.5)
+        >>> learner = TabularQLearner(policy, lr=0.5)
         >>> end = torch.ones(1, 1, dtype=torch.bool)
         >>> after = {"observation": torch.ones(1, 1), "reward": torch.ones(1, 1), "terminated": end}
         >>> choice = torch.tensor([[0, 1, 0]])

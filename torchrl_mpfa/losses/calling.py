@@ -52,7 +52,7 @@ def read_inputs(
 
 
 def call(network: TensorDictModule, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-    """Compute what a network gives, directly if it is a :class:`~torchrl_mpfa.DirectModule`.
+    """Compute what a network gives, directly if it is a ``DirectModule``.
 
     Args:
         network: The network.

@@ -15,23 +15,23 @@ from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.losses.trust import BEHAVIOR
 from torchrl_mpfa.methods.catalogue import METHODS, Method
-from torchrl_mpfa.methods.cer import CombinedSampler
+from torchrl_mpfa.methods.cer import CERSampler
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.halves import uniform_halves
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
-    ReplayPenalty,
+    HVPERPenalty,
     value_schedule,
 )
-from torchrl_mpfa.methods.klper import LowestDivergence
-from torchrl_mpfa.methods.la3p import LA3PSampler, split_draws
-from torchrl_mpfa.methods.lap import PriorityFloor
-from torchrl_mpfa.methods.mw import CappedSampler
+from torchrl_mpfa.methods.klper import KLPERSelection
+from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_draws
+from torchrl_mpfa.methods.lap import LAPFloor
+from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.ranges import check_ranges
-from torchrl_mpfa.methods.rank import RankSampler
+from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.methods.reaper import ENDED, EPISODE, ReaPERSampler
-from torchrl_mpfa.methods.ref_er import RememberForget, RememberingSampler
+from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.positive import check_level
 from torchrl_mpfa.replay import SignalReplayBuffer
@@ -56,17 +56,17 @@ _FUSIONS: dict[str, Callable[[Method], Fusion]] = {
 _UNIFORM: dict[str, Callable[[Method], RandomSampler]] = {
     "uniform": lambda method: RandomSampler(),
     "halves": lambda method: RandomSampler(),
-    "newest": lambda method: CombinedSampler(),
-    "near_policy": lambda method: RememberingSampler(),
+    "newest": lambda method: CERSampler(),
+    "near_policy": lambda method: ReFERSampler(),
     "geometric": lambda method: GeometricSampler(recency=method.recency),
 }
 _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "prioritized": SignalSampler,
-    "rank": RankSampler,
-    "capped": CappedSampler,
+    "rank": RankPERSampler,
+    "capped": MWSampler,
     "split": LA3PSampler,
 }
-_SELECTIONS: dict[str, Selection] = {"split": split_draws, "halves": uniform_halves}
+_SELECTIONS: dict[str, Selection] = {"split": la3p_draws, "halves": uniform_halves}
 _OF_PRIORITIES = (
     "combination",
     "floor_quantile",
@@ -336,9 +336,9 @@ def make_adjustments(method: Method) -> list[Adjustment]:
         )
         made.append(decay)
     if method.priority_floor > 0:
-        made.append(PriorityFloor(method.priority_floor, method.floor_quantile))
+        made.append(LAPFloor(method.priority_floor, method.floor_quantile))
     if method.replay_penalty > 0:
-        made.append(ReplayPenalty(penalty=method.replay_penalty, floor=method.eps))
+        made.append(HVPERPenalty(penalty=method.replay_penalty, floor=method.eps))
     return made
 
 
@@ -349,9 +349,9 @@ def make_selection(
     if method.selection in _SELECTIONS:
         return _SELECTIONS[method.selection]
     if method.selection == "near_policy" and policy is not None:
-        return RememberForget(policy, far_share=method.far_share, cutoff=method.far_cutoff)
+        return ReFERSelection(policy, far_share=method.far_share, cutoff=method.far_cutoff)
     if policy is not None and sigma is not None and method.candidates > 1:
-        choose = LowestDivergence(policy, batches=method.candidates, sigma=sigma)
+        choose = KLPERSelection(policy, batches=method.candidates, sigma=sigma)
         return lambda buffer: (
             replace(draw, batch=choose(draw.batch)) for draw in one_batch(buffer)
         )

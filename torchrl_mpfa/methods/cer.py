@@ -12,7 +12,7 @@ from torchrl.data import Storage
 from torchrl_mpfa.samplers.newest import NewestSampler
 
 
-class CombinedSampler(NewestSampler):
+class CERSampler(NewestSampler):
     """Uniform sampling, but for the first transition of each batch, which is the newest.
 
     Examples:
@@ -20,7 +20,7 @@ class CombinedSampler(NewestSampler):
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
         >>> buffer = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(100), sampler=CombinedSampler(), batch_size=4
+        ...     storage=LazyTensorStorage(100), sampler=CERSampler(), batch_size=4
         ... )
         >>> index = buffer.extend(TensorDict({"reward": torch.rand(10)}, [10]))
         >>> int(buffer.sample()["index"][0])

@@ -87,7 +87,7 @@ def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
 
 
 @dataclass(frozen=True)
-class ReplayPenalty:
+class HVPERPenalty:
     r"""Less for what was replayed often, :math:`\max(p_i - \kappa U_i, \epsilon)`.
 
     ``U`` is the number of replays as a share of the largest one in the batch.
@@ -101,7 +101,7 @@ class ReplayPenalty:
 
     Examples:
         >>> facts = BatchFacts(torch.zeros(2), torch.tensor([1.0, 4.0]), torch.arange(2))
-        >>> ReplayPenalty(penalty=0.4)(torch.tensor([1.0, 1.0]), facts).tolist()
+        >>> HVPERPenalty(penalty=0.4)(torch.tensor([1.0, 1.0]), facts).tolist()
         [0.8999999761581421, 0.6000000238418579]
     """
 

@@ -66,12 +66,12 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
     return 0.5 * ((wider - 1.0 - wider.log()).sum(-1) + mean.square().sum(-1) / variance)
 
 
-class LowestDivergence:
+class KLPERSelection:
     """Keeps the most on-policy one of several batches that a replay buffer drew as one.
 
     In a training loop::
 
-        select = LowestDivergence(policy, batches=3, sigma=lambda: float(noise.sigma))
+        select = KLPERSelection(policy, batches=3, sigma=lambda: float(noise.sigma))
         batch = select(buffer.sample(3 * 256))
 
     Args:
@@ -88,7 +88,7 @@ class LowestDivergence:
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl_mpfa import make_actor
-        >>> select = LowestDivergence(make_actor(24, 2), batches=2, sigma=0.2)
+        >>> select = KLPERSelection(make_actor(24, 2), batches=2, sigma=0.2)
         >>> seen = TensorDict({"observation": torch.rand(8, 24), "action": torch.rand(8, 2)}, [8])
         >>> select(seen).batch_size
         torch.Size([4])

@@ -29,7 +29,7 @@ _TINY = torch.finfo(torch.double).tiny
 class LA3PSampler(SignalSampler):
     r"""Samples a part of a batch: uniformly, by priority, or by the inverse of the priority.
 
-    Within :meth:`part`, which :func:`split_draws` uses, a batch has the size of that part, see
+    Within :meth:`part`, which :func:`la3p_draws` uses, a batch has the size of that part, see
     :meth:`sizes`; outside of it, it is a whole one by priority. All weights are 1.
 
     Args:
@@ -132,7 +132,7 @@ class LA3PSampler(SignalSampler):
             raise wrong("sampler", "_sum_tree", "positive where something was written", 0.0)
 
 
-def split_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+def la3p_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
     """The three updates of an LA3P step, in the order of the authors' code.
 
     Critic and actor learn from a uniform part of the batch, with the loss PAL; then the critic from

@@ -50,7 +50,7 @@ def running_bend(priority: Tensor, *, quantile: float, otherwise: float) -> Tens
 
 
 @dataclass(frozen=True)
-class PriorityFloor:
+class LAPFloor:
     r"""No priority below a floor, :math:`\max(|\delta_i|, 1)`.
 
     Args:
@@ -66,7 +66,7 @@ class PriorityFloor:
     Examples:
         >>> import torch
         >>> facts = BatchFacts(torch.zeros(2), torch.ones(2), torch.arange(2))
-        >>> PriorityFloor(1.0)(torch.tensor([0.2, 3.0]), facts).tolist()
+        >>> LAPFloor(1.0)(torch.tensor([0.2, 3.0]), facts).tolist()
         [1.0, 3.0]
     """
 

@@ -24,7 +24,7 @@ from torchrl_mpfa.storages.table import SignalTable
 _NO_LEAF = float("inf")
 
 
-class CappedSampler(SignalSampler):
+class MWSampler(SignalSampler):
     """Excludes a transition that was replayed often enough.
 
     Where fewer transitions are left than a batch has, a batch is sampled uniformly from all, so
@@ -40,7 +40,7 @@ class CappedSampler(SignalSampler):
         ValueError: If an argument is out of its range.
 
     Examples:
-        >>> CappedSampler(1000, 0.6, 0.4, signals=["reward", "td_error"]).replay_cap
+        >>> MWSampler(1000, 0.6, 0.4, signals=["reward", "td_error"]).replay_cap
         1024
     """
 

@@ -89,11 +89,11 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
     return kept if far > allowed else kept + min(rate, 1.0 - weight)
 
 
-class RememberingSampler(RandomSampler):
+class ReFERSampler(RandomSampler):
     r"""Uniform sampling by a sampler that keeps and saves what ReF-ER adapts.
 
     Examples:
-        >>> RememberingSampler().policy_weight
+        >>> ReFERSampler().policy_weight
         0.0001
     """
 
@@ -150,7 +150,7 @@ class RememberingSampler(RandomSampler):
         self.load_state_dict(self.check_dump(path))
 
 
-class RememberForget:
+class ReFERSelection:
     r"""Selection of ReF-ER: a uniform batch whose far transitions have no weight.
 
     Args:
@@ -163,7 +163,7 @@ class RememberForget:
 
     Examples:
         >>> from torchrl_mpfa import make_actor
-        >>> RememberForget(make_actor(24, 2)).limit(0)
+        >>> ReFERSelection(make_actor(24, 2)).limit(0)
         5.0
     """
 
@@ -185,7 +185,7 @@ class RememberForget:
         """Sample a batch, and say what of it counts.
 
         Args:
-            buffer: The buffer, with a :class:`RememberingSampler`.
+            buffer: The buffer, with a :class:`ReFERSampler`.
 
         Yields:
             One draw.
@@ -195,8 +195,8 @@ class RememberForget:
             KeyError: If the transitions lack mean or standard deviation of the behavior.
         """
         sampler = buffer.sampler
-        if not isinstance(sampler, RememberingSampler):
-            raise TypeError(f"buffer must have a RememberingSampler, got {type(sampler).__name__}")
+        if not isinstance(sampler, ReFERSampler):
+            raise TypeError(f"buffer must have a ReFERSampler, got {type(sampler).__name__}")
         batch = buffer.sample()
         now = actions_of(self.policy, batch)
         sigma = batch[BEHAVIOR_SIGMA].clamp_min(LEAST_SIGMA)

@@ -119,7 +119,7 @@ def make_value_table(cell_of: Callable[[Tensor], Tensor], cells: int, actions: i
         actions: Number of actions ``K``.
 
     Returns:
-        A module for :class:`~torchrl_mpfa.QLearner`.
+        A module for :class:`~torchrl_mpfa.TabularQLearner`.
 
     Raises:
         ValueError: If a size is not a positive integer.

@@ -59,7 +59,7 @@ class SignalSampler(TreeSampler):
         alpha: Priority exponent :math:`\alpha` of Eq. (8); 0 samples uniformly.
         beta: Importance exponent :math:`\beta` of Eq. (10).
         eps: :math:`\epsilon` of Eqs. (9) and (21), added once, before the adjustments.
-        dtype: As in :class:`~torchrl_mpfa.TreeSampler`.
+        dtype: As in :class:`~torchrl_mpfa.samplers.TreeSampler`.
         reduction: As in TorchRL.
         max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
             transition *in the buffer* was given by an update; if false, the highest ever.

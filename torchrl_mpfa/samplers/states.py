@@ -19,7 +19,7 @@ FORMAT = 2
 
 
 class SavedTrees(PrioritizedSampler):
-    """The part of :class:`~torchrl_mpfa.TreeSampler` that saves and loads."""
+    """The part of :class:`~torchrl_mpfa.samplers.TreeSampler` that saves and loads."""
 
     KIND = "proportional"
     """What a saved state must have been made by."""

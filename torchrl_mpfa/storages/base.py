@@ -32,7 +32,7 @@ _CLOCK = "_signals_clock"
 
 
 class SignalStorageMixin:
-    """Adds a :class:`~torchrl_mpfa.SignalTable` to a TorchRL storage.
+    """Adds a :class:`~torchrl_mpfa.storages.SignalTable` to a TorchRL storage.
 
     Every write of a slot resets its signals, whichever writer makes it, so that a transition
     never has those of the one that was there before; nothing of them shows in sampled batches.

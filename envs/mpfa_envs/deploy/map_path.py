@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class _Rays:
-    """Rays for :class:`~mpfa_envs.MapMemory` that change from scan to scan."""
+    """Rays for :class:`~mpfa_envs.sensing.map_memory.MapMemory` that change from scan to scan."""
 
     def __init__(self, max_range: float) -> None:
         self.angles = np.zeros(1)

@@ -87,7 +87,7 @@ class TaskConfig:
     progress: Progress = "straight_line"
     """Measure of an approach: ``"straight_line"``, the distance to the goal as in Eq.
     (25); ``"shortest_path"``, the path to it that keeps the collision distance
-    (:class:`~mpfa_envs.DistanceField`); or ``"none"``, only goal and collision count."""
+    (``DistanceField``); or ``"none"``, only goal and collision count."""
     reward: RewardFunction | None = None
     """Computes the reward in place of Eq. (25), robot by robot and hence slowly, and without
     progress_scale; ``functools.partial(navigation_reward, goal_reward=20.0)``, say, which is as
@@ -97,7 +97,7 @@ class TaskConfig:
     """Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``."""
     memory: Memory = "none"
     """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
-    the goal that is open on it (:class:`~mpfa_envs.MapMemory`); ``"none"``: it senses what is
+    the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
     before it and nothing else."""
     history: int = 0
     """Number of earlier scans that it senses beside the last one, sector by sector: those of the

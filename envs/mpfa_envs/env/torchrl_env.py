@@ -42,7 +42,7 @@ class NavigationTorchEnv(EnvBase):
     ``"done"``, ``"terminated"`` ``[1]``   bool
     and ``"truncated"``
     ``("info", name)``           ``[1]``   every entry of
-                                           :data:`~mpfa_envs.INFO_TYPES`, bool or float32
+                                           ``INFO_TYPES``, bool or float32
     ============================ ========= =============================================
 
     All shapes follow the batch size: ``[]`` for one robot, else ``[num_envs]``. ``reset(seed=3)``

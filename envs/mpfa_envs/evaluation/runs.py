@@ -176,7 +176,7 @@ def run_tasks(
         envs_at_once: How many episodes run together, which changes no result of a
             :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
             wheels; None: 64 for one, a :class:`Driver` or a
-            :class:`~mpfa_envs.DynamicWindow`, else one at a time.
+            :class:`~mpfa_envs.planners.DynamicWindow`, else one at a time.
         progress_bar: Whether to show one.
         on_end: Called at the end of every episode with the environment, the number of the robot,
             whose path is ``env.trail(robot)``, and that of the task.

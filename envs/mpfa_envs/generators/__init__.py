@@ -226,7 +226,7 @@ def split_worlds(
         ValueError: If an argument is out of its range.
 
     Examples:
-        >>> from mpfa_envs import split_worlds
+        >>> from mpfa_envs.generators import split_worlds
         >>> [world.name for world in split_worlds("clutter", "test", 2)]
         ['clutter-test-0', 'clutter-test-1']
     """
@@ -255,7 +255,7 @@ def generator_tasks(
         ValueError: If an argument is out of its range.
 
     Examples:
-        >>> from mpfa_envs import generator_tasks
+        >>> from mpfa_envs.generators import generator_tasks
         >>> pairs = generator_tasks("bars", "test", worlds=2, tasks=3)
         >>> [world.name for world, task in pairs]  # doctest: +NORMALIZE_WHITESPACE
         ['bars-test-0', 'bars-test-0', 'bars-test-0',

@@ -56,7 +56,8 @@ class FreeGrid:
         ValueError: If a number is out of its range, or there would be more than four million cells.
 
     Examples:
-        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.distance import FreeGrid
         >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
         >>> grid.clearance.shape, grid.origin
         ((100, 100), (-4.95, -4.95))
@@ -227,7 +228,8 @@ class DistanceField:
         ValueError: If the goal is not two finite numbers, or no cell is free.
 
     Examples:
-        >>> from mpfa_envs import WORLDS, DistanceField, FreeGrid
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.distance import DistanceField, FreeGrid
         >>> grid = FreeGrid(WORLDS["B"], distance=0.18)
         >>> field = DistanceField(grid, (4.0, 0.0))
         >>> round(field.at(3.9, 0.0), 1), round(field.at(0.0, 0.0), 1)  # [m]; a box is between
@@ -309,7 +311,7 @@ class DistanceField:
         place: tuple[float, float],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Cells of the window around a place in (i, j), ``[cells, 2]``, and their distances [m]."""
-        # They are those of :meth:`~mpfa_envs.FreeGrid.cells_around`.
+        # They are those of :meth:`~mpfa_envs.paths.distance.FreeGrid.cells_around`.
         x, y = place
         if free[i, j]:
             cells = np.concatenate(([[i, j]], _neighbors(free, i, j)))

@@ -55,7 +55,8 @@ class PathPlanner:
         ValueError: If the radius is not a positive length.
 
     Examples:
-        >>> from mpfa_envs import WORLDS, PathPlanner
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.planner import PathPlanner
         >>> planner = PathPlanner(WORLDS["B"], radius=0.18)
         >>> planner.is_straight((0.0, 0.0), (2.0, 3.0)), planner.is_straight((0.0, 0.0), (4.0, 0.0))
         (True, False)

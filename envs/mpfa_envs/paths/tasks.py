@@ -44,7 +44,7 @@ def sample_task_on_grid(
     """Sample a goal, and a start from which there is a path to it, over the cells of a grid.
 
     It takes milliseconds however many obstacles there are and however rare tasks are, where
-    :func:`~mpfa_envs.sample_task` tries points one by one.
+    :func:`~mpfa_envs.tasks.sampling.sample_task` tries points one by one.
 
     In the world of a map no path is longer than 20 m, start and goal have the usual clearance, and
     the field is that of a window around the goal.
@@ -69,7 +69,8 @@ def sample_task_on_grid(
 
     Examples:
         >>> import numpy as np
-        >>> from mpfa_envs import WORLDS, sample_task_on_grid
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.tasks import sample_task_on_grid
         >>> rng = np.random.default_rng(0)
         >>> task, field = sample_task_on_grid(WORLDS["D"], rng, distance=0.25)
         >>> WORLDS["D"].clearance(*task.goal) >= 0.4, field.at(*task.start[:2]) < 20.0

@@ -53,7 +53,8 @@ class AntColony:
         ValueError: If a number is out of its range.
 
     Examples:
-        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.distance import FreeGrid
         >>> from mpfa_envs.planners import AntColony, path_length
         >>> grid = FreeGrid(WORLDS["B"], distance=0.25, resolution=0.25)
         >>> path = AntColony(seed=0)(grid, (0.0, 0.0), (4.0, 0.0))

@@ -78,7 +78,8 @@ class DynamicWindow:
         ValueError: If a number is out of its range.
 
     Examples:
-        >>> from mpfa_envs import DynamicWindow, evaluate
+        >>> from mpfa_envs.planners import DynamicWindow
+        >>> from mpfa_envs import evaluate
         >>> results = evaluate(DynamicWindow(), "B", episodes=3, physics="kinematic")
         >>> [each.success for each in results]
         [True, True, True]

@@ -26,7 +26,7 @@ _FINE: Final = 0.05
 
 
 class MapPlanner:
-    """Plans on the known map and follows the path, a :class:`~mpfa_envs.Driver`.
+    """Plans on the known map and follows the path, a :class:`~mpfa_envs.evaluation.runs.Driver`.
 
     It knows all obstacles of the world and where the robot is, neither of which is in the
     observation: what it reaches is a ceiling for those that have the lidar alone.

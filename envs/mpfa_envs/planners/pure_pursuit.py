@@ -54,7 +54,8 @@ class PurePursuit:
         ValueError: If the path has no two positions, or the look-ahead distance is not positive.
 
     Examples:
-        >>> from mpfa_envs import ROBOTS, WORLDS, FreeGrid
+        >>> from mpfa_envs import ROBOTS, WORLDS
+        >>> from mpfa_envs.paths.distance import FreeGrid
         >>> from mpfa_envs.planners import PurePursuit
         >>> grid = FreeGrid(WORLDS["A"], distance=0.25)
         >>> pursuit = PurePursuit([(0.0, 0.0), (3.0, 0.0)], ROBOTS["turtlebot2"], grid)

@@ -44,7 +44,8 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
     """Find a shortest path with SciPy's Dijkstra, as a :class:`Search`.
 
     Examples:
-        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.distance import FreeGrid
         >>> from mpfa_envs.planners import dijkstra_path, path_length
         >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
         >>> path = dijkstra_path(grid, (0.0, 0.0), (4.0, 0.0))
@@ -74,7 +75,8 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
     never overestimated, so that the path is a shortest one.
 
     Examples:
-        >>> from mpfa_envs import WORLDS, FreeGrid
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.paths.distance import FreeGrid
         >>> from mpfa_envs.planners import astar_path, path_length
         >>> grid = FreeGrid(WORLDS["B"], distance=0.25)
         >>> path = astar_path(grid, (0.0, 0.0), (4.0, 0.0))
@@ -127,7 +129,7 @@ def centers(grid: FreeGrid, cells: list[int]) -> list[Point]:
 
 
 def path_length(grid: FreeGrid, path: list[Point]) -> float:
-    """Measure a path as :meth:`~mpfa_envs.FreeGrid.length` does.
+    """Measure a path as :meth:`~mpfa_envs.paths.distance.FreeGrid.length` does.
 
     Args:
         grid: The grid.

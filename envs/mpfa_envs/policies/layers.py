@@ -116,7 +116,7 @@ class Scale:
 
 @dataclass(frozen=True)
 class Table:
-    """Values of the cell that an observation lies in, see :class:`~mpfa_envs.Binning`."""
+    """Values of the cell that an observation lies in, see ``Binning``."""
 
     values: NDArray[np.float32]
     """Shape ``[cells, size]``."""

@@ -67,7 +67,7 @@ def render_trajectories(
             integer of at least 32, or no path is to be shown.
 
     Examples:
-        >>> from mpfa_envs import render_trajectories
+        >>> from mpfa_envs.render import render_trajectories
         >>> render_trajectories("A", [[(0, 0), (1, 1), (2, 3)]], [(2, 3)], ["success"]).shape
         (508, 480, 3)
     """

@@ -73,7 +73,8 @@ class MapMemory:
         lidar: What the robots see by.
 
     Examples:
-        >>> from mpfa_envs import Box, Lidar, MapMemory, World
+        >>> from mpfa_envs import Box, Lidar, World
+        >>> from mpfa_envs.sensing.map_memory import MapMemory
         >>> from mpfa_envs.robots.model import ROBOTS
         >>> wall = World(name="wall", boxes=(Box(0.9, -1.5, 1.1, 1.5),))
         >>> memory = MapMemory(1, ROBOTS["turtlebot2"], lidar := Lidar(wall))

@@ -67,7 +67,7 @@ def observation_slices(
         ValueError: If an argument is out of its range.
 
     Examples:
-        >>> from mpfa_envs import observation_slices
+        >>> from mpfa_envs.sensing.observation import observation_slices
         >>> observation_slices()["goal_direction"]
         slice(18, 20, None)
     """

@@ -48,7 +48,7 @@ def sample_task(
 
     The two are joined by a path that keeps the collision distance, so every task can be solved.
     Worlds with many obstacles, and narrow ones in which no point keeps the usual distance of goals,
-    are sampled by :func:`~mpfa_envs.sample_task_on_grid`.
+    are sampled by :func:`~mpfa_envs.paths.tasks.sample_task_on_grid`.
 
     Args:
         world: The room, its obstacles and its regions.
@@ -66,7 +66,8 @@ def sample_task(
 
     Examples:
         >>> import numpy as np
-        >>> from mpfa_envs import WORLDS, sample_task
+        >>> from mpfa_envs import WORLDS
+        >>> from mpfa_envs.tasks.sampling import sample_task
         >>> task = sample_task(WORLDS["A"], np.random.default_rng(0), collision_distance=0.35)
         >>> len(task.start), len(task.goal)
         (3, 2)
@@ -248,7 +249,8 @@ def evaluation_pairs(
         ValueError: If n or the seed is out of its range, or the world has no room for a task.
 
     Examples:
-        >>> from mpfa_envs import NavigationEnv, evaluation_pairs
+        >>> from mpfa_envs import NavigationEnv
+        >>> from mpfa_envs.tasks.sampling import evaluation_pairs
         >>> env = NavigationEnv(world="test", physics="kinematic")
         >>> task = evaluation_pairs("test", 2, seed=0)[1]
         >>> observation, info = env.reset(options=task._asdict())

@@ -67,9 +67,9 @@ def world_tasks(
 
     Args:
         name: A world, as in :class:`~mpfa_envs.NavigationEnv`, with tasks of
-            :func:`~mpfa_envs.evaluation_pairs`; ``"bars:test"`` or ``"bars:validation"``, the
+            ``evaluation_pairs``; ``"bars:test"`` or ``"bars:validation"``, the
             worlds of that split of a generator, four tasks in each, of
-            :func:`~mpfa_envs.generator_tasks`; or ``"barn"``, the benchmark's own task in its
+            ``generator_tasks``; or ``"barn"``, the benchmark's own task in its
             twenty worlds.
         episodes: Number of tasks; None: 200 in a world, 400 in the worlds of a generator, 20 in
             those of the benchmark. The first tasks of a longer list are those of a shorter one.

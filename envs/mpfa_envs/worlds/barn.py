@@ -38,7 +38,8 @@ def barn_task() -> Task:
         The task.
 
     Examples:
-        >>> from mpfa_envs import NavigationEnv, barn_task
+        >>> from mpfa_envs import NavigationEnv
+        >>> from mpfa_envs.worlds.barn import barn_task
         >>> env = NavigationEnv(world="barn-3", physics="kinematic")
         >>> observation, info = env.reset(options=barn_task()._asdict())
         >>> info["distance"]
@@ -64,7 +65,7 @@ def barn_world(index: int) -> World:
         ValueError: If there is no such world.
 
     Examples:
-        >>> from mpfa_envs import barn_world
+        >>> from mpfa_envs.worlds.barn import barn_world
         >>> world = barn_world(0)
         >>> world.name, len(world.cylinders)
         ('barn-0', 187)

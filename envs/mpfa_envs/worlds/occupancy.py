@@ -55,7 +55,8 @@ class OccupancyGrid:
 
     Examples:
         >>> import numpy as np
-        >>> from mpfa_envs import OccupancyGrid, World
+        >>> from mpfa_envs.worlds.occupancy import OccupancyGrid
+        >>> from mpfa_envs import World
         >>> cells = np.zeros((200, 100), dtype=bool)
         >>> cells[100, 20:] = True
         >>> grid = OccupancyGrid(cells, 0.05, origin=(-2.0, -1.0))

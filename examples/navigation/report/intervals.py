@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mpfa_envs import Interval
-from mpfa_envs.evaluation.results import wilson
+from mpfa_envs.evaluation.results import Interval, wilson
 
 Array = NDArray[np.float64]
 Statistic = Callable[..., Array]

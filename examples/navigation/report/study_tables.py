@@ -11,7 +11,7 @@ from textwrap import fill
 import numpy as np
 import pandas as pd
 
-from mpfa_envs import Interval
+from mpfa_envs.evaluation.results import Interval
 from navigation.report.intervals import (
     Array,
     difference_interval,

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 
-from mpfa_envs import Interval
+from mpfa_envs.evaluation.results import Interval
 from navigation.report.intervals import (
     Array,
     bootstrap_runs,

@@ -11,18 +11,18 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from mpfa_envs import WHEEL_PAIRS, Binning
 from mpfa_envs.policies.layers import Choice, Layer, Table, from_torch
+from mpfa_envs.robots.discrete import WHEEL_PAIRS
+from mpfa_envs.sensing.binning import Binning
 from navigation.settings.learners import LearnerSettings, is_discrete
 from navigation.settings.train import TrainSettings
 from torchrl_mpfa import (
     DDPGLearner,
-    DirectModule,
     DQNLearner,
     Learner,
-    QLearner,
     SACLearner,
     SignalDQNLoss,
+    TabularQLearner,
     TD3Learner,
     make_actor,
     make_critic,
@@ -31,10 +31,10 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     make_td3_loss,
     make_value_network,
-    make_value_table,
 )
-from torchrl_mpfa.methods import Curiosity, Method, loss_options
-from torchrl_mpfa.networks import StochasticActor
+from torchrl_mpfa.methods import Method, loss_options
+from torchrl_mpfa.methods.curiosity import Curiosity
+from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table
 from torchrl_mpfa.networks.values import ValueNetwork, ValueTable
 
 Options = dict[str, Any]
@@ -173,7 +173,7 @@ def _q_learning(
     settings: LearnerSettings, method: Method, observation_size: int, actions: int
 ) -> Learner:
     cells = Cells(Binning(observation_size=observation_size))
-    return QLearner(
+    return TabularQLearner(
         make_value_table(cells, cells.binning.cells, actions),
         lr=settings.table_lr,
         gamma=settings.gamma,

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from navigation.files import CHECKPOINT
-from torchrl_mpfa import load_safely
+from torchrl_mpfa.saving import load_safely
 
 FORMAT = 5
 """5: many robots, in the middle of their episodes."""

@@ -13,8 +13,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import AdditiveGaussianModule
 
 from navigation.settings.train import ExplorationSettings
-from torchrl_mpfa import DirectModule
-from torchrl_mpfa.networks import StochasticActor
+from torchrl_mpfa.networks import DirectModule, StochasticActor
 
 
 class Explorer(Protocol):

@@ -15,7 +15,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from tqdm import tqdm
 
-from mpfa_envs import WHEEL_PAIRS, Policy, RandomMirror, save_policy
+from mpfa_envs import Policy, RandomMirror, save_policy
+from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from navigation import files
 from navigation.environments import vector_of
 from navigation.records import (
@@ -39,8 +40,9 @@ from navigation.training.schedule import Schedule
 from navigation.training.showing import show_policy
 from navigation.training.tracking import Tracker
 from navigation.training.updates import UpdateLog
-from torchrl_mpfa import Draw, run_updates, save_atomically
-from torchrl_mpfa.saving import write_text_atomically
+from torchrl_mpfa import run_updates
+from torchrl_mpfa.saving import save_atomically, write_text_atomically
+from torchrl_mpfa.selection import Draw
 
 _RECENT = 100
 """Episodes whose success is shown."""

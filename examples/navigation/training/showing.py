@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mpfa_envs import EpisodeResult, Policy, save_policy
+from mpfa_envs import Policy, save_policy
+from mpfa_envs.evaluation.results import EpisodeResult
 from navigation import files
 from navigation.evaluating import drive
 from navigation.pictures import EPISODE, TRAJECTORIES, VALUES, write_pictures

@@ -15,7 +15,8 @@ from navigation.pictures import Values
 from navigation.settings.train import TrainSettings, as_settings
 from navigation.training.assembly import make_learner, method_of
 from navigation.training.checkpoints import read_checkpoint
-from torchrl_mpfa import Learner, SignalLoss
+from torchrl_mpfa import Learner
+from torchrl_mpfa.losses import SignalLoss
 
 
 def load_learner(folder: Path, policy: Policy) -> tuple[Learner, TrainSettings]:

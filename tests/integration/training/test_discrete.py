@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mpfa_envs import WHEEL_PAIRS, load_policy
+from mpfa_envs import load_policy
+from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from navigation.evaluating import drive
 from navigation.settings.checks import check_settings
 from navigation.settings.train import Stage

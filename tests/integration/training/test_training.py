@@ -21,8 +21,9 @@ from navigation.training import loop
 from navigation.training.checkpoints import random_state, read_checkpoint, set_random_state
 from navigation.training.loop import TrainingRun
 from tests.integration.tiny_runs import rows, tiny, train
-from torchrl_mpfa import SignalSampler, save_atomically
+from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods import ALIASES, Method
+from torchrl_mpfa.saving import save_atomically
 
 
 def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -> None:

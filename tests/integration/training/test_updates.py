@@ -15,7 +15,7 @@ from navigation.training.checkpoints import read_checkpoint
 from navigation.training.loop import TrainingRun
 from navigation.training.updates import COLUMNS, UpdateLog
 from tests.integration.tiny_runs import tiny, train
-from torchrl_mpfa import Draw
+from torchrl_mpfa.selection import Draw
 
 
 def of_run(folder: Path) -> pd.DataFrame:

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from tests.methods.replays import assert_shares, make_buffer, seeded, set_signals
-from torchrl_mpfa.methods import RankSampler, rank_share
+from torchrl_mpfa.methods.rank_per import RankPERSampler, rank_share
 
 ALPHA = 0.7
 
 
 def make_sampler(capacity, **kwargs):
-    return RankSampler(capacity, ALPHA, 0.5, 0.01, signals=["td_error"], **kwargs)
+    return RankPERSampler(capacity, ALPHA, 0.5, 0.01, signals=["td_error"], **kwargs)
 
 
 def shares_by_hand(errors):

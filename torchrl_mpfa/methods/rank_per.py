@@ -42,7 +42,7 @@ def _share_in(order: Tensor, priority: Tensor, *, alpha: float) -> Tensor:
     return rank_share((above + until + 1).double() / 2, alpha=alpha)
 
 
-class RankSampler(SignalSampler):
+class RankPERSampler(SignalSampler):
     r"""Sampling by :math:`P(i) \propto (1 / \mathrm{rank}(i))^\alpha`, insensitive to outliers.
 
     Ranks are by the fused and adjusted priority; with the TD error alone this is the rank-based
@@ -60,7 +60,7 @@ class RankSampler(SignalSampler):
         ValueError: If an argument is out of its range.
 
     Examples:
-        >>> RankSampler(1000, 0.7, 0.5, signals=["td_error"]).rank_refresh
+        >>> RankPERSampler(1000, 0.7, 0.5, signals=["td_error"]).rank_refresh
         0.25
     """
 
