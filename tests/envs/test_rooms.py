@@ -12,7 +12,6 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
 
-import mpfa_envs
 from mpfa_envs import ROOMS_TASK, NavigationEnv, VectorNavigationEnv, World, generate_world
 from mpfa_envs.generators import generator_tasks
 from mpfa_envs.sensing.observation import INFO_TYPES
@@ -72,11 +71,6 @@ def test_a_step_after_the_end_asks_for_a_reset(env: NavigationEnv) -> None:
             break
     with pytest.raises(ResetNeeded, match=r"call reset\(\) before step\(\)"):
         env.step(ACTIONS[0])
-
-
-def test_the_old_name_of_the_environment_warns() -> None:
-    with pytest.warns(DeprecationWarning, match="RoomsEnv is now mpfa_envs.NavigationEnv"):
-        assert mpfa_envs.RoomsEnv is NavigationEnv
 
 
 def test_an_episode_can_be_fixed(env: NavigationEnv) -> None:
