@@ -99,13 +99,13 @@ docs: $(STAMP) ## Build the documentation site; open site/index.html
 	@echo "written: site/index.html"
 
 bench: $(STAMP) ## Measure against TorchRL's own parts (minutes); ARGS='--quick'
-	$(BIN)/python -m benchmarks $(ARGS)
+	$(BIN)/python -m benchmarks.speed $(ARGS)
 
 wheel-test: $(STAMP) ## Build sdist and wheel, install the wheel elsewhere and test it
 	$(BIN)/python .ci/wheel_test.py
 
 clean: ## Remove builds and caches; runs/ and .venv stay
-	rm -rf dist build site .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/latest.json
+	rm -rf dist build site .mypy_cache .pytest_cache .ruff_cache .coverage benchmarks/speed/latest.json
 	find . -name .venv -prune -o -name .git -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Another Python than that of .venv is not ignored: it is installed for.

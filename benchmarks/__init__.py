@@ -1,1 +1,1 @@
-"""Speed against other libraries: ``python -m benchmarks``."""
+"""Measurements: speed against other libraries."""

@@ -111,7 +111,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["ruff format --check .", "ruff check .", "mypy", "--doctest-modules torchrl_mpfa"],
         ),
         (["doctest"], ["python -m pytest --doctest-modules torchrl_mpfa envs"]),
-        (["bench", "ARGS=--quick"], ["python -m benchmarks --quick"]),
+        (["bench", "ARGS=--quick"], ["python -m benchmarks.speed --quick"]),
         (["wheel-test"], ["python .ci/wheel_test.py"]),
     ],
 )

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import math
 
-from benchmarks.environment import measure
+from benchmarks.speed.environment import measure
 
 
 def test_the_benchmark_reports_what_it_promises() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from benchmarks.worlds import errors_of_fields, measure
+from benchmarks.speed.worlds import errors_of_fields, measure
 from mpfa_envs import (
     GENERATORS,
     Box,

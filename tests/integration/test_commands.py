@@ -26,7 +26,7 @@ import strength
 import study
 import torchrl_sac
 import torchrl_trainer
-from benchmarks import environment, scaling, worlds
+from benchmarks.speed import environment, scaling, worlds
 from navigation.settings.command_line import parse_overrides
 from navigation.settings.train import register
 from navigation.worlds import parse_worlds
@@ -58,9 +58,9 @@ MAINS: dict[str, Callable[[], object]] = {
     "study": study.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
-    "benchmarks.environment": environment.main,
-    "benchmarks.scaling": scaling.main,
-    "benchmarks.worlds": worlds.main,
+    "benchmarks.speed.environment": environment.main,
+    "benchmarks.speed.scaling": scaling.main,
+    "benchmarks.speed.worlds": worlds.main,
 }
 
 

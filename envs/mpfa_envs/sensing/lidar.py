@@ -1,8 +1,8 @@
 """A planar lidar that is computed exactly from the shapes of the world.
 
 The rays are intersected with boxes, circles and segments in closed form. It replaces PyBullet's ray
-test in both kinds of physics: for 54 rays it is many times faster (``benchmarks/environment.py``),
-and a test holds the two to the same answers.
+test in both kinds of physics: for 54 rays it is many times faster
+(``benchmarks/speed/environment.py``), and a test holds the two to the same answers.
 """
 
 from __future__ import annotations

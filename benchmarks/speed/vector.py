@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.timing import Call, Entry, entry, take_turns
+from benchmarks.speed.timing import Call, Entry, entry, take_turns
 from mpfa_envs import Box, Cylinder, VectorNavigationEnv, Walker, World
 
 ROBOTS = 64

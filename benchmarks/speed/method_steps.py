@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from benchmarks.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
-from benchmarks.timing import MICROSECONDS, Call, Entry, entry, take_turns
+from benchmarks.speed.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
+from benchmarks.speed.timing import MICROSECONDS, Call, Entry, entry, take_turns
 from navigation.settings.learners import LearnerSettings
 from navigation.training.assembly import make_curiosity, make_learner
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay

@@ -1,6 +1,6 @@
 """Actions and updates per second of a run, by the number of Ray workers that run its robots.
 
-    python -m benchmarks.scaling --workers 0 1 2 4 --robots 32 --updates 8 --seconds 20
+    python -m benchmarks.speed.scaling --workers 0 1 2 4 --robots 32 --updates 8 --seconds 20
 
 0 workers means a run without Ray; ratios are to the first row. Other settings of
 ``train.py`` go after ``--``. Time before the first updates is not counted.

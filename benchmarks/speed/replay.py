@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
-from benchmarks.timing import (
+from benchmarks.speed.timing import (
     MICROSECONDS,
     Call,
     Entry,

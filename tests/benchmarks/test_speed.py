@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks import method_steps, replay, run, scaling, timing, training, vector
-from benchmarks.timing import Entry, Timing, entry
+from benchmarks.speed import method_steps, replay, run, scaling, timing, training, vector
+from benchmarks.speed.timing import Entry, Timing, entry
 from navigation.settings.train import register
 from torchrl_mpfa.methods import METHODS
 

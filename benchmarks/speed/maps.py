@@ -1,6 +1,6 @@
 """What a large map costs: reading it, a scan, a clearance, a task; and boxes in its place.
 
-    python -m benchmarks.maps
+    python -m benchmarks.speed.maps
 
 Times are CPU time of one thread.
 """

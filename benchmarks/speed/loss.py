@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
-from benchmarks.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
-from benchmarks.timing import Call, Entry, compare
+from benchmarks.speed.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
+from benchmarks.speed.timing import Call, Entry, compare
 from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
 
 WIDTH = 256

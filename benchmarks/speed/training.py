@@ -24,8 +24,8 @@ from torchrl.envs import EnvBase, set_exploration_type
 from torchrl.envs.utils import ExplorationType, step_mdp
 from torchrl.modules import AdditiveGaussianModule
 
-from benchmarks.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
-from benchmarks.timing import (
+from benchmarks.speed.replay import ACTION_SIZE, BATCH_SIZE, OBSERVATION_SIZE, make_transitions
+from benchmarks.speed.timing import (
     MICROSECONDS,
     Call,
     Entry,

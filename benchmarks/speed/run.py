@@ -1,13 +1,13 @@
 """Run the benchmarks: print one table, write one file.
 
-    python -m benchmarks                 all of them, a few minutes
-    python -m benchmarks --quick         all of them, with fewer and shorter rounds
-    python -m benchmarks --only loss     one of them
-    python -m benchmarks --check         exit with status 1 if a ratio is above its target
+    python -m benchmarks.speed                 all of them, a few minutes
+    python -m benchmarks.speed --quick         all of them, with fewer and shorter rounds
+    python -m benchmarks.speed --only loss     one of them
+    python -m benchmarks.speed --check         exit with status 1 if a ratio is above its target
 
-The file, ``benchmarks/latest.json``, holds what this run measured: a list of objects with ``name``,
-``value``, ``unit``, ``ratio`` and ``baseline``. A ratio is this package's time over TorchRL's, both
-from this run; times alone say more about the machine than about the code.
+The file, ``benchmarks/speed/latest.json``, holds what this run measured: a list of objects with
+``name``, ``value``, ``unit``, ``ratio`` and ``baseline``. A ratio is this package's time over
+TorchRL's, both from this run; times alone say more about the machine than about the code.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import environment, loss, method_steps, replay, training, vector, worlds
-from benchmarks.timing import Entry
+from benchmarks.speed import environment, loss, method_steps, replay, training, vector, worlds
+from benchmarks.speed.timing import Entry
 from torchrl_mpfa.saving import write_text_atomically
 
 LATEST = Path(__file__).with_name("latest.json")
@@ -97,7 +97,7 @@ def missed_targets(entries: Sequence[Entry]) -> list[str]:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks",
+        prog="python -m benchmarks.speed",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

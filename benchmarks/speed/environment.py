@@ -1,8 +1,8 @@
 """Steps per second of the navigation task, and how hard its worlds are.
 
-    python -m benchmarks.environment                     # speed
-    python -m benchmarks.environment --worlds            # table of the worlds
-    python -m benchmarks.environment --picture FILE.png  # picture of the worlds
+    python -m benchmarks.speed.environment                     # speed
+    python -m benchmarks.speed.environment --worlds            # table of the worlds
+    python -m benchmarks.speed.environment --picture FILE.png  # picture of the worlds
 
 All times are CPU time of one thread (``time.process_time``), because wall-clock time on a shared
 machine measures its other users too. Every figure is the median of several short runs.

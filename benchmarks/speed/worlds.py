@@ -1,7 +1,7 @@
 """What a new world costs, the error of its distance field, and what the worlds look like.
 
-python -m benchmarks.worlds                         # a table of the generators
-python -m benchmarks.worlds --pictures docs/images  # twelve worlds of each, from easy to hard
+python -m benchmarks.speed.worlds                         # a table of the generators
+python -m benchmarks.speed.worlds --pictures docs/images  # twelve worlds of each, from easy to hard
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.timing import Call, Entry, entry, take_turns
+from benchmarks.speed.timing import Call, Entry, entry, take_turns
 from mpfa_envs import GENERATORS, NavigationEnv, World, generate_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.planner import PathPlanner

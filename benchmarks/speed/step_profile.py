@@ -1,7 +1,7 @@
 """Where the time of a training step goes, as a Markdown table.
 
-    python -m benchmarks.step_profile             networks of 2 x 64 and 2 x 256, eager and compiled
-    python -m benchmarks.step_profile --widths 128
+    python -m benchmarks.speed.step_profile       2 x 64 and 2 x 256 units, eager and compiled
+    python -m benchmarks.speed.step_profile --widths 128
 
 MPFA-PER on an environment that does nothing. CPU time of one thread; each part is the median over
 the steps.
@@ -18,8 +18,8 @@ from collections.abc import Sequence
 
 from torchrl.envs.utils import step_mdp
 
-from benchmarks.timing import MICROSECONDS, few_threads
-from benchmarks.training import TRANSITION, Agent, IdleTorchEnv, has_compiler
+from benchmarks.speed.timing import MICROSECONDS, few_threads
+from benchmarks.speed.training import TRANSITION, Agent, IdleTorchEnv, has_compiler
 
 PARTS = ("policy and noise", "environment", "write", "sample", "update", "priorities")
 
