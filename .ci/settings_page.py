@@ -20,8 +20,8 @@ from typing import Any
 
 from hydra import compose, initialize_config_module
 
-from navigation.settings.checks import settings_by_name
-from navigation.settings.train import GROUPS, Stage, TrainSettings, as_settings, register
+from training.settings.checks import settings_by_name
+from training.settings.train import GROUPS, Stage, TrainSettings, as_settings, register
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "settings.md"
 START = "## All settings\n"
@@ -76,7 +76,7 @@ def _learner_row(learner: str) -> str:
 @cache
 def _values(regime: str, *overrides: str) -> dict[str, Any]:
     """Every setting of a run that names a regime alone, and the choices of the groups."""
-    with initialize_config_module("navigation.settings", version_base="1.3"):
+    with initialize_config_module("training.settings", version_base="1.3"):
         config = compose("train", [f"regime={regime}", *overrides], return_hydra_config=True)
     chosen = config.hydra.runtime.choices
     settings = as_settings(config)

@@ -25,7 +25,6 @@ import torch
 from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, new_figure
-from navigation.files import check_folder
 from torchrl_mpfa.cliffwalk import (
     Cliffwalk,
     Features,
@@ -34,6 +33,7 @@ from torchrl_mpfa.cliffwalk import (
     updates_to_convergence,
 )
 from torchrl_mpfa.methods import make_replay
+from training.files import check_folder
 
 ORACLE = "greedy oracle"
 # A table has no action gradient, so that MPFA-PER fuses its other two signals.

@@ -32,19 +32,19 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import navigation.extra  # noqa: F401
+import training.extra  # noqa: F401
 
 # isort: split
-from navigation import files
-from navigation.environments import check_physics
-from navigation.settings.train import GROUPS, register
-from navigation.stopping import Stop
-from navigation.studies.arms import check_free, parse_arms
-from navigation.studies.execution import Runs, Start
-from navigation.studies.jobs import TESTED, Evaluation, Study, collect, other_than_asked
-from navigation.studies.processes import Child
-from navigation.worlds import parse_worlds
 from torchrl_mpfa.spelling import unknown
+from training import files
+from training.comparison.arms import check_free, parse_arms
+from training.comparison.execution import Runs, Start
+from training.comparison.jobs import TESTED, Evaluation, Study, collect, other_than_asked
+from training.comparison.processes import Child
+from training.environments import check_physics
+from training.settings.train import GROUPS, register
+from training.stopping import Stop
+from training.worlds import parse_worlds
 
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
@@ -136,7 +136,7 @@ def executor(address: str | None) -> Iterator[Start]:
         yield Child
         return
     try:
-        from navigation.studies.clusters import RemoteChild, connected
+        from training.comparison.clusters import RemoteChild, connected
     except ImportError as error:
         raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
     try:

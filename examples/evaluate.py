@@ -29,16 +29,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import navigation.extra  # noqa: F401
+import training.extra  # noqa: F401
 
 # isort: split
 import pandas as pd
 
 from mpfa_envs import GENERATORS, PLANNERS, Policy, RobotNoise, load_policy, make_planner
 from mpfa_envs.evaluation.results import EpisodeResult
-from navigation import files
-from navigation.environments import check_physics
-from navigation.evaluating import (
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.environments import check_physics
+from training.evaluating import (
     Drivable,
     Drives,
     drive,
@@ -46,12 +47,11 @@ from navigation.evaluating import (
     summary_row,
     tasks_of,
 )
-from navigation.live import watch
-from navigation.pictures import Values, write_pictures
-from navigation.records import as_table, write_table
-from navigation.training.values import load_learner, values_of
-from navigation.worlds import parse_worlds, world_name
-from torchrl_mpfa.saving import write_text_atomically
+from training.live import watch
+from training.pictures import Values, write_pictures
+from training.records import as_table, write_table
+from training.run.values import load_learner, values_of
+from training.worlds import parse_worlds, world_name
 
 EVALUATION = "evaluation.json"
 _DOCUMENTED = (

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mpfa_envs import Policy, evaluate, export_policy, load_policy
-from navigation import files
+from training import files
 
 TOLERANCE = 1e-6
 """By how much actions of the file may differ, unless it is quantized."""

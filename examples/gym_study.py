@@ -29,10 +29,10 @@ from control.runs import Run, begin_worker, make, wanted
 from control.table import FOLDER, SEEDS, TABLE_F, read_runs
 from control.tasks import TASKS
 from control.training import METHODS
-from navigation import files
-from navigation.report.kept_rows import keep
-from navigation.stopping import Stop
-from navigation.studies.protocol import ROOT
+from training import files
+from training.comparison.protocol import ROOT
+from training.report.kept_rows import keep
+from training.stopping import Stop
 
 _PAUSE = 0.5
 """Between two looks at the runs [s]."""

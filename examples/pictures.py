@@ -37,12 +37,6 @@ from mpfa_envs.render import (
     write_animation,
 )
 from mpfa_envs.render.charts import finish, new_figure
-from navigation.evaluating import Drivable, drive
-from navigation.pictures import Values, longest, trajectories_of
-from navigation.report.kept_rows import read_kept
-from navigation.report.study_rows import by_run
-from navigation.training.checkpoints import read_checkpoint
-from navigation.training.values import load_learner, values_of
 from torchrl_mpfa import (
     Learner,
     MPFASampler,
@@ -50,6 +44,12 @@ from torchrl_mpfa import (
     SignalReplayBuffer,
     SignalTensorStorage,
 )
+from training.evaluating import Drivable, drive
+from training.pictures import Values, longest, trajectories_of
+from training.report.kept_rows import read_kept
+from training.report.study_rows import by_run
+from training.run.checkpoints import read_checkpoint
+from training.run.values import load_learner, values_of
 
 ROOT = Path(__file__).parents[1]
 POLICIES = Path(__file__).parent / "policies"

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from mpfa_envs import NavigationEnv, Policy, WorldTask, load_policy
 from mpfa_envs.scene.scene import render_scene
 from mpfa_envs.scene.window import Window
-from navigation.evaluating import tasks_of
-from navigation.worlds import parse_worlds
+from training.evaluating import tasks_of
+from training.worlds import parse_worlds
 
 POLICY = Path(__file__).parent / "policies" / "td3-mpfa_per-rooms.npz"
 LETTERS = {"w": "up", "a": "left", "s": "down", "d": "right"}

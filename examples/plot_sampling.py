@@ -29,10 +29,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, look, new_figure
-from navigation.files import check_folder
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 from torchrl_mpfa.spelling import unknown
+from training.files import check_folder
 
 COUNT = 2_000
 BATCH_SIZE = 128

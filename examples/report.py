@@ -11,7 +11,7 @@ the training of each run has a ``learning_curve.png`` in its folder). The arms o
 (``compare.py --arm``) have rows and lines of their own, and evaluations with other physics have
 tables of their own. The unit is the run, not the episode: intervals are over runs, or over runs and
 pairs of start and goal, and tests compare the means of runs; see
-``navigation/report/intervals.py``.
+``training/report/intervals.py``.
 
 With ``--paper`` it makes, from the runs there are, ``paper.md`` with Tables 2 to 4 next to the
 paper's numbers, ``figure_3.png``, ``figure_5.png``, ``figure_8.png`` to ``figure_11.png``,
@@ -30,19 +30,23 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import navigation.extra  # noqa: F401
+import training.extra  # noqa: F401
 
 # isort: split
 import pandas as pd
 
-from navigation import files
-from navigation.figures import Runs, plot_evaluations
-from navigation.records import read_table
-from navigation.report.kept_rows import is_kept
-from navigation.report.paper_figures import plot_paper
-from navigation.report.paper_tables import paper_tables
-from navigation.report.study_pages import write_study
-from navigation.report.tables import (
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.comparison.jobs import Study, run_name
+from training.comparison.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
+from training.comparison.protocol import paper_studies, tables
+from training.figures import Runs, plot_evaluations
+from training.records import read_table
+from training.report.kept_rows import is_kept
+from training.report.paper_figures import plot_paper
+from training.report.paper_tables import paper_tables
+from training.report.study_pages import write_study
+from training.report.tables import (
     comparison_table,
     interval_table,
     outcome_table,
@@ -51,11 +55,7 @@ from navigation.report.tables import (
     speed_table,
     success_table,
 )
-from navigation.studies.jobs import Study, run_name
-from navigation.studies.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
-from navigation.studies.protocol import paper_studies, tables
-from navigation.worlds import family
-from torchrl_mpfa.saving import write_text_atomically
+from training.worlds import family
 
 
 def read_studies(folders: Sequence[Path]) -> pd.DataFrame:

@@ -27,12 +27,12 @@ import torch
 from tensordict import TensorDict
 
 from mpfa_envs import RandomMirror
-from navigation.report.tables import table
-from navigation.settings.command_line import composed
-from navigation.settings.train import register
-from navigation.studies.protocol import SPARSE
-from navigation.training.loop import TrainingRun
 from torchrl_mpfa import EntropyFusion, SignalSampler, TD3Learner
+from training.comparison.protocol import SPARSE
+from training.report.tables import table
+from training.run.loop import TrainingRun
+from training.settings.command_line import composed
+from training.settings.train import register
 
 METHODS = ("per", "mpfa_per", "mpfa_plus", "mpf_per", "lap", "uniform", "pal")
 SEEDS = (1700, 1701, 1702)

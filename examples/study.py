@@ -9,8 +9,8 @@
 
 Every run is made by ``compare.py``, with the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is in progress, and the same command continues it. Tables
-A to E are in ``navigation/studies/protocol.py``, with one folder per task in ``--folder``; table F,
-which is not about navigation, is made by ``gym_study.py``. The checkpoint of a finished run is
+A to E are in ``training/comparison/protocol.py``, with one folder per task in ``--folder``; table
+F, which is not about navigation, is made by ``gym_study.py``. The checkpoint of a finished run is
 removed: thousands of them take tens of gigabytes.
 """
 
@@ -23,11 +23,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import compare
-from navigation import files
-from navigation.report.kept_rows import is_kept, joined, keep, of_arms, read_all_kept
-from navigation.report.study_rows import Rows, read_runs, without_rows
-from navigation.studies.protocol import ROOT, Table, label_of, tables
-from navigation.studies.remaining import counts, free_checkpoints, hours_left, parts_left
+from training import files
+from training.comparison.protocol import ROOT, Table, label_of, tables
+from training.comparison.remaining import counts, free_checkpoints, hours_left, parts_left
+from training.report.kept_rows import is_kept, joined, keep, of_arms, read_all_kept
+from training.report.study_rows import Rows, read_runs, without_rows
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

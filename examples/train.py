@@ -8,7 +8,7 @@
     python examples/train.py ray.workers=8 robots=128 updates=32    robots on a Ray cluster
     python examples/train.py resume=runs/rooms-mpfa_per-ddpg-0    resume a run that was stopped
 
-``navigation/settings/`` has every setting; ``--help`` prints them with their values. Ctrl-C,
+``training/settings/`` has every setting; ``--help`` prints them with their values. Ctrl-C,
 SIGTERM and SIGHUP let the iteration end and save. Exit status: 0; 1 after an error, with the last
 iteration saved; 2 if a setting is wrong; 128 plus the number of the signal that stopped it.
 """
@@ -18,10 +18,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import navigation.extra  # noqa: F401
+import training.extra  # noqa: F401
 
 # isort: split
-from navigation.finished import after_the_end, is_finished
+from training.finished import after_the_end, is_finished
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
         print(after_the_end(Path(folder)))
         raise SystemExit(0)
     # Imports PyTorch, Hydra and wandb, which takes seconds.
-    from navigation.training.script import train
+    from training.run.script import train
 
     train(arguments)
 

@@ -146,23 +146,23 @@ def test_only_the_simulation_imports_pybullet():
 def test_only_the_tracking_of_the_training_application_imports_wandb():
     users = importers(EVERYTHING, {"wandb"})
     assert {user for user in users if not user.startswith("tests/")} == {
-        "examples/navigation/training/tracking.py"
+        "examples/training/run/tracking.py"
     }
 
 
 def test_the_training_application_s_folders_import_those_that_come_before_them():
-    folder = ROOT / "examples/navigation"
+    folder = ROOT / "examples/training"
     allowed = {
         "settings": set(),
-        "training": {"settings"},
-        "studies": {"settings"},
-        "report": {"settings", "studies"},
+        "run": {"settings"},
+        "comparison": {"settings"},
+        "report": {"settings", "comparison"},
         "": {"settings"},
     }
     for path in folder.rglob("*.py"):
         place = "" if path.parent == folder else path.parent.name
         modules = {node.module or "" for node in nodes_of(path) if isinstance(node, ast.ImportFrom)}
-        found = {name.split(".")[1] for name in modules if name.startswith("navigation.")}
+        found = {name.split(".")[1] for name in modules if name.startswith("training.")}
         assert found & set(allowed) <= allowed[place] | {place}, name_of(path)
 
 

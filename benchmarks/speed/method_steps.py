@@ -8,9 +8,9 @@ import torch
 
 from benchmarks.speed.replay import ACTION_SIZE, OBSERVATION_SIZE, make_transitions
 from benchmarks.speed.timing import MICROSECONDS, Call, Entry, entry, take_turns
-from navigation.settings.learners import LearnerSettings
-from navigation.training.assembly import make_curiosity, make_learner
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
+from training.run.assembly import make_curiosity, make_learner
+from training.settings.learners import LearnerSettings
 
 BASELINE = "ddpg"
 _FILL = 10_000

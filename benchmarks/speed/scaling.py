@@ -15,10 +15,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from navigation.settings.command_line import composed
-from navigation.settings.train import register
-from navigation.training.loop import TrainingRun
-from navigation.training.running import prepare_process
+from training.run.loop import TrainingRun
+from training.run.running import prepare_process
+from training.settings.command_line import composed
+from training.settings.train import register
 
 _WARM = 4
 """Iterations with updates that are not counted: programs are compiled, and workers fall in step."""

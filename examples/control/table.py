@@ -9,8 +9,8 @@ import pandas as pd
 from control.runs import Run, wanted
 from control.tasks import TASKS
 from control.training import METHODS
-from navigation.report.study_rows import Rows
-from navigation.studies.protocol import FIRST_SEED, Pair, Table
+from training.comparison.protocol import FIRST_SEED, Pair, Table
+from training.report.study_rows import Rows
 
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
 FOLDER = "gym"

@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks.speed import method_steps, replay, run, scaling, timing, training, vector
 from benchmarks.speed.timing import Entry, Timing, entry
-from navigation.settings.train import register
 from torchrl_mpfa.methods import METHODS
+from training.settings.train import register
 
 
 def check_schema(entries: Sequence[Entry]) -> None:

@@ -27,9 +27,9 @@ import study
 import torchrl_sac
 import torchrl_trainer
 from benchmarks.speed import environment, scaling, worlds
-from navigation.settings.command_line import parse_overrides
-from navigation.settings.train import register
-from navigation.worlds import parse_worlds
+from training.settings.command_line import parse_overrides
+from training.settings.train import register
+from training.worlds import parse_worlds
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(p.relative_to(ROOT) for p in ROOT.glob("docs/**/*.md"))]

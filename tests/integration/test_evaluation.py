@@ -14,14 +14,14 @@ from mpfa_envs import GENERATORS, load_policy, save_policy, world_tasks
 from mpfa_envs import evaluate as evaluate_policy
 from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.render import film_episode
-from navigation import files
-from navigation.evaluating import summary_row
-from navigation.records import read_table
-from navigation.settings.train import GROUPS, TrainSettings
-from navigation.studies.jobs import Evaluation, Job
-from navigation.training.assembly import make_learner
-from navigation.training.evaluations import exported_policy
-from navigation.worlds import parse_worlds, worlds_label
+from training import files
+from training.comparison.jobs import Evaluation, Job
+from training.evaluating import summary_row
+from training.records import read_table
+from training.run.assembly import make_learner
+from training.run.evaluations import exported_policy
+from training.settings.train import GROUPS, TrainSettings
+from training.worlds import parse_worlds, worlds_label
 
 SHIPPED = Path(evaluate.__file__).parent / "policies" / "td3-mpfa_per.npz"
 

@@ -26,10 +26,10 @@ from control.runs import EVALUATIONS, SETTINGS, Run, wanted
 from control.table import ALL, SEEDS, TABLE_F, label_of, missing, read_runs, with_mean
 from control.tasks import TASKS, make_env, task_of
 from control.training import METHODS, Regime, Settings, greedy_returns, iterations, train
-from navigation.report import study_pages
-from navigation.report.kept_rows import read_kept
-from navigation.report.study_rows import Rows, scores_of
 from torchrl_mpfa.methods import Replay, loss_options, make_replay
+from training.report import study_pages
+from training.report.kept_rows import read_kept
+from training.report.study_rows import Rows, scores_of
 
 # Rewards of one sign: mpfa_per weights its signals equally there.
 pytestmark = pytest.mark.filterwarnings("ignore:positive_above='mean'")

@@ -14,7 +14,7 @@ import play
 from mpfa_envs import Policy, world_tasks
 from mpfa_envs.policies.layers import Linear
 from mpfa_envs.scene.colors import RIVAL, ROBOT
-from navigation.live import watch
+from training.live import watch
 
 pygame = pytest.importorskip("pygame")
 

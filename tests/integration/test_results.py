@@ -9,7 +9,7 @@ import pytest
 
 import report
 import strength
-from navigation.report import study_pages
+from training.report import study_pages
 
 pytestmark = pytest.mark.usefixtures("tables_alone")
 DOCS = Path(__file__).parents[2] / "docs"

@@ -10,7 +10,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 import torchrl_sac
 from mpfa_envs import load_policy, make_navigation_env
-from navigation.evaluating import drive
+from training.evaluating import drive
 
 pytestmark = pytest.mark.filterwarnings("ignore:init_random_frames")
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from navigation.settings.train import (
+from training.run.loop import TrainingRun
+from training.settings.train import (
     GROUPS,
     CurriculumSettings,
     EnvironmentSettings,
     Stage,
     TrainSettings,
 )
-from navigation.training.loop import TrainingRun
 
 # Two worlds, so that a change of world lies between the checkpoints too.
 STAGES = [Stage("A", 3), Stage("B", 3)]

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from navigation.figures import plot_evaluations, plot_learning_curve
+from training.figures import plot_evaluations, plot_learning_curve
 
 BLUE, ORANGE, GRAY = (0, 114, 178), (230, 159, 0), (128, 128, 128)
 

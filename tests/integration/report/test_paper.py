@@ -13,13 +13,11 @@ from PIL import Image
 
 import compare
 import report
-from navigation import files
-from navigation.records import write_table
-from navigation.report.paper_figures import plot_claims, reward_of_blocks
-from navigation.report.paper_tables import trained_table, unseen_table
-from navigation.settings.train import GROUPS, Stage
-from navigation.studies.jobs import Job
-from navigation.studies.paper import (
+from tests.integration.report.test_figures import colored, heights
+from tests.integration.tiny_runs import tiny, train
+from training import files
+from training.comparison.jobs import Job
+from training.comparison.paper import (
     NAMES,
     PHIS,
     TABLE_2,
@@ -29,8 +27,10 @@ from navigation.studies.paper import (
     read_runs,
     studies,
 )
-from tests.integration.report.test_figures import colored, heights
-from tests.integration.tiny_runs import tiny, train
+from training.records import write_table
+from training.report.paper_figures import plot_claims, reward_of_blocks
+from training.report.paper_tables import trained_table, unseen_table
+from training.settings.train import GROUPS, Stage
 
 FIGURES = ["claims", *(f"figure_{n}" for n in (3, 5, 8, 9, 10, 11, 13))]
 

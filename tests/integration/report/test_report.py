@@ -12,8 +12,8 @@ from PIL import Image
 from scipy import stats
 
 import report
-from navigation.records import write_table
-from navigation.report.intervals import (
+from training.records import write_table
+from training.report.intervals import (
     bootstrap_runs,
     bootstrap_runs_and_pairs,
     interquartile_mean,
@@ -21,8 +21,8 @@ from navigation.report.intervals import (
     probability_of_improvement,
     t_interval,
 )
-from navigation.report.permutation import least_p, permutation_p
-from navigation.report.power import runs_needed
+from training.report.permutation import least_p, permutation_p
+from training.report.power import runs_needed
 
 LINE = "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |"
 

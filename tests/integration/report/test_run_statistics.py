@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from navigation.report.intervals import (
+from training.report.intervals import (
     Array,
     difference_interval,
     improvement_interval,
@@ -19,7 +19,7 @@ from navigation.report.intervals import (
     resampled_means,
     widened_ends,
 )
-from navigation.report.permutation import (
+from training.report.permutation import (
     deal_p,
     flip_p,
     flips,
@@ -29,7 +29,7 @@ from navigation.report.permutation import (
     rank_flip_p,
     rank_p,
 )
-from navigation.report.power import (
+from training.report.power import (
     MOST,
     difference_found,
     paired_difference_found,

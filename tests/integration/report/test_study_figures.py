@@ -10,19 +10,19 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from navigation.report.study_figures import (
+from tests.integration.report.test_figures import GRAY, ORANGE, colored
+from tests.integration.report.test_study_pages import PAIRS, small_table
+from training.comparison.protocol import KEY, OF_VOLUMES
+from training.report.study_figures import (
     looks_of,
     mean_curve,
     plot_curves,
     plot_profiles,
     plot_volumes,
 )
-from navigation.report.study_rows import (
+from training.report.study_rows import (
     Rows,
 )
-from navigation.studies.protocol import KEY, OF_VOLUMES
-from tests.integration.report.test_figures import GRAY, ORANGE, colored
-from tests.integration.report.test_study_pages import PAIRS, small_table
 
 
 def test_a_mean_curve_begins_at_zero_and_ends_where_the_shortest_run_does() -> None:

@@ -14,26 +14,26 @@ from PIL import Image
 
 import report
 import study
-from navigation import files
-from navigation.records import write_table
-from navigation.report import study_pages
-from navigation.report.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
-from navigation.report.permutation import deal_p
-from navigation.report.study_figures import (
+from training import files
+from training.comparison.arms import Arm
+from training.comparison.jobs import Evaluation, Job, Study
+from training.comparison.paper import NAMES, PHIS
+from training.comparison.protocol import Table, paper_studies, tables
+from training.records import write_table
+from training.report import study_pages
+from training.report.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
+from training.report.permutation import deal_p
+from training.report.study_figures import (
     plot_study,
 )
-from navigation.report.study_rows import (
+from training.report.study_rows import (
     Rows,
     missing,
     read_runs,
     scores_of,
     worlds_of,
 )
-from navigation.report.study_tables import arm_lines, comparison_lines, study_tables
-from navigation.studies.arms import Arm
-from navigation.studies.jobs import Evaluation, Job, Study
-from navigation.studies.paper import NAMES, PHIS
-from navigation.studies.protocol import Table, paper_studies, tables
+from training.report.study_tables import arm_lines, comparison_lines, study_tables
 
 TEST = Evaluation(("bars:test", "halls:test"), 4, "wheels")
 PAIRS = (("s/td3/per", "s/td3/uniform"), ("s/td3/uniform/wide", "s/td3/uniform"))

@@ -19,10 +19,10 @@ from mpfa_envs import (
     TaskConfig,
     load_policy,
 )
-from navigation.environments import env_arguments, make_training_env, vector_of
-from navigation.settings.environment import EnvironmentSettings, NoiseSettings
-from navigation.settings.train import REGIMES
 from tests.integration.tiny_runs import tiny, train
+from training.environments import env_arguments, make_training_env, vector_of
+from training.settings.environment import EnvironmentSettings, NoiseSettings
+from training.settings.train import REGIMES
 
 
 @pytest.mark.parametrize(("robot", "radius"), [("turtlebot2", 0.18), ("burger", 0.105)])

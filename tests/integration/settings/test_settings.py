@@ -10,13 +10,13 @@ from itertools import zip_longest
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from navigation.settings.checks import RULES, check_settings, settings_by_name
-from navigation.settings.command_line import composed, parse_overrides
-from navigation.settings.resuming import changed
-from navigation.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings, register
-from navigation.training.assembly import make_learner
 from tests.mpfa.losses import make_batch
 from torchrl_mpfa.methods.assembly import WORDS
+from training.run.assembly import make_learner
+from training.settings.checks import RULES, check_settings, settings_by_name
+from training.settings.command_line import composed, parse_overrides
+from training.settings.resuming import changed
+from training.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings, register
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,7 +1,0 @@
-"""The training application of the scripts: settings, training, studies of many runs, reports.
-
-It puts the parts of :mod:`torchrl_mpfa` and the task of :mod:`mpfa_envs` together. What a pipeline
-of your own would need is in those two packages. ``settings`` knows no other folder; ``training``
-and ``studies``, which starts the scripts as processes, import it; ``report`` imports ``studies``.
-What they share lies beside them.
-"""

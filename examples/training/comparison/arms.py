@@ -1,0 +1,128 @@
+"""The arms of a study: what is other in some of its runs, by a name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from training.settings.checks import NAME
+from training.settings.command_line import parse_overrides
+
+DEFAULTS = ("tracking=off", "evaluation.every=5000")
+"""What a study has unless its command line says otherwise."""
+_OF_THE_STUDY = ("learner", "method", "seed", "run_dir", "overwrite", "resume")
+"""Settings that a study gives each of its runs."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Settings of ``train.py`` that some runs of a study have, and a name for them."""
+
+    name: str = ""
+    """Part of the name of its runs."""
+    settings: tuple[str, ...] = ()
+    """As on the command line of ``train.py``."""
+
+    def over(self, overrides: Sequence[str]) -> list[str]:
+        """The settings of a study with those of the arm in the place of the same ones."""
+        own = [_key(setting) for setting in self.settings]
+        # The whole of a group takes the place of each setting in it.
+        kept = [o for o in overrides if not any(f"{_key(o)}.".startswith(f"{k}.") for k in own)]
+        return [*kept, *self.settings]
+
+
+PLAIN = Arm()
+"""The only arm of a study for which none is named."""
+
+
+def parse_arms(texts: Sequence[str]) -> list[Arm]:
+    """The arms on a command line; :data:`PLAIN` if there are none.
+
+    Args:
+        texts: Each as :func:`parse_arm` takes it.
+
+    Returns:
+        The arms.
+
+    Raises:
+        ValueError: If one cannot be read, or two have the same name.
+    """
+    arms: list[Arm] = []
+    for text in texts:
+        try:
+            arm = parse_arm(text)
+        except ValueError as error:
+            raise ValueError(f"--arm {text}: {error}") from error
+        if arm.name in [other.name for other in arms]:
+            raise ValueError(f"--arm has {arm.name} twice")
+        arms.append(arm)
+    return arms or [PLAIN]
+
+
+def parse_arm(text: str) -> Arm:
+    """An arm as on the command line.
+
+    Args:
+        text: ``NAME:SETTING=VALUE,SETTING=VALUE``; commas in brackets or quotes are of the value.
+
+    Returns:
+        The arm.
+
+    Raises:
+        ValueError: If it is no such thing, or a setting is unknown or one that the study gives.
+
+    Examples:
+        >>> parse_arm("short:robots=1,curriculum.stages=[{world: A, actions: 500}]").settings
+        ('robots=1', 'curriculum.stages=[{world: A, actions: 500}]')
+        >>> parse_arm("default:")
+        Arm(name='default', settings=())
+    """
+    name, colon, listed = text.partition(":")
+    allowed, wanted = NAME
+    if not colon or not allowed(name):
+        raise ValueError(f"must be NAME:SETTING=VALUE,... with a NAME of {wanted}")
+    settings = tuple(_split(listed)) if listed.strip() else ()
+    check_free(settings)
+    return Arm(name, settings)
+
+
+def check_free(settings: Sequence[str]) -> None:
+    """Refuse settings that the study itself gives its runs, and unknown ones.
+
+    Args:
+        settings: As on the command line of ``train.py``.
+
+    Raises:
+        ValueError: With the setting's name.
+    """
+    for setting in settings:
+        if setting.startswith("-") or "=" not in setting:
+            raise ValueError(f"{setting!r} is not NAME=VALUE")
+    for override in parse_overrides(settings):
+        key = override.key_or_group
+        if key in _OF_THE_STUDY:
+            raise ValueError(f"{key} is what the study gives each run, not a setting of all")
+
+
+def with_defaults(overrides: Sequence[str]) -> list[str]:
+    """The settings of a study, but where the command line has others."""
+    given = {_key(override) for override in overrides}
+    return [*(d for d in DEFAULTS if _key(d) not in given), *overrides]
+
+
+def _key(setting: str) -> str:
+    return setting.partition("=")[0]
+
+
+def _split(text: str) -> list[str]:
+    """Parts between the commas that are in no brackets and no quotes."""
+    parts, depth, quote = [""], 0, ""
+    for sign in text:
+        if quote or sign in "'\"":
+            quote = "" if sign == quote else quote or sign
+        depth += 0 if quote else (sign in "[{(") - (sign in ")}]")
+        if sign == "," and depth == 0 and not quote:
+            parts.append("")
+        else:
+            parts[-1] += sign
+    return [part.strip() for part in parts]

@@ -1,0 +1,274 @@
+"""Studies: the runs of several methods, learners, arms and seeds, their settings and rows."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.comparison.arms import PLAIN, Arm, with_defaults
+from training.evaluating import evaluation_folder
+from training.finished import is_finished, read_json
+from training.records import read_table, write_table
+from training.settings.checks import settings_by_name
+from training.settings.command_line import composed
+from training.settings.environment import EnvironmentSettings
+from training.settings.resuming import LAWFUL, OF_THE_CALL
+from training.settings.train import TrainSettings, as_settings
+
+SCRIPTS = Path(__file__).resolve().parents[2]
+_OF_THE_RESULT = ("evaluation.every", "ray.workers", "ray.steps", "ray.sync")
+"""Settings that a run may change on its way, although it becomes another one by them."""
+_FREE = {*LAWFUL, *OF_THE_CALL, "device", "threads"} - {*_OF_THE_RESULT}
+"""Settings that may be others than those that a study asks for."""
+
+
+def run_name(learner: str, method: str, arm: str, seed: int) -> str:
+    """Name of a run, and of its folder; an arm without a name is left out."""
+    return "-".join(part for part in (learner, method, arm, str(seed)) if part)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What every policy of a study is asked to do."""
+
+    words: tuple[str, ...]
+    """Worlds, as on the command line."""
+    episodes: int
+    """Pairs of start and goal in each of them."""
+    physics: str | None = None
+    """``wheels`` or ``kinematic``; None: as trained."""
+
+
+TESTED = Evaluation(("test",), 200)
+"""What ``compare.py`` asks for unless its command line says otherwise."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a study."""
+
+    learner: str
+    method: str
+    seed: int
+    folder: Path
+    """Of the study."""
+    arm: Arm = PLAIN
+
+    @property
+    def name(self) -> str:
+        """Name of the run, and of its folder."""
+        return run_name(self.learner, self.method, self.arm.name, self.seed)
+
+    @property
+    def path(self) -> Path:
+        """Folder of the run."""
+        return self.folder / self.name
+
+    def overrides(self, overrides: Sequence[str]) -> list[str]:
+        """Its settings on the command line of ``train.py``."""
+        own = [f"learner={self.learner}", f"method={self.method}", f"seed={self.seed}"]
+        # The runs that differ by their seeds alone are one group in wandb.
+        group = f"{self.folder.name}/{self.name.removesuffix(f'-{self.seed}')}"
+        own += [f"run_dir={self.path}", f"tracking.group={group[:128]}"]
+        return [*own, *with_defaults(self.arm.over(overrides))]
+
+    def asked(self, overrides: Sequence[str]) -> TrainSettings:
+        """Its settings.
+
+        Raises:
+            ValueError: If they cannot be, or are those of several runs.
+        """
+        try:
+            first, *others = composed(self.overrides(overrides))
+        except ValueError as error:
+            where = f"--arm {self.arm.name}: " if self.arm.name else ""
+            raise ValueError(f"{where}{error}") from error
+        if others:
+            raise ValueError("a study takes one value for each setting, not a sweep")
+        return first
+
+    def trains(self, overrides: Sequence[str], *, anew: bool = False) -> list[str]:
+        """The command that trains it, or goes on where a checkpoint lies."""
+        script = [str(SCRIPTS / "train.py")]
+        if (self.path / files.CHECKPOINT).exists() and not anew:
+            return [*script, f"resume={self.path}"]
+        return [*script, *self.overrides(overrides), "overwrite=true"]
+
+    def evaluates(self, wanted: Evaluation) -> list[str]:
+        """The command that evaluates its policy."""
+        return [
+            *(str(SCRIPTS / "evaluate.py"), str(self.path)),
+            *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
+            *(["--physics", wanted.physics] if wanted.physics else []),
+        ]
+
+    def physics(self, wanted: Evaluation) -> str:
+        """What it is evaluated with: ``wheels`` or ``kinematic``."""
+        if wanted.physics is not None:
+            return wanted.physics
+        trained = read_json(self.path / files.SETTINGS).get("environment", {})
+        return str(trained.get("physics", EnvironmentSettings.physics))
+
+    def results(self, wanted: Evaluation) -> Path:
+        """Folder of its evaluation."""
+        return self.path / evaluation_folder(wanted.words, self.physics(wanted))
+
+    def status(self) -> Mapping[str, Any]:
+        """How far it says that it is; nothing before its first episode."""
+        return read_json(self.path / files.STATUS)
+
+    def is_trained(self) -> bool:
+        """Whether it came to its end, and left behind what a run has there."""
+        return is_finished(self.path)
+
+    def is_evaluated(self, wanted: Evaluation) -> bool:
+        """Whether the policy that it has now was evaluated as it is asked for."""
+        found = read_json(self.results(wanted) / files.SETTINGS)
+        policy = self.path / files.POLICY
+        return (
+            self.is_trained()
+            and found.get("episodes") == wanted.episodes
+            and found.get("words") == list(wanted.words)
+            and found.get("physics") == self.physics(wanted)
+            # A study drives the pairs of the first seed, and robots without errors.
+            and found.get("seed", 0) == 0
+            and found.get("noise") is None
+            and policy.exists()
+            and found.get("sha256") == files.digest(policy)
+        )
+
+    def differences(self, asked: TrainSettings) -> list[str]:
+        """Where the settings that it was trained with are others than those asked for."""
+        found = read_json(self.path / files.SETTINGS)
+        if not found:
+            return []
+        had, wanted = (dict(settings_by_name(each)) for each in (as_settings(found), asked))
+        return [
+            f"{name}={had[name]}, asked for is {value}"
+            for name, value in wanted.items()
+            if name not in _FREE and had[name] != value
+        ]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs that one command of ``compare.py`` makes: each learner, method, arm and seed."""
+
+    folder: Path
+    methods: tuple[str, ...]
+    settings: tuple[str, ...]
+    """As on the command line of ``train.py``."""
+    seeds: Sequence[int]
+    learners: tuple[str, ...] = ("ddpg",)
+    arms: tuple[Arm, ...] = (PLAIN,)
+    evaluation: Evaluation = TESTED
+
+    @property
+    def arguments(self) -> list[str]:
+        """The command line of ``compare.py``; what it has by default is left out."""
+        words = ["--folder", str(self.folder)]
+        words += [f"--arm={arm.name}:{','.join(arm.settings)}" for arm in self.arms if arm.name]
+        if self.learners != ("ddpg",):
+            words += ["--learners", *self.learners]
+        words += ["--methods", *self.methods, "--seeds", *map(str, self.seeds)]
+        if self.evaluation != TESTED:
+            words += ["--worlds", *self.evaluation.words]
+            words += ["--episodes", str(self.evaluation.episodes)]
+        if self.evaluation.physics is not None:
+            words += ["--physics", self.evaluation.physics]
+        return [*words, "--", *self.settings]
+
+    @property
+    def command(self) -> str:
+        """What makes the runs, and leaves alone those that are made.
+
+        Examples:
+            >>> one = Study(Path("runs/x"), ("per",), ("robots=4",), range(2), arms=(Arm("a"),))
+            >>> one.command
+            'python examples/compare.py --folder runs/x --arm=a: --methods per --seeds 0 1 -- \
+robots=4'
+        """
+        return shlex.join(["python", "examples/compare.py", *self.arguments])
+
+    @property
+    def jobs(self) -> list[Job]:
+        """Its runs, in the order in which they are made."""
+        return [
+            Job(learner, method, seed, self.folder, arm)
+            # Seeds outside: a study that is cut short has as much of each method.
+            for seed in self.seeds
+            for learner in self.learners
+            for method in self.methods
+            for arm in self.arms
+        ]
+
+    def runs(self) -> dict[str, list[Job]]:
+        """Its runs by arm, or by method if it has no arms."""
+        found: dict[str, list[Job]] = {}
+        for job in self.jobs:
+            found.setdefault(job.arm.name or job.method, []).append(job)
+        return found
+
+
+def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job, list[str]]:
+    """Runs that were trained with other settings than those asked for.
+
+    Args:
+        jobs: The runs.
+        overrides: The settings of the study.
+
+    Returns:
+        Where they differ; runs as they should be are left out.
+
+    Raises:
+        ValueError: If settings cannot be.
+    """
+    asked: dict[tuple[str, str, Arm], TrainSettings] = {}
+    others = {}
+    for job in jobs:
+        # Settings are checked in their worlds, which takes a second: once for all seeds.
+        kind = job.learner, job.method, job.arm
+        if kind not in asked:
+            asked[kind] = job.asked(overrides)
+        found = job.differences(replace(asked[kind], seed=job.seed))
+        if found:
+            others[job] = found
+    return others
+
+
+def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
+    """Write the rows of all evaluated runs in one file, and their settings in another.
+
+    Args:
+        jobs: The runs.
+        wanted: What they were asked to do.
+        folder: Of the study.
+    """
+    tables, settings = [], {}
+    for job in jobs:
+        if job.is_evaluated(wanted):
+            table = read_table(job.results(wanted) / files.EPISODES)
+            table.insert(0, "learner", job.learner)
+            table.insert(1, "method", job.method)
+            table.insert(2, "arm", job.arm.name)
+            table.insert(3, "seed", job.seed)
+            settings[job.name] = read_json(job.path / files.SETTINGS)
+            table.insert(4, "physics", table.pop("physics"))
+            tables.append(table)
+    if tables:
+        write_table(pd.concat(tables), folder / files.EPISODES)
+    document = {
+        "worlds": wanted.words,
+        "episodes": wanted.episodes,
+        "physics": wanted.physics,
+        "runs": settings,
+    }
+    write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)

@@ -1,0 +1,104 @@
+"""The environments of a run: where it learns, and what a policy must sense where it is judged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from importlib import import_module
+from typing import Any
+
+from torchrl.envs import EnvBase, TransformedEnv
+
+from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
+from mpfa_envs.robots.model import resolve_robot
+from training.settings.environment import EnvironmentSettings
+
+_AHEAD, _SECTOR = 180.0, 10.0
+"""The lidar's field of view unless it is said, and that of a sector [deg]."""
+INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
+
+
+def check_physics(physics: str) -> None:
+    """Refuse simulated wheels where there is no PyBullet.
+
+    Args:
+        physics: ``wheels`` or ``kinematic``.
+
+    Raises:
+        ValueError: Then, with the way out.
+    """
+    if physics == "wheels":
+        try:
+            import_module("mpfa_envs.robots.simulation")
+        except ImportError as error:
+            raise ValueError(str(error)) from error
+
+
+def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
+    """What a policy must find again wherever it drives: robot, time, and lidar.
+
+    Args:
+        settings: The environment's settings in training.
+
+    Returns:
+        Arguments of :class:`mpfa_envs.NavigationEnv`.
+    """
+    # Only where it is not the default: policies are asked for no argument that they do not need.
+    seen = {} if settings.field_of_view == _AHEAD else {"lidar": _lidar(settings.field_of_view)}
+    return {
+        "robot": settings.robot,
+        "physics": settings.physics,
+        "max_steps": settings.max_steps,
+        "action_repeat": settings.action_repeat,
+        "memory": settings.memory,
+        "history": settings.history,
+        **seen,
+        # The lidar saturates where the training ends an episode, and tells all distances above.
+        "closeness_distance": collision_distance(settings),
+    }
+
+
+def _lidar(field_of_view: float) -> dict[str, Any]:
+    return {"field_of_view": field_of_view, "sectors": round(field_of_view / _SECTOR)}
+
+
+def collision_distance(settings: EnvironmentSettings) -> float:
+    """Distance of the robot's center from an obstacle that training counts as a collision [m]."""
+    return resolve_robot(settings.robot).radius + settings.clearance
+
+
+def make_training_env(
+    world: str, settings: EnvironmentSettings, *, robots: int = 1, discrete: bool = False
+) -> EnvBase:
+    """The environment to learn in.
+
+    Args:
+        world: Of a stage.
+        settings: The environment's settings.
+        robots: Number of robots.
+        discrete: Whether an action is a choice among pairs of wheel speeds.
+
+    Returns:
+        The environment of batch size ``[robots]``, with the entries of ``info`` that a run records.
+    """
+    env = NavigationTorchEnv(
+        world=world,
+        num_envs=robots,
+        info_keys=INFO,
+        collision_distance=collision_distance(settings),
+        progress=settings.progress,
+        progress_scale=settings.progress_scale,
+        detour_chance=settings.detour_chance,
+        max_goal_distance=settings.max_goal_distance or math.inf,
+        episodes_per_world=settings.episodes_per_world,
+        noise=asdict(settings.noise),
+        **env_arguments(settings),
+    )
+    return TransformedEnv(env, DiscreteWheels()) if discrete else env
+
+
+def vector_of(env: EnvBase) -> VectorNavigationEnv:
+    """The robots in an environment of :func:`make_training_env`."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    assert isinstance(base, NavigationTorchEnv)
+    return base.env

@@ -1,0 +1,134 @@
+"""How well a policy drives in the worlds of a command line, and where that is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from mpfa_envs import (
+    Policy,
+    RobotNoise,
+    VectorNavigationEnv,
+    WorldTask,
+    run_tasks,
+    summarize,
+    world_tasks,
+)
+from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.planners import DynamicWindow, MapPlanner
+from training.worlds import worlds_label
+
+Drivable = Policy | MapPlanner | DynamicWindow
+"""What drives, and knows by ``env_arguments`` what it must sense."""
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What a policy did in one world, or in the worlds of a generator."""
+
+    tasks: list[WorldTask]
+    results: list[EpisodeResult]
+    trails: list[list[tuple[float, float]]]
+    """Positions of the robot in each episode [m]."""
+
+    def of_world(self, name: str) -> list[int]:
+        """Numbers of the episodes in one world."""
+        return [n for n, each in enumerate(self.tasks) if each.world.name == name]
+
+
+def evaluation_folder(
+    words: Sequence[str], physics: str, *, seed: int = 0, noise: RobotNoise | None = None
+) -> str:
+    """Name of the folder of an evaluation: each choice has its own.
+
+    Args:
+        words: Worlds, as on the command line.
+        physics: ``wheels`` or ``kinematic``.
+        seed: Seed of the tasks in a world.
+        noise: Errors of the robot; None: none.
+
+    Returns:
+        The name; that of the first seed without noise may hold rows of a study.
+
+    Examples:
+        >>> evaluation_folder(["test", "bars:test"], "wheels", noise=RobotNoise(slip=0.1))
+        'evaluation-test+bars-test-wheels-slip0.1'
+    """
+    errors = {} if noise is None else asdict(noise)
+    return "".join(
+        [
+            f"evaluation-{worlds_label(words)}-{physics}",
+            f"-seed{seed}" if seed else "",
+            *(f"-{what}{value:g}" for what, value in errors.items() if value),
+        ]
+    )
+
+
+def tasks_of(
+    policy: Drivable, worlds: Sequence[str], *, episodes: int | None, seed: int
+) -> list[WorldTask]:
+    """The fixed tasks of some worlds, for the robot of a policy.
+
+    Args:
+        policy: The policy, or a planner.
+        worlds: What :func:`mpfa_envs.world_tasks` takes, each.
+        episodes: Number of tasks in each; None: as many as there usually are.
+        seed: Seed of the tasks in a world.
+
+    Returns:
+        The tasks, world by world.
+    """
+    robot = policy.env_arguments.get("robot", "turtlebot2")
+    return [
+        task
+        for world in worlds
+        for task in world_tasks(world, episodes=episodes, seed=seed, robot=robot)
+    ]
+
+
+def drive(
+    policy: Drivable,
+    world: str,
+    *,
+    episodes: int | None,
+    seed: int,
+    physics: str | None,
+    noise: RobotNoise | None = None,
+    progress: bool,
+) -> Drives:
+    """Drive a policy through fixed tasks, contact being the only collision.
+
+    As :func:`mpfa_envs.evaluate`, and the paths are kept.
+
+    Args:
+        policy: The policy, or a planner.
+        world: What :func:`mpfa_envs.world_tasks` takes.
+        episodes: Number of tasks; None: as many as there usually are.
+        seed: Seed of the tasks in a world.
+        physics: ``wheels`` or ``kinematic``; None: as trained.
+        noise: Errors of the robot; None: none.
+        progress: Whether to show a bar.
+
+    Returns:
+        Tasks, results and paths.
+    """
+    arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
+    if physics is not None:
+        arguments["physics"] = physics
+    tasks = tasks_of(policy, [world], episodes=episodes, seed=seed)
+    trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
+
+    def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
+        trails[number] = env.trail(robot)
+
+    results = run_tasks(policy, tasks, progress_bar=progress, on_end=keep, **arguments)
+    return Drives(tasks, results, trails)
+
+
+def summary_row(results: Sequence[EpisodeResult]) -> dict[str, float]:
+    """Estimates of :func:`mpfa_envs.summarize` with the ends of their intervals, as one row."""
+    row: dict[str, float] = {"episodes": len(results)}
+    for name, interval in summarize(results).items():
+        row |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return row

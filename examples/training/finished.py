@@ -1,0 +1,45 @@
+"""Whether a run has come to its end, read without PyTorch, which takes seconds to import."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from training import files
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether a run came to its end, and left behind what a run has there."""
+    there = all((folder / name).exists() for name in (files.POLICY, files.EPISODES))
+    return there and bool(read_json(folder / files.STATUS).get("finished"))
+
+
+def after_the_end(folder: Path) -> str:
+    """One sentence for who resumes a finished run: what can be done with it."""
+    status = read_json(folder / files.STATUS)
+    stages = read_json(folder / files.SETTINGS).get("curriculum", {}).get("stages", [])
+    words = []
+    for number, stage in enumerate(stages):
+        unit = "actions" if stage["actions"] else "episodes"
+        # The last one twice as long, as an example.
+        length = stage[unit] * (2 if number == len(stages) - 1 else 1)
+        words.append(f"{{world: {stage['world']}, {unit}: {length}}}")
+    longer = f"'curriculum.stages=[{', '.join(words)}]'"
+    return (
+        f"{folder} is finished, after {status['done']:,} {status['unit']}s: evaluate it with "
+        f"evaluate.py {folder}, or train on with train.py resume={folder} {longer}"
+    )
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """A JSON file of a run; empty where there is none.
+
+    Raises:
+        ValueError: If it is damaged.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: remove it, and the run is made anew") from error

@@ -1,0 +1,64 @@
+"""Episodes in a window while they are driven."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from mpfa_envs import WorldTask
+from mpfa_envs.render import drive_episode
+from mpfa_envs.scene.window import Window
+from training.evaluating import Drivable
+
+_PAUSE = 1.0
+"""For which the end of an episode is shown [s]."""
+
+
+class Watched(NamedTuple):
+    """How an episode ended that was seen to its end."""
+
+    world: str
+    outcome: str
+    time_s: float
+
+
+def watch(
+    policy: Drivable, tasks: Sequence[WorldTask], *, speed: float = 1.0, **env_arguments: Any
+) -> Iterator[Watched]:
+    """Drive tasks one after another in a window, until it is closed.
+
+    The key N goes on with the next task, Escape ends.
+
+    Args:
+        policy: The policy, or a planner.
+        tasks: The tasks.
+        speed: How many times as fast as real.
+        **env_arguments: Arguments of the environment in place of the policy's.
+
+    Yields:
+        How each episode ended that was not left.
+    """
+    window: Window | None = None
+    for number, task in enumerate(tasks):
+        for moment in drive_episode(policy, task, seed=number, **env_arguments):
+            env = moment.env
+            if window is None:
+                fps = speed / (env.config.time_step * env.config.action_repeat)
+                window = Window("N: next task   Escape: end", fps=fps)
+            (picture,) = env.render() or ()
+            if not window.show(picture) or "n" in window.pressed:
+                break
+            if moment.wheels is None:
+                yield _end(task.world.name, moment.info)
+                for _ in range(round(_PAUSE / (env.config.time_step * env.config.action_repeat))):
+                    window.show(picture)
+        if window is not None and window.closed:
+            break
+    if window is not None:
+        window.close()
+
+
+def _end(world: str, info: dict[str, Any]) -> Watched:
+    ends = ("success", "collision", "timeout")
+    outcome = next(name for name in ends if info[name][0])
+    return Watched(world, outcome, float(info["sim_time"][0]))

@@ -1,0 +1,111 @@
+"""The pictures of an evaluation: paths in up to nine worlds, Q over one, an episode in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mpfa_envs import Policy, World, WorldTask
+from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.render import (
+    film_episode,
+    render_trajectories,
+    render_values,
+    tiled,
+    write_animation,
+)
+from training.evaluating import Drivable, Drives
+
+Values = Callable[[NDArray[np.float32]], NDArray[np.float64]]
+"""What a critic thinks: from observations, ``[N, O]``, to numbers, ``[N]``."""
+
+TRAJECTORIES = "trajectories.png"
+VALUES = "values.png"
+EPISODE = "episode.gif"
+_PICTURED = 9
+"""Worlds in a picture at most."""
+
+
+def write_pictures(
+    policy: Drivable,
+    driven: Sequence[Drives],
+    folder: Path,
+    *,
+    values: Values | None = None,
+    **env_arguments: Any,
+) -> None:
+    """Write ``trajectories.png``, ``episode.gif`` and, of a policy, ``values.png``.
+
+    Args:
+        policy: The policy, or a planner.
+        driven: What it did, one for each row of the table.
+        folder: Where the pictures go.
+        values: What its critic thinks, if that is known; else there are arrows without colors.
+        **env_arguments: Arguments of the environment in place of the policy's.
+    """
+    Image.fromarray(trajectories_of(driven)).save(folder / TRAJECTORIES, optimize=True)
+    number, task = longest(driven)
+    # The number of a task is the seed of its walkers, and of the noise.
+    film = film_episode(policy, task, values=values, seed=number, **env_arguments)
+    write_animation(film.frames, folder / EPISODE, frame_time=film.frame_time, speed=4.0)
+    if isinstance(policy, Policy):
+        Image.fromarray(values_over(policy, task, values)).save(folder / VALUES, optimize=True)
+
+
+def trajectories_of(driven: Sequence[Drives], *, size: int = 360) -> NDArray[np.uint8]:
+    """The paths in up to nine worlds, each of a size [px], shape ``[height, width, 3]``."""
+    # One world of each row, then a second one of each, and so on.
+    in_turn = zip_longest(*map(worlds_in, driven))
+    worlds = [each for nth in in_turn for each in nth if each is not None]
+    size = 640 if len(worlds) == 1 else size
+    return tiled([picture_of(world, drives, size=size) for world, drives in worlds[:_PICTURED]])
+
+
+def worlds_in(drives: Drives) -> list[tuple[World, Drives]]:
+    """Each world of some drives, with the drives."""
+    return [(world, drives) for world in {e.world.name: e.world for e in drives.tasks}.values()]
+
+
+def picture_of(world: World, drives: Drives, *, size: int) -> NDArray[np.uint8]:
+    """The paths in one world, shape ``[size + 28, size, 3]``."""
+    numbers = drives.of_world(world.name)
+    return render_trajectories(
+        world,
+        [drives.trails[n] for n in numbers],
+        [drives.tasks[n].task.goal for n in numbers],
+        [drives.results[n].outcome for n in numbers],
+        title=world.name,
+        size=size,
+    )
+
+
+def longest(driven: Sequence[Drives]) -> tuple[int, WorldTask]:
+    """Number and task of the success with the longest way, which shows most; else of a failure."""
+    episodes: list[tuple[EpisodeResult, int, WorldTask]] = [
+        (result, number, task)
+        for each in driven
+        for number, (result, task) in enumerate(zip(each.results, each.tasks, strict=True))
+    ]
+    reached = [each for each in episodes if each[0].success]
+    _, number, task = max(reached or episodes, key=lambda each: each[0].path_length)
+    return number, task
+
+
+def values_over(policy: Policy, task: WorldTask, values: Values | None) -> NDArray[np.uint8]:
+    """Q and the actions all over the world of a task, each robot facing as at its start."""
+    return render_values(
+        task.world,
+        goal=task.task.goal,
+        heading=task.task.start[2],
+        values=values,
+        actions=policy,
+        title=task.world.name,
+        size=640,
+        **policy.env_arguments,
+    )

@@ -1,0 +1,220 @@
+"""Networks, loss and optimizers of a training run, put together from its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from mpfa_envs.policies.layers import Choice, Layer, Table, from_torch
+from mpfa_envs.robots.discrete import WHEEL_PAIRS
+from mpfa_envs.sensing.binning import Binning
+from torchrl_mpfa import (
+    DDPGLearner,
+    DQNLearner,
+    Learner,
+    SACLearner,
+    SignalDQNLoss,
+    TabularQLearner,
+    TD3Learner,
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_td3_loss,
+    make_value_network,
+)
+from torchrl_mpfa.methods import Method, loss_options
+from torchrl_mpfa.methods.curiosity import Curiosity
+from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table
+from torchrl_mpfa.networks.values import ValueNetwork, ValueTable
+from training.settings.learners import LearnerSettings, is_discrete
+from training.settings.train import TrainSettings
+
+Options = dict[str, Any]
+
+
+def make_learner(
+    settings: LearnerSettings,
+    method: Method,
+    observation_size: int,
+    action_size: int,
+    *,
+    device: str = "cpu",
+) -> Learner:
+    """Networks, loss and optimizers; the loss writes those signals that the method asks for.
+
+    Args:
+        settings: Networks, loss and optimizers.
+        method: Signals, importance weights, distance, averaging and kind of optimizer.
+        observation_size: ``O``.
+        action_size: ``A``.
+        device: Where the networks are.
+
+    Returns:
+        The learner.
+    """
+    if settings.algorithm == "q_learning":
+        return _q_learning(settings, method, observation_size, action_size)
+    network: Options = {
+        "width": settings.width,
+        "layers": settings.layers,
+        "layer_norm": settings.layer_norm,
+        "final_init": settings.final_init,
+    }
+    sizes = observation_size, action_size
+    if settings.algorithm == "dqn":
+        return _dqn(settings, method, make_value_network(*sizes, **network).to(device))
+    critic = make_critic(*sizes, late_action=settings.late_action, **network)
+    make = make_stochastic_actor if settings.algorithm == "sac" else make_actor
+    actor = make(*sizes, **network)
+    of_loss: Options = {
+        **loss_options(method),
+        "gamma": settings.gamma,
+        "reward_scale": settings.reward_scale,
+        "saturation_penalty": settings.saturation_penalty,
+        "saturation_limit": settings.saturation_limit,
+    }
+    of_learner: Options = {
+        "actor_lr": settings.actor_lr,
+        "critic_lr": settings.critic_lr,
+        "critic_weight_decay": settings.critic_weight_decay,
+        "tau": settings.tau,
+        "optimizer": method.optimizer,
+    }
+    make_one = ALGORITHMS[settings.algorithm]
+    return make_one(settings, actor.to(device), critic.to(device), of_loss, of_learner)
+
+
+def _ddpg(
+    settings: LearnerSettings,
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    of_loss: Options,
+    of_learner: Options,
+) -> Learner:
+    loss = make_ddpg_loss(actor, critic, **_smoothing(settings), **of_loss)
+    delay = settings.policy_delay
+    return DDPGLearner(loss, policy_delay=delay, compile=settings.compile, **of_learner)
+
+
+def _td3(
+    settings: LearnerSettings,
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    of_loss: Options,
+    of_learner: Options,
+) -> Learner:
+    loss = make_td3_loss(actor, critic, **_smoothing(settings), **of_loss)
+    delay = settings.policy_delay
+    return TD3Learner(loss, policy_delay=delay, compile=settings.compile, **of_learner)
+
+
+def _smoothing(settings: LearnerSettings) -> Options:
+    return {
+        # Wheel speeds are scaled to it by the environment.
+        "bounds": (-1.0, 1.0),
+        "policy_noise": settings.policy_noise,
+        "noise_clip": settings.noise_clip,
+    }
+
+
+def _sac(
+    settings: LearnerSettings,
+    actor: TensorDictModule,
+    critic: TensorDictModule,
+    of_loss: Options,
+    of_learner: Options,
+) -> Learner:
+    loss = make_sac_loss(actor, critic, alpha_init=settings.alpha_init, **of_loss)
+    return SACLearner(loss, alpha_lr=settings.alpha_lr, **of_learner)
+
+
+ALGORITHMS: dict[str, Callable[..., Learner]] = {"ddpg": _ddpg, "td3": _td3, "sac": _sac}
+"""Learners by the name of their algorithm."""
+
+
+def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Learner:
+    options = loss_options(method)
+    loss = SignalDQNLoss(
+        network,
+        **{name: options[name] for name in ("signals", "importance", "loss_function")},
+        double=settings.double,
+        gamma=settings.gamma,
+        reward_scale=settings.reward_scale,
+    )
+    return DQNLearner(
+        loss,
+        lr=settings.critic_lr,
+        weight_decay=settings.critic_weight_decay,
+        tau=settings.tau,
+        optimizer=method.optimizer,  # type: ignore[arg-type]
+    )
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a binning, of tensors."""
+
+    binning: Binning
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """From observations, shape ``[..., O]``, to numbers of cells, shape ``[...]``."""
+        return torch.from_numpy(np.asarray(self.binning(observation.cpu().numpy())))
+
+
+def _q_learning(
+    settings: LearnerSettings, method: Method, observation_size: int, actions: int
+) -> Learner:
+    cells = Cells(Binning(observation_size=observation_size))
+    return TabularQLearner(
+        make_value_table(cells, cells.binning.cells, actions),
+        lr=settings.table_lr,
+        gamma=settings.gamma,
+        importance=method.importance != "none",
+    )
+
+
+def method_of(settings: TrainSettings) -> Method:
+    """The method of a run; where actions are choices, without the action gradient."""
+    method = settings.method
+    if not is_discrete(settings.learner):
+        return method
+    return replace(method, signals=[s for s in method.signals if s != "action_gradient"])
+
+
+def policy_layers(policy: TensorDictModule) -> list[Layer]:
+    """The layers of a policy, from observation to the action without noise.
+
+    Args:
+        policy: Of a learner.
+
+    Returns:
+        Copies of the layers, as :class:`mpfa_envs.Policy` takes them.
+    """
+    choice = Choice(np.array(WHEEL_PAIRS, dtype=np.float32))
+    module = getattr(policy, "module", None)
+    if isinstance(module, ValueNetwork):
+        return [*from_torch(module.layers()), choice]
+    if isinstance(module, ValueTable):
+        cells = module.cell_of
+        assert isinstance(cells, Cells)
+        return [Table(module.table.numpy().copy(), **asdict(cells.binning)), choice]
+    network = policy if isinstance(policy, StochasticActor) else policy.module
+    return from_torch(network.layers())
+
+
+def make_curiosity(
+    method: Method, observation_size: int, action_size: int, *, device: str = "cpu"
+) -> Curiosity | None:
+    """The bonus on rewards, if the method has one."""
+    if not method.curiosity:
+        return None
+    made = Curiosity(observation_size, action_size, scale=method.curiosity_scale)
+    return made.to(device)

@@ -1,0 +1,265 @@
+"""The robots of a run in their training episodes, one action of each at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_mpfa.methods import Method, Replay, make_replay
+from training.environments import INFO, make_training_env, vector_of
+from training.records import EpisodeRecord
+from training.run.checkpoints import as_arrays, as_tensors
+from training.run.exploration import Explorer
+from training.settings.learners import is_discrete
+from training.settings.train import TrainSettings
+
+TRANSITION = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "done"),
+    ("next", "terminated"),
+)
+"""What a buffer keeps of a step."""
+_UNIFORM_SIGMA = 3**-0.5
+"""Standard deviation of actions that are uniform in [-1, 1]."""
+
+
+class Robots:
+    """Robots that act at random in the first steps of a run and by an explorer after them.
+
+    Args:
+        settings: Of the run.
+    """
+
+    def __init__(self, settings: TrainSettings) -> None:
+        self.settings = settings
+        self.count = settings.robots
+        self.seconds = 0.0
+        """Wall-clock time of the run before this process [s]."""
+        self.given_up = 0
+        """Episodes of the run that were under way when another stage began."""
+        self._started = time.perf_counter()
+        self._env: EnvBase | None = None
+        self._world: str | None = None
+        self._state: TensorDictBase | None = None
+        self._everyone = torch.arange(self.count)
+        self._rewards = torch.zeros(self.count, dtype=torch.double)
+        self._steps = torch.zeros(self.count, dtype=torch.long)
+        self._numbers = torch.zeros(self.count, 1, dtype=torch.long)
+        """Number of the episode that each robot is in."""
+        self.ended: list[int] = []
+        """Numbers of the episodes that ended with the last action."""
+        self._begun = 0
+
+    def make_replay(self, method: Method, *, seed: int, **policy: Any) -> Replay:
+        """The buffer that their transitions go to, and what is drawn from it.
+
+        Args:
+            method: What is kept and how it is drawn.
+            seed: Of the buffer's randomness.
+            **policy: ``policy`` and ``sigma`` of :func:`torchrl_mpfa.methods.make_replay`.
+        """
+        return make_replay(method, generator=torch.Generator().manual_seed(seed), **policy)
+
+    def environment(self, world: str) -> EnvBase:
+        """The environment of a stage, kept for as long as its world stays the same."""
+        if self._env is None or world != self._world:
+            self.close()
+            self._env = make_training_env(
+                world,
+                self.settings.environment,
+                robots=self.count,
+                discrete=is_discrete(self.settings.learner),
+            )
+            self._world = world
+        return self._env
+
+    def begin(self, world: str, explorer: Explorer, *, seed: int) -> None:
+        """Begin an episode with each robot; those that were on their way are given up.
+
+        Args:
+            world: Of the stage, as in the settings.
+            explorer: What acts.
+            seed: Seed of the environment.
+        """
+        env = self.environment(world)
+        env.set_seed(seed)
+        self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
+        self._state = env.reset()
+        self.given_up += int((self._steps > 0).sum())
+        self._rewards.zero_()
+        self._steps.zero_()
+
+    def _begin_episodes(self, begun: Tensor, explorer: Explorer) -> None:
+        """Number the episodes that begin, and tell the explorer of them."""
+        count = int(begun.sum())
+        self._numbers[begun, 0] = torch.arange(self._begun, self._begun + count)
+        self._begun += count
+        explorer.begin_episodes(begun)
+
+    @property
+    def next_episode(self) -> int:
+        """Number of the first episode in which no action has been taken yet."""
+        return self._begun - int((self._steps == 0).sum())
+
+    def drive(
+        self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[str] = ()
+    ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
+        """Take one action with each robot.
+
+        Args:
+            explorer: What acts.
+            actions: Of the run before these.
+            episode: Episodes of the run that have ended.
+            entries: What else the transitions must have: ``"episode"``, or ``"behavior_mean"``
+                and ``"behavior_sigma"``, the actions without noise and the spread of that.
+
+        Returns:
+            The entries of :data:`TRANSITION` and those others, batch size ``[robots]``, and the
+            records of the episodes that ended.
+        """
+        assert self._env is not None and self._state is not None
+        state, self._state = self._env.step_and_maybe_reset(
+            self._act(explorer, self._state, actions, entries)
+        )
+        if "episode" in entries:
+            state.set("episode", self._numbers.clone())
+        total = actions + self.count
+        records = self._note(
+            state["next"], self._everyone, explorer, episode=episode, total_steps=total
+        )
+        return state.select(*TRANSITION, *entries), records
+
+    def _note(
+        self,
+        after: TensorDictBase,
+        robots: Tensor,
+        explorer: Explorer,
+        *,
+        episode: int,
+        total_steps: int,
+    ) -> list[EpisodeRecord]:
+        """Take note of what an action of some robots brought; their records if episodes ended."""
+        self._rewards[robots] += after["reward"].squeeze(-1)
+        self._steps[robots] += 1
+        done = after["done"].squeeze(-1)
+        records: list[EpisodeRecord] = []
+        ended = robots[done]
+        self.ended = self._numbers[ended, 0].tolist()
+        if self.ended:
+            for row in done.nonzero().squeeze(-1).tolist():
+                robot, number = int(robots[row]), episode + len(records)
+                record = self._record(after[row], robot, episode=number, total_steps=total_steps)
+                records.append(record)
+            begun = torch.zeros(self.count, dtype=torch.bool)
+            begun[ended] = True
+            self._begin_episodes(begun, explorer)
+            self._rewards[ended] = 0.0
+            self._steps[ended] = 0
+        return records
+
+    @torch.no_grad()
+    def _act(
+        self, explorer: Explorer, state: TensorDictBase, actions: int, entries: Sequence[str]
+    ) -> TensorDictBase:
+        assert self._env is not None
+        if actions < self.settings.exploration.random_steps:
+            state = self._env.rand_action(state)
+            mean = torch.zeros_like(state["action"])
+            behavior = mean, torch.full((self.count, 1), _UNIFORM_SIGMA)
+        else:
+            observation = state.get("observation").to(self.settings.device)
+            state = state.set("action", explorer.act(observation).cpu())
+            behavior = explorer.behavior()
+        if "behavior_mean" in entries:
+            for name, value in zip(("behavior_mean", "behavior_sigma"), behavior, strict=True):
+                state.set(name, value.clone())
+        return state
+
+    def _record(
+        self, after: TensorDictBase, robot: int, *, episode: int, total_steps: int
+    ) -> EpisodeRecord:
+        reward, steps = self._rewards[robot].item(), int(self._steps[robot])
+        info: dict[str, Any] = {name: after["info", name].item() for name in INFO}
+        return EpisodeRecord(
+            episode=episode,
+            world=self._world or "",
+            steps=steps,
+            total_steps=total_steps,
+            reward=reward,
+            average_reward=reward / steps,
+            seconds=self.elapsed(),
+            **info,
+        )
+
+    def elapsed(self) -> float:
+        """Wall-clock time of the run so far [s]."""
+        return self.seconds + time.perf_counter() - self._started
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where every robot is, and what its next observation and record depend on."""
+        assert self._env is not None and self._state is not None
+        observation: Tensor = self._state["observation"]
+        return {
+            "environment": as_tensors(vector_of(self._env).state_dict()),
+            "observation": observation.clone(),
+            "rewards": self._rewards.clone(),
+            "steps": self._steps.clone(),
+            "numbers": self._numbers.clone(),
+            "begun": self._begun,
+            "seconds": self.elapsed(),
+            "given_up": self.given_up,
+        }
+
+    def recall(self, state: dict[str, Any]) -> None:
+        """Take over what counts for the whole run, and which episodes were under way.
+
+        Args:
+            state: What :meth:`state_dict` gave.
+        """
+        self.seconds = state["seconds"]
+        self.given_up = state.get("given_up", 0)
+        self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
+        if "numbers" in state:
+            self._numbers, self._begun = state["numbers"].clone(), state["begun"]
+
+    def can_go_on(self, state: dict[str, Any]) -> bool:
+        """Whether a state tells where the robots are, or episodes must begin anew."""
+        return state["environment"] is not None
+
+    def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
+        """Go on where :meth:`state_dict` was called.
+
+        Args:
+            world: Of the stage.
+            state: The state.
+        """
+        env = self.environment(world)
+        # A reset makes the entries that a step wants; what is in them is replaced.
+        self._state = env.reset()
+        vector_of(env).load_state_dict(as_arrays(state["environment"]))
+        self._state["observation"] = state["observation"].clone()
+        self.recall(state)
+
+    def close(self) -> None:
+        """Release the environment."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+
+def make_robots(settings: TrainSettings) -> Robots:
+    """The robots of a run, in this process or on a Ray cluster."""
+    if not settings.ray.workers:
+        return Robots(settings)
+    from training.run.fleet import Fleet
+
+    return Fleet(settings)

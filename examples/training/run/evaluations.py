@@ -1,0 +1,80 @@
+"""The evaluations of a run: its policy as a function of its own, driven through fixed tasks."""
+
+from __future__ import annotations
+
+import time
+
+from tensordict.nn import TensorDictModule
+
+from mpfa_envs import Policy, evaluate
+from training.environments import env_arguments
+from training.records import EvaluationRecord
+from training.run.assembly import policy_layers
+from training.settings.train import TrainSettings
+
+SEED = 1
+"""Of the pairs of start and goal: others than those of ``evaluate.py``."""
+
+
+def exported_policy(
+    policy: TensorDictModule, settings: TrainSettings, *, episodes: int = 0, steps: int = 0
+) -> Policy:
+    """The policy without noise, with what is needed to use it and how it was trained.
+
+    Args:
+        policy: The policy in training.
+        settings: Of the run.
+        episodes: That it was trained for.
+        steps: Actions that it was trained for.
+
+    Returns:
+        The policy, whose weights are copies.
+    """
+    return Policy(
+        policy_layers(policy),
+        card={
+            "method": settings.method.name,
+            "learner": settings.learner.name,
+            "curriculum": settings.curriculum.name,
+            "seed": settings.seed,
+            "episodes": episodes,
+            "steps": steps,
+        },
+        env_arguments=env_arguments(settings.environment),
+    )
+
+
+def evaluate_policy(
+    settings: TrainSettings,
+    policy: TensorDictModule,
+    *,
+    total_steps: int,
+    episode: int,
+    trained_for: float,
+) -> EvaluationRecord:
+    """Drive the fixed tasks of the validation world, or of others that the settings name.
+
+    Args:
+        settings: Of the run.
+        policy: The policy as it is now.
+        total_steps: Actions so far.
+        episode: Episodes so far.
+        trained_for: Wall-clock time of the training so far [s].
+
+    Returns:
+        Rates of success, collision and timeout, and the mean SPL.
+    """
+    start = time.perf_counter()
+    wanted = settings.evaluation
+    results = evaluate(
+        exported_policy(policy, settings), wanted.world, episodes=wanted.episodes, seed=SEED
+    )
+    names = ("success", "collision", "timeout", "spl")
+    return EvaluationRecord(
+        total_steps=total_steps,
+        episode=episode,
+        world=wanted.world,
+        seconds=time.perf_counter() - start,
+        trained_for=trained_for,
+        **{name: sum(getattr(r, name) for r in results) / len(results) for name in names},
+    )

@@ -1,0 +1,146 @@
+"""TorchRL's loggers that write to the folder of a run; one that goes on begins no second log.
+
+What was logged after the checkpoint that a run goes on from is logged again. Of a CSV file those
+rows are removed, and TensorBoard is told to forget them.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from training import files
+
+Entry = float | torch.Tensor | NDArray[np.uint8] | Path
+"""A number, values for a histogram, a picture ``[height, width, 3]``, or the file of a GIF."""
+
+
+class Log(Protocol):
+    """Where entries are logged."""
+
+    def log(self, entries: Mapping[str, Any], actions: int) -> None:
+        """Log entries by their names; what this kind of log cannot hold is left out."""
+
+    def flush(self) -> None:
+        """See that what was logged survives the end of this process, however it ends."""
+
+    def close(self) -> None:
+        """Finish the log."""
+
+
+class CSVLog:
+    """Numbers in ``csv/scalars/NAME.csv``, rows of actions and value.
+
+    Args:
+        folder: Of the run.
+        actions: After which the run goes on; 0: it begins.
+    """
+
+    def __init__(self, folder: Path, *, actions: int) -> None:
+        self._folder, self._actions = folder, actions
+
+    @cached_property
+    def _logger(self) -> Any:
+        # Only now: the log of a run that is begun anew has been moved out of the way.
+        from torchrl.record import CSVLogger
+
+        for path in (self._folder / files.CSV).rglob("*.csv"):
+            forget_after(self._actions, path)
+        return CSVLogger(files.CSV, log_dir=str(self._folder))
+
+    def log(self, entries: Mapping[str, Any], actions: int) -> None:
+        """Log the numbers."""
+        for name, value in entries.items():
+            if isinstance(value, int | float):
+                self._logger.log_scalar(name, value, step=actions)
+
+    def flush(self) -> None:
+        """Do nothing: the logger does so after every row."""
+
+    def close(self) -> None:
+        """Close the files, if there are any."""
+        if "_logger" in vars(self):
+            for file in self._logger.experiment.files.values():
+                file.close()
+
+
+def forget_after(actions: int, path: Path) -> None:
+    """Remove the rows of a CSV file that were logged after so many actions.
+
+    Args:
+        actions: Of the last row that is kept.
+        path: The file. A last row that was cut short is removed too.
+    """
+    rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = [row for row in rows if row.endswith("\n") and int(row.partition(",")[0]) <= actions]
+    if kept != rows:
+        path.write_text("".join(kept), encoding="utf-8")
+
+
+class TensorboardLog:
+    """Numbers, histograms and pictures in ``tensorboard/``.
+
+    Args:
+        folder: Of the run.
+        actions: After which the run goes on; 0: it begins.
+    """
+
+    def __init__(self, folder: Path, *, actions: int) -> None:
+        self._folder, self._actions = folder, actions
+
+    @cached_property
+    def _logger(self) -> Any:
+        # Only now: the log of a run that is begun anew has been moved out of the way.
+        from torch.utils.tensorboard import SummaryWriter
+        from torchrl.record import TensorboardLogger
+
+        class Continued(TensorboardLogger):
+            """TorchRL's, which hides what came after the checkpoint."""
+
+            def _create_experiment(this) -> SummaryWriter:
+                folder = self._folder / files.TENSORBOARD
+                return SummaryWriter(str(folder), purge_step=self._actions + 1)
+
+        return Continued(files.TENSORBOARD, log_dir=str(self._folder))
+
+    def log(self, entries: Mapping[str, Any], actions: int) -> None:
+        """Log what is no table."""
+        writer = self._logger.experiment
+        for name, value in entries.items():
+            if isinstance(value, int | float):
+                self._logger.log_scalar(name, value, step=actions)
+            elif isinstance(value, torch.Tensor):
+                self._logger.log_histogram(name, value, step=actions, bins="tensorflow")
+            elif isinstance(value, np.ndarray):
+                writer.add_image(name, value, actions, dataformats="HWC")
+            elif isinstance(value, Path):
+                add_gif(writer, name, value, actions)
+
+    def flush(self) -> None:
+        """Write what waits to be written."""
+        if "_logger" in vars(self):
+            self._logger.experiment.flush()
+
+    def close(self) -> None:
+        """Close the files, if there are any."""
+        if "_logger" in vars(self):
+            self._logger.experiment.close()
+
+
+def add_gif(writer: Any, name: str, path: Path, actions: int) -> None:
+    """Log an animation as a picture that moves, for which ``add_video`` would need MoviePy."""
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    content = path.read_bytes()
+    width, height = Image.open(io.BytesIO(content)).size
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=content)
+    summary = Summary(value=[Summary.Value(tag=name, image=image)])
+    writer._get_file_writer().add_summary(summary, actions)

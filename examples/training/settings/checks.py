@@ -1,0 +1,370 @@
+"""What values settings may have; each mistake is one sentence, before anything has started."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+
+from mpfa_envs import world_tasks
+from mpfa_envs.robots.model import resolve_robot
+from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule
+from torchrl_mpfa.methods import Method, can_be_remote
+from torchrl_mpfa.methods.assembly import WORDS, unused_settings
+from torchrl_mpfa.methods.ranges import RANGES
+from training.environments import check_physics, make_training_env
+from training.settings.environment import EnvironmentSettings
+from training.settings.learners import is_discrete
+from training.settings.train import TrainSettings
+from training.worlds import is_of_a_test
+
+
+def at_least(least: float) -> Rule:
+    """Finite, and not below a bound."""
+    return lambda value: least <= value < math.inf, f"at least {least:g}"
+
+
+def up_to(most: int) -> Rule:
+    """A count that this machine may have room for."""
+    return lambda value: 1 <= value <= most, f"from 1 to {most}"
+
+
+def choice(*names: str) -> Rule:
+    """One of some words."""
+    return lambda value: value in names, f"one of {', '.join(names)}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+LEVEL: Rule = (
+    lambda value: value == "mean" or (_is_number(value) and math.isfinite(value)),
+    "a finite number or mean",
+)
+NAME: Rule = (
+    lambda value: re.fullmatch(r"[\w.+-]+", value) is not None,
+    "letters, digits and any of . _ + -, as it names a folder",
+)
+
+SIGNALS = (
+    *("reward", "td_error", "action_gradient", "value"),
+    *("relative_value", "relative_td_error"),
+)
+"""What the losses of ``train.py`` write; a script of your own may have others."""
+MOST_ROBOTS = 4096
+"""On wheels these take 6.4 GB."""
+
+WORD: Rule = (lambda value: bool(value.strip()), "not be empty")
+
+LAST_SEED = 2**32 - 1
+"""Each stage has a seed of its own, a million times as large, which is to fit in 64 bits."""
+RULES: dict[str, Rule] = {
+    "run_dir": WORD,
+    "tracking.project": WORD,
+    "seed": at_least(0),
+    "threads": up_to(1024),
+    "checkpoint_every": at_least(1),
+    "robots": (
+        lambda value: 1 <= value <= MOST_ROBOTS,
+        f"from 1 to {MOST_ROBOTS}, as a robot takes up to 1.6 MB of memory",
+    ),
+    "updates": at_least(1),
+    "method.name": NAME,
+    **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
+    **{f"method.{name}": rule for name, rule in RANGES.items()},
+    "method.positive_above": LEVEL,
+    "method.capacity": up_to(10**9),
+    "learner.name": NAME,
+    "learner.algorithm": choice("ddpg", "td3", "sac", "dqn", "q_learning"),
+    "learner.actor_lr": POSITIVE,
+    "learner.critic_lr": POSITIVE,
+    "learner.lr_end_factor": SHARE,
+    "learner.lr_power": POSITIVE,
+    "learner.gamma": SHARE,
+    "learner.tau": ABOVE_ZERO,
+    "learner.width": up_to(2**16),
+    "learner.layers": up_to(100),
+    "learner.final_init": POSITIVE,
+    "learner.critic_weight_decay": NOT_NEGATIVE,
+    "learner.reward_scale": POSITIVE,
+    "learner.saturation_penalty": NOT_NEGATIVE,
+    "learner.saturation_limit": NOT_NEGATIVE,
+    "learner.policy_delay": at_least(1),
+    "learner.policy_noise": NOT_NEGATIVE,
+    "learner.noise_clip": NOT_NEGATIVE,
+    "learner.alpha_init": POSITIVE,
+    "learner.alpha_lr": POSITIVE,
+    "learner.table_lr": ABOVE_ZERO,
+    "curriculum.name": NAME,
+    "exploration.random_steps": at_least(0),
+    "exploration.sigma": NOT_NEGATIVE,
+    "exploration.sigma_end": NOT_NEGATIVE,
+    "exploration.epsilon": SHARE,
+    "exploration.epsilon_end": SHARE,
+    "exploration.annealing_steps": at_least(1),
+    "environment.physics": choice("wheels", "kinematic"),
+    "environment.max_steps": at_least(1),
+    "environment.action_repeat": at_least(1),
+    "environment.progress_scale": NOT_NEGATIVE,
+    "environment.clearance": NOT_NEGATIVE,
+    "environment.detour_chance": SHARE,
+    "environment.progress": choice("straight_line", "shortest_path", "none"),
+    "environment.memory": choice("none", "map"),
+    "environment.history": at_least(0),
+    "environment.field_of_view": (lambda value: 10.0 <= value <= 360.0, "from 10 to 360 [deg]"),
+    "environment.noise.range_noise": NOT_NEGATIVE,
+    "environment.noise.dropout": SHARE,
+    "environment.noise.slip": (lambda value: 0.0 <= value <= 0.45, "in [0, 0.45]"),
+    "environment.noise.latency": at_least(0),
+    "environment.noise.drift": NOT_NEGATIVE,
+    "environment.max_goal_distance": POSITIVE,
+    "environment.episodes_per_world": at_least(1),
+    "evaluation.every": at_least(0),
+    "evaluation.episodes": at_least(1),
+    "assessment.episodes": at_least(0),
+    "assessment.early_episodes": at_least(1),
+    "assessment.early_share": SHARE,
+    "assessment.best_factor": SHARE,
+    "assessment.by": choice("outcome", "return"),
+    "ray.address": WORD,
+    "ray.workers": at_least(0),
+    "ray.steps": at_least(1),
+    "tracking.mode": choice("offline", "online", "off"),
+    "tracking.group": (lambda value: 0 < len(value) <= 128, "a word of at most 128 letters"),
+    "tracking.log_every": at_least(1),
+    "tracking.pictures_every": at_least(0),
+}
+"""By dotted name; a setting that is null is not looked at."""
+
+
+def settings_by_name(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every setting with its dotted name.
+
+    Args:
+        settings: The settings.
+        prefix: What is before their names.
+
+    Yields:
+        Name and value; the settings of a group are single ones, stages are one value.
+    """
+    for entry in fields(settings):
+        if not prefix and entry.name in ("hydra", "defaults"):
+            continue
+        value, name = getattr(settings, entry.name), prefix + entry.name
+        if is_dataclass(value):
+            yield from settings_by_name(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def check_settings(settings: TrainSettings) -> None:
+    """Refuse a value that cannot be.
+
+    Args:
+        settings: The settings.
+
+    Raises:
+        ValueError: With the setting's name and its value.
+    """
+    if not settings.curriculum.stages:
+        raise ValueError("curriculum.stages must name at least one world, got []")
+    for name, value in settings_by_name(settings):
+        if value is not None:
+            _check_value(name, value)
+    if settings.seed > LAST_SEED:
+        raise ValueError(f"seed must be at most {LAST_SEED}, got {settings.seed}")
+    _resolve("environment.robot", resolve_robot, settings.environment.robot)
+    _check_stages(settings)
+    _resolve(
+        "evaluation.world",
+        lambda word: world_tasks(word, episodes=1, robot=settings.environment.robot),
+        settings.evaluation.world,
+    )
+    _check_method(settings.method)
+    if settings.evaluation.choose and not settings.evaluation.every:
+        raise ValueError(
+            "evaluation.choose needs evaluations: set evaluation.every, got 0, or "
+            "evaluation.choose=false"
+        )
+    if settings.evaluation.choose and is_of_a_test(settings.evaluation.world):
+        raise ValueError(
+            f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "
+            "got True: nothing may be chosen in the worlds of a test"
+        )
+    if settings.assessment.episodes:
+        _check_one_rule(settings)
+    _check_ray(settings)
+    if settings.learner.compile and settings.learner.algorithm not in ("ddpg", "td3"):
+        name = settings.learner.algorithm
+        name = "SAC" if name == "sac" else name
+        raise ValueError(f"learner.compile must be false with {name}, got True")
+    if is_discrete(settings.learner):
+        _check_values_alone(settings)
+    _check_device(settings.device)
+    check_physics(settings.environment.physics)
+    if settings.tracking.tensorboard and find_spec("tensorboard") is None:
+        raise ValueError(
+            "tracking=tensorboard needs TensorBoard: pip install 'torchrl-mpfa[tensorboard]'"
+        )
+
+
+def _check_value(name: str, value: Any) -> None:
+    allowed, wanted = rule = RULES.get(name, (lambda _: True, ""))
+    if not allowed(value):
+        must = wanted if rule is WORD else f"be {wanted}"
+        raise ValueError(f"{name} must {must}, got {value!r}")
+
+
+def _check_method(method: Method) -> None:
+    """Refuse what does not go together, or has no effect."""
+    for name, only, cause in unused_settings(method):
+        raise ValueError(
+            f"method.{name} must be {only} with method.{cause}="
+            f"{getattr(method, cause)}, which cannot use it, got {getattr(method, name)}"
+        )
+    for name in method.signals:
+        if name not in SIGNALS:
+            raise ValueError(f"method.signals must be of {', '.join(SIGNALS)}, got {name!r}")
+    if method.combination == "mixture" and method.selection != "prioritized":
+        raise ValueError(
+            f"method.combination must be sum or product with method.selection={method.selection}, "
+            "got mixture"
+        )
+    if method.capacity < method.batch_size * method.candidates:
+        raise ValueError(
+            f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "
+            f"got {method.capacity}: it would never learn"
+        )
+
+
+def _check_one_rule(settings: TrainSettings) -> None:
+    """Refuse a second rule of when updates are made, or of which policy is the run's."""
+    for name, value, only in (
+        ("method.update_block", settings.method.update_block, 1),
+        ("evaluation.choose", settings.evaluation.choose, False),
+    ):
+        if value != only:
+            raise ValueError(
+                f"{name} must be {str(only).lower()} with assessment.episodes="
+                f"{settings.assessment.episodes}, got {value}: two rules would make the same choice"
+            )
+
+
+def _check_ray(settings: TrainSettings) -> None:
+    """Refuse what needs the robots, or the buffer, in the process that learns."""
+    workers = settings.ray.workers
+    if not workers:
+        return
+    if find_spec("ray") is None:
+        raise ValueError(f"ray.workers={workers} needs Ray: pip install 'torchrl-mpfa[ray]'")
+    if settings.robots % workers:
+        raise ValueError(
+            f"robots must be a multiple of ray.workers={workers}, got {settings.robots}"
+        )
+    if not can_be_remote(settings.method):
+        raise ValueError(
+            f"ray.workers must be 0 with method={settings.method.name}, got {workers}: it needs "
+            "its buffer in the process that learns"
+        )
+    for name, value, only in (
+        ("assessment.episodes", settings.assessment.episodes, 0),
+        ("method.update_block", settings.method.update_block, 1),
+    ):
+        if value != only:
+            raise ValueError(f"{name} must be {only} with ray.workers={workers}, got {value}")
+
+
+def _check_values_alone(settings: TrainSettings) -> None:
+    """Refuse what a method has only where actions are numbers, or actor and critic two."""
+    method, algorithm = settings.method, settings.learner.algorithm
+    own = {"reward", "td_error", "action_gradient"}
+    # A table has no loss that could bend.
+    distances = ("l2", "smooth_l1") if algorithm == "dqn" else ("l2",)
+    for name, wrong in (
+        ("signals", any(signal not in own for signal in method.signals)),
+        ("selection", method.selection in ("split", "halves", "near_policy")),
+        ("candidates", method.candidates > 1),
+        ("target_average", method.target_average > 1),
+        ("loss_function", method.loss_function not in distances),
+        ("curiosity", method.curiosity),
+    ):
+        if wrong:
+            raise ValueError(
+                f"method={method.name} is not for learner={algorithm}, which has neither an actor "
+                f"nor continuous actions: method.{name}={getattr(method, name)}"
+            )
+    if algorithm == "q_learning" and settings.learner.reward_scale != 1:
+        raise ValueError(
+            "learner.reward_scale must be 1 with q_learning, whose table is in units of the "
+            f"reward, got {settings.learner.reward_scale}"
+        )
+    if method.signals == ["action_gradient"]:
+        raise ValueError(
+            f"method.signals must hold reward or td_error with learner={algorithm}, which has no "
+            "action gradient"
+        )
+
+
+def _check_stages(settings: TrainSettings) -> None:
+    """Refuse stages that count nothing or different things, and worlds without a task."""
+    stages = settings.curriculum.stages
+    for number, stage in enumerate(stages):
+        where = f"curriculum.stages[{number}]"
+        if min(stage.episodes, stage.actions) != 0 or stage.length < 1:
+            raise ValueError(
+                f"{where} must have episodes or actions, at least 1, got episodes="
+                f"{stage.episodes}, actions={stage.actions}"
+            )
+        if bool(stage.actions) != bool(stages[0].actions):
+            raise ValueError(f"{where} must count what the others count, episodes or actions")
+        _check_world(f"{where}.world", stage.world, settings)
+
+
+def _resolve(name: str, resolve: Callable[[str], Any], value: str) -> None:
+    """Have the error of something that is looked up name the setting."""
+    try:
+        resolve(value)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
+
+
+def _check_world(name: str, world: str, settings: TrainSettings) -> None:
+    """Refuse a world that there is not, or in which no episode can begin."""
+    environment = replace(settings.environment, physics="kinematic")
+    error = _refusal(world, environment)
+    if error is None:
+        return
+    for setting, without in (
+        ("max_goal_distance", replace(environment, max_goal_distance=None)),
+        ("clearance", replace(environment, clearance=0.0)),
+    ):
+        if _refusal(world, without) is None:
+            name += f", environment.{setting}={getattr(environment, setting)}"
+    raise ValueError(f"{name}: {' '.join(str(error).split())}") from error
+
+
+def _refusal(world: str, environment: EnvironmentSettings) -> Exception | None:
+    """Why no episode begins in a world, if none does."""
+    try:
+        env = make_training_env(world, environment)
+        env.set_seed(0)
+        env.reset()
+    except (ValueError, OSError) as error:
+        return error
+    env.close()
+    return None
+
+
+def _check_device(device: str) -> None:
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ValueError(f"device must be one that PyTorch knows, got {device!r}") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={device}: PyTorch finds no GPU on this machine")

@@ -1,0 +1,140 @@
+"""The command line of ``train.py``: every mistake in it is one sentence, before anything starts."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from itertools import pairwise, product
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from training.settings.checks import check_settings
+from training.settings.resuming import choices_of
+from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
+
+_WITH_A_WORD = ("--cfg", "-c", "--package", "-p", "--info", "-i")
+"""Options of Hydra that are followed by a word of their own."""
+
+
+def known_settings(settings: Any = TrainSettings, prefix: str = "") -> Iterator[str]:
+    """Every setting by its dotted name."""
+    for entry in fields(settings):
+        if not prefix and entry.name in ("hydra", "defaults"):
+            continue
+        name = prefix + entry.name
+        yield name
+        default = entry.default_factory() if callable(entry.default_factory) else entry.default
+        if is_dataclass(default):
+            yield from known_settings(default, f"{name}.")
+
+
+def parse_overrides(arguments: Sequence[str]) -> list[Override]:
+    """The settings on a command line.
+
+    Args:
+        arguments: The command line; options of Hydra are passed over.
+
+    Returns:
+        The settings, those of Hydra itself left out.
+
+    Raises:
+        ValueError: If one cannot be read, is unknown, or an unknown choice; with the nearest one.
+    """
+    texts = [
+        text
+        for before, text in pairwise(["", *arguments])
+        if not text.startswith("-") and before not in _WITH_A_WORD
+    ]
+    parser = OverridesParser.create()
+    parsed = []
+    for text in texts:
+        try:
+            parsed.append(parser.parse_override(text))
+        except HydraException as error:
+            raise ValueError(f"{text!r} is not NAME=VALUE: {_one_line(error)}") from error
+    known = list(known_settings())
+    overrides = [each for each in parsed if not each.key_or_group.startswith("hydra")]
+    for override in overrides:
+        key = override.key_or_group
+        if key not in known:
+            raise ValueError(f"unknown setting {key!r}{_nearest(key, known)}")
+        if key in GROUPS and not override.is_sweep_override():
+            _check_choices(key, choices_of(override))
+    return overrides
+
+
+def _check_choices(group: str, words: Sequence[str]) -> None:
+    """Refuse unknown choices of a group, and several that exclude each other."""
+    for word in words:
+        if word not in GROUPS[group]:
+            raise ValueError(
+                f"unknown choice {word!r} of {group!r}{_nearest(word, GROUPS[group])}; "
+                f"there are: {', '.join(GROUPS[group])}"
+            )
+    given = ",".join(words)
+    if group != SEVERAL and len(words) != 1:
+        raise ValueError(f"{group} must be one of {', '.join(GROUPS[group])}, got [{given}]")
+    if group != SEVERAL:
+        return
+    keys = [key for word in words for key in GROUPS[group][word]]
+    if not words or len(keys) < len(words) > 1 or len(set(keys)) < len(keys):
+        raise ValueError(
+            f"{group} must be off, or one or several of wandb (or online), tensorboard and csv, "
+            f"got [{given}]"
+        )
+
+
+def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
+    """The settings of each run that a command line asks for, checked.
+
+    Args:
+        arguments: Settings as on the command line of ``train.py``.
+
+    Yields:
+        The settings of the run, of each one if it is a sweep.
+
+    Raises:
+        ValueError: If a setting cannot have its value, with its name.
+    """
+    alternatives = []
+    for override in parse_overrides(arguments):
+        text = override.input_line or ""
+        if override.is_sweep_override():
+            key = text.partition("=")[0]
+            alternatives.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
+            alternatives.append([text])
+    for texts in product(*alternatives):
+        try:
+            # Of a module, as Hydra would read the source of every caller to find out where it is.
+            with initialize_config_module("training.settings", version_base="1.3"):
+                settings = as_settings(compose("train", list(texts)))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ValueError(_one_line(error)) from error
+        check_settings(settings)
+        yield settings
+
+
+def _one_line(error: Exception) -> str:
+    """What OmegaConf or Hydra has to say, without what only its developers can use."""
+    cause: BaseException = error
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    key = getattr(cause, "full_key", None)
+    text = str(getattr(cause, "msg", None) or cause).splitlines()[0]
+    return f"{key}: {text}" if key else text
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    # Most mistakes are typos, or settings without the section they are in.
+    names = list(known)
+    near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    inside = [name for name in names if name.split(".")[-1] == word.split(".")[-1]]
+    found = inside[:1] or near
+    return f": did you mean {found[0]!r}?" if found else ""

@@ -1,0 +1,135 @@
+"""What may change when a run goes on, and what may not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
+
+from training.settings.checks import settings_by_name
+from training.settings.train import (
+    GROUPS,
+    REGIMES,
+    SEVERAL,
+    Stage,
+    TrackingSettings,
+    TrainSettings,
+    as_settings,
+    curriculum_name,
+)
+
+LAWFUL = (
+    "curriculum.name",
+    "evaluation.every",
+    "checkpoint_every",
+    "tracking.mode",
+    "tracking.csv",
+    "tracking.tensorboard",
+    "tracking.project",
+    "tracking.group",
+    "tracking.log_every",
+    "tracking.pictures_every",
+    "ray.workers",
+    "ray.address",
+    "ray.steps",
+    "ray.sync",
+)
+"""Settings that a run may change on its way, beside more episodes."""
+OF_THE_CALL = ("resume", "run_dir", "overwrite")
+"""Settings that say how a run is started, and nothing of what it does."""
+
+
+def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
+    """The settings of a run with those of a command line on top.
+
+    Args:
+        saved: The settings in its checkpoint.
+        overrides: The command line.
+
+    Returns:
+        The settings.
+
+    Raises:
+        omegaconf.errors.OmegaConfBaseException: If a value is of another type.
+    """
+    before = as_settings(saved)
+    config = OmegaConf.structured(before)
+    for override in overrides:
+        key, value = override.key_or_group, override.value()
+        if key in OF_THE_CALL:
+            continue
+        if key in GROUPS and key != "regime":
+            chosen = [GROUPS[key][word] for word in choices_of(override)]
+            if key == SEVERAL:
+                chosen.insert(0, TrackingSettings)
+            # As at the start of the run, its regime has values of its own for any choice.
+            config[key] = OmegaConf.merge(*chosen, REGIMES[before.regime].get(key, {}))
+        else:
+            OmegaConf.update(config, key, value)
+    was_derived = before.curriculum.name == curriculum_name(before.curriculum.stages)
+    named = any(override.key_or_group == "curriculum.name" for override in overrides)
+    if was_derived and not named:
+        config.curriculum.name = None
+    return as_settings(config)
+
+
+def check_single(overrides: list[Override]) -> None:
+    """Refuse settings of several runs, as a sweep has them.
+
+    Args:
+        overrides: The command line.
+
+    Raises:
+        ValueError: With the first one.
+    """
+    for override in overrides:
+        if override.is_sweep_override():
+            key, _, values = (override.input_line or "").partition("=")
+            several = f": several are {key}=[{values}]" if key == SEVERAL else ""
+            raise ValueError(f"resume: a run takes one value, got {key}={values}{several}")
+
+
+def choices_of(override: Override) -> list[str]:
+    """What a command line chooses of a group: one word or several in brackets."""
+    value = override.value()
+    return [str(word) for word in (value if isinstance(value, list) else [value])]
+
+
+def check_lawful(before: TrainSettings, after: TrainSettings, folder: Path) -> None:
+    """Refuse what a run cannot change on its way.
+
+    Args:
+        before: Its settings.
+        after: Those that it shall go on with.
+        folder: Its folder.
+
+    Raises:
+        ValueError: With the settings that differ.
+    """
+    old, new = dict(settings_by_name(before)), dict(settings_by_name(after))
+    fixed = [n for n in new if n not in (*LAWFUL, *OF_THE_CALL, "curriculum.stages")]
+    wrong = [f"{name}={new[name]} (it has {old[name]})" for name in fixed if new[name] != old[name]]
+    if wrong:
+        raise ValueError(f"resume: the run in {folder} cannot change {', '.join(wrong)}")
+    if not extends(before.curriculum.stages, after.curriculum.stages):
+        raise ValueError(
+            f"resume: curriculum.stages may have more episodes in its last stage or more stages "
+            f"after it, the run in {folder} has {_short(before)}, got {_short(after)}"
+        )
+
+
+def extends(before: list[Stage], after: list[Stage]) -> bool:
+    """Whether stages begin with others, the last one of these perhaps with more of its unit."""
+    *fixed, last = before
+    count = len(fixed)
+    if len(after) <= count or after[:count] != fixed:
+        return False
+    same = after[count].world == last.world and bool(after[count].episodes) == bool(last.episodes)
+    return same and after[count].length >= last.length
+
+
+def _short(settings: TrainSettings) -> str:
+    stages = settings.curriculum.stages
+    return "[" + ", ".join(f"{stage.world}: {stage.length}" for stage in stages) + "]"

@@ -1,0 +1,371 @@
+"""Settings of a training run: typed, in one place, each with its default and its reason.
+
+Hydra builds its command line from these: ``train.py method=per learner.width=128 seed=3``. The
+settings of a method are those of :class:`torchrl_mpfa.methods.Method`; what values are allowed is
+in ``checks.py``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from mpfa_envs import GENERATORS
+from torchrl_mpfa.methods import METHODS, Method
+from training.settings.environment import EnvironmentSettings
+from training.settings.learners import (
+    DQNSettings,
+    LearnerSettings,
+    PlainSettings,
+    QLearningSettings,
+    SACSettings,
+    TD3Settings,
+)
+
+
+@dataclass
+class ExplorationSettings:
+    """Uniform actions at first, then Gaussian noise on the policy's, or some at random."""
+
+    random_steps: int = 1_000
+    """Steps of uniformly random actions."""
+    sigma: float = 1.0
+    """Standard deviation of the noise at the start."""
+    sigma_end: float = 0.2
+    """Standard deviation at the end; it does not vanish, as narrow data makes DDPG forget."""
+    epsilon: float = 1.0
+    """DQN and Q learning: chance of a random action at the start."""
+    epsilon_end: float = 0.1
+    """DQN and Q learning: chance at the end."""
+    annealing_steps: int = 5_000
+    """Steps in which the noise, or the chance, goes from its start to its end."""
+    varied: bool = True
+    """Whether each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
+    one size the robot is thrown out of every loop, and never learns what a loop is worth."""
+
+
+@dataclass
+class Stage:
+    """A number of episodes, or of actions, in one world or in the worlds of a generator."""
+
+    world: str = "A"
+    """``A``, ``B``, ``C``, ``D``, ``validation``, ``test``, the path of a world file, one world of
+    a generator, as ``bars-7``, or a generator, as ``mixed``: a new world in each episode."""
+    episodes: int = 0
+    """Episodes; 0: the stage counts actions."""
+    actions: int = 0
+    """Actions of all robots together; 0: the stage counts episodes."""
+
+    @property
+    def length(self) -> int:
+        """Episodes or actions, whichever it counts."""
+        return self.episodes or self.actions
+
+
+@dataclass
+class CurriculumSettings:
+    """Worlds one after the other."""
+
+    name: str | None = None
+    """Part of the run's folder and of its group in wandb; null: named after the stages."""
+    stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
+    """The worlds in their order; all of them count episodes, or all of them count actions."""
+    carry: bool = True
+    """Whether networks and buffer carry on from world to world, or start again; learning rates,
+    beta and random steps go by the whole run in either case."""
+
+
+CURRICULA = {
+    "A": [Stage("A", episodes=100)],
+    "B": [Stage("B", episodes=200)],
+    "C": [Stage("C", episodes=300)],
+    "D": [Stage("D", episodes=400)],
+    "paper": [Stage("A", 100), Stage("B", 200), Stage("C", 300), Stage("D", 400)],
+    "rooms": [Stage("mixed", actions=50_000)],
+}
+"""The paper's episodes in each of its worlds, all of them one after the other, and new worlds."""
+_LONGEST_NAME = 60
+
+
+def curriculum_name(stages: Sequence[Stage]) -> str:
+    """What a curriculum is called unless the user names it: after what is really run.
+
+    Args:
+        stages: The stages.
+
+    Returns:
+        The name of one of :data:`CURRICULA`, or worlds and episodes.
+
+    Examples:
+        >>> curriculum_name([Stage("A", 100)]), curriculum_name([Stage("A", 5), Stage("B", 7)])
+        ('A', 'A5+B7')
+    """
+    for name, known in CURRICULA.items():
+        if list(stages) == known:
+            return name
+    parts = [re.sub(r"[^\w.-]", "_", Path(s.world).stem) + str(s.length) for s in stages]
+    whole = "+".join(parts)
+    if len(whole) <= _LONGEST_NAME:
+        return whole
+    digest = hashlib.sha256(repr(list(stages)).encode()).hexdigest()[:8]
+    return f"{parts[0][:20]}+{len(parts) - 1}-more-{digest}"
+
+
+@dataclass
+class EvaluationSettings:
+    """Greedy episodes during training, which show how fast it learns and change nothing in it."""
+
+    every: int = 0
+    """Actions between two evaluations; 0: none."""
+    world: str = "validation"
+    """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
+    which nothing may be chosen, are refused with ``choose``. ``same``: where the last stage is."""
+    episodes: int = 20
+    """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
+    choose: bool = False
+    """Whether the policy of the run is the one that did best there, not the last one."""
+
+
+@dataclass
+class TrackingSettings:
+    """Where the run is logged; ``tracking=[wandb,csv]`` names several places."""
+
+    mode: str = "off"
+    """wandb: ``offline`` (no account), ``online`` or ``off``."""
+    csv: bool = False
+    """Whether TorchRL's CSVLogger writes a file for each number, to ``csv/`` of the folder."""
+    tensorboard: bool = False
+    """Whether TorchRL's TensorboardLogger writes to ``tensorboard/`` of the folder."""
+    project: str = "torchrl-mpfa"
+    """wandb: the project."""
+    group: str | None = None
+    """wandb: what the runs of a kind have in common; null: CURRICULUM-METHOD-LEARNER."""
+    log_every: int = 200
+    """Actions between two entries of losses, weights and priorities."""
+    pictures_every: int | None = 0
+    """Actions between two sets of pictures of the policy in the worlds of ``evaluation.world``,
+    for wandb and TensorBoard; 0: at the end alone, null: none."""
+
+
+@dataclass
+class AssessmentSettings:
+    """Whether policies are held fixed and assessed, and the best of them kept."""
+
+    episodes: int = 0
+    """Whole episodes that assess a policy before the next updates, 20 in TD7; 0: none do."""
+    early_episodes: int = 1
+    """Episodes that do so in the early part of a run, which fewer of them speed up."""
+    early_share: float = 0.15
+    """How much of the run that part is, TD7's 750,000 of 5 million steps."""
+    best_factor: float = 0.9
+    """What is left of the best score at its end, as the worst of more episodes is worse."""
+    by: str = "outcome"
+    """Score of an episode: ``outcome``, what Eq. (25) pays at its end, or ``return``, all of its
+    rewards, as in TD7. Returns grow with path length."""
+
+
+@dataclass
+class RaySettings:
+    """Where the robots drive; ``docs/scaling.md`` has what it needs and what it brings."""
+
+    workers: int = 0
+    """Processes that drive the robots, each an equal part of them; 0: the run drives them."""
+    address: str | None = None
+    """Address of a cluster's head; null: that of ``RAY_ADDRESS``, one that was started on this
+    machine, or else the cores of this machine."""
+    steps: int = 16
+    """Actions of each robot of a worker before it writes them and gets new weights."""
+    sync: bool = False
+    """Whether the workers wait for each other and for the updates. If not, they drive on while the
+    learner learns, and no two runs are alike."""
+
+
+@dataclass
+class TrainSettings:
+    """A training run."""
+
+    defaults: list[Any] = field(
+        default_factory=lambda: [
+            "_self_",
+            {"method": "mpfa_per"},
+            {"learner": "ddpg"},
+            {"curriculum": "A"},
+            {"tracking": "wandb"},
+            # After the learner: it has its values for all learners.
+            {"regime": "rooms"},
+            {"override hydra/job_logging": "none"},
+        ]
+    )
+    hydra: Any = field(
+        default_factory=lambda: {
+            "job": {"name": "train"},
+            "run": {"dir": "${run_dir}"},
+            "sweep": {
+                "dir": "runs/sweep-${now:%Y-%m-%d_%H-%M-%S}",
+                "subdir": "${one_folder:${hydra.job.override_dirname}}",
+            },
+            # The run writes its settings itself, once it knows that the folder is its own.
+            "output_subdir": None,
+        }
+    )
+    run_dir: str = (
+        "runs/${curriculum_name:${curriculum.name},${curriculum.stages}}"
+        "-${method.name}-${learner.name}-${seed}"
+    )
+    """Folder of checkpoints, logs and pictures."""
+    regime: str = "paper"
+    """``regime=rooms``: many robots in new worlds; ``regime=paper``: Table 1, one robot, A to D."""
+    seed: int = 0
+    """Seed of the networks, the exploration, the replay and the generated worlds."""
+    device: str = "cpu"
+    """Where the networks are; the buffer stays in main memory."""
+    threads: int = 1
+    """Threads of PyTorch, by which the last bits of a network depend; with networks this small a
+    second one gains nothing."""
+    overwrite: bool = False
+    """Whether to start again in a folder that holds a run; its files are moved to ``previous/``."""
+    resume: str | None = None
+    """Folder of a run to continue, with its own settings. More episodes, tracking and how
+    often to evaluate and to save may be changed; anything else is rejected."""
+    checkpoint_every: int = 10_000
+    """Actions between two checkpoints."""
+    robots: int = 1
+    """Robots that drive at once, each in a world of its own; those that are under way at the end of
+    a stage give up their episodes."""
+    updates: int = 1
+    """Updates for one action of each robot."""
+    method: Method = field(default_factory=Method)
+    """One of the methods by name; its settings can be changed one by one."""
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
+    """``ddpg``, ``td3``, ``sac``, ``plain``, ``dqn`` or ``q_learning``."""
+    curriculum: CurriculumSettings = field(default_factory=CurriculumSettings)
+    """``A``, ``B``, ``C`` or ``D``: a world of the paper; ``paper``: all four; or ``rooms``."""
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    """``wandb`` (or ``offline``), ``online``, ``tensorboard``, ``csv``, or several of them as
+    ``[wandb,csv]``; or ``off``."""
+    exploration: ExplorationSettings = field(default_factory=ExplorationSettings)
+    environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    assessment: AssessmentSettings = field(default_factory=AssessmentSettings)
+    ray: RaySettings = field(default_factory=RaySettings)
+
+
+SAME = "same"
+"""Evaluations in worlds such as those of the training."""
+REGIMES: dict[str, dict[str, Any]] = {
+    "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
+    "rooms": {
+        "regime": "rooms",
+        "defaults": [{"override /curriculum": "rooms"}],
+        "robots": 16,
+        "updates": 4,
+        "learner": {
+            "actor_lr": 3e-4,
+            "critic_lr": 3e-4,
+            "tau": 0.005,
+            # Without both a single critic's targets run ahead, and the robot circles.
+            "policy_delay": 2,
+            "policy_noise": 0.2,
+        },
+        "exploration": {"random_steps": 2_000, "annealing_steps": 20_000},
+        "environment": {
+            "physics": "kinematic",
+            "progress": "shortest_path",
+            "max_goal_distance": 20.0,
+            # Without it there is no way out of a pocket, and a third of the mazes fail.
+            "memory": "map",
+            # Less than the paper's, as mazes and fields are narrow.
+            "clearance": 0.05,
+        },
+        # A single critic may run away after it was good: one seed of ten ended at half.
+        "evaluation": {
+            "world": SAME,
+            "episodes": 100,
+            "every": 5_000,
+            "choose": True,
+        },
+    },
+}
+"""The paper's task and numbers, and what one would do today."""
+
+SEVERAL = "tracking"
+"""The group of which a run may have several choices: each says what it has beyond the others."""
+GROUPS: dict[str, dict[str, Any]] = {
+    "method": METHODS,
+    "learner": {
+        "ddpg": LearnerSettings,
+        "td3": TD3Settings,
+        "sac": SACSettings,
+        "plain": PlainSettings,
+        "dqn": DQNSettings,
+        "q_learning": QLearningSettings,
+    },
+    "curriculum": {name: CurriculumSettings(stages=stages) for name, stages in CURRICULA.items()},
+    "tracking": {
+        "wandb": {"mode": "offline"},
+        "offline": {"mode": "offline"},
+        "online": {"mode": "online"},
+        "tensorboard": {"tensorboard": True},
+        "csv": {"csv": True},
+        "off": {},
+    },
+    "regime": REGIMES,
+}
+
+
+@cache
+def _one_folder(settings: str) -> str:
+    """Name of the folder of a run, in which a value may be a path."""
+    return settings.replace("/", "_")
+
+
+def register() -> None:
+    """Make the settings known to Hydra; a second call changes nothing."""
+    OmegaConf.register_new_resolver("curriculum_name", _resolve_name, replace=True)
+    OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
+    store = ConfigStore.instance()
+    store.store(name="train", node=TrainSettings)
+    for group, choices in GROUPS.items():
+        package = "_global_" if group == "regime" else None
+        for name, node in choices.items():
+            store.store(group=group, name=name, node=node, package=package)
+
+
+def _resolve_name(name: str | None, stages: Sequence[Any]) -> str:
+    return name or curriculum_name([Stage(s.world, s.episodes, s.actions) for s in stages])
+
+
+def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
+    """Typed settings from what Hydra composed or a checkpoint holds.
+
+    Args:
+        config: The values; those that it lacks are the defaults.
+
+    Returns:
+        The settings, with the curriculum and the worlds of the evaluations named.
+
+    Raises:
+        omegaconf.errors.OmegaConfBaseException: If a value is of another type, or unknown.
+    """
+    values = OmegaConf.create(config) if isinstance(config, dict) else config.copy()
+    OmegaConf.set_struct(values, False)
+    for name in ("defaults", "hydra"):
+        values.pop(name, None)
+    merged = OmegaConf.merge(OmegaConf.structured(TrainSettings), values)
+    merged.pop("hydra", None)
+    settings = OmegaConf.to_object(merged)
+    assert isinstance(settings, TrainSettings)
+    curriculum = settings.curriculum
+    curriculum.name = curriculum.name or curriculum_name(curriculum.stages)
+    if settings.evaluation.world == SAME and curriculum.stages:
+        last = curriculum.stages[-1].world
+        settings.evaluation.world = f"{last}:validation" if last in GENERATORS else last
+    return settings

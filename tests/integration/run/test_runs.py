@@ -1,0 +1,382 @@
+"""Runs that cannot be mixed up: locks, signals, what may change on the way, and what may not."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+import train
+from tests.integration.tiny_runs import OVERRIDES
+from training import files
+from training.comparison.jobs import Job
+from training.files import CHECKPOINT, FolderInUse, lock
+from training.records import read_table
+from training.run import loop, tracking
+from training.run.checkpoints import read_checkpoint
+from training.run.loop import TrainingRun
+from training.run.running import Refused, resume, start
+from training.settings.checks import LAST_SEED
+from training.settings.command_line import composed, parse_overrides
+from training.settings.resuming import changed
+from training.settings.train import register
+
+STAGES = "curriculum.stages=[{{world: A, episodes: {}}}]"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
+    register()
+
+
+@pytest.fixture(autouse=True)
+def as_before() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    yield
+    torch.set_flush_denormal(False)
+    torch.set_num_threads(threads)
+
+
+def begin(folder: Path, *overrides: str, episodes: int = 3) -> int:
+    (settings,) = composed([*OVERRIDES, STAGES.format(episodes), *overrides])
+    return start(settings, folder)
+
+
+def go_on(folder: Path, *overrides: str) -> int:
+    return resume(folder, parse_overrides(overrides))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
+    assert begin(tmp_path, "seed=4") == 0
+    assert json.loads((tmp_path / files.SETTINGS).read_text())["seed"] == 4
+    status = json.loads((tmp_path / files.STATUS).read_text())
+    assert status["finished"] is True
+    assert (status["unit"], status["done"], status["total"]) == ("episode", 3, 3)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *(files.CHECKPOINT, files.POLICY, files.SETTINGS, files.EPISODES, files.CURVE),
+        *(files.STATUS, files.UPDATES, ".lock"),
+    }
+
+
+@pytest.mark.parametrize("lost", ["save_atomically", "write_table"])
+def test_a_run_is_not_finished_before_all_of_it_is_saved(
+    lost: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError("no space left")
+
+    job = Job("ddpg", "per", 0, tmp_path)
+    assert begin(job.path, episodes=1) == 0
+    assert job.is_trained()
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, lost, full)
+        patch.setattr(loop, "_TELL_EVERY", 0.0)
+        with pytest.raises(OSError, match="no space"):
+            go_on(job.path, STAGES.format(2))
+    status = job.status()
+    assert (status["done"], status["total"], status["finished"]) == (2, 2, False)
+    assert not job.is_trained()
+    assert go_on(job.path, STAGES.format(2)) == 0
+    assert job.is_trained()
+    (job.path / files.POLICY).unlink()
+    assert not job.is_trained()
+
+
+def test_a_finished_run_that_shall_go_on_is_not_finished_before_it_has_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(_: TrainingRun) -> bool:
+        raise SystemExit(137)
+
+    job = Job("ddpg", "per", 0, tmp_path)
+    assert begin(job.path, episodes=1) == 0
+    monkeypatch.setattr(TrainingRun, "train", killed)
+    with pytest.raises(SystemExit):
+        go_on(job.path, STAGES.format(2))
+    assert not job.is_trained()
+
+
+def test_the_last_seed_that_is_taken_can_be_trained_with(tmp_path: Path) -> None:
+    assert begin(tmp_path, f"seed={LAST_SEED}", episodes=1) == 0
+
+
+def test_a_second_run_in_the_same_folder_is_refused_while_the_first_is_at_work(
+    tmp_path: Path,
+) -> None:
+    with lock(tmp_path):
+        before = contents(tmp_path)
+        for again in (lambda: begin(tmp_path, "overwrite=true"), lambda: go_on(tmp_path)):
+            with pytest.raises(Refused, match=f"another process is using {tmp_path}"):
+                again()
+        assert contents(tmp_path) == before
+        with pytest.raises(FolderInUse), lock(tmp_path):
+            pass
+    assert begin(tmp_path, episodes=1) == 0
+
+
+def test_what_a_killed_save_left_is_removed(tmp_path: Path) -> None:
+    for name in (f".{CHECKPOINT}.99999.tmp", f".{files.POLICY}.x1y2", f".{files.EPISODES}.7.tmp"):
+        (tmp_path / name).write_bytes(b"half")
+    begin(tmp_path, episodes=1)
+    assert {path.name for path in tmp_path.glob(".*")} == {".lock"}
+
+
+def test_a_folder_with_a_run_is_not_written_over_unless_asked_to(tmp_path: Path) -> None:
+    begin(tmp_path, "seed=1", episodes=1)
+    before = contents(tmp_path)
+    with pytest.raises(Refused, match=f"{tmp_path} holds a run: continue it with resume="):
+        begin(tmp_path, "seed=2", episodes=1)
+    assert contents(tmp_path) == before
+
+
+def test_a_run_started_anew_and_killed_at_once_cannot_resume_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin(tmp_path, "seed=1", episodes=2)
+    old = (tmp_path / CHECKPOINT).read_bytes()
+
+    def killed(run: TrainingRun) -> bool:
+        raise SystemExit("as if killed before its first checkpoint")
+
+    monkeypatch.setattr(TrainingRun, "train", killed)
+    with pytest.raises(SystemExit):
+        begin(tmp_path, "seed=2", "overwrite=true")
+    monkeypatch.undo()
+    with pytest.raises(Refused, match=f"there is no {CHECKPOINT} in {tmp_path}"):
+        go_on(tmp_path)
+    assert not (tmp_path / files.POLICY).exists()
+    assert (tmp_path / files.PREVIOUS / CHECKPOINT).read_bytes() == old
+
+
+def test_a_setting_that_the_parts_refuse_leaves_the_old_run_in_its_place(tmp_path: Path) -> None:
+    begin(tmp_path, episodes=1)
+    before = contents(tmp_path)
+    with pytest.raises(Refused, match="layers must be at least 2"):
+        begin(tmp_path, "overwrite=true", "learner.layers=1")
+    assert contents(tmp_path) == before
+
+
+def test_a_run_goes_on_with_more_episodes_and_in_another_world(tmp_path: Path) -> None:
+    begin(tmp_path / "run", episodes=2)
+    assert go_on(tmp_path / "run", STAGES.format(3), "evaluation.every=10") == 0
+    more = "curriculum.stages=[{world: A, episodes: 3},{world: B, episodes: 1}]"
+    assert go_on(tmp_path / "run", more, "checkpoint_every=50", "tracking=off", "threads=1") == 0
+    assert list(read_table(tmp_path / "run" / files.EPISODES)["world"]) == ["A", "A", "A", "B"]
+    settings = json.loads((tmp_path / "run" / files.SETTINGS).read_text())
+    assert settings["curriculum"]["name"] == "A3+B1"
+    assert settings["evaluation"]["every"] == 10
+    # Nothing was written but in the run's own folder.
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: str) -> None:
+    words = ["regime=rooms", f"learner={learner}", "curriculum=rooms", "method=per"]
+    (settings,) = composed(words)
+    assert changed(asdict(settings), parse_overrides(words)) == settings
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("learner.gamma=0.5", r"cannot change learner.gamma=0.5 \(it has 0.99\)"),
+        ("method=per", "cannot change method.name=per"),
+        ("seed=9", r"seed=9 \(it has 0\)"),
+        ("evaluation.world=B", "evaluation.world=B"),
+        ("regime=rooms", r"cannot change regime=rooms \(it has paper\)"),
+        ("robots=4", r"cannot change robots=4 \(it has 1\)"),
+        (STAGES.format(1), r"curriculum.stages may have more .* has \[A: 2\], got \[A: 1\]"),
+        ("run_dir=elsewhere", "resume: run_dir is of no use, a run goes on in its folder"),
+        ("overwrite=true", "resume: overwrite is of no use"),
+        # Sums over two threads have other last bits.
+        ("threads=2", r"cannot change threads=2 \(it has 1\)"),
+        ("tracking=csv,wandb", r"takes one value, got tracking=.*: several are tracking=\[csv,wan"),
+        (
+            "evaluation.every=100,200",
+            "resume: a run takes one value, got evaluation.every=100,200$",
+        ),
+        ("learner.gamma=2", r"learner.gamma must be in \[0, 1\], got 2"),
+        ("learner.width=abc", "learner.width"),
+    ],
+)
+def test_what_a_run_cannot_change_on_its_way_is_refused_by_name(
+    override: str, message: str, two_episodes: Path
+) -> None:
+    before = contents(two_episodes)
+    with pytest.raises(Refused, match=message) as caught:
+        go_on(two_episodes, override)
+    assert "\n" not in str(caught.value)
+    assert contents(two_episodes) == before
+
+
+@pytest.fixture(scope="module")
+def two_episodes(registered: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    begin(folder, episodes=2)
+    return folder
+
+
+def test_one_wandb_run_stays_one_through_resuming(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[dict[str, object]] = []
+    init = tracking.wandb.init
+
+    def remember(**arguments: object) -> object:
+        started.append(arguments)
+        return init(**{**arguments, "mode": "disabled"})
+
+    monkeypatch.setattr(tracking.wandb, "init", remember)
+    begin(tmp_path, "tracking=offline", "tracking.pictures_every=null", episodes=1)
+    go_on(tmp_path, STAGES.format(2))
+    go_on(tmp_path, STAGES.format(3))
+    assert len({each["id"] for each in started}) == 1
+    assert [each["resume"] for each in started] == ["allow"] * 3
+    assert started[0]["group"] == "A1-mpfa_per-ddpg"
+    assert started[0]["tags"] == ["A1", "mpfa_per", "ddpg", "paper"]
+    assert started[0]["job_type"] == "train"
+    assert read_checkpoint(tmp_path)["wandb"] == started[0]["id"]
+
+
+def test_resuming_a_finished_run_says_so_and_what_else_there_is_to_do(
+    two_episodes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(two_episodes)
+    more = f"resume={two_episodes} 'curriculum.stages=[{{world: A, episodes: 4}}]'"
+    said = (
+        f"{two_episodes} is finished, after 2 episodes: evaluate it with evaluate.py "
+        f"{two_episodes}, or train on with train.py {more}\n"
+    )
+    # At once: nothing of what takes seconds to import is.
+    code = (
+        "import runpy, sys; sys.modules['torch'] = sys.modules['omegaconf'] = None; "
+        f"sys.argv = ['train.py', 'resume={two_episodes}']; "
+        f"runpy.run_path({train.__file__!r}, run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said, "")
+    assert go_on(two_episodes, "tracking=off") == 0
+    assert capsys.readouterr().out == said
+    assert contents(two_episodes) == before
+
+
+def exit_status(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
+    """What the script gives back in this process, which has all imported that it needs."""
+    monkeypatch.setattr(sys, "argv", ["train.py", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        train.main()
+    return caught.value.code
+
+
+def test_a_wrong_setting_is_one_line_and_exit_status_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_status(monkeypatch, f"run_dir={tmp_path / 'run'}", "learner.gamma=2") == 2
+    assert capsys.readouterr().err == "train.py: learner.gamma must be in [0, 1], got 2.0\n"
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("option", ["-m", "--multirun"])
+def test_a_sweep_has_no_run_dir(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert exit_status(monkeypatch, option, "seed=0,1", "run_dir=mine") == 2
+    assert "the folder hydra.sweep.dir=FOLDER" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_of_a_sweep_has_one_folder_though_a_value_is_a_path() -> None:
+    with initialize_config_module("training.settings", version_base="1.3"):
+        words = ["seed=1", "tracking.group=a/b"]
+        config = compose("train", words, return_hydra_config=True)
+    assert config.hydra.sweep.subdir == "seed=1,tracking.group=a_b"
+
+
+def appears(file: Path, seconds: float = 120) -> bool:
+    end = time.monotonic() + seconds
+    while not file.exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    return file.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_a_killed_run_goes_on_and_signals_save(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    words = [*OVERRIDES, STAGES.format(10_000), f"run_dir={folder}", "checkpoint_every=20"]
+    killed = subprocess.Popen(
+        [sys.executable, train.__file__ or "", *words], stderr=subprocess.PIPE, text=True
+    )
+    there = appears(folder / CHECKPOINT)
+    killed.send_signal(signal.SIGKILL)
+    _, err = killed.communicate(timeout=60)
+    assert there, err
+    assert killed.returncode == -signal.SIGKILL, err
+    assert err.strip().startswith("0%"), err  # The bar comes first, no warning of any import.
+    before = read_checkpoint(folder)["schedule"]["actions"]
+    assert before >= 20
+
+    (folder / files.STATUS).unlink(missing_ok=True)
+
+    def end_once_at_work() -> None:
+        appears(folder / files.STATUS)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=end_once_at_work, daemon=True).start()
+    status = exit_status(monkeypatch, f"resume={folder}", "checkpoint_every=1000000")
+    assert status == 128 + signal.SIGTERM
+    assert f"continue with: train.py resume={folder}" in capsys.readouterr().out
+    assert read_checkpoint(folder)["schedule"]["actions"] > before
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
+    saved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(run: TrainingRun) -> bool:
+        if saved:
+            run.save()
+        run.stop.ask()
+        run.stop.ask()
+        raise AssertionError("the second signal stops at once")
+
+    monkeypatch.setattr(TrainingRun, "train", interrupted)
+    assert begin(tmp_path) == 128 + signal.SIGINT
+    out = capsys.readouterr().out
+    assert (f"continue with: train.py resume={tmp_path}" in out) == saved
+    assert ("nothing of it was saved" in out) == (not saved)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
+    (settings,) = composed([*OVERRIDES, STAGES.format(50)])
+    run = TrainingRun(settings, tmp_path)
+
+    def stop() -> None:
+        if run.actions == 23:
+            os.kill(os.getpid(), number)
+
+    assert run.train(stop) is False
+    assert (run.actions, run.stop.exit_status) == (23, 128 + number)
+    assert read_checkpoint(tmp_path)["schedule"]["actions"] == 23
+    run.close()
+    with pytest.raises(KeyboardInterrupt):
+        run.stop.ask(number)

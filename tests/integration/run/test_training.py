@@ -1,0 +1,409 @@
+"""The training run: resuming, records, policies; every part of it on tiny runs."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torchrl.data import RandomSampler
+
+from mpfa_envs import load_policy
+from tests.integration.tiny_runs import rows, tiny, train
+from torchrl_mpfa import SignalSampler
+from torchrl_mpfa.methods import ALIASES, Method
+from torchrl_mpfa.saving import save_atomically
+from training.files import CHECKPOINT
+from training.records import EvaluationRecord
+from training.run import loop
+from training.run.checkpoints import random_state, read_checkpoint, set_random_state
+from training.run.loop import TrainingRun
+from training.settings.train import GROUPS, Stage, TrainSettings
+
+
+def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.evaluation.every, settings.evaluation.episodes = 15, 2
+    evaluated, plain = train(tmp_path / "evaluated", settings), train(tmp_path / "plain", tiny())
+    assert rows(evaluated) == rows(plain)
+    steps = [record.total_steps for record in evaluated.evaluations]
+    assert steps == list(range(15, evaluated.actions + 1, 15))
+    for record in evaluated.evaluations:
+        assert record.success + record.collision + record.timeout == pytest.approx(1.0)
+        assert record.world == "validation"
+    lines = (tmp_path / "evaluated" / "evaluations.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(steps)
+    assert not (tmp_path / "plain" / "evaluations.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "learner"),
+    [
+        ("mpfa_per", "ddpg"),
+        ("mpfa_per", "td3"),
+        *((method, "ddpg") for method in ("averaged_ddpg", "cer", "ddpg_radam", "hvper")),
+        *((method, "ddpg") for method in ("klper", "mw", "rank_per")),
+        ("la3p", "td3"),
+        ("mpfa_per", "sac"),
+    ],
+)
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
+    tmp_path: Path, method: str, learner: str
+) -> None:
+    whole = train(tmp_path / "whole", tiny(method, learner=learner))
+    stop_after(31, tmp_path, tiny(method, learner=learner))
+    resumed = TrainingRun(tiny(method, learner=learner), tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    assert_same_run(resumed, whole)
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
+def test_many_robots_are_stopped_in_the_middle_of_their_episodes_and_go_on(
+    tmp_path: Path, physics: str
+) -> None:
+    settings = tiny(episodes=[Stage("bars", actions=90)], robots=3, updates=2)
+    settings.environment.physics = physics
+    settings.environment.progress = "shortest_path"
+    whole = train(tmp_path / "whole", settings)
+    part = stop_after(45, tmp_path, settings)
+    assert all(record.total_steps <= 45 for record in part.records)
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    assert len(whole.records) > len(part.records)
+    assert_same_run(resumed, whole)
+
+
+def stop_after(actions: int, folder: Path, settings: TrainSettings) -> TrainingRun:
+    folder.mkdir(exist_ok=True)
+    run = TrainingRun(settings, folder)
+    run.train(lambda: run.actions >= actions and run.stop.ask())
+    run.close()
+    assert actions <= run.actions < actions + settings.robots
+    return run
+
+
+def assert_same_run(resumed: TrainingRun, whole: TrainingRun) -> None:
+    assert rows(resumed) == rows(whole)
+    assert resumed.actions == whole.actions
+    for mine, other in zip(
+        resumed.learner.loss.state_dict().values(),
+        whole.learner.loss.state_dict().values(),
+        strict=True,
+    ):
+        assert torch.equal(mine, other)
+    mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()
+    assert torch.equal(mine["_rng"][0], other["_rng"][0])
+    if "_sum_tree" in other["_sampler"]:
+        assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
+    if "_signals" in other["_storage"]:
+        signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
+        # NaN marks what is not known yet.
+        torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
+    first, again = train(tmp_path / "a", tiny()), train(tmp_path / "b", tiny())
+    other = tiny()
+    other.seed = 4
+    assert rows(first) == rows(again)
+    assert rows(first) != rows(train(tmp_path / "c", other))
+
+
+@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
+def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: str) -> None:
+    settings = tiny(method)
+    run = train(tmp_path, settings)
+    assert run.updates > 0
+    assert all(math.isfinite(record.reward) for record in run.records)
+    if not settings.method.signals:
+        assert isinstance(run.buffer.sampler, RandomSampler)
+    else:
+        assert isinstance(run.buffer.sampler, SignalSampler)
+        assert sorted(run.buffer.sampler.weights) == sorted(settings.method.signals)
+        assert run.buffer.sampler.beta == settings.method.beta_end
+
+
+@pytest.mark.parametrize("learner", ["sac", "td3"])
+@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
+def test_every_method_works_with_every_learner(tmp_path: Path, method: str, learner: str) -> None:
+    run = train(tmp_path, tiny(method, [Stage("A", 4)], learner))
+    weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
+    assert run.updates > 0
+    assert all(value.isfinite().all() for value in weights)
+
+
+def test_no_two_methods_have_the_same_settings() -> None:
+    methods = {name: m for name, m in GROUPS["method"].items() if name not in ALIASES}
+    bare = [replace(method, name="") for method in methods.values()]
+    assert all(one != other for place, one in enumerate(bare) for other in bare[:place])
+    assert all(method.name == name for name, method in methods.items())
+
+
+def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
+    settings = tiny("ddpg_radam")
+    settings.method.curiosity_scale = 1e6
+    # Nothing is learned in the first episodes, so that both runs drive the same way.
+    settings.method.batch_size = settings.method.capacity = 1000
+    plain = replace(settings.method, curiosity=False, curiosity_scale=Method().curiosity_scale)
+    without = replace(settings, method=plain)
+    curious, bare = train(tmp_path / "curious", settings), train(tmp_path / "plain", without)
+    assert [r.reward for r in curious.records] == [r.reward for r in bare.records]
+    learned = tiny("ddpg_radam")
+    learned.method.curiosity_scale = 1e6
+    run = train(tmp_path / "learned", learned)
+    assert max(abs(record.reward) for record in run.records) < 1e3
+    assert run.buffer[:]["next", "reward"].abs().max() < 1e3
+
+
+def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.curriculum.carry = False
+    run = train(tmp_path, settings)
+    of_second_world = sum(record.steps for record in run.records[3:])
+    assert len(run.buffer) == min(of_second_world, settings.method.capacity)
+    assert run.buffer.write_count == of_second_world
+
+    (tmp_path / "part").mkdir()
+    part = TrainingRun(settings, tmp_path / "part")
+    # Stopped between the worlds.
+    part.train(lambda: part.schedule.stage == 1 and part.stop.ask())
+    part.close()
+    resumed = TrainingRun(settings, tmp_path / "part", read_checkpoint(tmp_path / "part"))
+    assert resumed.train()
+    resumed.close()
+    assert rows(resumed) == rows(run)
+
+
+def test_a_finished_run_begins_further_worlds_as_its_curriculum_says(tmp_path: Path) -> None:
+    settings = tiny(episodes=[Stage("A", 3)])
+    settings.curriculum.carry = False
+    train(tmp_path, settings).close()
+    state = read_checkpoint(tmp_path)
+    settings.curriculum.stages.append(Stage("B", 2))
+    resumed = TrainingRun(settings, tmp_path, state)
+    assert resumed.robots.elapsed() >= state["robots"]["seconds"]
+    assert resumed.learner.updates == len(resumed.buffer) == 0
+    assert resumed.train()
+    resumed.close()
+    assert len(resumed.buffer) == sum(record.steps for record in resumed.records[3:])
+
+
+def test_a_stage_begins_though_an_evaluation_failed_just_before_it(tmp_path: Path) -> None:
+    settings = tiny(episodes=[Stage("A", actions=40), Stage("B", actions=20)])
+    settings.evaluation.every, settings.evaluation.episodes = 40, 2
+    failing = TrainingRun(settings, tmp_path)
+
+    def fail() -> None:
+        raise RuntimeError("out of memory")
+
+    failing._evaluate = fail  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match="out of memory"):
+        failing.train()
+    failing.close()
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    whole = train(tmp_path / "whole", settings)
+    assert rows(resumed) == rows(whole)
+
+
+def test_the_episodes_that_another_stage_cuts_short_are_counted(tmp_path: Path) -> None:
+    settings = tiny(episodes=[Stage("A", actions=30), Stage("B", actions=90)], robots=3)
+    settings.environment.max_steps = 200
+    run = train(tmp_path / "whole", settings)
+    before = [record for record in run.records if record.total_steps <= 30]
+    assert before == []
+    status = json.loads((tmp_path / "whole" / "status.json").read_text())
+    assert status["given_up"] == 3
+
+    # The same if the run was stopped in between, or ended there at first.
+    stop_after(60, tmp_path, settings)
+    assert read_checkpoint(tmp_path)["robots"]["given_up"] == 3
+    shorter = tiny(episodes=[Stage("A", actions=30)], robots=3)
+    shorter.environment.max_steps = 200
+    train(tmp_path / "more", shorter)
+    resumed = TrainingRun(settings, tmp_path / "more", read_checkpoint(tmp_path / "more"))
+    assert resumed.robots.given_up == 3
+    resumed.close()
+
+
+def test_the_random_numbers_of_a_gpu_are_kept_with_those_of_the_cpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    on_gpu = {"cuda:1": torch.tensor([7])}
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda device: on_gpu[device].clone())
+    monkeypatch.setattr(
+        torch.cuda, "set_rng_state", lambda state, device: on_gpu.update({device: state})
+    )
+    kept = random_state("cuda:1")
+    expected = torch.rand(3)
+    on_gpu["cuda:1"] = torch.tensor([8])
+    set_random_state("cuda:1", kept)
+    assert torch.equal(torch.rand(3), expected)
+    assert on_gpu["cuda:1"].item() == 7
+
+
+def test_a_checkpoint_has_the_random_numbers_of_the_device_that_it_runs_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = TrainingRun(tiny(), tmp_path)
+    asked: list[str] = []
+    monkeypatch.setattr(loop, "random_state", lambda device: asked.append(device))
+    run.settings.device = "cuda:0"
+    run.save()
+    run.close()
+    assert asked == ["cuda:0"]
+
+
+def test_the_records_say_how_every_episode_ended(tmp_path: Path) -> None:
+    run = train(tmp_path, tiny())
+    assert [record.world for record in run.records] == ["A"] * 3 + ["B"] * 3
+    assert all(r.success + r.collision + r.timeout == 1 for r in run.records)
+    assert sum(r.steps for r in run.records) == run.actions == run.records[-1].total_steps
+    assert (tmp_path / "episodes.csv").read_text().count("\n") == 1 + len(run.records)
+
+
+@pytest.mark.parametrize("learner", sorted({*GROUPS["learner"]} - {"dqn", "q_learning"}))
+def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str) -> None:
+    run = train(tmp_path, tiny(learner=learner))
+    policy = load_policy(tmp_path)
+    observation = torch.rand(5, 24)
+    trained = run.learner.policy.outputs({"observation": observation})["action"]
+    np.testing.assert_allclose(policy(observation.numpy()), trained.detach().numpy(), atol=1e-5)
+    assert policy.card["episodes"] == 6
+    assert policy.card["steps"] == run.actions
+    assert policy.env_arguments["closeness_distance"] == pytest.approx(0.25)
+
+
+def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    save_atomically({"format": 3}, tmp_path / CHECKPOINT)
+    with pytest.raises(ValueError, match=r"format 3, this version reads 5"):
+        read_checkpoint(tmp_path)
+    (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
+    with pytest.raises(ValueError, match=CHECKPOINT):
+        read_checkpoint(tmp_path)
+    with pytest.raises(FileNotFoundError, match="resume"):
+        read_checkpoint(tmp_path / "elsewhere")
+
+
+def test_an_update_that_is_refused_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
+    failing = TrainingRun(tiny(), tmp_path)
+    update, count = failing.learner.update, 0
+
+    def fail(draw: object) -> dict[str, torch.Tensor]:
+        nonlocal count
+        count += 1
+        if count == 15:
+            raise ValueError("the loss is not finite")
+        return update(draw)  # type: ignore[arg-type]
+
+    failing.learner.update = fail  # type: ignore[assignment, method-assign]
+    with pytest.raises(ValueError, match="not finite"):
+        failing.train()
+    failing.close()
+    resumed = TrainingRun(tiny(), tmp_path, read_checkpoint(tmp_path))
+    assert resumed.actions == failing.actions
+    assert resumed.train()
+    resumed.close()
+
+
+def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.checkpoint_every = 20
+    failing = TrainingRun(settings, tmp_path)
+
+    def fail() -> None:
+        if failing.actions == 35:
+            for weight in failing.learner.loss.parameters():
+                weight.data.fill_(math.nan)
+            raise RuntimeError("something broke")
+
+    with pytest.raises(RuntimeError, match="something broke"):
+        failing.train(fail)
+    failing.close()
+    assert read_checkpoint(tmp_path)["schedule"]["actions"] == 20
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    assert resumed.train()
+    resumed.close()
+    assert rows(resumed) == rows(train(tmp_path / "whole", tiny()))
+
+
+def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, successes = loop.evaluate_policy, iter((0.2, 0.9))
+
+    def evaluated(*arguments: Any, **named: Any) -> EvaluationRecord:
+        return replace(found(*arguments, **named), success=next(successes, 0.5))
+
+    monkeypatch.setattr(loop, "evaluate_policy", evaluated)
+    settings = tiny()
+    settings.evaluation.every, settings.evaluation.episodes = 10, 4
+    settings.evaluation.choose = True
+    run = TrainingRun(settings, tmp_path)
+    kept: list[dict[str, torch.Tensor]] = []
+    run.train(
+        lambda: (
+            len(run.evaluations) > len(kept)
+            and kept.append({k: v.clone() for k, v in run.learner.policy.state_dict().items()})
+        )
+    )
+    run.close()
+    scores = [(record.success, record.spl) for record in run.evaluations]
+    best = max(range(len(scores)), key=lambda number: (scores[number], number))
+    observation = np.random.default_rng(0).random((5, 24), dtype=np.float32)
+    assert best == 1 < len(scores) - 1
+    chosen = run.evaluations[best]
+    card = load_policy(tmp_path).card
+    assert (card["steps"], card["episodes"]) == (chosen.total_steps, chosen.episode)
+    run.learner.policy.load_state_dict(kept[best])
+    expected = run.learner.policy.outputs({"observation": torch.from_numpy(observation)})["action"]
+    np.testing.assert_allclose(
+        load_policy(tmp_path)(observation), expected.detach().numpy(), atol=1e-5
+    )
+
+
+def test_rates_fall_linearly_in_long_runs_and_with_the_cube_in_short_ones(tmp_path: Path) -> None:
+    def rate_at_half(episodes: int) -> float:
+        run = TrainingRun(tiny(episodes=[Stage("A", episodes)]), tmp_path)
+        run.schedule.count(actions=1, episodes=episodes // 2)
+        run._anneal()
+        run.close()
+        return float(run.learner.optimizer.param_groups[0]["lr"])
+
+    assert rate_at_half(100) == pytest.approx(1e-4 / 8)
+    assert rate_at_half(1000) == pytest.approx(1e-4 / 2)
+
+
+@pytest.mark.parametrize("method", ["la3p", "mpfa_per"])
+def test_the_log_has_what_critic_and_actor_gave_whoever_learned_last(
+    tmp_path: Path, method: str
+) -> None:
+    settings = tiny(method)
+    settings.tracking.log_every = 1
+    run = TrainingRun(settings, tmp_path)
+    logged = []
+
+    def log(step: int, values: Any, buffer: Any, batch: Any) -> None:
+        logged.append({"loss_value", "loss_actor", "td_error"} <= set(values))
+        assert "td_error" in batch["signals"].keys()  # noqa: SIM118
+
+    run.tracker.log_update = log  # type: ignore[method-assign]
+    run.train()
+    run.close()
+    assert logged
+    assert all(logged)
+
+
+def test_klper_is_told_the_noise_of_the_episode_that_acts(tmp_path: Path) -> None:
+    run = TrainingRun(tiny("klper"), tmp_path)
+    run.explorer.shares.fill_(0.25)  # type: ignore[attr-defined]
+    assert run.explorer.sigma == pytest.approx(0.25 * run.settings.exploration.sigma)
+    run.close()

@@ -1,0 +1,153 @@
+"""The rows that tell what a run learned from, against plain loops."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+
+from tests.integration.tiny_runs import tiny, train
+from torchrl_mpfa.selection import Draw
+from training.records import read_table
+from training.run.checkpoints import read_checkpoint
+from training.run.loop import TrainingRun
+from training.run.updates import COLUMNS, UpdateLog
+
+
+def of_run(folder: Path) -> pd.DataFrame:
+    return read_table(folder / "updates.csv")
+
+
+@pytest.mark.parametrize("method", ["mpfa_per", "uniform", "klper"])
+def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
+    tmp_path: Path, method: str
+) -> None:
+    settings = tiny(method)
+    settings.environment.max_steps, settings.tracking.log_every = 18, 7
+    run = TrainingRun(settings, tmp_path)
+    learned: dict[int, int] = {}
+    rewards: list[float] = []
+    expected: list[dict[str, float]] = []
+    extend, prepared = run.buffer.extend, run._prepared
+
+    def extended(rows: Any) -> torch.Tensor:
+        index = extend(rows)
+        rewards.extend(rows["next", "reward"].flatten().tolist())
+        for slot in index.tolist():
+            learned.pop(slot, None)
+        return index
+
+    updates = 0
+
+    def sees(draw: Draw) -> Draw:
+        nonlocal updates
+        updates += 1
+        slots = draw.batch["index"].tolist()
+        ages = [updates - learned[slot] for slot in slots if slot in learned]
+        positive = (run.buffer[:]["next", "reward"].flatten() > 0).tolist()
+        every = [
+            updates - at for slot, at in ({**learned, **dict.fromkeys(slots, updates)}).items()
+        ]
+        expected.append(
+            {
+                "td_error_age": sum(ages) / len(ages) if ages else math.nan,
+                "fresh": 1 - len(ages) / len(slots),
+                "positive_batch": sum(positive[slot] for slot in slots) / len(slots),
+                "positive_buffer": sum(positive) / len(positive),
+                "td_error_age_buffer": sum(every) / len(every),
+            }
+        )
+        learned.update(dict.fromkeys(slots, updates))
+        return prepared(draw)
+
+    run.buffer.extend = extended  # type: ignore[method-assign]
+    run._prepared = sees  # type: ignore[method-assign]
+    run.train()
+    run.close()
+    found = of_run(tmp_path)
+    assert list(found.columns[: len(COLUMNS)]) == list(COLUMNS)
+    assert found["total_steps"].tolist() == list(range(7, run.actions + 1, 7))
+    for place, row in enumerate(found.to_dict("records")):
+        assert row["reward"] == pytest.approx(sum(rewards[7 * place : 7 * place + 7]))
+        assert row["average_reward"] == pytest.approx(row["reward"] / 7)
+        if row["updates"] == 0:
+            assert math.isnan(row["td_error"])
+            continue
+        assert row["td_error"] > 0
+        for name, value in expected[int(row["updates"]) - 1].items():
+            assert row[name] == pytest.approx(value, nan_ok=True), name
+    assert found["updates"].iloc[-1] > 20
+    assert found["td_error_age"].max() > 1
+    if method == "mpfa_per":
+        assert set(found["phi"]) == {3.0}
+        weights = found[[f"weight_{name}" for name in settings.method.signals]].dropna()
+        assert weights.sum(axis=1).tolist() == pytest.approx([1.0] * len(weights))
+    else:
+        assert found["phi"].isna().all()
+
+
+def test_the_error_is_the_mean_of_the_sizes_in_units_of_the_reward(tmp_path: Path) -> None:
+    run = TrainingRun(tiny(), tmp_path)
+    run.train(lambda: len(run.buffer) >= 25 and run.stop.ask())
+    log = UpdateLog(100, reward_scale=0.1)
+    log.learns(torch.arange(4))
+    squared = torch.tensor([0.04, 0.0, 0.01, 0.01])
+    log.learned({"td_error": squared})
+    log.add(25, episode=1, buffer=run.buffer)
+    run.close()
+    assert log.rows[0]["td_error"] == pytest.approx((2 + 0 + 1 + 1) / 4)
+
+
+def test_a_run_that_was_killed_and_goes_on_has_every_row_once(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.environment.max_steps, settings.tracking.log_every = 25, 3
+    settings.checkpoint_every = 20
+    train(tmp_path / "whole", settings)
+    part = TrainingRun(settings, tmp_path)
+    saved = part.save
+    # Nothing that comes after 44 actions is written, as if it had been killed there.
+    part.save = lambda: saved() if part.actions < 45 else None  # type: ignore[method-assign]
+    part.train(lambda: part.actions >= 50 and part.stop.ask())
+    part.close()
+    assert of_run(tmp_path)["total_steps"].tolist() == list(range(3, 41, 3))
+    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
+    resumed.train()
+    resumed.close()
+    pd.testing.assert_frame_equal(of_run(tmp_path), of_run(tmp_path / "whole"))
+
+
+def test_a_run_goes_on_whose_checkpoint_is_older_than_the_rows(tmp_path: Path) -> None:
+    settings = tiny()
+    settings.environment.max_steps, settings.tracking.log_every = 25, 5
+    part = TrainingRun(settings, tmp_path)
+    part.train(lambda: part.actions >= 40 and part.stop.ask())
+    part.close()
+    state = read_checkpoint(tmp_path)
+    del state["log"]
+    resumed = TrainingRun(settings, tmp_path, state)
+    resumed.train()
+    resumed.close()
+    assert of_run(tmp_path)["total_steps"].iloc[0] == 45
+
+
+def test_the_share_that_phi_follows_is_in_the_rows(tmp_path: Path) -> None:
+    settings = tiny("mpfa_adaptive")
+    settings.tracking.log_every = 5
+    train(tmp_path, settings)
+    phi = of_run(tmp_path)["phi"].dropna()
+    assert phi.between(1, 10).all()
+    assert phi.nunique() > 1
+
+
+def test_a_transition_in_the_place_of_an_old_one_was_never_learned_from() -> None:
+    log = UpdateLog(4, reward_scale=1.0)
+    log.wrote(torch.arange(4), torch.ones(4, 1))
+    log.learns(torch.arange(4))
+    log.wrote(torch.tensor([1]), torch.ones(1, 1))
+    log.learns(torch.tensor([0, 1]))
+    _, before, _ = log.state_dict()["last"]
+    assert before.tolist() == [1, -1]
