@@ -73,7 +73,7 @@ train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: t
 	$(BIN)/python examples/train.py regime=$(REGIME) learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
 
 paper: $(STAMP) ## Make the paper's figures and tables from runs/paper, and name missing runs
-	$(BIN)/python examples/report.py runs/paper --paper $(ARGS)
+	$(BIN)/python -m benchmarks.study paper runs/paper $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ALSO) $(ARGS)

@@ -1,1 +1,1 @@
-"""Measurements: speed against other libraries."""
+"""Measurements: speed against other libraries, and the study of when prioritized replay helps."""

@@ -3,8 +3,6 @@
     python examples/report.py runs/compare
     python examples/report.py runs/compare runs/more           the runs of both together
     python examples/report.py docs/results --output runs/results
-    python examples/report.py runs/paper --paper          the paper's figures and tables
-    python examples/report.py docs/results/study --study --output runs/pages    pages of the study
 
 Writes ``tables.md`` and ``evaluations.png`` (greedy success in the validation world over actions;
 the training of each run has a ``learning_curve.png`` in its folder). The arms of a study
@@ -12,15 +10,6 @@ the training of each run has a ``learning_curve.png`` in its folder). The arms o
 tables of their own. The unit is the run, not the episode: intervals are over runs, or over runs and
 pairs of start and goal, and tests compare the means of runs; see
 ``training/report/intervals.py``.
-
-With ``--paper`` it makes, from the runs there are, ``paper.md`` with Tables 2 to 4 next to the
-paper's numbers, ``figure_3.png``, ``figure_5.png``, ``figure_8.png`` to ``figure_11.png``,
-``figure_13.png``, and ``claims.png`` on what Section 2.4 says about PER. Missing runs are named,
-with the command that makes them.
-
-With ``--study`` it makes, from the runs of ``study.py`` or the rows that its ``--keep`` wrote, a
-page and figures for each table: curves, performance profiles, arms side by side, for table D replay
-volume by method; for table A, in ``paper/``, the output of ``--paper``, which needs the runs.
 """
 
 from __future__ import annotations
@@ -37,15 +26,9 @@ import pandas as pd
 
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.comparison.jobs import Study, run_name
-from training.comparison.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
-from training.comparison.protocol import paper_studies, tables
+from training.comparison.jobs import run_name
 from training.figures import Runs, plot_evaluations
 from training.records import read_table
-from training.report.kept_rows import is_kept
-from training.report.paper_figures import plot_paper
-from training.report.paper_tables import paper_tables
-from training.report.study_pages import write_study
 from training.report.tables import (
     comparison_table,
     interval_table,
@@ -105,58 +88,6 @@ def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
     return found
 
 
-def write_paper(wanted: Sequence[Study], output: Path) -> int:
-    """Make the paper's tables and figures of the runs that there are, and name the others.
-
-    Args:
-        wanted: The study of all methods, and that of Fig. 5.
-        output: Where they go.
-
-    Returns:
-        Exit status: 1 if there are no runs at all.
-    """
-    trained, updates, tested = (
-        read_runs(wanted, find)
-        for find in (
-            lambda job: job.path / files.EPISODES,
-            lambda job: job.path / files.UPDATES,
-            evaluation_of,
-        )
-    )
-    absent = missing_lines(wanted)
-    text = paper_tables(trained, tested)
-    if absent:
-        text += f"\n\n## Missing\n\n{absent}"
-    print(text)
-    if not trained:
-        return 1
-    output.mkdir(parents=True, exist_ok=True)
-    write_text_atomically(text + "\n", output / "paper.md")
-    for path in plot_paper(trained, updates, output):
-        print(f"written: {path}")
-    return 0
-
-
-def report_study(folder: Path, output: Path) -> int:
-    """Make the pages and figures of the study.
-
-    Args:
-        folder: Of its runs, or of the rows that are kept of them.
-        output: Where they go.
-
-    Returns:
-        Exit status: 1 if there are no rows.
-    """
-    made = write_study(folder, output)
-    for path in made:
-        print(f"written: {path}")
-    if not made:
-        print(f"{folder} has no rows of the study, which study.py makes", file=sys.stderr)
-    elif output / "A.md" in made and not is_kept(folder):
-        write_paper(paper_studies(tables(folder)["A"]), output / "paper")
-    return 0 if made else 1
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Read the rows, write tables and figures.
 
@@ -171,35 +102,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
     parser.add_argument("--output", type=Path, help="folder (default: the first study's)")
-    parser.add_argument("--paper", action="store_true", help="the paper's figures and tables")
-    parser.add_argument("--study", action="store_true", help="the pages of the study")
-    parser.add_argument(
-        "--seeds", type=int, default=RUNS, help=f"runs that --paper wants (default: {RUNS})"
-    )
     options = parser.parse_args(arguments)
     output = options.output or options.folders[0]
-    if options.seeds < 1:
-        parser.error(f"--seeds must be at least 1, got {options.seeds}")
-    for name in ("paper", "study"):
-        if getattr(options, name) and len(options.folders) > 1:
-            parser.error(f"--{name} takes one folder, got {len(options.folders)}")
     there = [folder.resolve() for folder in options.folders]
     for folder, path in zip(options.folders, there, strict=True):
         if there.count(path) > 1:
             parser.error(f"{folder} is named twice: its runs count once")
     try:
         files.check_folder(output)
-        return report(options, output)
+        return report(options.folders, output)
     except ValueError as error:
         parser.error(" ".join(str(error).split()))
 
 
-def report(options: argparse.Namespace, output: Path) -> int:
-    """Write what the command line asks for.
+def report(folders: Sequence[Path], output: Path) -> int:
+    """Write tables and figures of some studies.
 
     Args:
-        options: The command line.
-        output: Where it goes.
+        folders: Their folders.
+        output: Where they go.
 
     Returns:
         Exit status.
@@ -207,14 +128,10 @@ def report(options: argparse.Namespace, output: Path) -> int:
     Raises:
         ValueError: If there are no rows, or none that can be read.
     """
-    if options.paper:
-        return write_paper(studies(options.folders[0], seeds=options.seeds), output)
-    if options.study:
-        return report_study(options.folders[0], output)
-    rows = read_studies(options.folders)
+    rows = read_studies(folders)
     if not len(rows):
-        folders = ", ".join(str(folder) for folder in options.folders)
-        raise ValueError(f"{folders}: no {files.EPISODES} with rows, which compare.py writes")
+        names = ", ".join(str(folder) for folder in folders)
+        raise ValueError(f"{names}: no {files.EPISODES} with rows, which compare.py writes")
     output.mkdir(parents=True, exist_ok=True)
     parts = []
     for physics, driven in rows.groupby("physics", sort=False):

@@ -150,6 +150,11 @@ def test_only_the_tracking_of_the_training_application_imports_wandb():
     }
 
 
+def test_nothing_imports_the_benchmarks():
+    users = importers(EVERYTHING, {"benchmarks"})
+    assert {user.split("/")[0] for user in users} == {"benchmarks", "tests"}
+
+
 def test_the_training_application_s_folders_import_those_that_come_before_them():
     folder = ROOT / "examples/training"
     allowed = {

@@ -7,26 +7,22 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import cliffwalk
 import compare
 import evaluate
 import export
-import gym_study
-import pictures
 import play
-import plot_sampling
 import report
 import stable_baselines
-import strength
-import study
 import torchrl_sac
 import torchrl_trainer
 from benchmarks.speed import environment, scaling, worlds
+from benchmarks.study.__main__ import COMMANDS
 from training.settings.command_line import parse_overrides
 from training.settings.train import register
 from training.worlds import parse_worlds
@@ -44,23 +40,21 @@ SHELL = (
 
 
 MAINS: dict[str, Callable[[], object]] = {
-    "cliffwalk": cliffwalk.main,
     "compare": compare.main,
     "evaluate": evaluate.main,
     "export": export.main,
-    "gym_study": gym_study.main,
-    "pictures": pictures.main,
     "play": play.main,
-    "plot_sampling": plot_sampling.main,
     "report": report.main,
     "stable_baselines": stable_baselines.main,
-    "strength": strength.main,
-    "study": study.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
     "benchmarks.speed.environment": environment.main,
     "benchmarks.speed.scaling": scaling.main,
     "benchmarks.speed.worlds": worlds.main,
+    **{
+        f"benchmarks.study {name}": import_module(f"benchmarks.study.{module}").main
+        for name, (module, _) in COMMANDS.items()
+    },
 }
 
 
@@ -89,6 +83,8 @@ def commands() -> list[tuple[str, ...]]:
 
 def main_of(words: Sequence[str]) -> tuple[str, list[str]]:
     """The script or module of a command, and what follows it."""
+    if words[:2] == ("-m", "benchmarks.study"):
+        return " ".join(words[1:3]), list(words[3:])
     if words[0] == "-m":
         return words[1], list(words[2:])
     assert (ROOT / words[0]).exists()
@@ -104,7 +100,7 @@ def understand(words: Sequence[str]) -> None:
         return
     sys.argv = [script, *arguments]
     with pytest.raises(Parsed) as found:
-        MAINS[script]()
+        MAINS[script](*[arguments] * script.startswith("benchmarks.study"))
     options = found.value.args[0]
     if script == "compare":
         parse_overrides(options.overrides)

@@ -8,12 +8,12 @@ from importlib import import_module
 
 import pytest
 
-import control
+import benchmarks.study
 import training
 
 MODULES = [
     module.name
-    for package in (control, training)
+    for package in (benchmarks.study, training)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
 ]
 
@@ -25,5 +25,5 @@ def test_the_examples_of_a_module_give_what_they_say(name: str) -> None:
 
 def test_there_are_examples_to_run() -> None:
     finder = doctest.DocTestFinder()
-    found = finder.find(import_module("training.comparison.protocol"))
+    found = finder.find(import_module("benchmarks.study.protocol"))
     assert sum(bool(each.examples) for each in found) >= 3

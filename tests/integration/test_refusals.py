@@ -11,14 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cliffwalk
 import compare
 import evaluate
 import export
-import gym_study
-import plot_sampling
 import report
-import study
 import train
 
 POLICY = str(Path(__file__).parents[2] / "examples/policies/td3-mpfa_per.npz")
@@ -104,19 +100,9 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (report.main, "nothing", "episodes.csv is damaged, its rows cannot be read"),
         (report.main, "run", "has no column learner: name the folder of a study"),
         (report.main, "run --output file", A_FILE),
-        (report.main, "run --seeds 0", "--seeds must be at least 1, got 0"),
-        (study.main, "Z", "there is no table Z"),
-        (study.main, "C --folder file", A_FILE),
-        (study.main, "C --keep file", A_FILE),
         (export.main, "damaged.npz", "damaged.npz"),
         (export.main, f"{POLICY} --output file/policy.onnx", f"--output: {A_FILE}"),
         (export.main, f"{POLICY} --output rows", "--output must end in .onnx, got rows"),
-        (gym_study.main, "--actions 400", "actions must be at least .*, 1000, got 400"),
-        (cliffwalk.main, "--lengths 1", "--lengths"),
-        (cliffwalk.main, "--eps inf", "--eps must be positive and finite, got inf"),
-        (cliffwalk.main, "--output file", f"--output: {A_FILE}"),
-        (plot_sampling.main, "pr", "did you mean 'per'"),
-        (plot_sampling.main, "per --output file", f"--output: {A_FILE}"),
     ],
 )
 def test_a_wrong_command_line_is_one_sentence_and_status_2(
@@ -163,7 +149,7 @@ def test_without_pybullet_simulated_wheels_are_refused_before_anything_has_begun
     assert sorted(folder.rglob("*")) == before
 
 
-@pytest.mark.parametrize("script", ["train", "evaluate", "compare", "report", "study"])
+@pytest.mark.parametrize("script", ["train", "evaluate", "compare", "report"])
 def test_without_its_extra_a_script_says_so_in_one_sentence(script: str, tmp_path: Path) -> None:
     file = Path(train.__file__ or "").with_name(f"{script}.py")
     hidden = (

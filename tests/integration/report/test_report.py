@@ -66,7 +66,7 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
     no = "none, no spread"
     assert f"| ddpg/per | 2 | success | 0.000 | {no} | {no} | {no} |  |" in text
     assert f"| ddpg/per | 2 | SPL | 0.000 | {no} | {no} | {no} | 0.000 {no} |" in text
-    assert "90.5%" not in text and "85.5%" not in text  # The paper's, which --paper compares with.
+    assert "90.5%" not in text and "85.5%" not in text  # The paper's.
     # From zero to 0.5 in 5,000 steps, then to 1 in 4,000: (1250 + 3000) / 9000.
     assert "| ddpg | mpfa_per | 9,000; 9,000 | 0.472 | 0.472, 0.472 |" in text
     # Two runs against two: six ways to deal them out, two of which differ as much.
