@@ -1,0 +1,145 @@
+"""DDPG with MPFA-PER on sixteen robots, all of it on one page: parts, loop, evaluation, policy.
+
+    python examples/ddpg.py                                      about a minute
+    python examples/ddpg.py --seed 1 --out runs/ddpg-1
+    python examples/evaluate.py runs/ddpg --worlds mazes:test    drives the policy that it wrote
+
+``train.py`` is this with settings, checkpoints, records, and other methods and learners.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.modules import AdditiveGaussianModule
+from tqdm import tqdm
+
+import torchrl_mpfa as mpfa
+from mpfa_envs import ROOMS_TASK, Policy, RandomMirror, evaluate, make_navigation_env, save_policy
+
+ROBOTS = 16
+STEPS = 8
+"""Actions of each robot between two rounds of updates."""
+ACTIONS_PER_UPDATE = 4
+"""Of all robots together."""
+CAPACITY = 100_000
+BATCH_SIZE = 256
+LEARNING_RATE = 3e-4
+EVALUATE_EVERY = 5_000
+"""Actions of all robots between two evaluations."""
+EPISODES = 100
+"""Episodes of an evaluation."""
+
+
+def main(arguments: Sequence[str] | None = None) -> Path:
+    """Train, and write the policy that did best in the validation worlds.
+
+    Args:
+        arguments: The command line.
+
+    Returns:
+        The file of the policy.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--actions", type=int, default=50_000, help="of all robots together")
+    parser.add_argument("--out", type=Path, default=Path("runs/ddpg"), help="folder of the policy")
+    options = parser.parse_args(arguments)
+    torch.manual_seed(options.seed)
+    torch.set_num_threads(1)  # With networks this small a second one gains nothing.
+    torch.set_flush_denormal(True)  # Tiny numbers would slow a CPU down.
+
+    # Sixteen robots, each in a new room in every episode. What brings them closer to the goal along
+    # the shortest path is rewarded.
+    env = make_navigation_env(
+        **ROOMS_TASK, num_envs=ROBOTS, info_keys=["success"], seed=options.seed
+    )
+    size = env.observation_spec["observation"].shape[-1]
+
+    # MPFA-PER: three signals of a transition (reward, TD error, action gradient), one priority.
+    buffer = mpfa.SignalReplayBuffer(
+        storage=mpfa.SignalTensorStorage(CAPACITY),
+        sampler=mpfa.MPFASampler(CAPACITY),
+        batch_size=BATCH_SIZE,
+    )
+    # Left and right are alike: half of what is sampled is shown in the mirror.
+    buffer.append_transform(RandomMirror(memory=ROOMS_TASK["memory"]))
+
+    # DDPG. The penalty keeps actions out of the flat ends of the tanh, where nothing is learned.
+    actor, critic = mpfa.make_actor(size, 2, width=64), mpfa.make_critic(size, 2, width=64)
+    loss = mpfa.make_ddpg_loss(actor, critic, reward_scale=0.1, saturation_penalty=1.0)
+    learner = mpfa.DDPGLearner(loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005)
+
+    # The first robot acts without noise, the last with all of it, and the others in between: what
+    # the policy does by itself, driving in circles included, is in the data from the start.
+    noise = AdditiveGaussianModule(
+        env.action_spec,
+        sigma_init=1.0,
+        sigma_end=0.2,
+        annealing_num_steps=20_000,
+        std=torch.linspace(0.0, 1.0, ROBOTS).unsqueeze(-1).tolist(),
+    )
+    collector = Collector(
+        env,
+        TensorDictSequential(actor, noise),
+        frames_per_batch=ROBOTS * STEPS,
+        total_frames=options.actions,
+        auto_register_policy_transforms=True,
+    )
+
+    collected, best, most, endings = 0, policy_of(actor), -1.0, []
+    with tqdm(total=options.actions, unit="action", smoothing=0.05) as bar:
+        for steps in collector:  # [ROBOTS, STEPS]
+            buffer.extend(steps.reshape(-1))
+            if len(buffer) >= BATCH_SIZE:
+                # Sample, learn, fuse the signals of what was sampled, boost, decay.
+                mpfa.run_updates(buffer, learner, updates=steps.numel() // ACTIONS_PER_UPDATE)
+            before, collected = collected, collected + steps.numel()
+            done = min(collected / options.actions, 1.0)
+            noise.step(steps.numel())
+            buffer.anneal(beta=0.4 + 0.6 * done, fraction=done)  # As in PER, beta rises to 1.
+            learner.anneal(1.0 - done)
+
+            endings += steps["next", "info", "success"][steps["next", "done"]].tolist()
+            bar.set_postfix_str(f"success lately {sum(endings[-100:])} %, at best {most:.0%}")
+            bar.update(min(collected, options.actions) - bar.n)
+            if done == 1.0 or before // EVALUATE_EVERY < collected // EVALUATE_EVERY:
+                policy = policy_of(actor)
+                success = success_of(policy, "mixed:validation")
+                if success >= most:
+                    best, most = policy, success
+    collector.shutdown()
+
+    print(f"success in validation worlds, by which the policy was chosen: {most:.0%}")
+    print(f"success in test worlds: {success_of(best, 'mixed:test'):.0%}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    file = save_policy(best, options.out)
+    print(f"written: {file}")
+    return file
+
+
+def policy_of(actor: TensorDictModule, **card: object) -> Policy:
+    """A copy of the actor without noise, which needs no PyTorch.
+
+    It says what a policy must find again wherever it drives: how the robot moves and senses.
+    """
+    senses = {name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")}
+    card = {"learner": "ddpg", "method": "mpfa_per", **card}
+    return Policy.from_layers(actor.module.layers(), card=card, env_arguments=senses)
+
+
+def success_of(policy: Policy, worlds: str) -> float:
+    """Share of the episodes in these worlds that reach the goal."""
+    results = evaluate(policy, worlds, episodes=EPISODES)
+    return sum(each.success for each in results) / len(results)
+
+
+if __name__ == "__main__":
+    main()
