@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         auto_register_policy_transforms=True,
     )
 
-    collected, best, most, endings = 0, policy_of(actor), -1.0, []
+    collected, best, most, endings = 0, policy_of(actor), 0.0, []
     with tqdm(total=options.actions, unit="action", smoothing=0.05) as bar:
         for steps in collector:  # [ROBOTS, STEPS]
             buffer.extend(steps.reshape(-1))
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
             bar.set_postfix_str(f"success lately {sum(endings[-100:])} %, at best {most:.0%}")
             bar.update(min(collected, options.actions) - bar.n)
             if done == 1.0 or before // EVALUATE_EVERY < collected // EVALUATE_EVERY:
-                policy = policy_of(actor)
+                policy = policy_of(actor, seed=options.seed, steps=collected)
                 success = success_of(policy, "mixed:validation")
                 if success >= most:
                     best, most = policy, success
@@ -130,9 +130,13 @@ def policy_of(actor: TensorDictModule, **card: object) -> Policy:
 
     It says what a policy must find again wherever it drives: how the robot moves and senses.
     """
-    senses = {name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")}
-    card = {"learner": "ddpg", "method": "mpfa_per", **card}
-    return Policy.from_layers(actor.module.layers(), card=card, env_arguments=senses)
+    return Policy.from_layers(
+        actor.module.layers(),
+        card={"learner": "ddpg", "method": "mpfa_per", **card},
+        env_arguments={
+            name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")
+        },
+    )
 
 
 def success_of(policy: Policy, worlds: str) -> float:

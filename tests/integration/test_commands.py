@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 import compare
+import ddpg
 import evaluate
 import export
 import play
@@ -41,6 +42,7 @@ SHELL = (
 
 MAINS: dict[str, Callable[[], object]] = {
     "compare": compare.main,
+    "ddpg": ddpg.main,
     "evaluate": evaluate.main,
     "export": export.main,
     "play": play.main,
@@ -96,7 +98,7 @@ def understand(words: Sequence[str]) -> None:
     script, arguments = main_of(words)
     if script == "train":
         parse_overrides(arguments)
-    if script in ("train", "quickstart", "torchrl_config"):
+    if script in ("train", "torchrl_config"):
         return
     sys.argv = [script, *arguments]
     with pytest.raises(Parsed) as found:
