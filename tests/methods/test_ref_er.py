@@ -16,7 +16,7 @@ from torchrl_mpfa import (
     make_td3_loss,
 )
 from torchrl_mpfa.learners.gradients import Gradients
-from torchrl_mpfa.losses.trust import Trust, trusted_loss
+from torchrl_mpfa.losses.functional import Trust, trusted_loss
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, importance_ratio, next_weight
 

@@ -84,11 +84,9 @@ def next_values(name, learner, batch):
         action = networks.target_actor.outputs(after)["action"]
         if name == "td3":
             action = (action + loss.target_noise(action)).clamp(-1, 1)
-            critics = networks.target_critics
-        else:
-            critics = [networks.target_critic]
         given = {"observation": after["observation"], "action": action}
-        return torch.stack([c.outputs(given)["state_action_value"].squeeze(-1) for c in critics])
+        each = [critic.outputs(given) for critic in networks.target_critics]
+        return torch.stack([found["state_action_value"].squeeze(-1) for found in each])
 
 
 @pytest.mark.parametrize("name", MAKE)

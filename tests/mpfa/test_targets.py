@@ -83,7 +83,6 @@ def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
     batch = of_several_steps(done_keys=["done"])
     _, loss = make_pair(name)
     networks = loss._networks()
-    critics = networks.target_critics if name == "td3" else [networks.target_critic]
     torch.manual_seed(3)
     compute = loss.value_loss if name == "td3" else loss.loss_value
     found = compute(batch)[1]["target_value"]
@@ -93,7 +92,7 @@ def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
         after = batch["next"][row]
         action = networks.target_actor.module(after["observation"])[1] + noise[row]
         action = action.clamp(-1.0, 1.0)
-        value = min(float(q.module(after["observation"], action)) for q in critics)
+        value = min(float(q.module(after["observation"], action)) for q in networks.target_critics)
         expected = float(after["reward"])
         if not bool(after["terminated"]):
             expected += GAMMA ** int(batch["steps_to_next_obs"][row]) * value

@@ -17,7 +17,7 @@ from torchrl_mpfa.losses import (
     make_sac_loss,
     make_td3_loss,
 )
-from torchrl_mpfa.losses.writing import DEFAULT_SIGNALS
+from torchrl_mpfa.losses.base import DEFAULT_SIGNALS
 
 
 @dataclass

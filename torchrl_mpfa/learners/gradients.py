@@ -15,16 +15,18 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.func import functional_call, grad, grad_and_value
 
-from torchrl_mpfa.losses.calling import Parts
+from torchrl_mpfa.losses.base import VALUE
 from torchrl_mpfa.losses.functional import (
+    Trust,
     bootstrap_target,
     critic_loss,
     least_value,
+    read_trust,
     saturation,
     smoothed_action,
+    trusted_loss,
 )
-from torchrl_mpfa.losses.trust import Trust, read_trust, trusted_loss
-from torchrl_mpfa.losses.writing import VALUE
+from torchrl_mpfa.losses.parts import Parts
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.selection import Trains

@@ -1,45 +1,57 @@
-"""What the losses of this package share: their options, the signals, and the critics' loss."""
+"""What the losses share: options, networks, signals (Eqs. 13-14), and means over the batch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
 from torchrl_mpfa.losses.averaging import AveragedNetwork, PastCritics
-from torchrl_mpfa.losses.calling import Tensors, call, read_inputs
-from torchrl_mpfa.losses.functional import DISTANCES, action_gradient, critic_loss, saturation
-from torchrl_mpfa.losses.refusals import check_networks
-from torchrl_mpfa.losses.targets import EstimatedTargets
-from torchrl_mpfa.losses.trust import read_trust, trusted_loss
-from torchrl_mpfa.losses.writing import DEFAULT_SIGNALS, WRITTEN, SignalWriting
+from torchrl_mpfa.losses.calling import Networks, StackedNetworks, Tensors, bind, call
+from torchrl_mpfa.losses.functional import (
+    DISTANCES,
+    action_gradient,
+    bootstrap_target,
+    critic_loss,
+    read_trust,
+    saturation,
+    trusted_loss,
+)
+from torchrl_mpfa.losses.parts import Parts, parts_of
 from torchrl_mpfa.networks import DirectModule
+from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.selection import Trains
-from torchrl_mpfa.signals import ACTION_GRADIENT
+from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
 
 Importance = Literal["critic", "torchrl", "none"]
+VALUE = "value"
+"""Name of the signal that is Q itself, which may be negative."""
+DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
+_SIGNALS = (*DEFAULT_SIGNALS, VALUE)
+_ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
-class CriticStep(NamedTuple):
-    """The loss of the critics, and what it was computed from."""
+@dataclass
+class SignalKeys:
+    """Keys that a loss of this package reads or writes beside those of TorchRL's loss."""
 
-    loss: Tensor
-    value: Tensor
-    """Q of each critic, shape ``[C, B]``."""
-    td_error: Tensor
-    """Target less value, shape ``[C, B]``."""
-    target: Tensor
-    """Shape ``[B]``."""
-    next_value: Tensor
-    """Value of the next state in the target, shape ``[B]``."""
+    action: NestedKey = "action"
+    preactivation: NestedKey = "preactivation"
+    td_error_signal: NestedKey = TD_ERROR.key
+    action_gradient_signal: NestedKey = ACTION_GRADIENT.key
+    value_signal: NestedKey = (SIGNALS_KEY, VALUE)
+    bend: NestedKey = "bend"
 
 
-class SignalLoss(SignalWriting, EstimatedTargets):
+class SignalLoss:
     r"""Options of the losses that write signals; mixed into one of TorchRL's.
 
     A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|` (Eq. 13) and
@@ -77,7 +89,11 @@ class SignalLoss(SignalWriting, EstimatedTargets):
     """
 
     loss_function: str
-    _critic_name: ClassVar[str]
+    tensor_keys: Any
+    value_estimator: Any
+    value_type: Any
+    _value_estimator: Any
+    _critic_name: ClassVar[str] = "qvalue_network"
     """TorchRL's name of the critic."""
 
     def __init__(
@@ -96,14 +112,11 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         **kwargs: Any,
     ) -> None:
         # Before TorchRL's constructor changes the networks.
-        check_networks(actor_network, critic_network, critic_name=self._critic_name)
-        unknown = [name for name in signals if name not in WRITTEN]
+        _check_networks(actor_network, critic_network, critic_name=self._critic_name)
+        unknown = [name for name in signals if name not in _SIGNALS]
         if unknown:
-            raise ValueError(f"signals must be among {WRITTEN}, got {unknown}")
-        if importance not in ("critic", "torchrl", "none"):
-            raise ValueError(
-                f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}"
-            )
+            raise ValueError(f"signals must be among {_SIGNALS}, got {unknown}")
+        check_importance(importance)
         if kwargs.get("loss_function", "l2") not in DISTANCES:
             raise ValueError(
                 f"loss_function must be one of {DISTANCES}, got {kwargs['loss_function']!r}"
@@ -132,40 +145,15 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         self.saturation_limit = saturation_limit
         self.target_average = target_average
         self.pal_alpha = pal_alpha
-        self._bound: Any = None
+        self._bound: Networks | None = None
         self._deferred: tuple[Tensor, Tensor] | None = None
+        """Actions and values whose gradients the backward pass of the loss will find."""
         # A list of modules, so that the past is saved, loaded and moved with the loss.
         self.past_critics = nn.ModuleList()
         if target_average > 1:
             # Of the current critics, which the target critics equal at the start.
             for network in self._held_critics(""):
                 self.past_critics.append(PastCritics(network.module, target_average - 1))
-
-    def current_critics(self) -> list[TensorDictModule]:
-        """The critics as modules of their own, for looking at Q: they get no gradient."""
-        return self._held_critics("")
-
-    # What each loss has of its own.
-
-    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
-        """Critics that hold the parameters whose name has this prefix, and get no gradient."""
-        raise NotImplementedError
-
-    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Q of the current critics, ``[C, B]``; the action leads to the first one alone."""
-        raise NotImplementedError
-
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        """Value of the next states in the targets, shape ``[B]``."""
-        raise NotImplementedError
-
-    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Tensors]:
-        """Loss of the critics under TorchRL's name for it, and values for the log."""
-        raise NotImplementedError
-
-    def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Loss of the actor, and others by the same batch, by name; and values for the log."""
-        raise NotImplementedError
 
     # What a learner asks for.
 
@@ -200,11 +188,55 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             values.update(more)
         return losses, values
 
+    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Tensors]:
+        """Loss of the critics under TorchRL's name for it, and values for the log."""
+        raise NotImplementedError
+
+    def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Loss of the actor, and others by the same batch, by name; and values for the log."""
+        raise NotImplementedError
+
+    def write_action_gradient(self, tensordict: TensorDictBase) -> None:
+        r"""Write the signal of Eq. (14) that the critics' loss was asked to defer.
+
+        A transition's action enters the loss through its own Q alone, so
+        :math:`\nabla_a Q = \nabla_a L / (\partial L / \partial Q)`: the backward pass of the loss
+        has found it on its way, and needs no other one before it.
+
+        Args:
+            tensordict: The batch that the loss was computed of; nothing happens if it deferred
+                nothing.
+
+        Raises:
+            RuntimeError: If the loss was not differentiated.
+        """
+        if self._deferred is None:
+            return
+        (action, value), self._deferred = self._deferred, None
+        if action.grad is None or value.grad is None:
+            raise RuntimeError(
+                "the action gradient was deferred: call backward() on the loss first"
+            )
+        slope = value.grad[0].unsqueeze(-1)
+        gradient = action.grad / slope
+        flat = slope == 0
+        if bool(flat.any()):  # Where there is no error there is nothing to divide.
+            action = action.detach().requires_grad_(True)
+            with torch.enable_grad():
+                critic = self._networks().frozen_critics[0]
+                value = self._q(critic, tensordict, {self.tensor_keys.action: action})
+                gradient = torch.where(flat, action_gradient(value, action), gradient)
+        self._write_gradient(tensordict, gradient)
+
     def keep_target_critics(self) -> None:
         """Keep the target critics as they are now for the average that later targets have."""
         if self.past_critics:
             for critic, past in zip(self._held_critics("target_"), self.past_critics, strict=True):
                 past.push(critic.module)  # type: ignore[operator]
+
+    def current_critics(self) -> list[TensorDictModule]:
+        """The critics as modules of their own, for looking at Q: they get no gradient."""
+        return self._held_critics("")
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """What the actor's loss moves."""
@@ -218,16 +250,29 @@ class SignalLoss(SignalWriting, EstimatedTargets):
         flat = getattr(self, f"{name}_params").flatten_keys().values()
         return [value for value in flat if value.requires_grad]
 
-    # The critics' loss.
+    # The critics' loss, in the order of its steps.
 
-    def _critic_step(
-        self, tensordict: TensorDictBase, *, defer_gradient: bool, loss_function: str | None
-    ) -> CriticStep:
-        """Loss of the critics (Eq. 11); writes the signals (Eqs. 13-14) in ``tensordict``."""
+    def _q(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
+        """Q of a critic, shape ``[B]``, at the states of ``source`` and the actions chosen."""
+        found: Tensor = call(critic, source, chosen)[self.tensor_keys.state_action_value]
+        return found.squeeze(-1)
+
+    def _values(self, source: TensorDictBase, action: Tensor) -> Tensor:
+        """Q of the current critics, ``[C, B]``; the action leads to the first one alone."""
+        critic, keys = self._networks().critic, self.tensor_keys
+        if not isinstance(critic, StackedNetworks):
+            return self._q(critic, source, {keys.action: action}).unsqueeze(0)
+        others = len(self._networks().target_critics) - 1
+        found = critic.call(
+            source, [{keys.action: a} for a in [action, *[action.detach()] * others]]
+        )
+        return torch.stack([out[keys.state_action_value].squeeze(-1) for out in found])
+
+    def _stored_values(self, tensordict: TensorDictBase, *, defer_gradient: bool) -> Tensor:
+        """Q of the stored actions, ``[C, B]``; writes its slope (Eq. 14), or defers that."""
         self._deferred = None
         with_slope = ACTION_GRADIENT.name in self.signals
         differentiable = torch.is_grad_enabled()
-        name = loss_function or self.loss_function
         action = tensordict[self.tensor_keys.action].detach()
         # The slope is wanted under no_grad as well, when a loss is only looked at.
         with torch.set_grad_enabled(with_slope or differentiable):
@@ -239,37 +284,144 @@ class SignalLoss(SignalWriting, EstimatedTargets):
                 self._deferred = action, value
             elif with_slope:
                 self._write_gradient(tensordict, action_gradient(value[0], action))
-        if not differentiable:
-            value = value.detach()
+        return value if differentiable else value.detach()
 
-        with torch.no_grad():
-            next_value = self._next_value(tensordict["next"])
-            target = self._target(tensordict, next_value)
-        td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, value)
+    def _target(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
+        """Targets by the loss's value estimator, Eq. (5) unless told otherwise, shape ``[B]``."""
+        after, keys, estimator = tensordict["next"], self.tensor_keys, self.value_estimator
+        if not self.bootstraps_once:
+            scaled = scale_rewards(tensordict, keys, self.reward_scale)
+            longer: Tensor = estimator.value_estimate(scaled, next_value=next_value.unsqueeze(-1))
+            return longer.squeeze(-1)
+        steps = tensordict.get(estimator.tensor_keys.steps_to_next_obs, None)
+        reward = after[keys.reward] * self.reward_scale
+        return bootstrap_target(
+            reward.reshape(next_value.shape),
+            next_value,
+            after[keys.terminated].reshape(next_value.shape),
+            gamma=estimator.gamma,
+            steps=None if steps is None else steps.reshape(next_value.shape),
+        )
+
+    def _write_signals(self, tensordict: TensorDictBase, td_error: Tensor, value: Tensor) -> None:
+        """Write ``|TD error|`` (Eq. 13), the largest of the critics, and Q of the first."""
+        if TD_ERROR.name in self.signals:
+            size = td_error_priority(td_error).amax(0)
+            tensordict.set(self.tensor_keys.td_error_signal, size / self.reward_scale)
+        if VALUE in self.signals:
+            tensordict.set(self.tensor_keys.value_signal, value[0].detach() / self.reward_scale)
+
+    def _write_gradient(self, tensordict: TensorDictBase, gradient: Tensor) -> None:
+        """Write the norm of the gradient of the first critic (Eq. 14)."""
+        size = action_gradient_priority(gradient, order=self.gradient_order)
+        tensordict.set(self.tensor_keys.action_gradient_signal, size / self.reward_scale)
+
+    def _critic_mean(
+        self, tensordict: TensorDictBase, value: Tensor, target: Tensor, loss_function: str | None
+    ) -> Tensor:
+        """Loss of the critics (Eq. 4), with the importance weights of Eq. (11) or TorchRL's."""
         bend = tensordict.get(self.tensor_keys.bend, None)
         loss = critic_loss(
             value,
             target,
-            name,
+            loss_function or self.loss_function,
             unit=self.reward_scale * (1.0 if bend is None else bend.reshape(-1)),
             pal_alpha=self.pal_alpha,
         )
-        return CriticStep(self._weigh(loss, tensordict), value, td_error, target, next_value)
-
-    def _weigh(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Mean over the batch, with the importance weights of Eq. (11), or TorchRL's way."""
         if self.importance == "critic":
             weight = tensordict.get(self.tensor_keys.priority_weight, None)
             if weight is not None:
                 loss = loss * weight.reshape(loss.shape).to(loss.device)
-        return self._reduce(loss, tensordict)
+        return self._mean(tensordict, loss)
 
-    def _reduce(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _mean(self, tensordict: TensorDictBase, loss: Tensor) -> Tensor:
         """Mean over the batch; with ``importance="torchrl"`` by TorchRL's weights."""
         weights = self._maybe_get_priority_weight(tensordict)  # type: ignore[attr-defined]
         reduced: Tensor = self._reduce_loss(loss, tensordict=tensordict, weights=weights)  # type: ignore[attr-defined]
         return reduced
+
+    # The actor's loss.
+
+    def _actor_mean(
+        self,
+        tensordict: TensorDictBase,
+        loss: Tensor,
+        action: Tensor,
+        preactivation: Tensor | None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean of the losses ``[B]`` of an actor, with the penalty on saturation; and its log."""
+        mean = self._mean(tensordict, trusted_loss(loss, action, read_trust(tensordict)))
+        if preactivation is None:
+            if self.saturation_penalty > 0:
+                raise KeyError(
+                    f"saturation_penalty is {self.saturation_penalty}, but the actor writes no "
+                    f"{self.tensor_keys.preactivation!r}"
+                )
+            return mean, {}
+        if self.saturation_penalty > 0:
+            penalty = saturation(preactivation, limit=self.saturation_limit)
+            mean = mean + self.saturation_penalty * penalty
+        return mean, {"preactivation": preactivation.detach().abs()}
+
+    # The estimator of the targets.
+
+    @property
+    def bootstraps_once(self) -> bool:
+        """Whether a target needs its own transition alone, as in Eq. (5)."""
+        estimator = self.value_estimator
+        return type(estimator) is TD0Estimator and not estimator.average_rewards
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
+        """As in TorchRL: set how targets are made, by TD(0), TD(1) or TD(lambda).
+
+        Args:
+            value_type: A member of :class:`~torchrl.objectives.ValueEstimators`, or an estimator.
+            **hyperparams: Of the estimator; ``gamma`` among them.
+
+        Returns:
+            What TorchRL's method gives.
+
+        Raises:
+            ValueError: If it is another estimator.
+        """
+        kept = self._value_estimator, self.value_type
+        try:
+            found = super().make_value_estimator(value_type, **hyperparams)  # type: ignore[misc]
+        except NotImplementedError as error:
+            self._value_estimator, self.value_type = kept
+            raise ValueError(f"value_type is not supported: {error}") from error
+        if not isinstance(self._value_estimator, _ESTIMATORS):
+            made = type(self._value_estimator).__name__
+            self._value_estimator, self.value_type = kept
+            names = ", ".join(each.__name__ for each in _ESTIMATORS)
+            raise ValueError(f"value_type must make one of {names}, got {made}")
+        self._forward_value_estimator_keys()  # type: ignore[attr-defined]
+        return found
+
+    # The networks, made once: they hold the parameters of the loss.
+
+    def _networks(self) -> Networks:
+        if self._bound is None:
+            actor, params = self.actor_network, self.actor_network_params  # type: ignore[attr-defined]
+            target = self.target_actor_network_params  # type: ignore[attr-defined]
+            critic, of_critic = (
+                getattr(self, f"{self._critic_name}{end}") for end in ("", "_params")
+            )
+            self._bound = Networks(
+                actor=bind(actor, params),
+                critic=(StackedNetworks if of_critic.batch_size else bind)(critic, of_critic),
+                frozen_critics=self._held_critics(""),
+                target_actor=bind(actor, target).requires_grad_(False),
+                target_critics=self._averaged_critics(),
+            )
+        return self._bound
+
+    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
+        """Critics that hold the parameters whose name has this prefix, and get no gradient."""
+        network = getattr(self, self._critic_name)
+        params = getattr(self, f"{prefix}{self._critic_name}_params").detach()
+        each = params.unbind(0) if params.batch_size else [params]
+        return [bind(network, own).requires_grad_(False) for own in each]
 
     def _averaged_critics(self) -> list[TensorDictModule]:
         """Target critics, each of them with its past ones if ``target_average`` is above one."""
@@ -285,39 +437,13 @@ class SignalLoss(SignalWriting, EstimatedTargets):
             for critic, past in zip(critics, self.past_critics, strict=True)
         ]
 
-    # The actor's loss.
-
-    def _policy_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Loss of a deterministic actor, the values in it, ``[B]``, and others for the log."""
-        networks = self._networks()
-        chosen = call(networks.actor, read_inputs(networks.actor, tensordict))
-        value = self._value(networks.frozen_critic, tensordict, chosen)
-        action = chosen[self.tensor_keys.action]
-        loss = self._reduce(trusted_loss(-value, action, read_trust(tensordict)), tensordict)
-        loss, log = self._penalize_saturation(loss, chosen.get(self.tensor_keys.preactivation))
-        return loss, value.detach(), log
-
-    def _penalize_saturation(
-        self, loss: Tensor, preactivation: Tensor | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Add the penalty on actions before their tanh, ``[B, A]``; give their size for the log."""
-        if preactivation is None:
-            if self.saturation_penalty > 0:
-                raise KeyError(
-                    f"saturation_penalty is {self.saturation_penalty}, but the actor writes no "
-                    f"{self.tensor_keys.preactivation!r}"
-                )
-            return loss, {}
-        if self.saturation_penalty > 0:
-            penalty = saturation(preactivation, limit=self.saturation_limit)
-            loss = loss + self.saturation_penalty * penalty
-        return loss, {"preactivation": preactivation.detach().abs()}
+    def parts(self) -> Parts:
+        """The networks as functions of tensors, for a compiled update."""
+        return parts_of(self, self._networks())
 
     def forget_networks(self) -> None:
-        """Have the networks that hold the parameters made anew: those lie elsewhere now."""
+        """Have the networks that hold the parameters made again: those lie elsewhere now."""
         self._bound = None
-
-    # The networks hold the parameters of the loss; these may put others in their place.
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
         self._bound = None
@@ -330,3 +456,39 @@ class SignalLoss(SignalWriting, EstimatedTargets):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_bound": None, "_deferred": None}
+
+
+def check_importance(importance: str) -> None:
+    """Raise if this is no use of importance weights."""
+    if importance not in ("critic", "torchrl", "none"):
+        raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")
+
+
+def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> TensorDictBase:
+    """A shallow copy of a batch with scaled rewards, and ends as booleans as TorchRL needs them."""
+    found = batch.copy()
+    after = found["next"]
+    after.set(keys.reward, after[keys.reward] * reward_scale)
+    for key in (keys.done, keys.terminated):
+        if (end := after.get(key, None)) is not None:
+            after.set(key, end.bool())
+    return found
+
+
+def _check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
+    """Raise at what are no networks, and at those in the wrong order."""
+    first = critic[0] if isinstance(critic, list) and critic else critic
+    for name, network in (("actor_network", actor), (critic_name, first)):
+        if not hasattr(network, "in_keys") or not hasattr(network, "out_keys"):
+            raise TypeError(f"{name} must be a TensorDictModule, got {type(network).__name__}")
+    swapped = sorted(map(str, set(first.out_keys) & set(actor.in_keys)))
+    if swapped:
+        raise ValueError(
+            f"actor_network and {critic_name} are in the wrong order: actor_network reads "
+            f"{swapped[0]!r}, which {critic_name} writes"
+        )
+    if not set(actor.out_keys) & set(first.in_keys):
+        raise ValueError(
+            f"{critic_name} must read what actor_network writes, {list(actor.out_keys)}, but "
+            f"reads {list(first.in_keys)}"
+        )

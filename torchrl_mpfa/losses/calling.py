@@ -1,4 +1,4 @@
-"""Calling networks from a loss: as functions of tensors where that is possible.
+"""Networks that hold the tensors of a loss, called as functions of tensors where that is possible.
 
 TorchRL swaps parameters in and out of one module at every call, and passes tensordicts. With
 networks of a hundred units both take longer than the network itself.
@@ -6,7 +6,7 @@ networks of a hundred units both take longer than the network itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -18,11 +18,23 @@ from torch import Tensor
 from torch.func import functional_call
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from torchrl_mpfa.losses.averaging import AveragedNetwork
 from torchrl_mpfa.networks import DirectModule
 
 Tensors = Mapping[NestedKey, Tensor]
 """Tensors by key."""
+
+
+@dataclass
+class Networks:
+    """The networks of a loss."""
+
+    actor: Any
+    critic: Any
+    """The critic, or the :class:`StackedNetworks` of several."""
+    frozen_critics: list[TensorDictModule]
+    """Each critic, for gradients to flow through: it gets none itself."""
+    target_actor: Any
+    target_critics: list[TensorDictModule]
 
 
 def bind(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
@@ -33,34 +45,18 @@ def bind(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
 
 
 def read_inputs(
-    network: TensorDictModule, source: TensorDictBase, instead: Tensors | None = None
+    network: TensorDictModule, source: TensorDictBase, chosen: Tensors | None = None
 ) -> dict[NestedKey, Tensor]:
-    """Collect what a network reads.
-
-    Args:
-        network: The network.
-        source: Where its inputs are taken from, detached.
-        instead: Tensors that take the place of those of ``source``.
-
-    Returns:
-        Inputs by key.
-    """
-    instead = instead or {}
-    return {
-        key: instead[key] if key in instead else source[key].detach() for key in network.in_keys
-    }
+    """What a network reads: what was chosen, and the rest out of ``source``, detached."""
+    chosen = chosen or {}
+    return {key: chosen[key] if key in chosen else source[key].detach() for key in network.in_keys}
 
 
-def call(network: TensorDictModule, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-    """Compute what a network gives, directly if it is a ``DirectModule``.
-
-    Args:
-        network: The network.
-        inputs: What it reads, by key.
-
-    Returns:
-        Outputs by key.
-    """
+def call(
+    network: TensorDictModule, source: TensorDictBase, chosen: Tensors | None = None
+) -> dict[NestedKey, Tensor]:
+    """What a network gives for the inputs of :func:`read_inputs`."""
+    inputs = read_inputs(network, source, chosen)
     if isinstance(network, DirectModule):
         return network.outputs(inputs)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -68,93 +64,38 @@ def call(network: TensorDictModule, inputs: dict[NestedKey, Tensor]) -> dict[Nes
     return {key: value for key in network.out_keys if (value := found.get(key)) is not None}
 
 
-def bare(params: TensorDictBase) -> dict[str, Tensor]:
-    """Parameters by the names that the module in a :class:`DirectModule` has for them."""
-    flat = params.flatten_keys(".").items()
-    return {
-        name.removeprefix("module."): value for name, value in flat if isinstance(value, Tensor)
-    }
-
-
 class StackedNetworks:
-    """Networks of one structure whose parameters are stacked, called one after the other.
+    """Networks of one structure whose parameters are stacked, ``[C, ...]``, called in turn.
 
     With two small networks ``torch.vmap`` costs twice as much.
-
-    Args:
-        network: Any of them.
-        params: Their parameters, batch size ``[C]``.
     """
 
     def __init__(self, network: TensorDictModule, params: TensorDictBase) -> None:
         self.network = deepcopy(network)
-        flat = params.flatten_keys(".").items()
-        self._params = {name: value for name, value in flat if isinstance(value, Tensor)}
-        self.bare = bare(params)
+        self._params = bare(params) if isinstance(network, DirectModule) else _by_name(params)
 
-    def call(self, inputs: Sequence[dict[NestedKey, Tensor]]) -> list[dict[NestedKey, Tensor]]:
-        """Compute what each network gives for inputs of its own, as :func:`call` does for one."""
-        direct = isinstance(self.network, DirectModule)
-        split = {
-            name: value.unbind(0) for name, value in (self.bare if direct else self._params).items()
-        }
-        pairs = [
-            ({name: value[i] for name, value in split.items()}, each)
-            for i, each in enumerate(inputs)
-        ]
-        if isinstance(self.network, DirectModule):
-            keys, module = self.network.in_keys, self.network.module
-            found = [
-                functional_call(module, weights, tuple(each[key] for key in keys))
-                for weights, each in pairs
-            ]
-            return [self.network.by_key(out) for out in found]
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            outs = [
-                functional_call(self.network, weights, (TensorDict(each),))
-                for weights, each in pairs
-            ]
-        return [dict(out.items(True, True)) for out in outs]
+    def call(self, source: TensorDictBase, chosen: Sequence[Tensors]) -> list[Tensors]:
+        """What each network gives for what was chosen for it, as :func:`call` does for one."""
+        split = {name: value.unbind(0) for name, value in self._params.items()}
+        found: list[Tensors] = []
+        for place, instead in enumerate(chosen):
+            weights = {name: value[place] for name, value in split.items()}
+            inputs = read_inputs(self.network, source, instead)
+            if isinstance(self.network, DirectModule):
+                out = functional_call(self.network.module, weights, tuple(inputs.values()))
+                found.append(self.network.by_key(out))
+                continue
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                out = functional_call(self.network, weights, (TensorDict(inputs),))
+            found.append(dict(out.items(True, True)))
+        return found
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What a loss is made of, as functions of tensors."""
-
-    actor: DirectModule
-    """Policy that holds the current parameters."""
-    critic: DirectModule
-    """Any of the critics, for its structure."""
-    critic_parameters: dict[str, Tensor]
-    """Parameters of all critics, ``[C, ...]`` where they are stacked."""
-    target_actor: DirectModule
-    """Policy that holds the target parameters."""
-    target_critics: Sequence[DirectModule]
-    """``C`` critics that hold the target parameters."""
-    target_parameters: tuple[dict[str, Tensor], dict[str, Tensor]]
-    """Parameters of target actor and target critics, by the same names; those of an actor that has
-    no target of its own are the current ones."""
-    stacked: bool
-    """Whether parameters of critics are stacked, be it of one."""
-    action_bounds: tuple[Any, Any] | None = None
-    """Least and greatest action of a smoothed target; None: targets are not smoothed."""
-    target_noise: Callable[[Tensor], Tensor] | None = None
-    """Noise of a smoothed target, for actions of the same shape."""
-
-    def split(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:
-        """Parameters of each critic."""
-        if not self.stacked:
-            return [parameters]
-        count = len(self.target_critics)
-        return [{name: value[i] for name, value in parameters.items()} for i in range(count)]
-
-    def of_targets(self, parameters: dict[str, Tensor]) -> list[dict[str, Tensor]]:
-        """Parameters of each target critic, by the names that its module has for them."""
-        return [
-            {f"{_prefix(critic)}{name}": value for name, value in own.items()}
-            for critic, own in zip(self.target_critics, self.split(parameters), strict=True)
-        ]
+def bare(params: TensorDictBase) -> dict[str, Tensor]:
+    """Parameters by the names that the module in a :class:`DirectModule` has for them."""
+    return {name.removeprefix("module."): value for name, value in _by_name(params).items()}
 
 
-def _prefix(critic: DirectModule) -> str:
-    return "network." if isinstance(critic.module, AveragedNetwork) else ""
+def _by_name(params: TensorDictBase) -> dict[str, Tensor]:
+    flat = params.flatten_keys(".").items()
+    return {name: value for name, value in flat if isinstance(value, Tensor)}

@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
-from torchrl_mpfa.checks import SHARE, check
-from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.calling import Parts, bare, bind, call, read_inputs
-from torchrl_mpfa.losses.smoothing import TargetSmoothing, bounds_of, check_noise
-from torchrl_mpfa.losses.writing import SignalKeys
+from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, check
+from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.calling import call
+from torchrl_mpfa.losses.functional import smoothed_action, smoothing_noise
+from torchrl_mpfa.networks.bounds import given_bounds
 
 
-class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
+class SignalDDPGLoss(SignalLoss, DDPGLoss):
     r""":class:`~torchrl.objectives.DDPGLoss` that also writes the signals of Eqs. (13)-(14).
 
     The critic's loss is Eq. (11), :math:`\frac{1}{N} \sum_i w_i (y_i - Q(s_i, a_i))^2` with the
@@ -72,7 +73,7 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, DDPGLoss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.writing.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -90,8 +91,8 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
         bounds: Any = None,
         **kwargs: Any,
     ) -> None:
-        check_noise(policy_noise, noise_clip)
-        within = bounds_of(action_spec, bounds) if policy_noise > 0 else None
+        check(NOT_NEGATIVE, policy_noise=policy_noise, noise_clip=noise_clip)
+        within = given_bounds(action_spec, bounds) if policy_noise > 0 else None
         super().__init__(actor_network, value_network, delay_actor=delay_actor, **kwargs)
         self.policy_noise, self.noise_clip = policy_noise, noise_clip
         if within is not None:
@@ -118,20 +119,36 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        step = self._critic_step(
-            tensordict, defer_gradient=defer_gradient, loss_function=loss_function
-        )
-        squared = step.td_error[0].square()
+        value = self._stored_values(tensordict, defer_gradient=defer_gradient)
+        with torch.no_grad():
+            target = self._target(tensordict, self._next_value(tensordict["next"]))
+        td_error = (target - value).detach()
+        self._write_signals(tensordict, td_error, value)
+        loss = self._critic_mean(tensordict, value, target, loss_function)
+
+        squared, value = td_error[0].square(), value[0].detach()
         tensordict.set(self.tensor_keys.priority, squared, inplace=True)
-        value = step.value[0].detach()
         metadata = {
             "td_error": squared,
             "pred_value": value,
-            "target_value": step.target,
-            "target_value_max": step.target.max(),
+            "target_value": target,
+            "target_value_max": target.max(),
             "pred_value_max": value.max(),
         }
-        return step.loss, metadata
+        return loss, metadata
+
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        """Q of the target networks at the next states in Eq. (5), shape ``[B]``."""
+        networks, key = self._networks(), self.tensor_keys.action
+        chosen = call(networks.target_actor, after)
+        if self.policy_noise > 0:
+            noise, (low, high) = self.target_noise(chosen[key]), (self.min_action, self.max_action)
+            chosen[key] = smoothed_action(chosen[key], noise, low=low, high=high)
+        return self._q(networks.target_critics[0], after, chosen)
+
+    def target_noise(self, action: Tensor) -> Tensor:
+        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
+        return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor's loss, with the penalty on saturation if there is one.
@@ -142,8 +159,11 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        loss, _, metadata = self._policy_loss(tensordict)
-        return loss, metadata
+        networks, keys = self._networks(), self.tensor_keys
+        chosen = call(networks.actor, tensordict)
+        value = self._q(networks.frozen_critics[0], tensordict, chosen)
+        preactivation = chosen.get(keys.preactivation)
+        return self._actor_mean(tensordict, -value, chosen[keys.action], preactivation)
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
         return self.loss_value(batch, **options)
@@ -151,68 +171,6 @@ class SignalDDPGLoss(SignalLoss, TargetSmoothing, DDPGLoss):
     def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         loss, log = self.loss_actor(batch)
         return {"loss_actor": loss}, log
-
-    def _values(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        critic, keys = self._networks().critic, self.tensor_keys
-        found = call(critic, read_inputs(critic, tensordict, {keys.action: action}))
-        return found[keys.state_action_value].squeeze(-1).unsqueeze(0)
-
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        networks = self._networks()
-        chosen = call(networks.target_actor, read_inputs(networks.target_actor, after))
-        if self.policy_noise > 0:
-            key = self.tensor_keys.action
-            chosen = {**chosen, key: self._smoothed(chosen[key])}
-        return self._value(networks.target_critic, after, chosen)
-
-    def _networks(self) -> _Networks:
-        """The networks with their parameters in place, held for good."""
-        if self._bound is None:
-            actor, critic = self.actor_network_params, self.value_network_params
-            target_actor = self.target_actor_network_params
-            self._bound = _Networks(
-                actor=bind(self.actor_network, actor),
-                critic=bind(self.value_network, critic),
-                frozen_critic=bind(self.value_network, critic.detach()).requires_grad_(False),
-                target_actor=bind(self.actor_network, target_actor).requires_grad_(False),
-                target_critic=self._averaged_critics()[0],
-            )
-        return self._bound
-
-    def _held_critics(self, prefix: str) -> list[TensorDictModule]:
-        params = getattr(self, f"{prefix}value_network_params").detach()
-        return [bind(self.value_network, params).requires_grad_(False)]
-
-    def parts(self) -> Parts:
-        """The networks as functions of tensors."""
-        networks = self._networks()
-        critic, smooths = networks.critic, self.policy_noise > 0
-        return Parts(
-            actor=networks.actor,
-            critic=critic,
-            critic_parameters=dict(critic.module.named_parameters()),
-            target_actor=networks.target_actor,
-            target_critics=[networks.target_critic],
-            target_parameters=(
-                bare(self.target_actor_network_params),
-                bare(self.target_value_network_params),
-            ),
-            stacked=False,
-            action_bounds=(self.min_action, self.max_action) if smooths else None,
-            target_noise=self.target_noise if smooths else None,
-        )
-
-
-@dataclass
-class _Networks:
-    """Networks that hold the tensors of a loss."""
-
-    actor: TensorDictModule
-    critic: TensorDictModule
-    frozen_critic: TensorDictModule
-    """The critic, through which the actor's gradient flows but which gets none itself."""
-    target_actor: TensorDictModule
-    target_critic: TensorDictModule
 
 
 def make_ddpg_loss(

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
+from torchrl_mpfa.losses.base import check_importance, scale_rewards
 from torchrl_mpfa.losses.functional import distance
-from torchrl_mpfa.losses.targets import as_torchrl_needs
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
@@ -63,10 +63,7 @@ class SignalDQNLoss(DQNLoss):
         gamma: float = 0.99,
     ) -> None:
         check_signals(signals)
-        if importance not in ("critic", "torchrl", "none"):
-            raise ValueError(
-                f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}"
-            )
+        check_importance(importance)
         if loss_function not in _DISTANCES:
             raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
         check(POSITIVE, reward_scale=reward_scale)
@@ -94,9 +91,7 @@ class SignalDQNLoss(DQNLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        scaled = as_torchrl_needs(
-            batch.select(*self.in_keys), self.tensor_keys, reward_scale=self.reward_scale
-        )
+        scaled = scale_rewards(batch.select(*self.in_keys), self.tensor_keys, self.reward_scale)
         # Transitions of several steps say of how many: the bootstrap is discounted by all of them.
         steps = self.value_estimator.tensor_keys.steps_to_next_obs
         if (count := batch.get(steps, None)) is not None:

@@ -6,13 +6,22 @@ the size of an action.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
 PAL = "pal"
 DISTANCES = ("l1", "l2", "smooth_l1", PAL)
-"""Names of the loss functions, of which all but the last are for :func:`distance`."""
+"""Names of the loss functions, of which all but the last are TorchRL's too."""
+
+POLICY_WEIGHT = "policy_weight"
+BEHAVIOR_WEIGHT = "behavior_weight"
+BEHAVIOR_MEAN = "behavior_mean"
+BEHAVIOR_SIGMA = "behavior_sigma"
+BEHAVIOR = (BEHAVIOR_MEAN, BEHAVIOR_SIGMA)
 
 
 def bootstrap_target(
@@ -53,75 +62,22 @@ def bootstrap_target(
 
 
 def smoothing_noise(action: Tensor, *, deviation: float, limit: float) -> Tensor:
-    r"""Noise of TD3's target, :math:`\mathrm{clip}(N(0, \sigma), -c, c)`.
-
-    Args:
-        action: Any actions, for their shape ``[B, A]``, type and device.
-        deviation: :math:`\sigma`, in units of the action.
-        limit: :math:`c`.
-
-    Returns:
-        Noise, shape ``[B, A]``.
-
-    Examples:
-        >>> noise = smoothing_noise(torch.zeros(100, 2), deviation=1.0, limit=0.5)
-        >>> bool((noise.abs() <= 0.5).all())
-        True
-    """
+    r"""Noise of TD3's target for actions ``[B, A]``, :math:`\mathrm{clip}(N(0, \sigma), -c, c)`."""
     return torch.randn_like(action).mul_(deviation).clamp_(-limit, limit)
 
 
 def smoothed_action(action: Tensor, noise: Tensor, *, low: Tensor, high: Tensor) -> Tensor:
-    """Action of TD3's target, with noise and within the bounds, shape ``[B, A]``.
-
-    Args:
-        action: Of the target actor, shape ``[B, A]``.
-        noise: Of :func:`smoothing_noise`, shape ``[B, A]``.
-        low: Least action, shape ``[]`` or ``[A]``.
-        high: Greatest action, of the same shape.
-
-    Returns:
-        Actions, shape ``[B, A]``.
-
-    Examples:
-        >>> bounds = {"low": torch.tensor(-1.0), "high": torch.tensor(1.0)}
-        >>> smoothed_action(torch.tensor([[0.9]]), torch.tensor([[0.5]]), **bounds)
-        tensor([[1.]])
-    """
+    """Action of TD3's target, with noise and within the bounds, shape ``[B, A]``."""
     return torch.clamp(action + noise, low, high)
 
 
 def least_value(values: Tensor) -> Tensor:
-    r"""Value in TD3's clipped double-Q target, :math:`\min_k Q_k`.
-
-    Args:
-        values: Of each critic, shape ``[C, B]``.
-
-    Returns:
-        The least, shape ``[B]``.
-
-    Examples:
-        >>> least_value(torch.tensor([[1.0, 4.0], [2.0, 3.0]])).tolist()
-        [1.0, 3.0]
-    """
+    r"""Value in TD3's clipped double-Q target, :math:`\min_k Q_k`, from ``[C, B]`` to ``[B]``."""
     return values.amin(0)
 
 
 def soft_value(values: Tensor, log_density: Tensor, *, alpha: float | Tensor) -> Tensor:
-    r"""Value in SAC's target and actor's loss, :math:`\min_k Q_k(s, a) - \alpha \ln \pi(a | s)`.
-
-    Args:
-        values: Of each critic, shape ``[C, B]``.
-        log_density: :math:`\ln \pi(a | s)`, shape ``[B]``.
-        alpha: Temperature.
-
-    Returns:
-        Soft values, shape ``[B]``.
-
-    Examples:
-        >>> soft_value(torch.tensor([[1.0], [2.0]]), torch.tensor([-1.0]), alpha=0.5).tolist()
-        [1.5]
-    """
+    r"""Value in SAC's target and actor's loss, :math:`\min_k Q_k(s, a) - \alpha \ln \pi(a | s)`."""
     return least_value(values) - alpha * log_density
 
 
@@ -133,26 +89,7 @@ def critic_loss(
     unit: float | Tensor,
     pal_alpha: float,
 ) -> Tensor:
-    """Loss of each transition, summed over the critics (Eq. 4).
-
-    Args:
-        value: Q of each critic, shape ``[C, B]``.
-        target: Targets, shape ``[B]``.
-        loss_function: As of :func:`distance`, as are the following two.
-        unit: Error at which the last two bend.
-        pal_alpha: Priority exponent that PAL stands for.
-
-    Returns:
-        Losses, shape ``[B]``.
-
-    Raises:
-        ValueError: If the loss function is unknown.
-
-    Examples:
-        >>> value, target = torch.zeros(2, 3), torch.ones(3)
-        >>> critic_loss(value, target, "l2", unit=1.0, pal_alpha=0.4).tolist()
-        [2.0, 2.0, 2.0]
-    """
+    """Loss of each transition (Eq. 4), summed over the critics, from ``[C, B]`` to ``[B]``."""
     target = target.expand_as(value)
     return distance(value, target, loss_function, unit=unit, pal_alpha=pal_alpha).sum(0)
 
@@ -165,29 +102,11 @@ def distance(
     unit: float | Tensor = 1.0,
     pal_alpha: float = 0.4,
 ) -> Tensor:
-    """Loss of each transition by the name of its distance.
+    """Distance of value and target, ``[C, B]`` or ``[B]``, one of :data:`DISTANCES`.
 
-    ``"l2"`` is Eq. (4) of the paper, ``"smooth_l1"`` the Huber loss of LAP, ``"pal"`` that of
-    :func:`pal_distance`.
-
-    Args:
-        value: Q, shape ``[C, B]`` or ``[B]``.
-        target: Targets, of the same shape.
-        loss_function: ``"l1"``, ``"l2"``, ``"smooth_l1"`` or ``"pal"``.
-        unit: Error at which the last two bend. A loss whose rewards are scaled gives its factor
-            here, so that they bend at an error of one in units of the environment's reward; a
-            bend that moves comes as a number for each transition, shape ``[B]``.
-        pal_alpha: Priority exponent that PAL stands for.
-
-    Returns:
-        Loss, of the same shape.
-
-    Raises:
-        ValueError: If the name is unknown.
-
-    Examples:
-        >>> distance(torch.zeros(1), torch.full((1,), 3.0), "smooth_l1").tolist()
-        [2.5]
+    ``"l2"`` is Eq. (4), ``"smooth_l1"`` the Huber loss of LAP. This and PAL bend at an error of
+    ``unit``: the factor of the rewards in a loss that scales them, so that they bend at an error
+    of one in units of the environment's reward; or a number for each transition, ``[B]``.
     """
     if loss_function not in DISTANCES:
         raise ValueError(f"loss_function must be one of {DISTANCES}, got {loss_function!r}")
@@ -202,7 +121,7 @@ def distance(
 
 
 def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
-    r"""Loss of which uniform sampling expects the gradient that LAP has.
+    r"""Loss whose expected gradient under uniform sampling equals that of LAP.
 
     .. math::
 
@@ -210,20 +129,8 @@ def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
         \frac{|\delta|^{1 + \alpha}}{1 + \alpha} & \text{else} \end{cases} \qquad
         \lambda = \frac1B \sum_j \max(|\delta_j|, 1)^\alpha
 
-    Fujimoto et al. (2020), "An equivalence between loss functions and non-uniform sampling in
-    experience replay", https://arxiv.org/abs/2007.06049.
-
-    Args:
-        error: TD errors, shape ``[C, B]`` or ``[B]``; of several critics the largest one is in
-            :math:`\lambda`.
-        alpha: Priority exponent :math:`\alpha` of the sampling that it stands for.
-
-    Returns:
-        Loss of each transition, of the same shape.
-
-    Examples:
-        >>> pal_distance(torch.tensor([0.5, -0.5])).tolist()
-        [0.125, 0.125]
+    with the largest error of several critics in :math:`\lambda`. Fujimoto et al. (2020),
+    https://arxiv.org/abs/2007.06049.
     """
     size = error.abs()
     # A power with a fractional exponent has no finite slope at zero, where it is not wanted.
@@ -234,19 +141,7 @@ def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
 
 
 def saturation(preactivation: Tensor, *, limit: float) -> Tensor:
-    r"""How deep actions lie in the flat ends of the tanh, the mean of :math:`\max(0, |u| - l)^2`.
-
-    Args:
-        preactivation: Actions before the tanh :math:`u`, shape ``[B, A]``.
-        limit: The limit :math:`l`.
-
-    Returns:
-        The mean, shape ``[]``.
-
-    Examples:
-        >>> saturation(torch.tensor([[0.5, -3.5]]), limit=1.5).item()
-        2.0
-    """
+    r"""How deep actions lie in the flat ends of the tanh: mean of :math:`\max(0, |u| - l)^2`."""
     return (preactivation.abs() - limit).clamp_min(0).square().mean()
 
 
@@ -255,20 +150,46 @@ def action_gradient(value: Tensor, action: Tensor) -> Tensor:
 
     The gradient of the sum has them all at once, as no transition enters another one's value;
     layers that mix a batch (batch normalization) would break that.
-
-    Args:
-        value: Q, shape ``[B]``.
-        action: The actions that it was computed from, shape ``[B, A]``.
-
-    Returns:
-        The gradient, detached, shape ``[B, A]``; ``value`` can still be differentiated.
-
-    Examples:
-        >>> action = torch.tensor([[3.0], [4.0]], requires_grad=True)
-        >>> action_gradient(action.square().sum(-1), action).tolist()
-        [[6.0], [8.0]]
     """
     (gradient,) = torch.autograd.grad(
         value, action, grad_outputs=torch.ones_like(value), retain_graph=True
     )
     return gradient.detach()
+
+
+class Trust(NamedTuple):
+    """Weights of ReF-ER, which hold the actor near the behavior policy."""
+
+    policy: Tensor
+    """Weight of the actor's loss, shape ``[B]``."""
+    behavior: Tensor
+    """Weight of the divergence from the behavior, shape ``[B]``."""
+    mean: Tensor
+    """Mean of the behavior's actions, shape ``[B, A]``."""
+    sigma: Tensor
+    """Their standard deviation, shape ``[B, 1]``."""
+
+
+def read_trust(batch: TensorDictBase) -> Trust | None:
+    """Read the weights of ReF-ER; None if a batch has none, and the actor is free."""
+    if batch.get(POLICY_WEIGHT, None) is None:
+        return None
+    policy, behavior = batch[POLICY_WEIGHT].reshape(-1), batch[BEHAVIOR_WEIGHT].reshape(-1)
+    return Trust(policy, behavior, batch[BEHAVIOR_MEAN], batch[BEHAVIOR_SIGMA])
+
+
+def trusted_loss(loss: Tensor, action: Tensor, trust: Trust | None) -> Tensor:
+    r"""Loss of the actor with the divergence from the behavior, shape ``[B]``.
+
+    .. math::
+
+        w_i L_i + v_i \sum_a \frac{(a_i - \mu_i)^2}{2 \sigma_i^2}
+
+    The second term is the divergence of two Gaussians of one width, around the actor's action and
+    around the behavior's mean.
+    """
+    if trust is None:
+        return loss
+    distance = ((action - trust.mean) / trust.sigma).square().sum(-1) / 2
+    found: Tensor = trust.policy * loss + trust.behavior * distance
+    return found

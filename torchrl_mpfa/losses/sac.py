@@ -13,15 +13,13 @@ from torchrl.objectives import SACLoss, ValueEstimators
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
-from torchrl_mpfa.losses.calling import StackedNetworks, bind, read_inputs
+from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.calling import read_inputs
 from torchrl_mpfa.losses.functional import least_value, soft_value
-from torchrl_mpfa.losses.trust import read_trust, trusted_loss
-from torchrl_mpfa.losses.twin import TwinCritics
-from torchrl_mpfa.losses.writing import SignalKeys
 from torchrl_mpfa.networks import StochasticActor
 
 
-class SignalSACLoss(TwinCritics, SACLoss):
+class SignalSACLoss(SignalLoss, SACLoss):
     r""":class:`~torchrl.objectives.SACLoss` that also writes the signals of Eqs. (13)-(14).
 
     The target of both critics is :math:`y_i = r_i + \gamma (\min_k Q'_k(s_{i+1}, a') - \alpha
@@ -65,7 +63,7 @@ class SignalSACLoss(TwinCritics, SACLoss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, SACLoss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.writing.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -86,6 +84,45 @@ class SignalSACLoss(TwinCritics, SACLoss):
                 raise ValueError(f"{name} is not supported, got {kwargs[name]!r}")
         check(POSITIVE, alpha_init=kwargs.get("alpha_init", 1.0))
         super().__init__(actor_network, qvalue_network, **kwargs)
+
+    def value_loss(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        defer_gradient: bool = False,
+        loss_function: str | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
+
+        Args:
+            tensordict: A batch of transitions, batch size ``[B]``.
+            defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
+            loss_function: As there.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        value = self._stored_values(tensordict, defer_gradient=defer_gradient)
+        with torch.no_grad():
+            next_value = self._next_value(tensordict["next"])
+            target = self._target(tensordict, next_value)
+        td_error = (target - value).detach()
+        self._write_signals(tensordict, td_error, value)
+        loss = self._critic_mean(tensordict, value, target, loss_function)
+        metadata = {
+            "td_error": td_error.square(),
+            "next_state_value": next_value,
+            "pred_value": value.detach(),
+            "target_value": target,
+        }
+        return loss, metadata
+
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        """Soft value of the next states at actions of the current policy, shape ``[B]``."""
+        action, log_prob, _ = self._sample(after)
+        chosen = {self.tensor_keys.action: action}
+        values = [self._q(critic, after, chosen) for critic in self._networks().target_critics]
+        return soft_value(torch.stack(values), log_prob, alpha=self._alpha)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """What TorchRL's ``forward`` asks for: :meth:`value_loss`, and ``|TD error|``.
@@ -109,16 +146,14 @@ class SignalSACLoss(TwinCritics, SACLoss):
             The loss, and detached values for the log; with ``"log_prob"``, ``[B]``, for
             :meth:`temperature_loss`.
         """
-        keys, critics = self.tensor_keys, self._networks().frozen_critics
         action, log_prob, preactivation = self._sample(tensordict)
-        inputs = read_inputs(critics.network, tensordict, {keys.action: action})
-        found = critics.call([inputs] * self.num_qvalue_nets)
-        values = torch.stack([out[keys.state_action_value].squeeze(-1) for out in found])
-        of_each = -soft_value(values, log_prob, alpha=self._alpha)
-        loss = self._reduce(trusted_loss(of_each, action, read_trust(tensordict)), tensordict)
-        loss, metadata = self._penalize_saturation(loss, preactivation)
+        chosen = {self.tensor_keys.action: action}
+        critics = self._networks().frozen_critics
+        values = torch.stack([self._q(critic, tensordict, chosen) for critic in critics])
+        each = -soft_value(values, log_prob, alpha=self._alpha)
+        loss, log = self._actor_mean(tensordict, each, action, preactivation)
         least = least_value(values.detach())
-        return loss, {"log_prob": log_prob.detach(), "state_action_value_actor": least, **metadata}
+        return loss, {"log_prob": log_prob.detach(), "state_action_value_actor": least, **log}
 
     def temperature_loss(self, tensordict: TensorDictBase, log_prob: Tensor) -> Tensor:
         r"""Loss of the temperature, the mean of :math:`-\ln\alpha (\ln\pi(a | s_i) + \bar H)`.
@@ -130,7 +165,10 @@ class SignalSACLoss(TwinCritics, SACLoss):
         Returns:
             The loss.
         """
-        return self._reduce(self.alpha_loss(log_prob), tensordict)
+        return self._mean(tensordict, self.alpha_loss(log_prob))
+
+    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
+        return self.value_loss(batch, **options)
 
     def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         loss, log = self.actor_loss(batch)
@@ -139,20 +177,6 @@ class SignalSACLoss(TwinCritics, SACLoss):
         # A new tensor: the step will change the logarithm in place.
         alpha = self.log_alpha.detach().exp()
         return losses, {"alpha": alpha, "entropy": -log_prob.mean(), **log}
-
-    def _networks(self) -> _Networks:
-        """The networks with their parameters in place, held for good."""
-        if self._bound is None:
-            critic, params = self.qvalue_network, self.qvalue_network_params
-            frozen = params.detach()
-            self._bound = _Networks(
-                actor=bind(self.actor_network, self.actor_network_params),
-                critics=StackedNetworks(critic, params),
-                frozen_critics=StackedNetworks(critic, frozen),
-                frozen_critic=bind(critic, frozen[0]).requires_grad_(False),
-                target_critics=self._averaged_critics(),
-            )
-        return self._bound
 
     def _sample(self, source: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Actions of the current policy, ``[B, A]``, their log-densities, ``[B]``, and means."""
@@ -163,24 +187,6 @@ class SignalSACLoss(TwinCritics, SACLoss):
         found = actor.get_dist_params(TensorDict(inputs))
         action, log_prob = compute_rsample_log_prob(actor.build_dist_from_params(found))
         return action, log_prob, found.get(self.tensor_keys.preactivation, None)
-
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        action, log_prob, _ = self._sample(after)
-        values = self._target_values(after, {self.tensor_keys.action: action})
-        return soft_value(values, log_prob, alpha=self._alpha)
-
-
-@dataclass
-class _Networks:
-    """Networks that hold the tensors of a loss."""
-
-    actor: ProbabilisticTensorDictSequential
-    critics: StackedNetworks
-    frozen_critics: StackedNetworks
-    """The critics, through which the actor's gradient flows but which get none themselves."""
-    frozen_critic: TensorDictModule
-    """The first of these."""
-    target_critics: list[TensorDictModule]
 
 
 def make_sac_loss(

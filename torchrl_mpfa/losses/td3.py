@@ -5,20 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 
-from torchrl_mpfa.checks import SHARE, check
-from torchrl_mpfa.losses.calling import Parts, StackedNetworks, bare, bind, call, read_inputs
-from torchrl_mpfa.losses.functional import least_value
-from torchrl_mpfa.losses.smoothing import TargetSmoothing, bounds_of, check_noise
-from torchrl_mpfa.losses.twin import TwinCritics
-from torchrl_mpfa.losses.writing import SignalKeys
+from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, check
+from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.calling import call
+from torchrl_mpfa.losses.functional import least_value, smoothed_action, smoothing_noise
+from torchrl_mpfa.networks.bounds import given_bounds
 
 
-class SignalTD3Loss(TwinCritics, TargetSmoothing, TD3Loss):
+class SignalTD3Loss(SignalLoss, TD3Loss):
     r""":class:`~torchrl.objectives.TD3Loss` that also writes the signals of Eqs. (13)-(14).
 
     Of its two critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; the
@@ -54,10 +54,12 @@ class SignalTD3Loss(TwinCritics, TargetSmoothing, TD3Loss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, TD3Loss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.writing.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    min_action: Tensor
+    max_action: Tensor
 
     def __init__(
         self,
@@ -68,9 +70,55 @@ class SignalTD3Loss(TwinCritics, TargetSmoothing, TD3Loss):
         bounds: Any = None,
         **kwargs: Any,
     ) -> None:
-        low, high = bounds_of(action_spec, bounds)
-        check_noise(kwargs.get("policy_noise", 0.0), kwargs.get("noise_clip", 0.0))
-        super().__init__(actor_network, qvalue_network, bounds=(low, high), **kwargs)
+        within = given_bounds(action_spec, bounds)
+        noise = {name: kwargs.get(name, 0.0) for name in ("policy_noise", "noise_clip")}
+        check(NOT_NEGATIVE, **noise)
+        super().__init__(actor_network, qvalue_network, bounds=within, **kwargs)
+
+    def value_loss(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        defer_gradient: bool = False,
+        loss_function: str | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
+
+        Args:
+            tensordict: A batch of transitions, batch size ``[B]``.
+            defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
+            loss_function: As there.
+
+        Returns:
+            The loss, and detached values for the log.
+        """
+        value = self._stored_values(tensordict, defer_gradient=defer_gradient)
+        with torch.no_grad():
+            next_value = self._next_value(tensordict["next"])
+            target = self._target(tensordict, next_value)
+        td_error = (target - value).detach()
+        self._write_signals(tensordict, td_error, value)
+        loss = self._critic_mean(tensordict, value, target, loss_function)
+        metadata = {
+            "td_error": td_error.square(),
+            "next_state_value": next_value,
+            "pred_value": value.detach(),
+            "target_value": target,
+        }
+        return loss, metadata
+
+    def _next_value(self, after: TensorDictBase) -> Tensor:
+        """Least Q of the target critics at the smoothed action in the next states, ``[B]``."""
+        networks, key = self._networks(), self.tensor_keys.action
+        action = call(networks.target_actor, after)[key]
+        noise, (low, high) = self.target_noise(action), (self.min_action, self.max_action)
+        chosen = {key: smoothed_action(action, noise, low=low, high=high)}
+        values = [self._q(critic, after, chosen) for critic in networks.target_critics]
+        return least_value(torch.stack(values))
+
+    def target_noise(self, action: Tensor) -> Tensor:
+        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
+        return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor's loss by the first critic, with the penalty on saturation if there is one.
@@ -81,62 +129,19 @@ class SignalTD3Loss(TwinCritics, TargetSmoothing, TD3Loss):
         Returns:
             The loss, and detached values for the log.
         """
-        loss, value, metadata = self._policy_loss(tensordict)
-        return loss, {"state_action_value_actor": value, **metadata}
+        networks, keys = self._networks(), self.tensor_keys
+        chosen = call(networks.actor, tensordict)
+        value = self._q(networks.frozen_critics[0], tensordict, chosen)
+        preactivation = chosen.get(keys.preactivation)
+        loss, log = self._actor_mean(tensordict, -value, chosen[keys.action], preactivation)
+        return loss, {"state_action_value_actor": value.detach(), **log}
+
+    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
+        return self.value_loss(batch, **options)
 
     def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         loss, log = self.actor_loss(batch)
         return {"loss_actor": loss}, log
-
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        actor, key = self._networks().target_actor, self.tensor_keys.action
-        action = call(actor, read_inputs(actor, after))[key]
-        action = self._smoothed(action)
-        return least_value(self._target_values(after, {key: action}))
-
-    def _networks(self) -> _Networks:
-        """The networks with their parameters in place, held for good."""
-        if self._bound is None:
-            first = self.qvalue_network_params[0].detach()
-            actor, critic = self.actor_network, self.qvalue_network
-            self._bound = _Networks(
-                actor=bind(actor, self.actor_network_params),
-                critics=StackedNetworks(critic, self.qvalue_network_params),
-                frozen_critic=bind(critic, first).requires_grad_(False),
-                target_actor=bind(actor, self.target_actor_network_params).requires_grad_(False),
-                target_critics=self._averaged_critics(),
-            )
-        return self._bound
-
-    def parts(self) -> Parts:
-        """The networks as functions of tensors."""
-        networks = self._networks()
-        return Parts(
-            actor=networks.actor,
-            critic=networks.critics.network,
-            critic_parameters=networks.critics.bare,
-            target_actor=networks.target_actor,
-            target_critics=networks.target_critics,
-            target_parameters=(
-                bare(self.target_actor_network_params),
-                bare(self.target_qvalue_network_params),
-            ),
-            stacked=True,
-            action_bounds=(self.min_action, self.max_action),
-            target_noise=self.target_noise,
-        )
-
-
-@dataclass
-class _Networks:
-    """Networks that hold the tensors of a loss."""
-
-    actor: TensorDictModule
-    critics: StackedNetworks
-    frozen_critic: TensorDictModule
-    """The first critic, through which gradients flow but which gets none itself."""
-    target_actor: TensorDictModule
-    target_critics: list[TensorDictModule]
 
 
 def make_td3_loss(

@@ -13,7 +13,7 @@ from torchrl.data import RandomSampler, Storage
 from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
 from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
-from torchrl_mpfa.losses.trust import BEHAVIOR
+from torchrl_mpfa.losses.functional import BEHAVIOR
 from torchrl_mpfa.methods.catalogue import METHODS, Method
 from torchrl_mpfa.methods.cer import CERSampler
 from torchrl_mpfa.methods.geometric import GeometricSampler

@@ -26,7 +26,7 @@ from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
-from torchrl_mpfa.losses.trust import (
+from torchrl_mpfa.losses.functional import (
     BEHAVIOR_MEAN,
     BEHAVIOR_SIGMA,
     BEHAVIOR_WEIGHT,

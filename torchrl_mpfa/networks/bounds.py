@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
@@ -52,6 +54,21 @@ def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tu
             f"action_spec must have finite bounds, low < high, got {low.tolist()} and "
             f"{high.tolist()}"
         )
+    return low, high
+
+
+def given_bounds(action_spec: TensorSpec | None, bounds: Any) -> tuple[Tensor, Tensor]:
+    """Least and greatest action, of a spec or as they are given; of both or none it raises."""
+    if (action_spec is None) == (bounds is None):
+        raise ValueError(
+            "one of action_spec and bounds must be given, got "
+            f"action_spec={action_spec} and bounds={bounds}"
+        )
+    if action_spec is not None:
+        bounds = action_bounds(action_spec)
+    low, high = map(torch.as_tensor, bounds)
+    if not bool((low.isfinite() & high.isfinite() & (low < high)).all()):
+        raise ValueError(f"bounds must be finite, low < high, got {bounds}")
     return low, high
 
 
