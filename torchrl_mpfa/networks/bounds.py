@@ -99,22 +99,7 @@ class ActionScale(nn.Module):
 
 
 def action_scale(action_spec: TensorSpec | None, action_size: int) -> ActionScale | None:
-    """The last layer that a policy needs after its tanh; None if actions are in [-1, 1].
-
-    Args:
-        action_spec: Spec of the actions; None: they are in [-1, 1].
-        action_size: ``A``.
-
-    Returns:
-        The layer, if one is needed.
-
-    Raises:
-        ValueError: As of :func:`action_bounds`.
-
-    Examples:
-        >>> action_scale(Bounded(low=-1.0, high=1.0, shape=(2,)), 2) is None
-        True
-    """
+    """The last layer that a policy needs after its tanh; None if actions are in [-1, 1]."""
     if action_spec is None:
         return None
     low, high = action_bounds(action_spec, action_size)

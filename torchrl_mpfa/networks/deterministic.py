@@ -8,13 +8,16 @@ start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
+from torchrl_mpfa.networks.direct import DirectModule
+from torchrl_mpfa.networks.perceptron import Perceptron
 
 
 class Actor(nn.Module):
@@ -24,18 +27,14 @@ class Actor(nn.Module):
         self,
         observation_size: int,
         action_size: int,
+        perceptron: Perceptron,
         *,
-        width: int,
-        layers: int,
-        layer_norm: bool,
-        final_init: float | None,
         scale: ActionScale | None = None,
     ) -> None:
         super().__init__()
         # One flat sequence: in small networks each nested call is felt.
-        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
-        self.body = nn.Sequential(*hidden)
-        self.head = last_layer(width, action_size, final_init)
+        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
+        self.head = perceptron.last(action_size)
         self.scale = scale
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,24 +53,18 @@ class Critic(nn.Module):
     """Q function; the action joins at the first or the second layer."""
 
     def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        *,
-        width: int,
-        layers: int,
-        layer_norm: bool,
-        final_init: float | None,
-        late_action: bool,
+        self, observation_size: int, action_size: int, perceptron: Perceptron, *, late_action: bool
     ) -> None:
         super().__init__()
         self.late_action = late_action
-        first = observation_size if late_action else observation_size + action_size
-        second = width + action_size if late_action else width
-        self.first = nn.Sequential(*hidden_layers(first, width, layer_norm=layer_norm))
-        sizes = [second, *[width] * (layers - 1)]
-        rest = hidden_layers(*sizes, layer_norm=layer_norm)
-        self.rest = nn.Sequential(*rest, last_layer(sizes[-1], 1, final_init))
+        first, second = observation_size, perceptron.width
+        if late_action:
+            second += action_size
+        else:
+            first += action_size
+        self.first = nn.Sequential(*perceptron.hidden(first, 1))
+        rest = perceptron.hidden(second, perceptron.layers - 1)
+        self.rest = nn.Sequential(*rest, perceptron.last(1))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """From ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``."""
@@ -88,10 +81,7 @@ def make_actor(
     action_size: int,
     *,
     action_spec: TensorSpec | None = None,
-    width: int = 256,
-    layers: int = 2,
-    layer_norm: bool = True,
-    final_init: float | None = 3e-3,
+    **options: Any,
 ) -> DirectModule:
     """Policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
 
@@ -100,11 +90,8 @@ def make_actor(
         action_size: ``A``.
         action_spec: A bounded spec, such as ``env.action_spec``: actions are the tanh, scaled to
             its bounds. None: actions are in [-1, 1].
-        width: Units of each hidden layer.
-        layers: Number of hidden layers.
-        layer_norm: Normalize each hidden layer, so that no feature grows without bound.
-        final_init: The last layer starts uniformly within this, hence near the middle of the
-            tanh; None leaves PyTorch's start.
+        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
+            ``layer_norm``, ``final_init``.
 
     Returns:
         A module for TorchRL's losses and collectors.
@@ -119,41 +106,24 @@ def make_actor(
         >>> actor(TensorDict({"observation": torch.rand(5, 3)}, [5]))["action"].shape
         torch.Size([5, 1])
     """
-    check_counts(
-        observation_size=observation_size, action_size=action_size, width=width, layers=layers
-    )
-    actor = Actor(
-        observation_size,
-        action_size,
-        width=width,
-        layers=layers,
-        layer_norm=layer_norm,
-        final_init=final_init,
-        scale=action_scale(action_spec, action_size),
-    )
+    check_counts(observation_size=observation_size, action_size=action_size)
+    perceptron, scale = Perceptron(**options), action_scale(action_spec, action_size)
+    actor = Actor(observation_size, action_size, perceptron, scale=scale)
     return DirectModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
 
 
 def make_critic(
-    observation_size: int,
-    action_size: int,
-    *,
-    width: int = 256,
-    layers: int = 2,
-    layer_norm: bool = True,
-    final_init: float | None = 3e-3,
-    late_action: bool = True,
+    observation_size: int, action_size: int, *, late_action: bool = True, **options: Any
 ) -> DirectModule:
     """Critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
 
     Args:
         observation_size: ``O``.
         action_size: ``A``.
-        width: Units of each hidden layer.
-        layers: Number of hidden layers; with ``late_action`` at least two.
-        layer_norm: As in :func:`make_actor`.
-        final_init: As in :func:`make_actor`.
-        late_action: Whether the action joins at the second layer in place of the first.
+        late_action: Whether the action joins at the second layer in place of the first; there must
+            be two then.
+        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
+            ``layer_norm``, ``final_init``.
 
     Returns:
         A module for TorchRL's losses.
@@ -165,18 +135,9 @@ def make_critic(
         >>> make_critic(24, 2).out_keys
         ['state_action_value']
     """
-    check_counts(
-        observation_size=observation_size, action_size=action_size, width=width, layers=layers
-    )
-    if late_action and layers < 2:
-        raise ValueError(f"layers must be at least 2 with late_action, got {layers}")
-    critic = Critic(
-        observation_size,
-        action_size,
-        width=width,
-        layers=layers,
-        layer_norm=layer_norm,
-        final_init=final_init,
-        late_action=late_action,
-    )
+    check_counts(observation_size=observation_size, action_size=action_size)
+    perceptron = Perceptron(**options)
+    if late_action and perceptron.layers < 2:
+        raise ValueError(f"layers must be at least 2 with late_action, got {perceptron.layers}")
+    critic = Critic(observation_size, action_size, perceptron, late_action=late_action)
     return DirectModule(critic, in_keys=["observation", "action"], out_keys=["state_action_value"])

@@ -1,16 +1,13 @@
-"""Modules that a loss can call with tensors, and the layers that they are made of."""
+"""A module that a loss can call with tensors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import pairwise
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-
-from torchrl_mpfa.checks import NOT_NEGATIVE, check
 
 
 class DirectModule(TensorDictModule):
@@ -55,32 +52,3 @@ class DirectModule(TensorDictModule):
         return dict(
             zip(self.out_keys, found if isinstance(found, tuple) else (found,), strict=True)
         )
-
-
-def hidden_layers(*sizes: int, layer_norm: bool) -> list[nn.Module]:
-    """Layers from the first size to the last, each followed by LayerNorm (if asked) and ReLU.
-
-    Examples:
-        >>> [type(layer).__name__ for layer in hidden_layers(24, 64, layer_norm=True)]
-        ['Linear', 'LayerNorm', 'ReLU']
-    """
-    layers: list[nn.Module] = []
-    for inputs, outputs in pairwise(sizes):
-        norm = [nn.LayerNorm(outputs)] if layer_norm else []
-        layers += [nn.Linear(inputs, outputs), *norm, nn.ReLU()]
-    return layers
-
-
-def last_layer(inputs: int, outputs: int, final_init: float | None) -> nn.Linear:
-    """A linear layer that starts uniformly within ``final_init``; None leaves PyTorch's start.
-
-    Examples:
-        >>> bool(last_layer(64, 2, 3e-3).weight.abs().max() <= 3e-3)
-        True
-    """
-    layer = nn.Linear(inputs, outputs)
-    if final_init is not None:
-        check(NOT_NEGATIVE, final_init=final_init)
-        nn.init.uniform_(layer.weight, -final_init, final_init)
-        nn.init.uniform_(layer.bias, -final_init, final_init)
-    return layer

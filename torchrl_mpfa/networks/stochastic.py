@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +18,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
+from torchrl_mpfa.networks.direct import DirectModule
+from torchrl_mpfa.networks.perceptron import Perceptron
 
 _SCALE_BIAS = math.log(math.e - 1.0)
 """The softplus of this is one."""
@@ -63,21 +65,11 @@ def sample_tanh_normal(
 class StochasticNetwork(nn.Module):
     """Mean and scale of an action before its tanh, each from a head of its own."""
 
-    def __init__(
-        self,
-        observation_size: int,
-        action_size: int,
-        *,
-        width: int,
-        layers: int,
-        layer_norm: bool,
-        final_init: float | None,
-    ) -> None:
+    def __init__(self, observation_size: int, action_size: int, perceptron: Perceptron) -> None:
         super().__init__()
-        hidden = hidden_layers(observation_size, *[width] * layers, layer_norm=layer_norm)
-        self.body = nn.Sequential(*hidden)
-        self.head = last_layer(width, action_size, final_init)
-        self.scale_head = last_layer(width, action_size, final_init)
+        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
+        self.head = perceptron.last(action_size)
+        self.scale_head = perceptron.last(action_size)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """From ``[..., O]`` to mean and scale, each ``[..., A]``."""
@@ -170,10 +162,7 @@ def make_stochastic_actor(
     action_size: int,
     *,
     action_spec: TensorSpec | None = None,
-    width: int = 256,
-    layers: int = 2,
-    layer_norm: bool = True,
-    final_init: float | None = 3e-3,
+    **options: Any,
 ) -> StochasticActor:
     """Policy from ``"observation"`` to ``"preactivation"``, ``"scale"`` and ``"action"``.
 
@@ -185,11 +174,9 @@ def make_stochastic_actor(
         observation_size: ``O``.
         action_size: ``A``.
         action_spec: As in :func:`~torchrl_mpfa.make_actor`.
-        width: Units of each hidden layer.
-        layers: Number of hidden layers.
-        layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
-        final_init: The last layers start uniformly within this, hence means near zero and scales
-            near one; None leaves PyTorch's start.
+        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
+            ``layer_norm``, ``final_init``; the last layers are those of means (near zero at the
+            start) and scales (near one).
 
     Returns:
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
@@ -204,16 +191,7 @@ def make_stochastic_actor(
         >>> torch.allclose(found["action"], found["preactivation"].tanh())
         True
     """
-    check_counts(
-        observation_size=observation_size, action_size=action_size, width=width, layers=layers
-    )
-    network = StochasticNetwork(
-        observation_size,
-        action_size,
-        width=width,
-        layers=layers,
-        layer_norm=layer_norm,
-        final_init=final_init,
-    )
+    check_counts(observation_size=observation_size, action_size=action_size)
+    network = StochasticNetwork(observation_size, action_size, Perceptron(**options))
     scale = action_scale(action_spec, action_size)
     return StochasticActor(network, action_size=action_size, scale=scale)

@@ -3,43 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.networks.direct import DirectModule, hidden_layers, last_layer
+from torchrl_mpfa.networks.direct import DirectModule
+from torchrl_mpfa.networks.perceptron import Perceptron
 
 _OUT_KEYS = ["action_value", "action", "chosen_action_value"]
-
-
-def one_hot_choice(values: Tensor) -> Tensor:
-    """The greatest of some values as a one-hot choice, integers of the same shape.
-
-    Examples:
-        >>> one_hot_choice(torch.tensor([0.5, 2.0, 1.0])).tolist()
-        [0, 1, 0]
-    """
-    return nn.functional.one_hot(values.argmax(-1), values.shape[-1])
 
 
 class ValueNetwork(nn.Module):
     """A perceptron with an output for each action."""
 
-    def __init__(
-        self,
-        observation_size: int,
-        actions: int,
-        *,
-        width: int,
-        layers: int,
-        layer_norm: bool,
-        final_init: float | None,
-    ) -> None:
+    def __init__(self, observation_size: int, actions: int, perceptron: Perceptron) -> None:
         super().__init__()
-        sizes = observation_size, *[width] * layers
-        self.body = nn.Sequential(*hidden_layers(*sizes, layer_norm=layer_norm))
-        self.head = last_layer(width, actions, final_init)
+        self.body = nn.Sequential(*perceptron.hidden(observation_size, perceptron.layers))
+        self.head = perceptron.last(actions)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
@@ -66,27 +48,19 @@ class ValueTable(nn.Module):
 
 
 def _chosen(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return values, one_hot_choice(values), values.amax(-1, keepdim=True)
+    """Values, the greatest of them as a one-hot choice, and its value."""
+    choice = nn.functional.one_hot(values.argmax(-1), values.shape[-1])
+    return values, choice, values.amax(-1, keepdim=True)
 
 
-def make_value_network(
-    observation_size: int,
-    actions: int,
-    *,
-    width: int = 256,
-    layers: int = 2,
-    layer_norm: bool = True,
-    final_init: float | None = 3e-3,
-) -> DirectModule:
+def make_value_network(observation_size: int, actions: int, **options: Any) -> DirectModule:
     """Network from ``"observation"`` to a value for each action, and the best one, one-hot.
 
     Args:
         observation_size: ``O``.
         actions: Number of actions ``K``.
-        width: Units of each hidden layer.
-        layers: Number of hidden layers.
-        layer_norm: Normalize each hidden layer.
-        final_init: The last layer starts uniformly within this; None leaves PyTorch's start.
+        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
+            ``layer_norm``, ``final_init``.
 
     Returns:
         A module for ``DQNLoss``.
@@ -98,15 +72,8 @@ def make_value_network(
         >>> make_value_network(24, 7).outputs({"observation": torch.rand(5, 24)})["action"].shape
         torch.Size([5, 7])
     """
-    check_counts(observation_size=observation_size, actions=actions, width=width, layers=layers)
-    network = ValueNetwork(
-        observation_size,
-        actions,
-        width=width,
-        layers=layers,
-        layer_norm=layer_norm,
-        final_init=final_init,
-    )
+    check_counts(observation_size=observation_size, actions=actions)
+    network = ValueNetwork(observation_size, actions, Perceptron(**options))
     return DirectModule(network, in_keys=["observation"], out_keys=_OUT_KEYS)
 
 
