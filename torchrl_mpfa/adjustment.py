@@ -172,6 +172,11 @@ class Counting(Protocol):
         ...
 
 
+def counts_buffer(adjustment: object) -> bool:
+    """Whether an adjustment is to count the buffer."""
+    return bool(getattr(adjustment, "counts", False))
+
+
 @dataclass(frozen=True)
 class PositiveBoost:
     r"""Eq. (22) for positive transitions, all others unchanged.

@@ -27,13 +27,12 @@ from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
 from torchrl.data import RandomSampler
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting, counts_buffer
 from torchrl_mpfa.cliffwalk import Cliffwalk, updates_to_convergence
 from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.weighing import asks
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.storages.table import SignalTable
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
@@ -69,7 +68,7 @@ def check_adjustment(adjustment: Adjustment) -> None:
         reward = torch.randn(count, generator=generator, dtype=torch.double) * 3
         replays = torch.randint(1, 50, (count,), generator=generator).double()
         facts = BatchFacts(reward, replays, torch.arange(count), mean_reward=float(reward.mean()))
-        if asks(adjustment) and isinstance(adjustment, Counting):
+        if counts_buffer(adjustment) and isinstance(adjustment, Counting):
             table = _table(("reward", "td_error"), scale=1.0, offset=0.0)
             known = table.rows[: table.size, : len(table.names)].sum(1)
             facts = replace(facts, counted=adjustment.count(table, known))

@@ -3,7 +3,6 @@
 import math
 
 import pytest
-import torch
 
 from tests import oracles
 from tests.mpfa.transitions import (
@@ -15,7 +14,6 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import FixedFusion
-from torchrl_mpfa.samplers.statistics import effective_sample_size, signal_shares
 
 NAMES = ["td_error", "action_gradient", "reward"]
 
@@ -29,20 +27,6 @@ def trained():
     batch = write_signals(buffer.sample())
     buffer.update_tensordict_priority(batch)
     return buffer, batch
-
-
-def test_effective_sample_size_of_hand_numbers():
-    assert effective_sample_size(torch.ones(7)) == pytest.approx(7.0)
-    assert effective_sample_size(torch.tensor([1.0, 0.0, 0.0])) == pytest.approx(1.0)
-    # (1 + 2 + 3)^2 / (1 + 4 + 9)
-    assert effective_sample_size(torch.tensor([1.0, 2.0, 3.0])) == pytest.approx(36 / 14)
-
-
-def test_shares_of_hand_numbers():
-    # Means 2 and 4, weights 0.75 and 0.25: parts 1.5 and 1.
-    found = signal_shares(torch.tensor([[1.0, 8.0], [3.0, 0.0]]), torch.tensor([0.75, 0.25]))
-    assert found.tolist() == pytest.approx([0.6, 0.4])
-    assert signal_shares(torch.zeros(3, 2), torch.ones(2)).tolist() == [0.5, 0.5]
 
 
 def test_weights_and_entropies_are_those_of_the_whole_buffer(trained):

@@ -35,12 +35,12 @@ from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.positive import check_level
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.samplers.binding import signal_table_of
 from torchrl_mpfa.samplers.mixture import MixtureSampler
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.selection import Selection, one_batch
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.storages.table import signal_table_of
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
 
 _SIGNALS = {signal.name: signal for signal in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)}

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.weighing import Weighing
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler, Weighing
 from torchrl_mpfa.saved import Entry
 from torchrl_mpfa.storages.table import SignalTable
 

@@ -2,42 +2,52 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import zip_longest
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts
-from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_counts, check_index
+from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
+from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_counts, check_finite, check_index
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion
 from torchrl_mpfa.moving_fusion import Annealed
-from torchrl_mpfa.positive import level_of, one_sided
-from torchrl_mpfa.samplers.binding import signal_table_of
-from torchrl_mpfa.samplers.rows import check_signals, write_signals
-from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
-from torchrl_mpfa.samplers.statistics import batch_statistics
-from torchrl_mpfa.samplers.tree import TreeSampler, in_dimensions_of
-from torchrl_mpfa.samplers.weighing import (
-    Weighing,
-    boost_factor,
-    count_anew,
-    counted_entries,
-    counted_state,
-    entries_of,
-    weighing_entries,
-    weights_of,
+from torchrl_mpfa.positive import is_positive, level_of, one_sided
+from torchrl_mpfa.samplers.tree import (
+    ORDERED,
+    TreeSampler,
+    as_slots,
+    in_dimensions_of,
+    last_of_each,
 )
-from torchrl_mpfa.saved import Entry, exactly
+from torchrl_mpfa.saved import Entry, count, exactly, number
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
-from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.storages.table import SignalTable, signal_table_of
 
 _ENTROPY_REFRESH = 1 / 256
+# With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
+# capacity.
+_COUNT_REFRESH = 1 / 16
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Results of the last passes over the buffer, and the state of the buffer at each of them."""
+
+    weights: Tensor  # One per fused signal, in the order of their columns, [K].
+    mean_reward: float
+    writes: int  # Transitions that had been written when the weights were computed.
+    counted: tuple[Tensor | None, ...] = ()  # One result per adjustment, None if it has none.
+    counted_writes: int = 0  # Transitions that had been written when the adjustments counted.
+    learned_since: int = 0  # Transitions that were learned from since then.
+
+
+_NOTHING = Weighing(torch.empty(0), 0.0, 0)
 
 
 class SignalSampler(TreeSampler):
@@ -68,7 +78,7 @@ class SignalSampler(TreeSampler):
         fusion: How they are weighted, see :class:`~torchrl_mpfa.Fusion`.
         adjustments: What is done to the fused priorities, in order.
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
-            probabilities anew; 0 counts at every update. The default costs a constant time per
+            probabilities again; 0 counts at every update. The default costs a constant time per
             written transition, whatever the capacity.
         stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
             priority, as the PER paper does, in place of ``B`` independent ones.
@@ -122,6 +132,12 @@ class SignalSampler(TreeSampler):
             if not callable(adjust):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
         self.entropy_refresh = entropy_refresh
+        self._counting = [counts_buffer(each) for each in self.adjustments]
+        self._telling = [
+            (place, each)
+            for place, each in enumerate(self.adjustments)
+            if self._counting[place] and hasattr(each, "entries")
+        ]
         self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
         self._names = [s.name for s in self.signals]
         self._columns: slice | list[int] = []
@@ -152,29 +168,20 @@ class SignalSampler(TreeSampler):
         return dict(zip(self._names, self._weighing.weights.tolist(), strict=True))
 
     def anneal(self, fraction: float) -> None:
-        """Tell the fusion how much of the training is done, from 0 to 1, if it wants to know."""
+        """Tell a fusion with a schedule how much of the training is done, from 0 to 1."""
         if isinstance(self.fusion, Annealed):
             self.fusion.anneal(fraction)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
         """Sample slots by Eq. (8), and count a replay for each.
 
-        Args:
-            storage: The storage to sample from.
-            batch_size: ``B``.
-
-        Returns:
-            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
-            each; and ``"priority_weight"`` of Eq. (10) with ``"written_at"``, by which an
-            overwritten slot is known, each of shape ``[B]``.
-
-        Raises:
-            RuntimeError: If the storage is empty.
-            ValueError: If ``batch_size`` is not positive.
+        As :meth:`TreeSampler.sample`; an overwritten slot is known by ``"written_at"``, ``[B]``.
         """
         slots, weight = self._sampled(storage, batch_size)
-        told = entries_of(self._weighing, self.adjustments, len(slots))
-        info = {"priority_weight": weight, **told}
+        info = {"priority_weight": weight}
+        for place, adjust in self._telling:
+            counted = () if self._weighing is None else self._weighing.counted
+            info |= adjust.entries(counted[place] if counted else None, len(slots))
         self._last_batch = (slots, weight)
         table = getattr(storage, "signal_table", None)
         if table is not None:
@@ -191,19 +198,7 @@ class SignalSampler(TreeSampler):
     def update_priority(
         self, index: int | Tensor, priority: float | Tensor, *, storage: Storage | None = None
     ) -> None:
-        """Set priorities directly, as TorchRL's sampler does: neither fused nor adjusted.
-
-        Args:
-            index: As in :meth:`TreeSampler.update_priority`.
-            priority: Priorities before eps and alpha, shape ``[B]``, ``[B, 1]`` or ``[]``.
-            storage: The storage, which places in several dimensions need.
-
-        Raises:
-            IndexError: If a slot is outside the buffer.
-            TypeError: If the index holds anything but integers.
-            RuntimeError: If ``priority`` has not one number a slot.
-            ValueError: If a priority is negative or not finite, or so high that sums overflow.
-        """
+        """Set priorities directly, see :meth:`TreeSampler.update_priority`."""
         # TorchRL's buffers hand a first priority to transitions that they find in a storage.
         if self._table is None and self._highest is not None:
             self._warn_once(
@@ -256,42 +251,40 @@ class SignalSampler(TreeSampler):
         check_counts(batches=batches)
         if len(slots) % batches:
             raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
-        sizes = [len(slots) // batches] * batches
         # A batch from before the buffer was emptied is stale, as its times of writing tell.
         filled = table.size if written_at is None else table.known
         if len(check_index(slots, filled)) < len(slots):
             raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
-        rows, live, stale = table.rows.index_select(0, slots), None, 0
-        if written_at is not None:
-            if written_at.numel() != slots.numel():
-                raise ValueError(
-                    "written_at must have one number per transition, got shape "
-                    f"{[*written_at.shape]} for {slots.numel()} slots"
-                )
-            written_at = written_at.reshape(-1).to(rows.device)
-            same = rows.select(1, table.time_column) == written_at
-            if not same.all():
-                live, stale = same, int((~same).sum())
-                sizes = same.reshape(batches, -1).sum(1).tolist()
-                rows, slots = rows[same], slots[same]
-        write_signals(rows, table, signals, self._learned, live=live, sizes=sizes)
-        check_signals(rows[:, self._columns], self._names, self._learned)
+        rows, live, sizes = (
+            table.rows.index_select(0, slots),
+            None,
+            [len(slots) // batches] * batches,
+        )
+        if written_at is not None and not (same := _not_overwritten(table, rows, written_at)).all():
+            live, sizes = same, same.reshape(batches, -1).sum(1).tolist()
+            rows, slots = rows[same], slots[same]
+        stale = 0 if live is None else len(live) - len(slots)
+
+        # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
+        table.fill_learned(rows, signals, self._learned, live, sizes)
+        table.check_fused(rows, self._names, self._columns)
         if slots.numel() == 0:
             return stale
-
-        weighing, fused = self._weighing, []
+        weighing, adjusted = self._weighing, []
         for one, of_one in zip(slots.split(sizes), rows.split(sizes), strict=True):
             if len(one):
-                weighing = self._counted(table, one, self._weigh(table, one, weighing), weighing)
-                fused.append(self._fused(table, of_one, one, weighing))
-        priority = fused[0] if len(fused) == 1 else torch.cat(fused)
+                weighing = self._weigh(table, one, weighing)  # Eqs. (15)-(20).
+                adjusted.append(self._fused(table, of_one, one, weighing))  # Eqs. (21)-(24).
+        priority = adjusted[0] if len(adjusted) == 1 else torch.cat(adjusted)
         highest = self._checked(priority, "adjusted priorities")
+
+        # Nothing has changed so far, so that a call that raises leaves everything as it was.
         self._weighing = weighing
-        if len(slots) > SERIAL and (last := last_of_each(slots)) is not None:
+        if len(slots) > ORDERED and (last := last_of_each(slots)) is not None:
             slots, rows, priority = slots[last], rows[last], priority[last]
             highest = bounds(priority)[1]
         table.rows.index_copy_(0, slots, rows)
-        self._set(slots, priority, highest)
+        self._set(slots, priority, highest)  # Eq. (8).
         return stale
 
     def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
@@ -304,10 +297,9 @@ class SignalSampler(TreeSampler):
             mean_reward=weighing.mean_reward,
             written_at=rows.select(1, table.time_column),
         )
-        for adjust, counted in zip_longest(self.adjustments, weighing.counted):
-            priority = adjust(
-                priority, facts if counted is None else replace(facts, counted=counted)
-            )
+        for place, adjust in enumerate(self.adjustments):
+            told = replace(facts, counted=weighing.counted[place]) if weighing.counted else facts
+            priority = adjust(priority, told)
         if priority.shape != slots.shape:
             raise ValueError(
                 f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
@@ -315,18 +307,56 @@ class SignalSampler(TreeSampler):
         return priority.to(torch.double)
 
     def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
-        """Priorities before any adjustment, eps included, shape ``[B]``."""
+        """Priorities of Eq. (21), eps included, shape ``[B]``."""
         combine = COMBINATIONS[self.combination]
         return combine(rows[:, self._columns], weighing.weights, eps=self._eps)
 
+    def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
+        """Weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
+        always = self.entropy_refresh == 0
+        fresh = table.writes - (0 if last is None else last.writes)
+        due = always or not 0 <= fresh <= self.entropy_refresh * table.size
+        if last is None or due:
+            weights = self._fusion_weights(table, index)
+            if (text := one_sided(table.rewards, (self.fusion, *self.adjustments))) is not None:
+                self._warn_once(text)
+            mean, before = float(table.rewards.mean()), last or _NOTHING
+            made = replace(before, weights=weights, mean_reward=mean, writes=table.writes)
+        elif getattr(self.fusion, "every_batch", False):
+            made = replace(last, weights=self._fusion_weights(table, index))
+        else:
+            made = last
+        return self._count(table, len(index), made, always) if any(self._counting) else made
+
+    def _fusion_weights(self, table: SignalTable, index: Tensor) -> Tensor:
+        """Weights of the fusion, checked, in double precision, shape ``[K]``."""
+        weights = self.fusion.weights(self._names, table, index)
+        if weights.shape != (len(self._names),):
+            raise ValueError(
+                f"fusion must give {len(self._names)} weights, got shape {[*weights.shape]}"
+            )
+        check_finite("weights of the fusion", weights)
+        return weights.to(torch.double)
+
+    def _count(self, table: SignalTable, learned: int, last: Weighing, always: bool) -> Weighing:
+        """Have the adjustments count the buffer again if enough of it changed."""
+        changed = table.writes - last.counted_writes + last.learned_since
+        if last.counted and 0 <= changed <= _COUNT_REFRESH * table.size and not always:
+            return replace(last, learned_since=last.learned_since + learned)
+        fused = self._combined(table.rows[: table.size], last)
+        counted = [
+            each.count(table, fused) if counts else None  # type: ignore[attr-defined]
+            for each, counts in zip(self.adjustments, self._counting, strict=True)
+        ]
+        for value in counted:
+            if value is not None:
+                check_finite("what an adjustment counted", value)
+        return replace(
+            last, counted=tuple(counted), counted_writes=table.writes, learned_since=learned
+        )
+
     def bind(self, storage: Storage) -> SignalTable:
-        """Take the signals of a storage as those to fuse.
-
-        Args:
-            storage: The storage.
-
-        Returns:
-            Its signals.
+        """Take the signals of a storage as those to fuse, and return them.
 
         Raises:
             TypeError: If the storage keeps no signals.
@@ -345,69 +375,94 @@ class SignalSampler(TreeSampler):
             self._table = table
         return table
 
-    def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
-        """Count the probabilities of Eqs. (16)-(17) anew if enough changed since the last count."""
-        fresh = table.writes - (0 if last is None else last.writes)
-        due = not 0 <= fresh <= self.entropy_refresh * table.size or self.entropy_refresh == 0
-        if last is not None and not due and not getattr(self.fusion, "every_batch", False):
-            return last
-        weights = weights_of(self.fusion, self._names, table, index)
-        if last is not None and not due:
-            return replace(last, weights=weights)
-        if (text := one_sided(table.rewards, (self.fusion, *self.adjustments))) is not None:
-            self._warn_once(text)
-        return Weighing(weights, float(table.rewards.mean()), table.writes)
-
-    def _counted(
-        self, table: SignalTable, index: Tensor, weighing: Weighing, last: Weighing | None
-    ) -> Weighing:
-        """The weighing with what the adjustments counted, anew if enough has changed."""
-        return count_anew(
-            weighing,
-            last,
-            self.adjustments,
-            table,
-            lambda made: self._combined(table.rows[: table.size], made),
-            learned=len(index),
-            always=self.entropy_refresh == 0,
-        )
-
     def stats(self, storage: Storage) -> dict[str, float]:
-        """What the priorities are made of; see ``docs/metrics.md`` for each entry.
+        """Composition of the priorities; see ``docs/metrics.md`` for each entry.
 
-        Args:
-            storage: The storage that was sampled.
-
-        Returns:
-            Weights, entropies and shares of the signals, fractions of positive transitions,
-            effective sample size and age of the last batch, and the factor of the boost.
+        Weights, entropies and shares of the signals, fractions of positive transitions, effective
+        sample size and age of the last batch, and the factor of the boost.
         """
-        table = self.bind(storage)
+        table, weights = self.bind(storage), self.weights
         level = level_of((*self.adjustments, self.fusion))
-        found = batch_statistics(
-            self._names, self.weights, self.fusion, table, self._last_batch, level
-        )
-        return {**found, **boost_factor(self._weighing, self.adjustments)}
+        found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
+        if table.size:
+            mean = float(table.rewards.mean())
+            above = is_positive(table.rewards, level, mean=mean)
+            found["positive_fraction_buffer"] = float(above.double().mean())
+        if table.size and self._last_batch is not None:
+            index, importance = self._last_batch
+            rows = table.rows[index]
+            if (entropies := getattr(self.fusion, "entropies", None)) is not None:
+                values = entropies(self._names, table, index).tolist()
+                found |= {f"entropy/{n}": v for n, v in zip(self._names, values, strict=True)}
+            known = rows[:, self._columns]
+            known = known[~known.isnan().any(1)]
+            if weights and len(known):
+                shares = _shares(known, known.new_tensor([weights[name] for name in self._names]))
+                found |= {f"share/{n}": s for n, s in zip(self._names, shares, strict=True)}
+            age = table.writes - 1 - rows[:, table.time_column]
+            above = is_positive(rows[:, table.reward_column], level, mean=mean)
+            found["positive_fraction_batch"] = float(above.double().mean())
+            found["effective_sample_size"] = float(
+                importance.sum().square() / importance.square().sum()
+            )
+            found["sampled_age_mean"] = float(age.mean())
+            found["sampled_age_max"] = float(age.max())
+            found["replay_count_mean"] = float(rows[:, table.count_column].mean())
+        for place, adjust in enumerate(self.adjustments):
+            if isinstance(adjust, PositiveBoost):
+                counted = () if self._weighing is None else self._weighing.counted
+                factor = adjust.factor(counted[place] if counted else None)
+                found.setdefault("boost_factor", float(factor))
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
-        return {
+        last = self._weighing or _NOTHING
+        state = {
             **super().state_dict(),
             "_signals": sorted(self._names),
             "_weights": self.weights,
-            "_weighed_at": 0 if self._weighing is None else self._weighing.writes,
-            "_mean_reward": 0.0 if self._weighing is None else self._weighing.mean_reward,
-            **counted_state(self._weighing, self.adjustments),
+            "_weighed_at": last.writes,
+            "_mean_reward": last.mean_reward,
         }
+        if any(self._counting):
+            state["_counted"] = [None if v is None else v.clone() for v in last.counted]
+            state["_counted_writes"] = last.counted_writes
+            state["_learned_since"] = last.learned_since
+        return state
 
     def _entries(self) -> list[Entry]:
         names = sorted(self._names)
-        return [
+
+        def fit_signals(weights: Any) -> bool:
+            return isinstance(weights, Mapping) and (
+                not weights
+                or (
+                    sorted(weights) == names
+                    and all(number(name).holds(value) for name, value in weights.items())
+                )
+            )
+
+        def fit_adjustments(counted: Any) -> bool:
+            finite = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
+            return isinstance(counted, list) and (not counted or finite == self._counting)
+
+        entries = [
             *super()._entries(),
             exactly("_signals", names),
-            *weighing_entries(names),
-            *counted_entries(self.adjustments),
+            Entry("_weights", fit_signals, f"empty, or one number for each of {names}"),
+            count("_weighed_at"),
+            Entry(
+                "_mean_reward",
+                lambda mean: isinstance(mean, int | float) and math.isfinite(mean),
+                "a finite number",
+            ),
         ]
+        if any(self._counting):
+            words = f"empty, or finite numbers for {sum(self._counting)} adjustments"
+            entries += [Entry("_counted", fit_adjustments, words)]
+            entries += [count("_counted_writes"), count("_learned_since")]
+        return entries
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave.
@@ -428,3 +483,22 @@ class SignalSampler(TreeSampler):
 
     def _ordered(self, weights: Mapping[str, float]) -> Tensor:
         return torch.tensor([weights[name] for name in self._names], dtype=torch.double)
+
+
+def _not_overwritten(table: SignalTable, rows: Tensor, written_at: Tensor) -> Tensor:
+    """Rows whose slot still holds the transition that was sampled, shape ``[B]``."""
+    if written_at.numel() != len(rows):
+        raise ValueError(
+            "written_at must have one number per transition, got shape "
+            f"{[*written_at.shape]} for {len(rows)} slots"
+        )
+    return rows.select(1, table.time_column) == written_at.reshape(-1).to(rows.device)
+
+
+def _shares(signals: Tensor, weights: Tensor) -> list[float]:
+    """Share of each signal in the mean fused priority; equal ones if every signal is zero."""
+    parts = signals.mean(0) * weights
+    total = parts.sum()
+    shares = parts / total if total > 0 else torch.full_like(parts, 1.0 / parts.numel())
+    found: list[float] = shares.tolist()
+    return found

@@ -19,10 +19,11 @@ from torchrl_mpfa.checks import (
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
-from torchrl_mpfa.samplers.slots import SERIAL, as_slots, last_of_each
 from torchrl_mpfa.samplers.states import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
+ORDERED = 2048
+"""Rows up to which writing by index keeps their order."""
 
 
 class TreeSampler(SavedTrees):
@@ -374,7 +375,7 @@ class TreeSampler(SavedTrees):
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         """Write priorities, eps included, to the trees."""
-        if len(slots) > SERIAL and (last := last_of_each(slots)) is not None:
+        if len(slots) > ORDERED and (last := last_of_each(slots)) is not None:
             slots, priority = slots[last], priority[last]
         self._priorities.index_copy_(0, slots, priority)
         self._max_tree[slots] = -priority if learned else torch.full_like(priority, math.inf)
@@ -401,3 +402,60 @@ def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
     if getattr(storage, "ndim", 1) == 1:
         return slots
     return torch.unravel_index(slots, storage.shape)
+
+
+def as_slots(index: Any, storage: Any = None) -> Tensor:
+    """Slots along the flattened storage, shape ``[B]``, from whatever names them.
+
+    Args:
+        index: A number, numbers of shape ``[B]``, or places in a storage of ``D`` dimensions: a
+            tensor of shape ``[B, D]``, or a tuple of ``D`` tensors of shape ``[B]``.
+        storage: The storage, which places in several dimensions need.
+
+    Raises:
+        TypeError: If the index holds anything but integers: a mask would be read as slots 0 and 1.
+        RuntimeError: If it has several dimensions and the storage has one, or is not given.
+        IndexError: If a place is outside the storage.
+    """
+    if isinstance(index, tuple):
+        index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
+    slots = torch.as_tensor(index, device="cpu")
+    if slots.numel() == 0:
+        return slots.new_empty(0, dtype=torch.long)
+    if slots.dtype is torch.bool or slots.is_floating_point() or slots.is_complex():
+        raise TypeError(f"index must hold integers, got {slots.dtype}")
+    slots = slots.long()
+    if slots.ndim <= 1:
+        return slots.reshape(-1)
+    # Not the filled part of it: a batch may be from before the storage was emptied.
+    shape = getattr(storage, "_total_shape", None)
+    if shape is None or len(shape) < 2 or len(shape) != slots.shape[-1]:
+        raise RuntimeError(
+            f"index must have one dimension, or one place for each dimension of a storage, got "
+            f"shape {[*slots.shape]} for a storage of shape {None if shape is None else [*shape]}"
+        )
+    places = slots.reshape(-1, len(shape))
+    # TorchRL's writers mark with -1 what was not stored.
+    skipped = (places == -1).all(-1)
+    wrong = ((places < 0) | (places >= torch.tensor(shape))).any(-1) & ~skipped
+    if bool(wrong.any()):
+        raise IndexError(
+            f"index must be within the storage's shape {[*shape]}, got {places[wrong][0].tolist()}"
+        )
+    slots = places[:, 0]
+    for dimension in range(1, len(shape)):
+        slots = slots * shape[dimension] + places[:, dimension]
+    return torch.where(skipped, -1, slots)
+
+
+def last_of_each(slots: Tensor) -> Tensor | None:
+    """Last position of each slot, shape ``[U]``; None if every slot appears once.
+
+    Of a slot that is written twice in one call the last must win, which writing by index leaves
+    open for large batches.
+    """
+    unique, inverse = slots.unique(return_inverse=True)
+    if len(unique) == len(slots):
+        return None
+    positions = torch.arange(len(slots))
+    return torch.zeros_like(unique).scatter_reduce_(0, inverse, positions, "amax")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,12 @@ from numpy.typing import NDArray
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_mpfa.checks import bounds, check_finite
 from torchrl_mpfa.saved import Entry, check_entries, count, exactly
 from torchrl_mpfa.signals import Signal, as_signals
+
+Priority = Callable[[Tensor], Tensor] | None
+Columns = slice | list[int]
 
 
 class SignalTable:
@@ -136,6 +140,49 @@ class SignalTable:
                 rows[:, self.column[signal.name]] = _not_negative(signal, value)
         return rows
 
+    def fill_learned(
+        self,
+        rows: Tensor,
+        signals: Mapping[str, Tensor],
+        learned: Mapping[str, Priority],
+        live: Tensor | None,
+        sizes: Sequence[int],
+    ) -> None:
+        """Put learned signals in copies of rows, of those that are live, batch by batch."""
+        count = len(rows) if live is None else len(live)
+        for name, priority_of in learned.items():
+            if name not in signals:
+                raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
+            value = signals[name].detach()
+            if value.numel() != count or value.is_complex():
+                raise ValueError(
+                    f"signal {name!r} must have one real number per transition, got {value.dtype} "
+                    f"of shape {[*value.shape]} for {count} slots"
+                )
+            value = value.reshape(-1) if live is None else value.reshape(-1)[live]
+            column = rows.select(1, self.column[name])
+            if priority_of is None:
+                column.copy_(value)
+                continue
+            for one, into in zip(value.split(sizes), column.split(sizes), strict=True):
+                if len(one):
+                    into.copy_(priority_of(one))
+
+    def check_fused(self, rows: Tensor, names: Sequence[str], columns: Columns) -> None:
+        """Reject rows whose signals cannot be fused: missing, negative or not finite."""
+        if len(rows) == 0:
+            return
+        # A NaN makes both of these NaN, so that one pass finds whatever is wrong.
+        chosen = rows[:, columns]
+        low, high = bounds(chosen)
+        if low >= 0 and high < math.inf:
+            return
+        written = {signal.name for signal in self.written}
+        for name, value in zip(names, chosen.unbind(1), strict=True):
+            if name in written and bool(value.isnan().any()):
+                raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
+            check_finite(f"signal {name!r}", value)
+
     def missing(self, rows: Tensor) -> str | None:
         """Name of the first entry known at the write that some of the rows lack."""
         # Of two rewards the signal counts first: it is the one that an error should name.
@@ -239,6 +286,24 @@ class SignalTable:
         self.clear()
         self.size, self.writes = state["size"], state["writes"]
         self.rows[: self.size] = state["rows"]
+
+
+def signal_table_of(storage: object, signals: Sequence[Signal], capacity: int) -> SignalTable:
+    """The signals of a storage, which must fit the signals and the capacity of a sampler."""
+    table = getattr(storage, "signal_table", None)
+    if not isinstance(table, SignalTable):
+        raise TypeError(
+            f"storage must keep signals (SignalTensorStorage, SignalMemmapStorage), got "
+            f"{type(storage).__name__}"
+        )
+    if table.capacity != capacity:
+        raise ValueError(
+            f"max_capacity of the sampler is {capacity}, max_size of the storage {table.capacity}"
+        )
+    absent = [signal.name for signal in signals if signal.name not in table.column]
+    if absent:
+        raise ValueError(f"signals {absent} of the sampler are not in the storage: {table.names}")
+    return table
 
 
 def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.float64]:
