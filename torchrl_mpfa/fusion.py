@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, check
+from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, check, check_finite
 from torchrl_mpfa.positive import Level, check_level
 
 if TYPE_CHECKING:
@@ -219,6 +219,17 @@ class Fusion(Protocol):
             One weight a signal, in the order of ``names``, shape ``[K]``.
         """
         ...
+
+
+def checked_weights(
+    fusion: Fusion, names: Sequence[str], table: SignalTable, index: Tensor
+) -> Tensor:
+    """Weights of a fusion, checked, in double precision, shape ``[K]``."""
+    weights = fusion.weights(names, table, index)
+    if weights.shape != (len(names),):
+        raise ValueError(f"fusion must give {len(names)} weights, got shape {[*weights.shape]}")
+    check_finite("weights of the fusion", weights)
+    return weights.to(torch.double)
 
 
 @dataclass(frozen=True)

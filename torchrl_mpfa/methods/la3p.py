@@ -110,22 +110,14 @@ class LA3PSampler(SignalSampler):
         return torch.ones(size, dtype=torch.double)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
         super().load_state_dict(state_dict)
         slots = self._priorities.isfinite().nonzero().squeeze(1)
         if len(slots):
             self._inverse_tree[slots] = 1.0 / state_dict["_sum_tree"][slots]
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
-
-        Raises:
-            ValueError: If an entry is missing, of another sampler, or not what it must be.
-        """
+        """Reject a state that does not fit, before anything changes."""
         super().check_state(state_dict)
         shares = state_dict["_sum_tree"][~state_dict["_priorities"].isnan()]
         if not bool((shares > 0).all()):

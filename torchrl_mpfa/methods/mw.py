@@ -44,6 +44,7 @@ class MWSampler(SignalSampler):
     """
 
     KIND = "capped"
+    SAVED = (*SignalSampler.SAVED, "_spent")
 
     def __init__(self, *args: Any, replay_cap: int = 1024, **kwargs: Any) -> None:
         check_counts(replay_cap=replay_cap)
@@ -61,7 +62,7 @@ class MWSampler(SignalSampler):
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         if not learned:
-            self._spent[slots] = False  # The count of a fresh transition starts anew.
+            self._spent[slots] = False  # The count of a fresh transition starts again.
         super()._write(slots, priority, learned=learned)
 
     def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
@@ -83,10 +84,6 @@ class MWSampler(SignalSampler):
             return super()._sample_slots(size, batch_size)
         return self._uniform(size, batch_size), torch.ones(batch_size)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that the next batches depend on; tensors and plain values only."""
-        return {**super().state_dict(), "_spent": self._spent.clone()}
-
     def _entries(self) -> list[Entry]:
         return [
             *super()._entries(),
@@ -95,12 +92,3 @@ class MWSampler(SignalSampler):
 
     def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
         return super()._saved_leaves(state, written).masked_fill(state["_spent"][written], 0.0)
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
-        super().load_state_dict(state_dict)
-        self._spent.copy_(state_dict["_spent"])

@@ -52,7 +52,7 @@ class RankPERSampler(SignalSampler):
 
     Args:
         *args: As :class:`~torchrl_mpfa.SignalSampler`.
-        rank_refresh: Share of the buffer whose priority may be written anew before all are
+        rank_refresh: Share of the buffer whose priority may be written again before all are
             sorted; 0 sorts at every update.
         **kwargs: As :class:`~torchrl_mpfa.SignalSampler`.
 
@@ -65,6 +65,7 @@ class RankPERSampler(SignalSampler):
     """
 
     KIND = "rank"
+    SAVED = (*SignalSampler.SAVED, "_order", "_written")
 
     def __init__(self, *args: Any, rank_refresh: float = 0.25, **kwargs: Any) -> None:
         check(NOT_NEGATIVE, rank_refresh=rank_refresh)
@@ -100,10 +101,6 @@ class RankPERSampler(SignalSampler):
         if len(self._order):
             self._sort()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that the next batches depend on; tensors and plain values only."""
-        return {**super().state_dict(), "_order": self._order.clone(), "_written": self._written}
-
     def _entries(self) -> list[Entry]:
         most = self._max_capacity
         order = Entry(
@@ -117,12 +114,3 @@ class RankPERSampler(SignalSampler):
 
     def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
         return _share_in(state["_order"], state["_priorities"][written], alpha=state["_alpha"])
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
-        super().load_state_dict(state_dict)
-        self._order, self._written = state_dict["_order"].clone(), state_dict["_written"]

@@ -15,15 +15,12 @@ policy counts as a Gaussian around its action, as wide as the behavior was.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import RandomSampler, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
 from torchrl_mpfa.losses.functional import (
@@ -33,7 +30,7 @@ from torchrl_mpfa.losses.functional import (
     POLICY_WEIGHT,
 )
 from torchrl_mpfa.methods.acting import actions_of
-from torchrl_mpfa.samplers.states import check_sampler
+from torchrl_mpfa.samplers.states import SavedValues
 from torchrl_mpfa.saved import count, number
 from torchrl_mpfa.selection import Draw
 
@@ -42,7 +39,6 @@ LEAST_SIGMA = 0.2
 _CUTOFF_DECAY = 5e-7
 _RATE = 0.1
 _FIRST_WEIGHT = 1e-4
-_FILE = "trust.json"
 
 
 def importance_ratio(action: Tensor, now: Tensor, then: Tensor, sigma: Tensor) -> Tensor:
@@ -89,13 +85,16 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
     return kept if far > allowed else kept + min(rate, 1.0 - weight)
 
 
-class ReFERSampler(RandomSampler):
+class ReFERSampler(SavedValues):
     r"""Uniform sampling by a sampler that keeps and saves what ReF-ER adapts.
 
     Examples:
         >>> ReFERSampler().policy_weight
         0.0001
     """
+
+    FILE = "trust.json"
+    ENTRIES = (number("_policy_weight", high=1.0), count("_batches"))
 
     def __init__(self) -> None:
         super().__init__()
@@ -106,48 +105,6 @@ class ReFERSampler(RandomSampler):
         super()._empty()
         # The batches go on: they are the training's.
         self.policy_weight = _FIRST_WEIGHT
-
-    def state_dict(self) -> dict[str, Any]:
-        """The weight of the policy's gradient, and the batches so far."""
-        return {"_policy_weight": self.policy_weight, "_batches": self.batches}
-
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Reject a state that does not fit, before anything changes.
-
-        Raises:
-            ValueError: If an entry is missing or not what it must be.
-        """
-        check_sampler(state_dict, [number("_policy_weight", high=1.0), count("_batches")])
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
-        self.check_state(state_dict)
-        self.policy_weight = state_dict["_policy_weight"]
-        self.batches = state_dict["_batches"]
-
-    def dumps(self, path: str | Path) -> None:
-        """Save in a folder."""
-        folder = Path(path)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / _FILE).write_text(json.dumps(self.state_dict()), encoding="utf-8")
-
-    def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read a saved sampler and refuse it as :meth:`check_state` does."""
-        state: dict[str, Any] = json.loads((Path(path) / _FILE).read_text(encoding="utf-8"))
-        self.check_state(state)
-        return state
-
-    def loads(self, path: str | Path) -> None:
-        """Restore from a folder.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
-        self.load_state_dict(self.check_dump(path))
 
 
 class ReFERSelection:

@@ -161,21 +161,13 @@ class MixtureSampler(SignalSampler):
         ]
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Reject a state that does not fit, before anything changes.
-
-        Raises:
-            ValueError: If an entry is missing, of another sampler, or not what it must be.
-        """
+        """Reject a state that does not fit, before anything changes."""
         super().check_state(state_dict)
         for name, part in self._parts.items():
             part.check_state(state_dict["_parts"][name])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
         super().load_state_dict(state_dict)
         for name, part in self._parts.items():
             part.load_state_dict(state_dict["_parts"][name])

@@ -14,7 +14,7 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
 from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_counts, check_finite, check_index
-from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion
+from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
 from torchrl_mpfa.samplers.tree import (
@@ -255,12 +255,9 @@ class SignalSampler(TreeSampler):
         filled = table.size if written_at is None else table.known
         if len(check_index(slots, filled)) < len(slots):
             raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
-        rows, live, sizes = (
-            table.rows.index_select(0, slots),
-            None,
-            [len(slots) // batches] * batches,
-        )
-        if written_at is not None and not (same := _not_overwritten(table, rows, written_at)).all():
+        rows, live = table.rows.index_select(0, slots), None
+        sizes = [len(slots) // batches] * batches
+        if written_at is not None and not (same := table.same(rows, written_at)).all():
             live, sizes = same, same.reshape(batches, -1).sum(1).tolist()
             rows, slots = rows[same], slots[same]
         stale = 0 if live is None else len(live) - len(slots)
@@ -317,26 +314,16 @@ class SignalSampler(TreeSampler):
         fresh = table.writes - (0 if last is None else last.writes)
         due = always or not 0 <= fresh <= self.entropy_refresh * table.size
         if last is None or due:
-            weights = self._fusion_weights(table, index)
+            weights = checked_weights(self.fusion, self._names, table, index)
             if (text := one_sided(table.rewards, (self.fusion, *self.adjustments))) is not None:
                 self._warn_once(text)
             mean, before = float(table.rewards.mean()), last or _NOTHING
             made = replace(before, weights=weights, mean_reward=mean, writes=table.writes)
         elif getattr(self.fusion, "every_batch", False):
-            made = replace(last, weights=self._fusion_weights(table, index))
+            made = replace(last, weights=checked_weights(self.fusion, self._names, table, index))
         else:
             made = last
         return self._count(table, len(index), made, always) if any(self._counting) else made
-
-    def _fusion_weights(self, table: SignalTable, index: Tensor) -> Tensor:
-        """Weights of the fusion, checked, in double precision, shape ``[K]``."""
-        weights = self.fusion.weights(self._names, table, index)
-        if weights.shape != (len(self._names),):
-            raise ValueError(
-                f"fusion must give {len(self._names)} weights, got shape {[*weights.shape]}"
-            )
-        check_finite("weights of the fusion", weights)
-        return weights.to(torch.double)
 
     def _count(self, table: SignalTable, learned: int, last: Weighing, always: bool) -> Weighing:
         """Have the adjustments count the buffer again if enough of it changed."""
@@ -376,44 +363,45 @@ class SignalSampler(TreeSampler):
         return table
 
     def stats(self, storage: Storage) -> dict[str, float]:
-        """Composition of the priorities; see ``docs/metrics.md`` for each entry.
-
-        Weights, entropies and shares of the signals, fractions of positive transitions, effective
-        sample size and age of the last batch, and the factor of the boost.
-        """
+        """Composition of buffer and last batch by name; see ``docs/metrics.md`` for each entry."""
         table, weights = self.bind(storage), self.weights
-        level = level_of((*self.adjustments, self.fusion))
         found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
-        if table.size:
-            mean = float(table.rewards.mean())
-            above = is_positive(table.rewards, level, mean=mean)
-            found["positive_fraction_buffer"] = float(above.double().mean())
-        if table.size and self._last_batch is not None:
-            index, importance = self._last_batch
-            rows = table.rows[index]
-            if (entropies := getattr(self.fusion, "entropies", None)) is not None:
-                values = entropies(self._names, table, index).tolist()
-                found |= {f"entropy/{n}": v for n, v in zip(self._names, values, strict=True)}
-            known = rows[:, self._columns]
-            known = known[~known.isnan().any(1)]
-            if weights and len(known):
-                shares = _shares(known, known.new_tensor([weights[name] for name in self._names]))
-                found |= {f"share/{n}": s for n, s in zip(self._names, shares, strict=True)}
-            age = table.writes - 1 - rows[:, table.time_column]
-            above = is_positive(rows[:, table.reward_column], level, mean=mean)
-            found["positive_fraction_batch"] = float(above.double().mean())
-            found["effective_sample_size"] = float(
-                importance.sum().square() / importance.square().sum()
-            )
-            found["sampled_age_mean"] = float(age.mean())
-            found["sampled_age_max"] = float(age.max())
-            found["replay_count_mean"] = float(rows[:, table.count_column].mean())
         for place, adjust in enumerate(self.adjustments):
             if isinstance(adjust, PositiveBoost):
                 counted = () if self._weighing is None else self._weighing.counted
                 factor = adjust.factor(counted[place] if counted else None)
                 found.setdefault("boost_factor", float(factor))
-        return found
+        if table.size == 0:
+            return found
+        level, mean = level_of((*self.adjustments, self.fusion)), float(table.rewards.mean())
+        positive = is_positive(table.rewards, level, mean=mean)
+        found["positive_fraction_buffer"] = float(positive.double().mean())
+        if self._last_batch is None:
+            return found
+        index, importance = self._last_batch
+        rows = table.rows[index]
+        if (entropies := getattr(self.fusion, "entropies", None)) is not None:
+            values = entropies(self._names, table, index).tolist()
+            found |= {f"entropy/{n}": v for n, v in zip(self._names, values, strict=True)}
+        known = rows[:, self._columns]
+        known = known[~known.isnan().any(1)]
+        if weights and len(known):
+            # Shares in the mean priority of Eq. (21); equal ones if every signal is zero.
+            parts = known.mean(0) * self._ordered(weights)
+            shares = (
+                parts / parts.sum() if parts.sum() > 0 else torch.full_like(parts, 1 / len(parts))
+            )
+            found |= {f"share/{n}": v for n, v in zip(self._names, shares.tolist(), strict=True)}
+        positive = is_positive(rows[:, table.reward_column], level, mean=mean)
+        age = table.writes - 1 - rows[:, table.time_column]
+        return {
+            **found,
+            "positive_fraction_batch": float(positive.double().mean()),
+            "effective_sample_size": float(importance.sum().square() / importance.square().sum()),
+            "sampled_age_mean": float(age.mean()),
+            "sampled_age_max": float(age.max()),
+            "replay_count_mean": float(rows[:, table.count_column].mean()),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
@@ -435,28 +423,22 @@ class SignalSampler(TreeSampler):
         names = sorted(self._names)
 
         def fit_signals(weights: Any) -> bool:
-            return isinstance(weights, Mapping) and (
-                not weights
-                or (
-                    sorted(weights) == names
-                    and all(number(name).holds(value) for name, value in weights.items())
-                )
-            )
+            known = isinstance(weights, Mapping) and (not weights or sorted(weights) == names)
+            return known and all(number("weight").holds(value) for value in weights.values())
 
         def fit_adjustments(counted: Any) -> bool:
-            finite = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
-            return isinstance(counted, list) and (not counted or finite == self._counting)
+            fit = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
+            return isinstance(counted, list) and (not counted or fit == self._counting)
+
+        def finite(mean: Any) -> bool:
+            return isinstance(mean, int | float) and math.isfinite(mean)
 
         entries = [
             *super()._entries(),
             exactly("_signals", names),
             Entry("_weights", fit_signals, f"empty, or one number for each of {names}"),
             count("_weighed_at"),
-            Entry(
-                "_mean_reward",
-                lambda mean: isinstance(mean, int | float) and math.isfinite(mean),
-                "a finite number",
-            ),
+            Entry("_mean_reward", finite, "a finite number"),
         ]
         if any(self._counting):
             words = f"empty, or finite numbers for {sum(self._counting)} adjustments"
@@ -465,11 +447,7 @@ class SignalSampler(TreeSampler):
         return entries
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
         super().load_state_dict(state_dict)
         if state_dict["_weights"]:
             self._weighing = Weighing(
@@ -477,28 +455,8 @@ class SignalSampler(TreeSampler):
                 state_dict["_mean_reward"],
                 state_dict["_weighed_at"],
                 tuple(state_dict.get("_counted", ())),
-                state_dict.get("_counted_writes", 0),
-                state_dict.get("_learned_since", 0),
+                *(state_dict.get(name, 0) for name in ("_counted_writes", "_learned_since")),
             )
 
     def _ordered(self, weights: Mapping[str, float]) -> Tensor:
         return torch.tensor([weights[name] for name in self._names], dtype=torch.double)
-
-
-def _not_overwritten(table: SignalTable, rows: Tensor, written_at: Tensor) -> Tensor:
-    """Rows whose slot still holds the transition that was sampled, shape ``[B]``."""
-    if written_at.numel() != len(rows):
-        raise ValueError(
-            "written_at must have one number per transition, got shape "
-            f"{[*written_at.shape]} for {len(rows)} slots"
-        )
-    return rows.select(1, table.time_column) == written_at.reshape(-1).to(rows.device)
-
-
-def _shares(signals: Tensor, weights: Tensor) -> list[float]:
-    """Share of each signal in the mean fused priority; equal ones if every signal is zero."""
-    parts = signals.mean(0) * weights
-    total = parts.sum()
-    shares = parts / total if total > 0 else torch.full_like(parts, 1.0 / parts.numel())
-    found: list[float] = shares.tolist()
-    return found

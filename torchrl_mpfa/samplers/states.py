@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torchrl.data import RandomSampler
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.saved import Entry, check_entries, exactly, number, wrong
@@ -22,7 +23,11 @@ class SavedTrees(PrioritizedSampler):
     """The part of :class:`~torchrl_mpfa.samplers.TreeSampler` that saves and loads."""
 
     KIND = "proportional"
-    """What a saved state must have been made by."""
+    """The sampler that a saved state must be of."""
+    SAVED: tuple[str, ...] = (
+        *("_alpha", "_beta", "_eps", "_highest", "_highest_slot", "_priorities"),
+    )
+    """Attributes that are saved as they are."""
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
@@ -32,12 +37,7 @@ class SavedTrees(PrioritizedSampler):
             "_format": FORMAT,
             "_kind": self.KIND,
             "_max_capacity": self._max_capacity,
-            "_alpha": float(self._alpha),
-            "_beta": float(self._beta),
-            "_eps": float(self._eps),
-            "_highest": self._highest,
-            "_highest_slot": self._highest_slot,
-            "_priorities": self._priorities.clone(),
+            **{name: _copy(getattr(self, name)) for name in self.SAVED},
             "_learned": torch.as_tensor(self._max_tree[slots]).reshape(-1) <= 0,
             "_sum_tree": torch.as_tensor(self._sum_tree[slots]).reshape(-1).clone(),
             "_min_tree": torch.as_tensor(self._min_tree[slots]).reshape(-1).clone(),
@@ -56,7 +56,7 @@ class SavedTrees(PrioritizedSampler):
         _check_leaves(state_dict, written, self._saved_leaves(state_dict, written))
 
     def _entries(self) -> list[Entry]:
-        """What each entry of a saved state must be."""
+        """The entries of a saved state."""
         slots = self._max_capacity
         each_slot: dict[str, Any] = {"dtype": torch.double, "shape": (slots,)}
         return [
@@ -82,24 +82,16 @@ class SavedTrees(PrioritizedSampler):
         ]
 
     def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        """What written slots of a saved state are sampled in proportion to, shape ``[M]``."""
+        """Leaves that follow from the priorities of a saved state, shape ``[M]``."""
         priorities: Tensor = state["_priorities"][written]
         return priorities.pow(state["_alpha"])
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
         self.check_state(state_dict)
         self._init()
-        self._alpha = state_dict["_alpha"]
-        self._beta = state_dict["_beta"]
-        self._eps = state_dict["_eps"]
-        self._highest = state_dict["_highest"]
-        self._highest_slot = state_dict["_highest_slot"]
-        self._priorities.copy_(state_dict["_priorities"])
+        for name in self.SAVED:
+            setattr(self, name, _copy(state_dict[name]))
         # Leaves that were never written hold what the tree takes for nothing; only the others
         # are written back, and inner nodes follow from the leaves alone.
         slots = self._priorities.isfinite().nonzero().squeeze(1)
@@ -127,15 +119,55 @@ class SavedTrees(PrioritizedSampler):
         return state
 
     def loads(self, path: str | Path) -> None:
-        """Restore from a folder.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore from a folder, or raise as :meth:`check_state` does."""
         self.load_state_dict(self.check_dump(path))
 
 
-def check_sampler(state: Any, entries: list[Entry]) -> None:
+class SavedValues(RandomSampler):
+    """The part of uniform samplers that saves and loads what they adapt: plain values."""
+
+    FILE: str
+    ENTRIES: tuple[Entry, ...]
+    """Each is an attribute, whose name has no underscore."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next batches depend on beside the generator; plain values only."""
+        return {entry.name: getattr(self, entry.name[1:]) for entry in self.ENTRIES}
+
+    def check_state(self, state_dict: dict[str, Any]) -> None:
+        """Reject a state that does not fit, before anything changes."""
+        check_sampler(state_dict, self.ENTRIES)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
+        self.check_state(state_dict)
+        for entry in self.ENTRIES:
+            setattr(self, entry.name[1:], state_dict[entry.name])
+
+    def dumps(self, path: str | Path) -> None:
+        """Save in a folder."""
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / self.FILE).write_text(json.dumps(self.state_dict()), encoding="utf-8")
+
+    def check_dump(self, path: str | Path) -> dict[str, Any]:
+        """Read a saved sampler and reject it as :meth:`check_state` does."""
+        found = json.loads((Path(path) / self.FILE).read_text(encoding="utf-8"))
+        # A file of version 0.1 has a single value without its name.
+        state = found if isinstance(found, dict) else {self.ENTRIES[0].name: found}
+        self.check_state(state)
+        return state
+
+    def loads(self, path: str | Path) -> None:
+        """Restore from a folder, or raise as :meth:`check_state` does."""
+        self.load_state_dict(self.check_dump(path))
+
+
+def _copy(value: Any) -> Any:
+    return value.clone() if isinstance(value, Tensor) else value
+
+
+def check_sampler(state: Any, entries: Iterable[Entry]) -> None:
     """Reject the state of a sampler that is not as described."""
     check_entries("sampler", state, entries, missing=ValueError)
 

@@ -33,8 +33,8 @@ class TreeSampler(SavedTrees):
     these differences: it samples in double precision, as single precision is not enough for
     a million slots; the highest priority in the buffer costs O(log N) instead of O(N); randomness
     comes from a generator that ``torch.manual_seed`` reaches and that is saved; a priority that is
-    negative or not finite is refused where it enters; a saved state holds tensors and numbers
-    only, and one that does not fit is refused before anything changes.
+    negative or not finite is rejected where it enters; a saved state holds tensors and numbers
+    only, and one that does not fit is rejected before anything changes.
 
     Args:
         max_capacity: Capacity of the storage ``N``.
@@ -81,7 +81,14 @@ class TreeSampler(SavedTrees):
         self.stratified = stratified
         self._weight_dtype = dtype
         super().__init__(
-            max_capacity, alpha, beta, eps, dtype, reduction, max_priority_within_buffer, device
+            max_capacity,
+            float(alpha),
+            float(beta),
+            float(eps),
+            dtype,
+            reduction,
+            max_priority_within_buffer,
+            device,
         )
 
     def _init(self) -> None:
@@ -107,9 +114,9 @@ class TreeSampler(SavedTrees):
         Setting it follows in all leaves.
 
         Raises:
-            TypeError: If it is set to what is no number.
-            ValueError: If it is set to what is negative or not finite, or to what leaves priorities
-                of zero or without a finite sum; nothing is changed then.
+            TypeError: If it is set to anything but a number.
+            ValueError: If the number is negative, not finite, or leaves priorities of zero or
+                without a finite sum; nothing is changed then.
         """
         alpha: float = self._alpha
         return alpha
@@ -118,12 +125,12 @@ class TreeSampler(SavedTrees):
     def alpha(self, value: float) -> None:
         check(NOT_NEGATIVE, alpha=value)
         self._check_alpha(value)
-        before, self._alpha = self._alpha, value
+        before, self._alpha = self._alpha, float(value)
         if value != before:
             self._retransform_priority_trees(before, value)
 
     def _check_alpha(self, value: float) -> None:
-        """Refuse an exponent by which priorities vanish or overflow."""
+        """Reject an exponent by which priorities vanish or overflow."""
         written = self._priorities[self._priorities > 0]
         before, self._alpha = self._alpha, value
         leaf = self._leaf(written)
@@ -139,8 +146,8 @@ class TreeSampler(SavedTrees):
         r"""Importance exponent :math:`\beta` of Eq. (10).
 
         Raises:
-            TypeError: If it is set to what is no number.
-            ValueError: If it is set to what is negative or not finite; nothing is changed then.
+            TypeError: If it is set to anything but a number.
+            ValueError: If the number is negative or not finite; nothing is changed then.
         """
         beta: float = self._beta
         return beta
@@ -148,7 +155,7 @@ class TreeSampler(SavedTrees):
     @beta.setter
     def beta(self, value: float) -> None:
         check(NOT_NEGATIVE, beta=value)
-        self._beta = value
+        self._beta = float(value)
 
     @property
     def _max_priority(self) -> tuple[float | None, int | None]:
@@ -204,7 +211,7 @@ class TreeSampler(SavedTrees):
         return not self.stratified
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
-        """Draw slots by Eq. (8), with the weights of Eq. (10).
+        """Sample slots by Eq. (8), with the weights of Eq. (10).
 
         Args:
             storage: The storage to sample from.
@@ -288,12 +295,7 @@ class TreeSampler(SavedTrees):
         return mass.add_(torch.randperm(batch_size, generator=self._rng)).div_(batch_size)
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
-        """Give fresh transitions the highest priority.
-
-        Raises:
-            IndexError: If a slot is outside the buffer.
-            TypeError: If the index holds anything but integers.
-        """
+        """Give fresh transitions the highest priority, or raise as :meth:`update_priority`."""
         slots = check_index(as_slots(index, storage), self._max_capacity)
         if len(slots) == 0:
             return
@@ -359,7 +361,7 @@ class TreeSampler(SavedTrees):
         return fresh & (value.float() == torch.tensor(self.default_priority).float())
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
-        """The highest of priorities, eps included, which are refused if they poison a tree."""
+        """The highest of priorities, eps included; those that poison a tree are rejected."""
         low, high = bounds(priority)
         if not (low >= 0 and high < math.inf):
             check_finite(name, priority)
@@ -405,23 +407,13 @@ def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
 
 
 def as_slots(index: Any, storage: Any = None) -> Tensor:
-    """Slots along the flattened storage, shape ``[B]``, from whatever names them.
-
-    Args:
-        index: A number, numbers of shape ``[B]``, or places in a storage of ``D`` dimensions: a
-            tensor of shape ``[B, D]``, or a tuple of ``D`` tensors of shape ``[B]``.
-        storage: The storage, which places in several dimensions need.
-
-    Raises:
-        TypeError: If the index holds anything but integers: a mask would be read as slots 0 and 1.
-        RuntimeError: If it has several dimensions and the storage has one, or is not given.
-        IndexError: If a place is outside the storage.
-    """
+    """Slots ``[B]`` along the flattened storage, from slots or places ``[B, D]`` or a tuple."""
     if isinstance(index, tuple):
         index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
     slots = torch.as_tensor(index, device="cpu")
     if slots.numel() == 0:
         return slots.new_empty(0, dtype=torch.long)
+    # A mask would be read as slots 0 and 1.
     if slots.dtype is torch.bool or slots.is_floating_point() or slots.is_complex():
         raise TypeError(f"index must hold integers, got {slots.dtype}")
     slots = slots.long()

@@ -183,6 +183,15 @@ class SignalTable:
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
             check_finite(f"signal {name!r}", value)
 
+    def same(self, rows: Tensor, written_at: Tensor) -> Tensor:
+        """Rows of transitions that were sampled and not overwritten since, shape ``[B]``."""
+        if written_at.numel() != len(rows):
+            raise ValueError(
+                "written_at must have one number per transition, got shape "
+                f"{[*written_at.shape]} for {len(rows)} slots"
+            )
+        return rows.select(1, self.time_column) == written_at.reshape(-1).to(rows.device)
+
     def missing(self, rows: Tensor) -> str | None:
         """Name of the first entry known at the write that some of the rows lack."""
         # Of two rewards the signal counts first: it is the one that an error should name.
@@ -277,11 +286,7 @@ class SignalTable:
         ]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
         self.check_state(state)
         self.clear()
         self.size, self.writes = state["size"], state["writes"]

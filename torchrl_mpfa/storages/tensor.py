@@ -75,22 +75,12 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         return super().get(index)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore data and signals.
-
-        Raises:
-            KeyError: See :meth:`check_state`.
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore data and signals, or raise as :meth:`check_state` does."""
         super().load_state_dict(state_dict)
         self._settle_device()
 
     def loads(self, path: str | Path) -> None:
-        """Restore data and signals from a folder.
-
-        Raises:
-            KeyError: See :meth:`check_state`.
-            ValueError: See :meth:`check_state`.
-        """
+        """Restore data and signals from a folder, or raise as :meth:`check_state` does."""
         super().loads(path)
         self._settle_device()
 
