@@ -4,137 +4,91 @@ from __future__ import annotations
 
 import warnings
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mpfa_envs.later import after_import
-
 if TYPE_CHECKING:
-    from mpfa_envs.env.config import PAPER_TASK, TaskConfig
-    from mpfa_envs.env.navigation import NavigationEnv
-    from mpfa_envs.env.registration import ENV_IDS, ROOMS_TASK
-    from mpfa_envs.env.torchrl_env import NavigationTorchEnv, make_navigation_env
-    from mpfa_envs.env.vector import VectorNavigationEnv
-    from mpfa_envs.evaluation.results import summarize
-    from mpfa_envs.evaluation.runs import evaluate, run_tasks
-    from mpfa_envs.generators import GENERATORS, generate_world, register_generator
-    from mpfa_envs.planners import PLANNERS, make_planner
-    from mpfa_envs.policies.export import export_policy
-    from mpfa_envs.policies.files import load_policy, save_policy
-    from mpfa_envs.policies.policy import Policy
-    from mpfa_envs.robots.discrete import DiscreteWheels
-    from mpfa_envs.robots.model import ROBOTS, RobotModel
-    from mpfa_envs.robots.noise import RobotNoise
-    from mpfa_envs.sensing.lidar import Lidar
-    from mpfa_envs.sensing.mirror import Mirror, RandomMirror
-    from mpfa_envs.sensing.observation import OBSERVATION
-    from mpfa_envs.tasks.reward import RewardTerms, StepOutcome, navigation_reward
-    from mpfa_envs.tasks.sets import WorldTask, world_tasks
-    from mpfa_envs.worlds.builtin import WORLDS
-    from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
-    from mpfa_envs.worlds.task import Task
-    from mpfa_envs.worlds.walker import Walker
-    from mpfa_envs.worlds.world import World
-    from mpfa_envs.worlds.world_file import load_world, save_world
-    from mpfa_envs.worlds.yaml_nodes import WorldFileError
+    from mpfa_envs.env.config import PAPER_TASK as PAPER_TASK
+    from mpfa_envs.env.config import TaskConfig as TaskConfig
+    from mpfa_envs.env.navigation import NavigationEnv as NavigationEnv
+    from mpfa_envs.env.registration import ENV_IDS as ENV_IDS
+    from mpfa_envs.env.registration import ROOMS_TASK as ROOMS_TASK
+    from mpfa_envs.env.torchrl_env import NavigationTorchEnv as NavigationTorchEnv
+    from mpfa_envs.env.torchrl_env import make_navigation_env as make_navigation_env
+    from mpfa_envs.env.vector import VectorNavigationEnv as VectorNavigationEnv
+    from mpfa_envs.evaluation.results import summarize as summarize
+    from mpfa_envs.evaluation.runs import evaluate as evaluate
+    from mpfa_envs.evaluation.runs import run_tasks as run_tasks
+    from mpfa_envs.generators import GENERATORS as GENERATORS
+    from mpfa_envs.generators import generate_world as generate_world
+    from mpfa_envs.generators import register_generator as register_generator
+    from mpfa_envs.planners import PLANNERS as PLANNERS
+    from mpfa_envs.planners import make_planner as make_planner
+    from mpfa_envs.policies.export import export_policy as export_policy
+    from mpfa_envs.policies.files import load_policy as load_policy
+    from mpfa_envs.policies.files import save_policy as save_policy
+    from mpfa_envs.policies.policy import Policy as Policy
+    from mpfa_envs.robots.discrete import DiscreteWheels as DiscreteWheels
+    from mpfa_envs.robots.model import ROBOTS as ROBOTS
+    from mpfa_envs.robots.model import RobotModel as RobotModel
+    from mpfa_envs.robots.noise import RobotNoise as RobotNoise
+    from mpfa_envs.sensing.lidar import Lidar as Lidar
+    from mpfa_envs.sensing.mirror import Mirror as Mirror
+    from mpfa_envs.sensing.mirror import RandomMirror as RandomMirror
+    from mpfa_envs.sensing.observation import OBSERVATION as OBSERVATION
+    from mpfa_envs.tasks.reward import RewardTerms as RewardTerms
+    from mpfa_envs.tasks.reward import StepOutcome as StepOutcome
+    from mpfa_envs.tasks.reward import navigation_reward as navigation_reward
+    from mpfa_envs.tasks.sets import WorldTask as WorldTask
+    from mpfa_envs.tasks.sets import world_tasks as world_tasks
+    from mpfa_envs.worlds.builtin import WORLDS as WORLDS
+    from mpfa_envs.worlds.shapes import Box as Box
+    from mpfa_envs.worlds.shapes import Cylinder as Cylinder
+    from mpfa_envs.worlds.shapes import Polygon as Polygon
+    from mpfa_envs.worlds.task import Task as Task
+    from mpfa_envs.worlds.walker import Walker as Walker
+    from mpfa_envs.worlds.world import World as World
+    from mpfa_envs.worlds.world_file import load_world as load_world
+    from mpfa_envs.worlds.world_file import save_world as save_world
+    from mpfa_envs.worlds.yaml_nodes import WorldFileError as WorldFileError
 
 EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 """A world file to start your own from."""
 
-__all__ = [
-    "ENV_IDS",
-    "EXAMPLE_WORLD",
-    "GENERATORS",
-    "OBSERVATION",
-    "PAPER_TASK",
-    "PLANNERS",
-    "ROBOTS",
-    "ROOMS_TASK",
-    "WORLDS",
-    "Box",
-    "Cylinder",
-    "DiscreteWheels",
-    "Lidar",
-    "Mirror",
-    "NavigationEnv",
-    "NavigationTorchEnv",
-    "Policy",
-    "Polygon",
-    "RandomMirror",
-    "RewardTerms",
-    "RobotModel",
-    "RobotNoise",
-    "StepOutcome",
-    "Task",
-    "TaskConfig",
-    "VectorNavigationEnv",
-    "Walker",
-    "World",
-    "WorldFileError",
-    "WorldTask",
-    "evaluate",
-    "export_policy",
-    "generate_world",
-    "load_policy",
-    "load_world",
-    "make_navigation_env",
-    "make_planner",
-    "navigation_reward",
-    "register_generator",
-    "run_tasks",
-    "save_policy",
-    "save_world",
-    "summarize",
-    "world_tasks",
-]
-
-_MODULES = {
-    "ENV_IDS": "env.registration",
-    "GENERATORS": "generators",
-    "OBSERVATION": "sensing.observation",
-    "PAPER_TASK": "env.config",
-    "PLANNERS": "planners",
-    "ROBOTS": "robots.model",
-    "ROOMS_TASK": "env.registration",
-    "WORLDS": "worlds.builtin",
-    "Box": "worlds.shapes",
-    "Cylinder": "worlds.shapes",
-    "DiscreteWheels": "robots.discrete",
-    "Lidar": "sensing.lidar",
-    "Mirror": "sensing.mirror",
-    "NavigationEnv": "env.navigation",
-    "NavigationTorchEnv": "env.torchrl_env",
-    "Policy": "policies.policy",
-    "Polygon": "worlds.shapes",
-    "RandomMirror": "sensing.mirror",
-    "RewardTerms": "tasks.reward",
-    "RobotModel": "robots.model",
-    "RobotNoise": "robots.noise",
-    "StepOutcome": "tasks.reward",
-    "Task": "worlds.task",
-    "TaskConfig": "env.config",
-    "VectorNavigationEnv": "env.vector",
-    "Walker": "worlds.walker",
-    "World": "worlds.world",
-    "WorldFileError": "worlds.yaml_nodes",
-    "WorldTask": "tasks.sets",
-    "evaluate": "evaluation.runs",
-    "export_policy": "policies.export",
-    "generate_world": "generators",
-    "load_policy": "policies.files",
-    "load_world": "worlds.world_file",
-    "make_navigation_env": "env.torchrl_env",
-    "make_planner": "planners",
-    "navigation_reward": "tasks.reward",
-    "register_generator": "generators",
-    "run_tasks": "evaluation.runs",
-    "save_policy": "policies.files",
-    "save_world": "worlds.world_file",
-    "summarize": "evaluation.results",
-    "world_tasks": "tasks.sets",
+_NAMES = {
+    "env.config": "PAPER_TASK TaskConfig",
+    "env.navigation": "NavigationEnv",
+    "env.registration": "ENV_IDS ROOMS_TASK",
+    "env.torchrl_env": "NavigationTorchEnv make_navigation_env",
+    "env.vector": "VectorNavigationEnv",
+    "evaluation.results": "summarize",
+    "evaluation.runs": "evaluate run_tasks",
+    "generators": "GENERATORS generate_world register_generator",
+    "planners": "PLANNERS make_planner",
+    "policies.export": "export_policy",
+    "policies.files": "load_policy save_policy",
+    "policies.policy": "Policy",
+    "robots.discrete": "DiscreteWheels",
+    "robots.model": "ROBOTS RobotModel",
+    "robots.noise": "RobotNoise",
+    "sensing.lidar": "Lidar",
+    "sensing.mirror": "Mirror RandomMirror",
+    "sensing.observation": "OBSERVATION",
+    "tasks.reward": "RewardTerms StepOutcome navigation_reward",
+    "tasks.sets": "WorldTask world_tasks",
+    "worlds.builtin": "WORLDS",
+    "worlds.shapes": "Box Cylinder Polygon",
+    "worlds.task": "Task",
+    "worlds.walker": "Walker",
+    "worlds.world": "World",
+    "worlds.world_file": "load_world save_world",
+    "worlds.yaml_nodes": "WorldFileError",
 }
-"""Where each name is. A module is imported when a name of it is first asked for: a robot that runs
-:mod:`mpfa_envs.deploy` has neither gymnasium nor torch, and Numba takes half a second."""
+"""Public names by module. A module is imported when a name of it is first asked for: a robot that
+runs :mod:`mpfa_envs.deploy` has neither SciPy nor torch, and Numba takes half a second."""
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(["EXAMPLE_WORLD", *_MODULE_OF], key=lambda name: (not name.isupper(), name))
 _RENAMED = {
     "BARN_WORLDS": "worlds.barn.BARN_WORLDS",
     "Binning": "sensing.binning.Binning",
@@ -173,7 +127,7 @@ _OF_THE_EXTRA = ("gymnasium", "networkx", "numba", "PIL", "yaml", "scipy")
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first asked for."""
-    module = _MODULES.get(name)
+    module = _MODULE_OF.get(name)
     if name in _RENAMED:
         message = f"mpfa_envs.{name} is now mpfa_envs.{_RENAMED[name]}"
         warnings.warn(message, DeprecationWarning, stacklevel=2)
@@ -190,4 +144,6 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-after_import("gymnasium", "mpfa_envs.env.registration")
+# A robot that runs :mod:`mpfa_envs.deploy` may have no gymnasium, and needs no ids.
+if find_spec("gymnasium") is not None:
+    import_module("mpfa_envs.env.registration")
