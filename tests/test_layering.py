@@ -136,10 +136,11 @@ def test_the_navigation_task_does_not_know_the_replay_parts():
     assert not importers(TASKS, {"torchrl_mpfa"})
 
 
-def test_only_the_simulation_imports_pybullet():
+def test_only_the_simulation_and_its_comparison_import_pybullet():
     users = importers(EVERYTHING, {"pybullet", "pybullet_utils"})
     assert {user for user in users if not user.startswith("tests/")} == {
-        "envs/mpfa_envs/robots/simulation.py"
+        "benchmarks/speed/bullet_world.py",
+        "envs/mpfa_envs/robots/simulation.py",
     }
 
 

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.speed.bullet_world import BulletWorld
 from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, World
 from mpfa_envs.paths.planner import PathPlanner
 from mpfa_envs.render import render_trajectories, tiled
 from mpfa_envs.tasks.sampling import evaluation_pairs
-from tests.envs.bullet_world import BulletWorld
 
 ROUNDS = 5
 PAIRS = 200
@@ -193,7 +193,7 @@ def drive_straight(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, li
         options: The task.
 
     Returns:
-        How the episode ended and the way of the robot.
+        How the episode ended and the path of the robot.
     """
     return _follow(env, options, [options["goal"]])
 
@@ -206,7 +206,7 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
         options: The task.
 
     Returns:
-        How the episode ended and the way of the robot.
+        How the episode ended and the path of the robot.
     """
     start, goal = options["start"][:2], options["goal"]
     for radius in (PAPER_TASK["collision_distance"], env.config.robot.radius):
@@ -242,7 +242,7 @@ def _distance(info: dict[str, Any], point: tuple[float, float]) -> float:
 
 
 def describe_world(world: World) -> dict[str, float]:
-    """Say how dense a world is and how far one gets in it without seeing.
+    """Measure how dense a world is and how far a robot gets in it without seeing.
 
     Args:
         world: The world.

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.speed.bullet_world import BulletWorld
 from mpfa_envs import EXAMPLE_WORLD, WORLDS, Box, Cylinder, Lidar, World, generate_world, load_world
-from tests.envs.bullet_world import BulletWorld
 
 
 def test_the_rays_go_from_left_to_right_over_the_front() -> None:

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.speed.convex import convex_parts
 from mpfa_envs import Box, Cylinder, Lidar, Polygon, World
-from tests.envs.shapes import convex_parts
 
 DENTED = Polygon(((-2.0, -1.0), (1.5, -1.5), (0.5, 0.0), (2.0, 1.0), (-1.0, 2.0), (-0.5, 0.5)))
 TRIANGLE = Polygon(((2.0, 2.0), (4.0, 2.5), (3.0, 4.0)))

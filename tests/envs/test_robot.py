@@ -7,9 +7,9 @@ import numpy as np
 import pybullet
 import pytest
 
+from benchmarks.speed.bullet_world import BulletWorld
 from mpfa_envs import ROBOTS, WORLDS, Box, Cylinder, Polygon, RobotModel, World
 from mpfa_envs.robots.drives import WheelDrives
-from tests.envs.bullet_world import BulletWorld
 
 
 class Wheels:

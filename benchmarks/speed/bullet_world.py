@@ -1,4 +1,4 @@
-"""A world in PyBullet, whose contacts and ray test check ours."""
+"""A world in PyBullet: its ray test is a baseline of ours, and tests compare the two."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pybullet
 
+from benchmarks.speed.convex import convex_parts
 from mpfa_envs.robots.simulation import Simulation
-from tests.envs.shapes import convex_parts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
