@@ -1,15 +1,16 @@
-"""Distance of many robots from the nearest obstacle or wall of their worlds."""
+"""Distance from points to the nearest obstacle or wall."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mpfa_envs.compiled import njit
 from mpfa_envs.worlds.cell_loops import clearance_of_cells
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from mpfa_envs.worlds.batch import BatchArrays
@@ -18,33 +19,16 @@ if TYPE_CHECKING:
 @njit
 def clearance_at(worlds: BatchArrays, robot: int, x: float, y: float) -> float:
     """Measure the distance from a point in a robot's world to the nearest obstacle or wall [m]."""
-    half_size = worlds.half_sizes[robot]
-    nearest = min(half_size[0] - abs(x), half_size[1] - abs(y))
-    square = math.inf
-    boxes, circles = worlds.boxes[robot], worlds.circles[robot]
-    for index in range(worlds.counts[robot, 0]):
-        across = max(boxes[index, 0] - x, x - boxes[index, 2], 0.0)
-        up = max(boxes[index, 1] - y, y - boxes[index, 3], 0.0)
-        square = min(square, across * across + up * up)
-    first = 0
-    for polygon in range(worlds.counts[robot, 3]):
-        last = worlds.polygon_ends[robot, polygon]
-        edges = worlds.segments[robot, first:last]
-        near, inside = _to_polygon(edges, x, y)
-        if inside:
-            nearest = min(nearest, -math.sqrt(near))
-        else:
-            square = min(square, near)
-        first = last
-    nearest = min(nearest, math.sqrt(square))
-    for index in range(worlds.counts[robot, 1]):
-        dx, radius = circles[index, 0] - x, circles[index, 2]
-        near = nearest + radius
-        if abs(dx) < near:  # Few are nearer than the nearest so far.
-            dy = circles[index, 1] - y
-            square = dx * dx + dy * dy
-            if square < near * near:
-                nearest = math.sqrt(square) - radius
+    boxes, circles, _, polygons = worlds.counts[robot]
+    nearest = clearance_of_shapes(
+        worlds.half_sizes[robot],
+        worlds.boxes[robot, :boxes],
+        worlds.circles[robot, :circles],
+        worlds.segments[robot],
+        worlds.polygon_ends[robot, :polygons],
+        x,
+        y,
+    )
     number = worlds.grid_of[robot]
     if number >= 0:
         columns, rows = worlds.grids.shapes[number]
@@ -53,6 +37,65 @@ def clearance_at(worlds: BatchArrays, robot: int, x: float, y: float) -> float:
         resolution = worlds.grids.resolutions[number]
         nearest = clearance_of_cells(left, right, resolution, x, y, nearest)
     return nearest
+
+
+@njit
+def clearance_of_shapes(
+    half_size: NDArray[np.float64],
+    boxes: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    segments: NDArray[np.float64],
+    polygon_ends: NDArray[np.int64],
+    x: float,
+    y: float,
+) -> float:
+    """Measure the distance from a point to the nearest shape of some or wall [m]; 0 in a box."""
+    nearest = min(half_size[0] - abs(x), half_size[1] - abs(y))
+    square = math.inf
+    for index in range(boxes.shape[0]):
+        across = max(boxes[index, 0] - x, x - boxes[index, 2], 0.0)
+        up = max(boxes[index, 1] - y, y - boxes[index, 3], 0.0)
+        square = min(square, across * across + up * up)
+    first = 0
+    for last in polygon_ends:
+        near, inside = _to_polygon(segments[first:last], x, y)
+        if inside:
+            nearest = min(nearest, -math.sqrt(near))
+        else:
+            square = min(square, near)
+        first = last
+    nearest = min(nearest, math.sqrt(square))
+    for index in range(circles.shape[0]):
+        dx, radius = circles[index, 0] - x, circles[index, 2]
+        near = nearest + radius
+        if abs(dx) < near:  # Few are nearer than the nearest so far.
+            dy = circles[index, 1] - y
+            square = dx * dx + dy * dy
+            if square < near * near:
+                nearest = math.sqrt(square) - radius
+    return nearest
+
+
+@njit
+def clearances_of_shapes(
+    half_size: NDArray[np.float64],
+    boxes: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    segments: NDArray[np.float64],
+    polygon_ends: NDArray[np.int64],
+    points: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Measure the same for points ``[N, 2]``, negative in a box [m], ``[N]``."""
+    found = np.empty(len(points))
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        found[k] = clearance_of_shapes(half_size, boxes, circles, segments, polygon_ends, x, y)
+        for box in range(boxes.shape[0]):
+            across = max(boxes[box, 0] - x, x - boxes[box, 2])
+            up = max(boxes[box, 1] - y, y - boxes[box, 3])
+            if max(across, up) < 0.0:
+                found[k] = min(found[k], max(across, up))
+    return found
 
 
 @njit

@@ -31,8 +31,6 @@ MOST_OBSTACLES: Final = 1000
 """No room has more obstacles."""
 _APART: Final = 0.05
 """Places of a line whose clearance is looked at are this far apart, at most [m]."""
-_CHUNK: Final = 2_000_000
-"""Distances between points and obstacles that are computed at once."""
 _PARTS: Final[Mapping[str, type[Shape | Walker]]] = {
     "boxes": Box,
     "cylinders": Cylinder,
@@ -255,27 +253,17 @@ class World:
     @cached_property
     def arrays(self) -> WorldArrays:
         """All numbers of the world in arrays, for kernels."""
+        boxes = [(box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes]
         circles = [(cylinder.x, cylinder.y, cylinder.radius) for cylinder in self.cylinders]
         edges = [edge for polygon in self.polygons for edge in polygon.edges]
         counts = [len(polygon.vertices) for polygon in self.polygons]
         return WorldArrays(
             np.array(self.size, dtype=np.float64) / 2,
-            np.array(self._edges, dtype=np.float64).reshape(-1, 4),
+            np.array(boxes, dtype=np.float64).reshape(-1, 4),
             np.array(circles, dtype=np.float64).reshape(-1, 3),
             np.array(edges, dtype=np.float64).reshape(-1, 4),
             np.cumsum(counts, dtype=np.int64),
         )
-
-    @cached_property
-    def _edges(self) -> tuple[tuple[float, float, float, float], ...]:
-        """Edges of the boxes (x_min, y_min, x_max, y_max) [m]."""
-        return tuple((box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes)
-
-    @cached_property
-    def _circles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers ``[2, cylinders]`` and radii ``[cylinders]`` [m]."""
-        rows = self.arrays.circles
-        return np.ascontiguousarray(rows[:, :2].T), np.ascontiguousarray(rows[:, 2])
 
     def clearance(self, x: float, y: float) -> float:
         """Measure the distance from a point to the nearest obstacle or wall.
@@ -288,26 +276,13 @@ class World:
             Distance [m]; zero in a box or an occupied cell, negative in a cylinder, in a polygon
             and behind a wall.
         """
-        half_width, half_depth = self.size[0] / 2, self.size[1] / 2
-        nearest = min(half_width - abs(x), half_depth - abs(y))
-        # For a room's dozen boxes a plain loop takes a fifth of the time of NumPy calls.
-        square = math.inf
-        for x_min, y_min, x_max, y_max in self._edges:
-            across = x_min - x if x < x_min else x - x_max if x > x_max else 0.0
-            up = y_min - y if y < y_min else y - y_max if y > y_max else 0.0
-            gap = across * across + up * up
-            if gap < square:
-                square = gap
-        nearest = min(nearest, math.sqrt(square))
-        if self.cylinders:
-            centers, radii = self._circles
-            nearest = min(nearest, float((np.hypot(*(centers - ((x,), (y,)))) - radii).min()))
-        if self.polygons:
-            nearest = min(nearest, float(self._to_polygons(np.array([[x, y]]))[0]))
-        if self.occupancy is not None:
-            # Imported here because it needs Numba, which takes half a second.
-            from mpfa_envs.worlds.cell_loops import clearance_of_cells
+        # Imported here, and below, because they need Numba, which takes half a second.
+        from mpfa_envs.worlds.cell_loops import clearance_of_cells
+        from mpfa_envs.worlds.clearance_loops import clearance_of_shapes
 
+        x, y = float(x), float(y)
+        nearest = clearance_of_shapes(*self.arrays, x, y)
+        if self.occupancy is not None:
             left, right, _ = self.occupancy.arrays
             nearest = clearance_of_cells(left, right, self.occupancy.resolution, x, y, nearest)
         return nearest
@@ -322,28 +297,12 @@ class World:
             Distances, shape ``[N]`` [m], negative in an obstacle and behind a wall; zero in an
             occupied cell.
         """
-        x, y = points[:, 0], points[:, 1]
-        nearest = np.minimum(self.size[0] / 2 - np.abs(x), self.size[1] / 2 - np.abs(y))
-        edges = self.arrays.boxes.T
-        (center_x, center_y), radii = self._circles
-        rows = max(1, _CHUNK // max(1, len(self.boxes) + len(radii) + len(self.arrays.segments)))
-        for first in range(0, len(points), rows):
-            part = slice(first, first + rows)
-            px, py = x[part, None], y[part, None]
-            # How far outside of each box; negative inside.
-            across = np.maximum(edges[0] - px, px - edges[2])
-            up = np.maximum(edges[1] - py, py - edges[3])
-            outside = np.hypot(np.maximum(across, 0.0), np.maximum(up, 0.0))
-            to_boxes = outside + np.minimum(np.maximum(across, up), 0.0)
-            to_circles = np.hypot(center_x - px, center_y - py) - radii
-            for gaps in (to_boxes, to_circles):
-                if gaps.size:
-                    nearest[part] = np.minimum(nearest[part], gaps.min(axis=1))
-            if self.polygons:
-                nearest[part] = np.minimum(nearest[part], self._to_polygons(points[part]))
-        if self.occupancy is not None:
-            from mpfa_envs.worlds.cell_loops import clearances_of_cells
+        from mpfa_envs.worlds.cell_loops import clearances_of_cells
+        from mpfa_envs.worlds.clearance_loops import clearances_of_shapes
 
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        nearest = clearances_of_shapes(*self.arrays, points)
+        if self.occupancy is not None:
             left, right, _ = self.occupancy.arrays
             clearances_of_cells(left, right, self.occupancy.resolution, points, nearest)
         return nearest
@@ -360,40 +319,3 @@ class World:
         """
         steps = math.ceil(math.dist(start, end) / _APART) + 1
         return float(self.clearances(np.linspace(start, end, steps)).min())
-
-    def inside_polygons(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell in which polygons points lie.
-
-        A point is inside if the line from it to the right crosses the outline an odd number of
-        times.
-
-        Args:
-            points: Positions, shape ``[N, 2]`` [m].
-
-        Returns:
-            Shape ``[N, polygons]``.
-        """
-        x, y = points[:, :1], points[:, 1:]
-        x0, y0, x1, y1 = self.arrays.segments.T
-        spans = (y0 <= y) != (y1 <= y)
-        # Left of an upward edge or right of a downward one.
-        side = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
-        crossings = spans & ((side > 0.0) == (y1 > y0))
-        return np.logical_xor.reduceat(crossings, self._polygon_starts, axis=1)
-
-    @cached_property
-    def _polygon_starts(self) -> NDArray[np.int64]:
-        """Start of each polygon's edges in ``arrays.segments``."""
-        return np.concatenate(([0], self.arrays.polygon_ends[:-1]))
-
-    def _to_polygons(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance from points ``[N, 2]`` to the nearest polygon [m], negative in one, ``[N]``."""
-        x, y = points[:, :1], points[:, 1:]
-        x0, y0, x1, y1 = self.arrays.segments.T
-        along_x, along_y = x1 - x0, y1 - y0
-        share = (x - x0) * along_x + (y - y0) * along_y
-        share = np.clip(share / (along_x * along_x + along_y * along_y), 0.0, 1.0)
-        gaps = np.hypot(x0 + share * along_x - x, y0 + share * along_y - y)
-        to_outlines = np.minimum.reduceat(gaps, self._polygon_starts, axis=1)
-        signed = np.where(self.inside_polygons(points), -to_outlines, to_outlines)
-        return np.asarray(signed.min(axis=1))
