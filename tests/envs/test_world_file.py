@@ -55,7 +55,7 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
         ("size: [4]\n", 1, r"size must be \[width, depth\], got 1 entries"),
         ("size: 4\n", 1, "size must be a list"),
         ("size: [4, wide]\n", 1, "size must be a number in meters, got 'wide'"),
-        ("size: [4, -4]\n", 1, "size must be positive"),
+        ("size: [4, -4]\n", 1, "size must be two positive lengths"),
         ("size: [4, 4]\nname: [a]\n", 2, "name must be text"),
         ("size: [4, 4]\nsize: [5, 5]\n", 2, "key 'size' appears twice"),
         ("size: [4, 4]\nboxes: 3\n", 2, "boxes must be a list"),
@@ -78,7 +78,7 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
         (
             "size: [4, 4]\nboxes:\n  - {x_min: 1, x_max: 3, y_min: 0, y_max: 1}\n",
             3,
-            "an entry of boxes lies outside the room",
+            "boxes must lie in the room",
         ),
         (
             "size: [4, 4]\nboxes:\n  - {x_min: 1, xmax: 3, y_min: 0, y_max: 1}\n",
@@ -122,7 +122,7 @@ def test_a_world_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
         (
             "size: [4, 4]\npolygons:\n  - [[0, 0], [1, 0], [0, 1]]\n  - [[0, 0], [3, 0], [0, 1]]\n",
             4,
-            "an entry of polygons lies outside the room",
+            "polygons must lie in the room",
         ),
         ("size: [4, 4\nboxes: 1\n", 2, "is not YAML"),
         ("size: !!python/object/apply:os.system [echo]\n", 1, "size must be"),

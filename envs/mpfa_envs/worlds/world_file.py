@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,11 +32,11 @@ _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
 _WALKER: Final = ("radius", "speed", "behavior", "waypoints")
 _KEYS: Final = ("name", "size", "polygons", "walkers", *_SHAPES)
 _REGION_CLEARANCE: Final = 0.5
-"""A region must hold a point this far from every obstacle: what the TurtleBot2 asks for [m]."""
+"""A region must hold a point this far from every obstacle, which a TurtleBot2 needs [m]."""
 _FINEST: Final = 0.01
-"""Room that a square of this diagonal may hold is not looked for [m]."""
+"""Squares of a smaller diagonal are not searched for room [m]."""
 _MOST_CELLS: Final = 100_000
-"""A region in which more squares are undecided is too large and too narrow to be looked through."""
+"""A region that leaves more squares undecided is too large and too narrow to search."""
 
 
 def load_world(path: str | os.PathLike[str]) -> World:
@@ -46,7 +48,7 @@ def load_world(path: str | os.PathLike[str]) -> World:
         path: The file.
 
     Returns:
-        The world; without a name in the file it is called as the file.
+        The world; without a name in the file, it has that of the file.
 
     Raises:
         WorldFileError: If the file cannot be read, is too large, is not YAML, or does not describe
@@ -80,129 +82,86 @@ class _Reader(NodeReader):
     def world(self, root: yaml.Node | None) -> World:
         """Read the whole file."""
         entries = self.mapping(root, "the file", _KEYS)
-        name = self.path.stem
-        if "name" in entries:
-            name = self.text(entries["name"], "name")
+        name = self.text(entries["name"], "name") if "name" in entries else self.path.stem
         if "size" not in entries:
             raise self.error(root, "size is missing; it is a list [width, depth] in meters")
-        size = self.size(entries["size"])
-        room = self.built(entries["size"], name=name, size=size)
-        boxes = self.shapes(entries, "boxes", room)
-        cylinders = self.shapes(entries, "cylinders", room)
-        polygons = self.polygons(entries, room)
-        world = self.built(
-            root,
-            name=name,
-            size=size,
-            boxes=tuple(box for box, _ in boxes if isinstance(box, Box)),
-            cylinders=tuple(shape for shape, _ in cylinders if isinstance(shape, Cylinder)),
-            polygons=polygons,
-        )
-        starts = self.regions(entries, "start", world)
-        goals = self.regions(entries, "goal", world)
-        return World(
-            name=name,
-            size=size,
-            boxes=world.boxes,
-            cylinders=world.cylinders,
-            polygons=polygons,
-            start_regions=starts,
-            goal_regions=goals,
-            walkers=self.walkers(entries, world),
-        )
+        with self.at(entries["size"]):
+            room = World(name=name, size=self.pair(entries["size"], "size", "[width, depth]"))
+        obstacles = {
+            key: self.parts(entries, key, room, key) for key in ("boxes", "cylinders", "polygons")
+        }
+        with self.at(root):
+            world = replace(room, **obstacles)
+        starts = self.parts(entries, "start", room, "start_regions")
+        goals = self.parts(entries, "goal", room, "goal_regions")
+        for key, regions in (("start", starts), ("goal", goals)):
+            for node, region in zip(self.nodes(entries, key), regions, strict=True):
+                found = _has_room(world, region)
+                if not found:
+                    what = "is too large to find a" if found is None else "has no"
+                    raise self.error(
+                        node,
+                        f"an entry of {key} {what} point {_REGION_CLEARANCE} m from every obstacle "
+                        f"and wall, got {region}",
+                    )
+        walkers = self.parts(entries, "walkers", world, "walkers")
+        return replace(world, start_regions=starts, goal_regions=goals, walkers=walkers)
 
-    def built(self, node: yaml.Node | None, **parts: Any) -> World:
-        """Build a world, with the line of a node in its error."""
+    @contextmanager
+    def at(self, node: yaml.Node | None) -> Iterator[None]:
+        """Give an error about a value the line of a node."""
         try:
-            return World(**parts)
+            yield
+        except WorldFileError:
+            raise
         except ValueError as error:
             raise self.error(node, str(error)) from error
 
-    def size(self, node: yaml.Node) -> tuple[float, float]:
-        """Read the size of the room [m]."""
-        width, depth = self.pair(node, "size", "[width, depth]")
-        if width <= 0 or depth <= 0:
-            raise self.error(node, f"size must be positive, got {[width, depth]}")
-        return width, depth
+    def nodes(self, entries: dict[str, yaml.Node], key: str) -> list[yaml.Node]:
+        """Read a list, empty without the key."""
+        return self.items(entries[key], key) if key in entries else []
 
-    def shapes(
-        self, entries: dict[str, yaml.Node], key: str, room: World
-    ) -> list[tuple[Box | Cylinder, yaml.Node]]:
-        """Read a list of shapes that lie in the room, each with its node."""
-        if key not in entries:
-            return []
-        shapes: list[tuple[Box | Cylinder, yaml.Node]] = []
-        for node in self.items(entries[key], key):
-            what = f"an entry of {key}"
-            values = self.mapping(node, what, _SHAPES[key])
-            for name in _SHAPES[key]:
-                if name not in values:
-                    raise self.error(node, f"{what} lacks the key {name!r}")
-            numbers = {name: self.number(value, name) for name, value in values.items()}
-            try:
-                shape = Cylinder(**numbers) if key == "cylinders" else Box(**numbers)
-            except ValueError as error:
-                raise self.error(node, str(error)) from error
-            if not room.holds(shape):
-                raise self.error(node, f"{what} lies outside the room {room.room}, got {shape}")
-            shapes.append((shape, node))
-        return shapes
+    def parts(
+        self, entries: dict[str, yaml.Node], key: str, world: World, field: str
+    ) -> tuple[Any, ...]:
+        """Read a list of parts, each of which fits in the world by itself."""
+        read = {"polygons": self.polygon, "walkers": self.walker}.get(key, self.shape)
+        parts = []
+        for node in self.nodes(entries, key):
+            with self.at(node):
+                parts.append(read(node, key))
+                replace(world, **{field: (parts[-1],)})
+        return tuple(parts)
 
-    def polygons(self, entries: dict[str, yaml.Node], room: World) -> tuple[Polygon, ...]:
-        """Read a list of polygons, each a list of vertices, that lie in the room."""
-        polygons: list[Polygon] = []
-        for node in self.items(entries["polygons"], "polygons") if "polygons" in entries else ():
-            what = "an entry of polygons"
-            vertices = tuple(
-                self.pair(vertex, "a vertex", "[x, y]") for vertex in self.items(node, what)
+    def shape(self, node: yaml.Node, key: str) -> Box | Cylinder:
+        """Read a box, a cylinder or a region."""
+        what = f"an entry of {key}"
+        values = self.mapping(node, what, _SHAPES[key])
+        for name in _SHAPES[key]:
+            if name not in values:
+                raise self.error(node, f"{what} lacks the key {name!r}")
+        numbers = {name: self.number(value, name) for name, value in values.items()}
+        return Cylinder(**numbers) if key == "cylinders" else Box(**numbers)
+
+    def polygon(self, node: yaml.Node, key: str) -> Polygon:
+        """Read a polygon, a list of vertices."""
+        vertices = self.items(node, f"an entry of {key}")
+        return Polygon(tuple(self.pair(vertex, "a vertex", "[x, y]") for vertex in vertices))
+
+    def walker(self, node: yaml.Node, key: str) -> Walker:
+        """Read a walker."""
+        given = self.mapping(node, f"an entry of {key}", _WALKER)
+        values: dict[str, Any] = {
+            name: self.number(given[name], name) for name in ("radius", "speed") if name in given
+        }
+        if "behavior" in given:
+            values["behavior"] = self.text(given["behavior"], "behavior")
+        if "waypoints" in given:
+            points = self.items(given["waypoints"], "waypoints")
+            values["waypoints"] = tuple(
+                self.pair(point, "a waypoint", "[x, y]") for point in points
             )
-            try:
-                polygon = Polygon(vertices)
-            except ValueError as error:
-                raise self.error(node, str(error)) from error
-            if not room.holds(polygon):
-                raise self.error(node, f"{what} lies outside the room {room.room}, got {polygon}")
-            polygons.append(polygon)
-        return tuple(polygons)
-
-    def walkers(self, entries: dict[str, yaml.Node], world: World) -> tuple[Walker, ...]:
-        """Read a list of walkers that have room in the world."""
-        walkers: list[Walker] = []
-        for node in self.items(entries["walkers"], "walkers") if "walkers" in entries else ():
-            given = self.mapping(node, "an entry of walkers", _WALKER)
-            values: dict[str, Any] = {
-                name: self.number(given[name], name) for name in _WALKER[:2] if name in given
-            }
-            if "behavior" in given:
-                values["behavior"] = self.text(given["behavior"], "behavior")
-            if "waypoints" in given:
-                values["waypoints"] = tuple(
-                    self.pair(point, "a waypoint", "[x, y]")
-                    for point in self.items(given["waypoints"], "waypoints")
-                )
-            try:
-                walkers.append(Walker(**values))
-                replace(world, walkers=(walkers[-1],))
-            except ValueError as error:
-                raise self.error(node, str(error)) from error
-        return tuple(walkers)
-
-    def regions(self, entries: dict[str, yaml.Node], key: str, world: World) -> tuple[Box, ...]:
-        """Read regions in which a robot has room."""
-        regions: list[Box] = []
-        for region, node in self.shapes(entries, key, world):
-            if not isinstance(region, Box):
-                continue
-            found = _has_room(world, region)
-            if not found:
-                what = "is too large to find a" if found is None else "has no"
-                raise self.error(
-                    node,
-                    f"an entry of {key} {what} point {_REGION_CLEARANCE} m from every obstacle "
-                    f"and wall, got {region}",
-                )
-            regions.append(region)
-        return tuple(regions)
+        return Walker(**values)
 
 
 def _has_room(world: World, region: Box) -> bool | None:
