@@ -92,7 +92,7 @@ class FreeGrid:
             left, right, _ = cells.arrays
             lower_clearances(left, right, cells.resolution, self.xs, self.ys, self.clearance)
         self.free: NDArray[np.bool_] = self.clearance >= np.float32(self.distance)
-        """Whether the center keeps the distance, ``[nx, ny]``."""
+        """Cells whose center keeps the distance, ``[nx, ny]``."""
 
     @cached_property
     def cells(self) -> NDArray[np.int64]:
@@ -114,15 +114,7 @@ class FreeGrid:
         return neighbor_lists(self.free, self._numbers, MOVES, self.resolution * STEP_SCALE)
 
     def index(self, x: float, y: float) -> tuple[int, int]:
-        """Find the cell of a position, the nearest one for a position outside.
-
-        Args:
-            x: Position [m].
-            y: Position [m].
-
-        Returns:
-            Column and row.
-        """
+        """Column and row of a position's cell [m], the nearest one for a position outside."""
         places = zip((x, y), self.origin, self.free.shape, strict=True)
         i, j = (
             min(max(round((at - first) / self.resolution), 0), count - 1)
@@ -134,15 +126,16 @@ class FreeGrid:
         """Position (x, y) of a cell's center [m]."""
         return float(self.xs[i]), float(self.ys[j])
 
-    def cells_around(self, place: tuple[float, float]) -> list[tuple[int, float]]:
+    def around(self, place: tuple[float, float]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Find the cells through which paths to or from a position pass.
 
         Args:
             place: Position (x, y) [m].
 
         Returns:
-            Numbers of the cells around it, or of the nearest one if its own is not free, and how
-            far they are from it [m].
+            Columns and rows of the position's own cell and of those that a move reaches from it, or
+            of the nearest cell if its own is not free, ``[cells, 2]``; and their distances from the
+            position, none zero [m], ``[cells]``.
 
         Raises:
             ValueError: If no cell is free.
@@ -150,31 +143,25 @@ class FreeGrid:
         if not self.free.any():
             raise ValueError(f"grid must have a free cell, and {self.world.name!r} has none")
         i, j = self.index(*place)
+        cells = _with_neighbors(self.free, i, j) if self.free[i, j] else self.cells
+        gaps = np.hypot(self.xs[cells[:, 0]] - place[0], self.ys[cells[:, 1]] - place[1])
         if not self.free[i, j]:
-            gaps = np.hypot(
-                self.xs[self.cells[:, 0]] - place[0], self.ys[self.cells[:, 1]] - place[1]
-            )
             nearest = int(gaps.argmin())
-            return [(nearest, float(gaps[nearest]))]
-        starts, neighbors, _ = self.moves
-        number = self._numbers[i, j]
-        around = [number, *neighbors[starts[number] : starts[number + 1]]]
-        return [(int(at), math.dist(self.center(*self.cells[at]), place)) for at in around]
+            cells, gaps = cells[nearest : nearest + 1], gaps[nearest : nearest + 1]
+        # A gap of zero would be no edge of a graph.
+        return cells, np.maximum(gaps, 1e-12)
+
+    def cells_around(self, place: tuple[float, float]) -> list[tuple[int, float]]:
+        """Numbers of the cells :meth:`around` a position (x, y), and their distances [m]."""
+        cells, gaps = self.around(place)
+        return list(zip(self._numbers[tuple(cells.T)].tolist(), gaps.tolist(), strict=True))
 
     def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
-        """Measure the path between two positions.
-
-        Args:
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Length [m]; infinite if there is no path.
-        """
+        """Length of the path between two positions (x, y) [m]; infinite if there is none."""
         if not self.free.any():
             return math.inf
         direct = math.dist(start, goal)
-        # In a map, which may be large, a window is looked through first.
+        # In a map, which may be large, a window is searched first.
         windows = (1.2 * direct + 1.0, 2.0 * direct + 4.0) if self.world.occupancy else ()
         for longest in windows:
             found = DistanceField(self, goal, longest).length_from(start)
@@ -198,12 +185,11 @@ class FreeGrid:
         first = self.cells_around(goal)
         starts, neighbors, lengths = self.moves
         count = len(starts) - 1
-        # The goal is a node of its own, the last one, from which the cells around it are reached.
+        # The goal is the last node, from which the cells around it are reached.
         numbers, gaps = zip(*first, strict=True)
         return csr_array(
             (
-                # A gap of zero would be no edge.
-                np.concatenate((lengths, np.maximum(gaps, 1e-12))),
+                np.concatenate((lengths, gaps)),
                 np.concatenate((neighbors, np.array(numbers, dtype=np.int32))),
                 np.append(starts, np.int32(len(neighbors) + len(first))),
             ),
@@ -243,8 +229,7 @@ class DistanceField:
     ) -> None:
         self.grid = grid
         self.goal = (check_number("goal", goal[0]), check_number("goal", goal[1]))
-        if not grid.free.any():
-            raise ValueError(f"grid must have a free cell, and {grid.world.name!r} has none")
+        cells, gaps = grid.around(self.goal)
         i, j = grid.index(*self.goal)
         # Moves are measured a little short.
         reach = min(longest / STEP_SCALE / grid.resolution, max(grid.free.shape))
@@ -255,9 +240,10 @@ class DistanceField:
             slice(first, at + wide + 1) for first, at in zip(self.first, (i, j), strict=True)
         )
         free = grid.free[self.window]
-        seeds, gaps = self._around(free, i - self.first[0], j - self.first[1], self.goal)
+        seeds, inside = self._in_window(cells, free.shape)
         step = grid.resolution * STEP_SCALE
-        self.lengths = path_lengths(free, seeds, gaps, MOVES, step, float(longest))
+        limit = float(longest)
+        self.lengths = path_lengths(free, seeds[inside], gaps[inside], MOVES, step, limit)
         """Lengths of the shortest paths [m], infinite where there is none, ``[columns, rows]``."""
 
     @property
@@ -276,60 +262,31 @@ class DistanceField:
         return fill_from_nearest(self.lengths.astype(np.float32))
 
     def at(self, x: float, y: float) -> float:
-        """Read the length of the path from a position, at the window's edge from outside of it.
+        """Length of the path from a position, interpolated between the centers of cells [m].
 
-        Args:
-            x: Position [m].
-            y: Position [m].
-
-        Returns:
-            Length [m], interpolated between the centers of the cells.
+        From outside of the window it is that of the window's edge.
         """
         return interpolate(self.filled, *self.origin, self.resolution, x, y)
 
     def length_from(self, start: tuple[float, float]) -> float:
-        """Measure the path from a position.
-
-        Args:
-            start: Position (x, y) [m].
-
-        Returns:
-            Length [m]; infinite if there is no path in the window.
-        """
-        i, j = (at - first for at, first in zip(self.grid.index(*start), self.first, strict=True))
-        columns, rows = self.lengths.shape
-        if not (0 <= i < columns and 0 <= j < rows):
+        """Length of the path from a position (x, y) [m]; infinite without one in the window."""
+        cells, gaps = self.grid.around(start)
+        cells, inside = self._in_window(cells, self.lengths.shape)
+        if not inside[0]:
             return math.inf
-        cells, gaps = self._around(self.grid.free[self.window], i, j, start)
-        return float((self.lengths[cells[:, 0], cells[:, 1]] + gaps).min(initial=math.inf))
+        cells = cells[inside]
+        return float((self.lengths[cells[:, 0], cells[:, 1]] + gaps[inside]).min())
 
-    def _around(
-        self,
-        free: NDArray[np.bool_],
-        i: int,
-        j: int,
-        place: tuple[float, float],
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Cells of the window around a place in (i, j), ``[cells, 2]``, and their distances [m]."""
-        # They are those of :meth:`~mpfa_envs.paths.distance.FreeGrid.cells_around`.
-        x, y = place
-        if free[i, j]:
-            cells = np.concatenate(([[i, j]], _neighbors(free, i, j)))
-        else:
-            cells = np.argwhere(free)
-        gaps = np.hypot(
-            self.grid.xs[cells[:, 0] + self.first[0]] - x,
-            self.grid.ys[cells[:, 1] + self.first[1]] - y,
-        )
-        if not free[i, j] and len(cells):
-            nearest = int(gaps.argmin())
-            cells, gaps = cells[nearest : nearest + 1], gaps[nearest : nearest + 1]
-        # A gap of zero would be no edge of a graph.
-        return cells.astype(np.int64), np.maximum(gaps, 1e-12)
+    def _in_window(
+        self, cells: NDArray[np.int64], shape: tuple[int, ...]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Columns and rows in the window, and which cells lie in it."""
+        cells = cells - self.first
+        return cells, ((cells >= 0) & (cells < shape)).all(axis=1)
 
 
-def _neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:
-    """Cells to which a move leads from a cell, ``[cells, 2]``."""
+def _with_neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:
+    """A cell, and those to which a move leads from it, ``[cells, 2]``."""
     columns, rows = free.shape
     to = MOVES[:, :2] + (i, j)
     inside = ((to >= 0) & (to < (columns, rows))).all(axis=1)
@@ -338,4 +295,4 @@ def _neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:
     is_open = (
         free[to[:, 0], to[:, 1]] & free[over[:, 0], over[:, 1]] & free[under[:, 0], under[:, 1]]
     )
-    return to[is_open]
+    return np.concatenate(([[i, j]], to[is_open]))
