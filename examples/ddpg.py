@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -52,6 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     parser.add_argument("--actions", type=int, default=50_000, help="of all robots together")
     parser.add_argument("--out", type=Path, default=Path("runs/ddpg"), help="folder of the policy")
     options = parser.parse_args(arguments)
+    if options.actions < 1:
+        parser.error(f"--actions must be at least 1, got {options.actions}")
+    options.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
     torch.set_num_threads(1)  # With networks this small a second one gains nothing.
     torch.set_flush_denormal(True)  # Tiny numbers would slow a CPU down.
@@ -83,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         env.action_spec,
         sigma_init=1.0,
         sigma_end=0.2,
-        annealing_num_steps=20_000,
+        annealing_num_steps=max(int(0.4 * options.actions), 1),
         std=torch.linspace(0.0, 1.0, ROBOTS).unsqueeze(-1).tolist(),
     )
     collector = Collector(
@@ -94,32 +98,33 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         auto_register_policy_transforms=True,
     )
 
-    collected, best, most, endings = 0, policy_of(actor), 0.0, []
+    collected, best, most = 0, policy_of(actor), 0.0
+    outcomes: deque[bool] = deque(maxlen=100)
     with tqdm(total=options.actions, unit="action", smoothing=0.05) as bar:
         for steps in collector:  # [ROBOTS, STEPS]
             buffer.extend(steps.reshape(-1))
             if len(buffer) >= BATCH_SIZE:
                 # Sample, learn, fuse the signals of what was sampled, boost, decay.
                 mpfa.run_updates(buffer, learner, updates=steps.numel() // ACTIONS_PER_UPDATE)
-            before, collected = collected, collected + steps.numel()
+            collected += steps.numel()
             done = min(collected / options.actions, 1.0)
             noise.step(steps.numel())
             buffer.anneal(beta=0.4 + 0.6 * done, fraction=done)  # As in PER, beta rises to 1.
             learner.anneal(1.0 - done)
 
-            endings += steps["next", "info", "success"][steps["next", "done"]].tolist()
-            bar.set_postfix_str(f"success lately {sum(endings[-100:])} %, at best {most:.0%}")
-            bar.update(min(collected, options.actions) - bar.n)
-            if done == 1.0 or before // EVALUATE_EVERY < collected // EVALUATE_EVERY:
+            if collected % EVALUATE_EVERY < steps.numel() or done == 1.0:
                 policy = policy_of(actor, seed=options.seed, steps=collected)
                 success = success_of(policy, "mixed:validation")
                 if success >= most:
                     best, most = policy, success
+            outcomes.extend(steps["next", "info", "success"][steps["next", "done"]].tolist())
+            lately = sum(outcomes) / max(len(outcomes), 1)
+            bar.set_postfix_str(f"success {lately:.0%}, without noise {most:.0%} at best")
+            bar.update(min(collected, options.actions) - bar.n)
     collector.shutdown()
 
     print(f"success in validation worlds, by which the policy was chosen: {most:.0%}")
     print(f"success in test worlds: {success_of(best, 'mixed:test'):.0%}")
-    options.out.mkdir(parents=True, exist_ok=True)
     file = save_policy(best, options.out)
     print(f"written: {file}")
     return file
