@@ -10,18 +10,21 @@ of the last episodes, so that :math:`K = 1` is DDPG.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from torchrl_mpfa.networks import DirectModule
+
 
 class PastCritics(nn.Module):
-    """The parameters that a network had at the last few calls of :meth:`push`.
+    """The parameters that a network had at the last ``count`` calls of :meth:`push`."""
 
-    Args:
-        network: The network.
-        count: How many of its states are kept.
-    """
+    share: Tensor
+    taken: Tensor
 
     def __init__(self, network: nn.Module, count: int) -> None:
         super().__init__()
@@ -33,9 +36,6 @@ class PastCritics(nn.Module):
         # Of the states, and last of the network itself: all that exist count the same.
         self.register_buffer("share", torch.zeros(count + 1))
         self.share[-1] = 1.0
-
-    share: Tensor
-    taken: Tensor
 
     @torch.no_grad()
     def push(self, network: nn.Module) -> None:
@@ -59,12 +59,7 @@ class PastCritics(nn.Module):
 
 
 class AveragedNetwork(nn.Module):
-    r"""Mean of a network and its earlier states, :math:`\frac1K \sum_k Q(s, a; \theta_{(k)})`.
-
-    Args:
-        network: The network.
-        past: Its earlier states.
-    """
+    r"""Mean of a network and its earlier states, :math:`\frac1K \sum_k Q(s, a; \theta_{(k)})`."""
 
     def __init__(self, network: nn.Module, past: PastCritics) -> None:
         super().__init__()
@@ -76,3 +71,14 @@ class AveragedNetwork(nn.Module):
         each = [functional_call(self.network, state, inputs) for state in self.past.states()]
         found = torch.stack([*each, self.network(*inputs)])
         return torch.tensordot(self.past.share, found, dims=1)
+
+
+def average(critics: list[Any], pasts: Iterable[Any]) -> list[Any]:
+    """Target critics, each of them averaged with its past ones if any are kept."""
+    pasts = list(pasts)
+    if not pasts:
+        return critics
+    return [
+        DirectModule(AveragedNetwork(each.module, past), each.in_keys, each.out_keys)
+        for each, past in zip(critics, pasts, strict=True)
+    ]

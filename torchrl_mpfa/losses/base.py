@@ -14,8 +14,16 @@ from torch import Tensor, nn
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
-from torchrl_mpfa.losses.averaging import AveragedNetwork, PastCritics
-from torchrl_mpfa.losses.calling import Networks, StackedNetworks, Tensors, bind, call
+from torchrl_mpfa.losses.averaging import PastCritics, average
+from torchrl_mpfa.losses.calling import (
+    Networks,
+    StackedNetworks,
+    Tensors,
+    bind,
+    bind_frozen,
+    call,
+    check_networks,
+)
 from torchrl_mpfa.losses.functional import (
     DISTANCES,
     action_gradient,
@@ -112,7 +120,7 @@ class SignalLoss:
         **kwargs: Any,
     ) -> None:
         # Before TorchRL's constructor changes the networks.
-        _check_networks(actor_network, critic_network, critic_name=self._critic_name)
+        check_networks(actor_network, critic_network, critic_name=self._critic_name)
         unknown = [name for name in signals if name not in _SIGNALS]
         if unknown:
             raise ValueError(f"signals must be among {_SIGNALS}, got {unknown}")
@@ -412,30 +420,14 @@ class SignalLoss:
                 critic=(StackedNetworks if of_critic.batch_size else bind)(critic, of_critic),
                 frozen_critics=self._held_critics(""),
                 target_actor=bind(actor, target).requires_grad_(False),
-                target_critics=self._averaged_critics(),
+                target_critics=average(self._held_critics("target_"), self.past_critics),
             )
         return self._bound
 
     def _held_critics(self, prefix: str) -> list[TensorDictModule]:
         """Critics that hold the parameters whose name has this prefix, and get no gradient."""
-        network = getattr(self, self._critic_name)
-        params = getattr(self, f"{prefix}{self._critic_name}_params").detach()
-        each = params.unbind(0) if params.batch_size else [params]
-        return [bind(network, own).requires_grad_(False) for own in each]
-
-    def _averaged_critics(self) -> list[TensorDictModule]:
-        """Target critics, each of them with its past ones if ``target_average`` is above one."""
-        critics = self._held_critics("target_")
-        if not self.past_critics:
-            return critics
-        return [
-            DirectModule(
-                AveragedNetwork(critic.module, past),  # type: ignore[arg-type]
-                in_keys=critic.in_keys,
-                out_keys=critic.out_keys,
-            )
-            for critic, past in zip(critics, self.past_critics, strict=True)
-        ]
+        name = self._critic_name
+        return bind_frozen(getattr(self, name), getattr(self, f"{prefix}{name}_params"))
 
     def parts(self) -> Parts:
         """The networks as functions of tensors, for a compiled update."""
@@ -473,22 +465,3 @@ def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> Tens
         if (end := after.get(key, None)) is not None:
             after.set(key, end.bool())
     return found
-
-
-def _check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
-    """Raise at what are no networks, and at those in the wrong order."""
-    first = critic[0] if isinstance(critic, list) and critic else critic
-    for name, network in (("actor_network", actor), (critic_name, first)):
-        if not hasattr(network, "in_keys") or not hasattr(network, "out_keys"):
-            raise TypeError(f"{name} must be a TensorDictModule, got {type(network).__name__}")
-    swapped = sorted(map(str, set(first.out_keys) & set(actor.in_keys)))
-    if swapped:
-        raise ValueError(
-            f"actor_network and {critic_name} are in the wrong order: actor_network reads "
-            f"{swapped[0]!r}, which {critic_name} writes"
-        )
-    if not set(actor.out_keys) & set(first.in_keys):
-        raise ValueError(
-            f"{critic_name} must read what actor_network writes, {list(actor.out_keys)}, but "
-            f"reads {list(first.in_keys)}"
-        )

@@ -44,6 +44,13 @@ def bind(network: TensorDictModule, params: TensorDictBase) -> TensorDictModule:
     return copied
 
 
+def bind_frozen(network: TensorDictModule, params: TensorDictBase) -> list[TensorDictModule]:
+    """As :func:`bind`, of each of the parameters if they are stacked; they get no gradient."""
+    params = params.detach()
+    each = params.unbind(0) if params.batch_size else [params]
+    return [bind(network, own).requires_grad_(False) for own in each]
+
+
 def read_inputs(
     network: TensorDictModule, source: TensorDictBase, chosen: Tensors | None = None
 ) -> dict[NestedKey, Tensor]:
@@ -99,3 +106,22 @@ def bare(params: TensorDictBase) -> dict[str, Tensor]:
 def _by_name(params: TensorDictBase) -> dict[str, Tensor]:
     flat = params.flatten_keys(".").items()
     return {name: value for name, value in flat if isinstance(value, Tensor)}
+
+
+def check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
+    """Raise at what are no networks, and at those in the wrong order."""
+    first = critic[0] if isinstance(critic, list) and critic else critic
+    for name, network in (("actor_network", actor), (critic_name, first)):
+        if not hasattr(network, "in_keys") or not hasattr(network, "out_keys"):
+            raise TypeError(f"{name} must be a TensorDictModule, got {type(network).__name__}")
+    swapped = sorted(map(str, set(first.out_keys) & set(actor.in_keys)))
+    if swapped:
+        raise ValueError(
+            f"actor_network and {critic_name} are in the wrong order: actor_network reads "
+            f"{swapped[0]!r}, which {critic_name} writes"
+        )
+    if not set(actor.out_keys) & set(first.in_keys):
+        raise ValueError(
+            f"{critic_name} must read what actor_network writes, {list(actor.out_keys)}, but "
+            f"reads {list(first.in_keys)}"
+        )
