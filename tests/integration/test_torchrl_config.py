@@ -50,7 +50,6 @@ from torchrl_mpfa.configs import (
     StochasticActorConfig,
 )
 from torchrl_mpfa.losses import SignalLoss
-from torchrl_mpfa.networks import Perceptron
 from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
 
 pytestmark = [
@@ -222,7 +221,6 @@ def test_fusion_adjustments_and_signals_are_configurations_of_their_own() -> Non
         (ActorConfig, make_actor, set()),
         (StochasticActorConfig, make_stochastic_actor, set()),
         (CriticConfig, make_critic, set()),
-        (CriticConfig, Perceptron, set()),
     ],
 )
 def test_every_argument_is_a_field_with_the_same_default(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -31,6 +31,7 @@ from torchrl_mpfa.losses.functional import (
     critic_loss,
     read_trust,
     saturation,
+    scale_rewards,
     trusted_loss,
 )
 from torchrl_mpfa.losses.parts import Parts, parts_of
@@ -39,7 +40,6 @@ from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.selection import Trains
 from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
 
-Importance = Literal["critic", "torchrl", "none"]
 VALUE = "value"
 """Name of the signal that is Q itself, which may be negative."""
 DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
@@ -111,7 +111,7 @@ class SignalLoss:
         *,
         signals: Sequence[str] = DEFAULT_SIGNALS,
         gradient_order: float = 2.0,
-        importance: Importance = "critic",
+        importance: str = "critic",
         reward_scale: float = 1.0,
         saturation_penalty: float = 0.0,
         saturation_limit: float = 1.5,
@@ -147,7 +147,7 @@ class SignalLoss:
         )  # type: ignore[call-arg]
         self.signals = tuple(signals)
         self.gradient_order = gradient_order
-        self.importance: Importance = importance
+        self.importance = importance
         self.reward_scale = reward_scale
         self.saturation_penalty = saturation_penalty
         self.saturation_limit = saturation_limit
@@ -184,19 +184,19 @@ class SignalLoss:
             and values for the log.
         """
         losses: dict[str, Tensor] = {}
-        values: dict[str, Tensor] = {}
+        log: dict[str, Tensor] = {}
         self._deferred = None  # Of an update that failed halfway.
         if trains != "actor":
-            loss, log = self._critics_part(batch, defer_gradient=True, loss_function=loss_function)
-            losses["loss_value"] = loss
-            values.update(log)
+            options = {"defer_gradient": True, "loss_function": loss_function}
+            losses["loss_value"], log = self._critics_part(batch, **options)
         if trains != "critic":
             of_actor, more = self._actors_part(batch)
-            losses.update(of_actor)
-            values.update(more)
-        return losses, values
+            losses, log = {**losses, **of_actor}, {**log, **more}
+        return losses, log
 
-    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Tensors]:
+    def _critics_part(
+        self, batch: TensorDictBase, **options: Any
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the critics under TorchRL's name for it, and values for the log."""
         raise NotImplementedError
 
@@ -454,14 +454,3 @@ def check_importance(importance: str) -> None:
     """Raise if this is no use of importance weights."""
     if importance not in ("critic", "torchrl", "none"):
         raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")
-
-
-def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> TensorDictBase:
-    """A shallow copy of a batch with scaled rewards, and ends as booleans as TorchRL needs them."""
-    found = batch.copy()
-    after = found["next"]
-    after.set(keys.reward, after[keys.reward] * reward_scale)
-    for key in (keys.done, keys.terminated):
-        if (end := after.get(key, None)) is not None:
-            after.set(key, end.bool())
-    return found

@@ -6,7 +6,7 @@ the size of an action.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -155,6 +155,17 @@ def action_gradient(value: Tensor, action: Tensor) -> Tensor:
         value, action, grad_outputs=torch.ones_like(value), retain_graph=True
     )
     return gradient.detach()
+
+
+def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> TensorDictBase:
+    """A shallow copy of a batch with scaled rewards, and ends as booleans as TorchRL needs them."""
+    found = batch.copy()
+    after = found["next"]
+    after.set(keys.reward, after[keys.reward] * reward_scale)
+    for key in (keys.done, keys.terminated):
+        if (end := after.get(key, None)) is not None:
+            after.set(key, end.bool())
+    return found
 
 
 class Trust(NamedTuple):

@@ -3,7 +3,6 @@
 from torchrl_mpfa.networks.bounds import ActionScale, action_bounds
 from torchrl_mpfa.networks.deterministic import Actor, Critic, make_actor, make_critic
 from torchrl_mpfa.networks.direct import DirectModule
-from torchrl_mpfa.networks.perceptron import Perceptron
 from torchrl_mpfa.networks.stochastic import (
     StochasticActor,
     StochasticNetwork,
@@ -17,7 +16,6 @@ __all__ = [
     "Actor",
     "Critic",
     "DirectModule",
-    "Perceptron",
     "StochasticActor",
     "StochasticNetwork",
     "action_bounds",

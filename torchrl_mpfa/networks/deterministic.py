@@ -8,8 +8,6 @@ start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
@@ -81,7 +79,10 @@ def make_actor(
     action_size: int,
     *,
     action_spec: TensorSpec | None = None,
-    **options: Any,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
 ) -> DirectModule:
     """Policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
 
@@ -90,8 +91,11 @@ def make_actor(
         action_size: ``A``.
         action_spec: A bounded spec, such as ``env.action_spec``: actions are the tanh, scaled to
             its bounds. None: actions are in [-1, 1].
-        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
-            ``layer_norm``, ``final_init``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers.
+        layer_norm: Normalize each hidden layer, so that no feature grows without bound.
+        final_init: The last layer starts uniformly within this, hence near the middle of the
+            tanh; None leaves PyTorch's start.
 
     Returns:
         A module for TorchRL's losses and collectors.
@@ -107,23 +111,32 @@ def make_actor(
         torch.Size([5, 1])
     """
     check_counts(observation_size=observation_size, action_size=action_size)
-    perceptron, scale = Perceptron(**options), action_scale(action_spec, action_size)
+    perceptron = Perceptron(width, layers, layer_norm, final_init)
+    scale = action_scale(action_spec, action_size)
     actor = Actor(observation_size, action_size, perceptron, scale=scale)
     return DirectModule(actor, in_keys=["observation"], out_keys=["preactivation", "action"])
 
 
 def make_critic(
-    observation_size: int, action_size: int, *, late_action: bool = True, **options: Any
+    observation_size: int,
+    action_size: int,
+    *,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
+    late_action: bool = True,
 ) -> DirectModule:
     """Critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
 
     Args:
         observation_size: ``O``.
         action_size: ``A``.
-        late_action: Whether the action joins at the second layer in place of the first; there must
-            be two then.
-        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
-            ``layer_norm``, ``final_init``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers; with ``late_action`` at least two.
+        layer_norm: As in :func:`make_actor`.
+        final_init: As in :func:`make_actor`.
+        late_action: Whether the action joins at the second layer in place of the first.
 
     Returns:
         A module for TorchRL's losses.
@@ -136,8 +149,8 @@ def make_critic(
         ['state_action_value']
     """
     check_counts(observation_size=observation_size, action_size=action_size)
-    perceptron = Perceptron(**options)
-    if late_action and perceptron.layers < 2:
-        raise ValueError(f"layers must be at least 2 with late_action, got {perceptron.layers}")
+    perceptron = Perceptron(width, layers, layer_norm, final_init)
+    if late_action and layers < 2:
+        raise ValueError(f"layers must be at least 2 with late_action, got {layers}")
     critic = Critic(observation_size, action_size, perceptron, late_action=late_action)
     return DirectModule(critic, in_keys=["observation", "action"], out_keys=["state_action_value"])

@@ -11,27 +11,12 @@ from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts
 
 @dataclass(frozen=True)
 class Perceptron:
-    """Options of an actor, a critic, or a value network.
+    """Options of an actor, a critic, or a value network, see :func:`~torchrl_mpfa.make_actor`."""
 
-    Args:
-        width: Units of each hidden layer.
-        layers: Number of hidden layers.
-        layer_norm: Normalize each hidden layer, so that no feature grows without bound.
-        final_init: The last layer starts uniformly within this, hence near the middle of a tanh;
-            None leaves PyTorch's start.
-
-    Raises:
-        ValueError: If an argument is out of its range.
-
-    Examples:
-        >>> [type(layer).__name__ for layer in Perceptron(width=64).hidden(24, 1)]
-        ['Linear', 'LayerNorm', 'ReLU']
-    """
-
-    width: int = 256
-    layers: int = 2
-    layer_norm: bool = True
-    final_init: float | None = 3e-3
+    width: int
+    layers: int
+    layer_norm: bool
+    final_init: float | None
 
     def __post_init__(self) -> None:
         check_counts(width=self.width, layers=self.layers)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -162,7 +161,10 @@ def make_stochastic_actor(
     action_size: int,
     *,
     action_spec: TensorSpec | None = None,
-    **options: Any,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
 ) -> StochasticActor:
     """Policy from ``"observation"`` to ``"preactivation"``, ``"scale"`` and ``"action"``.
 
@@ -174,9 +176,11 @@ def make_stochastic_actor(
         observation_size: ``O``.
         action_size: ``A``.
         action_spec: As in :func:`~torchrl_mpfa.make_actor`.
-        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
-            ``layer_norm``, ``final_init``; the last layers are those of means (near zero at the
-            start) and scales (near one).
+        width: Units of each hidden layer.
+        layers: Number of hidden layers.
+        layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
+        final_init: The last layers start uniformly within this, hence means near zero and scales
+            near one; None leaves PyTorch's start.
 
     Returns:
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.
@@ -192,6 +196,7 @@ def make_stochastic_actor(
         True
     """
     check_counts(observation_size=observation_size, action_size=action_size)
-    network = StochasticNetwork(observation_size, action_size, Perceptron(**options))
+    perceptron = Perceptron(width, layers, layer_norm, final_init)
+    network = StochasticNetwork(observation_size, action_size, perceptron)
     scale = action_scale(action_spec, action_size)
     return StochasticActor(network, action_size=action_size, scale=scale)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -53,14 +52,24 @@ def _chosen(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return values, choice, values.amax(-1, keepdim=True)
 
 
-def make_value_network(observation_size: int, actions: int, **options: Any) -> DirectModule:
+def make_value_network(
+    observation_size: int,
+    actions: int,
+    *,
+    width: int = 256,
+    layers: int = 2,
+    layer_norm: bool = True,
+    final_init: float | None = 3e-3,
+) -> DirectModule:
     """Network from ``"observation"`` to a value for each action, and the best one, one-hot.
 
     Args:
         observation_size: ``O``.
         actions: Number of actions ``K``.
-        **options: Of :class:`~torchrl_mpfa.networks.Perceptron`: ``width``, ``layers``,
-            ``layer_norm``, ``final_init``.
+        width: Units of each hidden layer.
+        layers: Number of hidden layers.
+        layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
+        final_init: As there.
 
     Returns:
         A module for ``DQNLoss``.
@@ -73,7 +82,8 @@ def make_value_network(observation_size: int, actions: int, **options: Any) -> D
         torch.Size([5, 7])
     """
     check_counts(observation_size=observation_size, actions=actions)
-    network = ValueNetwork(observation_size, actions, Perceptron(**options))
+    perceptron = Perceptron(width, layers, layer_norm, final_init)
+    network = ValueNetwork(observation_size, actions, perceptron)
     return DirectModule(network, in_keys=["observation"], out_keys=_OUT_KEYS)
 
 
