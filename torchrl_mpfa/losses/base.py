@@ -194,9 +194,7 @@ class SignalLoss:
             losses, log = {**losses, **of_actor}, {**log, **more}
         return losses, log
 
-    def _critics_part(
-        self, batch: TensorDictBase, **options: Any
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
         """Loss of the critics under TorchRL's name for it, and values for the log."""
         raise NotImplementedError
 
@@ -270,10 +268,8 @@ class SignalLoss:
         critic, keys = self._networks().critic, self.tensor_keys
         if not isinstance(critic, StackedNetworks):
             return self._q(critic, source, {keys.action: action}).unsqueeze(0)
-        others = len(self._networks().target_critics) - 1
-        found = critic.call(
-            source, [{keys.action: a} for a in [action, *[action.detach()] * others]]
-        )
+        others = [action.detach()] * (len(self._networks().target_critics) - 1)
+        found = critic.call(source, [{keys.action: each} for each in (action, *others)])
         return torch.stack([out[keys.state_action_value].squeeze(-1) for out in found])
 
     def _stored_values(self, tensordict: TensorDictBase, *, defer_gradient: bool) -> Tensor:
@@ -351,19 +347,18 @@ class SignalLoss:
     # The actor's loss.
 
     def _actor_mean(
-        self,
-        tensordict: TensorDictBase,
-        loss: Tensor,
-        action: Tensor,
-        preactivation: Tensor | None,
+        self, tensordict: TensorDictBase, loss: Tensor, chosen: Tensors
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean of the losses ``[B]`` of an actor, with the penalty on saturation; and its log."""
-        mean = self._mean(tensordict, trusted_loss(loss, action, read_trust(tensordict)))
+        keys = self.tensor_keys
+        loss = trusted_loss(loss, chosen[keys.action], read_trust(tensordict))
+        mean = self._mean(tensordict, loss)
+        preactivation = chosen.get(keys.preactivation)
         if preactivation is None:
             if self.saturation_penalty > 0:
                 raise KeyError(
                     f"saturation_penalty is {self.saturation_penalty}, but the actor writes no "
-                    f"{self.tensor_keys.preactivation!r}"
+                    f"{keys.preactivation!r}"
                 )
             return mean, {}
         if self.saturation_penalty > 0:
@@ -385,9 +380,6 @@ class SignalLoss:
         Args:
             value_type: A member of :class:`~torchrl.objectives.ValueEstimators`, or an estimator.
             **hyperparams: Of the estimator; ``gamma`` among them.
-
-        Returns:
-            What TorchRL's method gives.
 
         Raises:
             ValueError: If it is another estimator.

@@ -159,11 +159,10 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        networks, keys = self._networks(), self.tensor_keys
+        networks = self._networks()
         chosen = call(networks.actor, tensordict)
         value = self._q(networks.frozen_critics[0], tensordict, chosen)
-        preactivation = chosen.get(keys.preactivation)
-        return self._actor_mean(tensordict, -value, chosen[keys.action], preactivation)
+        return self._actor_mean(tensordict, -value, chosen)
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
         return self.loss_value(batch, **options)

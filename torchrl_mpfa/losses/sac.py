@@ -14,7 +14,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
 from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
-from torchrl_mpfa.losses.calling import read_inputs
+from torchrl_mpfa.losses.calling import Tensors, read_inputs
 from torchrl_mpfa.losses.functional import least_value, soft_value
 from torchrl_mpfa.networks import StochasticActor
 
@@ -92,16 +92,7 @@ class SignalSACLoss(SignalLoss, SACLoss):
         defer_gradient: bool = False,
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
-
-        Args:
-            tensordict: A batch of transitions, batch size ``[B]``.
-            defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
-            loss_function: As there.
-
-        Returns:
-            The loss, and detached values for the log.
-        """
+        """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
         value = self._stored_values(tensordict, defer_gradient=defer_gradient)
         with torch.no_grad():
             next_value = self._next_value(tensordict["next"])
@@ -119,52 +110,30 @@ class SignalSACLoss(SignalLoss, SACLoss):
 
     def _next_value(self, after: TensorDictBase) -> Tensor:
         """Soft value of the next states at actions of the current policy, shape ``[B]``."""
-        action, log_prob, _ = self._sample(after)
-        chosen = {self.tensor_keys.action: action}
+        chosen, log_prob = self._sample(after)
         values = [self._q(critic, after, chosen) for critic in self._networks().target_critics]
         return soft_value(torch.stack(values), log_prob, alpha=self._alpha)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """What TorchRL's ``forward`` asks for: :meth:`value_loss`, and ``|TD error|``.
-
-        Args:
-            tensordict: A batch of transitions, batch size ``[B]``.
-
-        Returns:
-            The loss, and the larger error of the critics, ``[B]``.
-        """
+        """Loss of :meth:`value_loss`, and the larger error, as TorchRL's ``forward`` asks for."""
         loss, metadata = self.value_loss(tensordict)
         return loss, {"td_error": metadata["td_error"].amax(0).sqrt()}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor's loss by the least of the critics, with the penalty on saturation if there is one.
+        """Actor's loss by the least of the critics, as :meth:`SignalDDPGLoss.loss_actor`.
 
-        Args:
-            tensordict: A batch of transitions, batch size ``[B]``.
-
-        Returns:
-            The loss, and detached values for the log; with ``"log_prob"``, ``[B]``, for
-            :meth:`temperature_loss`.
+        Among the values for the log is ``"log_prob"``, ``[B]``, for :meth:`temperature_loss`.
         """
-        action, log_prob, preactivation = self._sample(tensordict)
-        chosen = {self.tensor_keys.action: action}
+        chosen, log_prob = self._sample(tensordict)
         critics = self._networks().frozen_critics
         values = torch.stack([self._q(critic, tensordict, chosen) for critic in critics])
         each = -soft_value(values, log_prob, alpha=self._alpha)
-        loss, log = self._actor_mean(tensordict, each, action, preactivation)
+        loss, log = self._actor_mean(tensordict, each, chosen)
         least = least_value(values.detach())
         return loss, {"log_prob": log_prob.detach(), "state_action_value_actor": least, **log}
 
     def temperature_loss(self, tensordict: TensorDictBase, log_prob: Tensor) -> Tensor:
-        r"""Loss of the temperature, the mean of :math:`-\ln\alpha (\ln\pi(a | s_i) + \bar H)`.
-
-        Args:
-            tensordict: The batch that the actor's loss was computed of, batch size ``[B]``.
-            log_prob: ``"log_prob"`` out of that, ``[B]``.
-
-        Returns:
-            The loss.
-        """
+        r"""Loss of the temperature, the mean of :math:`-\ln\alpha (\ln\pi(a | s_i) + \bar H)`."""
         return self._mean(tensordict, self.alpha_loss(log_prob))
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
@@ -178,15 +147,18 @@ class SignalSACLoss(SignalLoss, SACLoss):
         alpha = self.log_alpha.detach().exp()
         return losses, {"alpha": alpha, "entropy": -log_prob.mean(), **log}
 
-    def _sample(self, source: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Actions of the current policy, ``[B, A]``, their log-densities, ``[B]``, and means."""
-        actor = self._networks().actor
+    def _sample(self, source: TensorDictBase) -> tuple[Tensors, Tensor]:
+        """Actions of the policy and means by key, ``[B, A]``, and log-densities, ``[B]``."""
+        actor, keys = self._networks().actor, self.tensor_keys
         inputs = read_inputs(actor, source)
         if isinstance(actor, StochasticActor):
-            return actor.sample(inputs)
-        found = actor.get_dist_params(TensorDict(inputs))
-        action, log_prob = compute_rsample_log_prob(actor.build_dist_from_params(found))
-        return action, log_prob, found.get(self.tensor_keys.preactivation, None)
+            action, log_prob, mean = actor.sample(inputs)
+        else:
+            found = actor.get_dist_params(TensorDict(inputs))
+            action, log_prob = compute_rsample_log_prob(actor.build_dist_from_params(found))
+            mean = found.get(keys.preactivation, None)
+        chosen = {keys.action: action}
+        return chosen if mean is None else {**chosen, keys.preactivation: mean}, log_prob
 
 
 def make_sac_loss(

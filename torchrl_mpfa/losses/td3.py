@@ -82,16 +82,7 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
         defer_gradient: bool = False,
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum of the critics' losses; writes the signals (Eqs. 13-14) in ``tensordict``.
-
-        Args:
-            tensordict: A batch of transitions, batch size ``[B]``.
-            defer_gradient: As in :meth:`SignalDDPGLoss.loss_value`.
-            loss_function: As there.
-
-        Returns:
-            The loss, and detached values for the log.
-        """
+        """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
         value = self._stored_values(tensordict, defer_gradient=defer_gradient)
         with torch.no_grad():
             next_value = self._next_value(tensordict["next"])
@@ -121,19 +112,11 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
         return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor's loss by the first critic, with the penalty on saturation if there is one.
-
-        Args:
-            tensordict: A batch of transitions, batch size ``[B]``.
-
-        Returns:
-            The loss, and detached values for the log.
-        """
-        networks, keys = self._networks(), self.tensor_keys
+        """Actor's loss by the first critic, as :meth:`SignalDDPGLoss.loss_actor`."""
+        networks = self._networks()
         chosen = call(networks.actor, tensordict)
         value = self._q(networks.frozen_critics[0], tensordict, chosen)
-        preactivation = chosen.get(keys.preactivation)
-        loss, log = self._actor_mean(tensordict, -value, chosen[keys.action], preactivation)
+        loss, log = self._actor_mean(tensordict, -value, chosen)
         return loss, {"state_action_value_actor": value.detach(), **log}
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
