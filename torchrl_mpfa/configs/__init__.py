@@ -11,23 +11,21 @@ by itself.
 
 from torchrl.trainers.algorithms.configs import ConfigStore
 
-from torchrl_mpfa.configs.learning import (
+from torchrl_mpfa.configs.methods import METHOD_CONFIGS
+from torchrl_mpfa.configs.parts import (
     ActorConfig,
     CriticConfig,
+    MPFASamplerConfig,
     PriorityGuardConfig,
     PriorityStepperConfig,
     SignalDDPGLossConfig,
-    SignalSACLossConfig,
-    SignalTD3LossConfig,
-    StochasticActorConfig,
-)
-from torchrl_mpfa.configs.methods import METHOD_CONFIGS
-from torchrl_mpfa.configs.replay import (
-    MPFASamplerConfig,
     SignalMemmapStorageConfig,
     SignalReplayBufferConfig,
+    SignalSACLossConfig,
     SignalSamplerConfig,
+    SignalTD3LossConfig,
     SignalTensorStorageConfig,
+    StochasticActorConfig,
 )
 
 __all__ = [

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field, fields, make_dataclass
+from dataclasses import fields, make_dataclass
 from typing import Any, get_type_hints
 
 from torchrl.trainers.algorithms.configs.data import ReplayBufferBaseConfig
 
+from torchrl_mpfa.configs.signatures import field_default
 from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
 from torchrl_mpfa.methods.assembly import has_one_batch_a_step
 from torchrl_mpfa.replay import SignalReplayBuffer
@@ -23,7 +24,7 @@ def _config(name: str, target: str) -> type:
     entries: list[tuple[str, Any, Any]] = []
     for setting in fields(Method):
         value = getattr(method, setting.name)
-        entries.append((setting.name, hints[setting.name], _default(value)))
+        entries.append((setting.name, hints[setting.name], field_default(value)))
     entries += [(word, Any, "auto" if word == "device" else None) for word in _BESIDE]
     entries += [("_target_", str, f"{_PLACE}.{target}"), ("_convert_", str, "all")]
     title = "".join(part.capitalize() for part in name.split("_"))
@@ -31,10 +32,6 @@ def _config(name: str, target: str) -> type:
     made.__doc__ = f"Configuration of the method ``{name}``; see :class:`Method` for its settings."
     made.__module__ = __name__
     return made
-
-
-def _default(value: Any) -> Any:
-    return field(default_factory=lambda: list(value)) if isinstance(value, list) else value
 
 
 def _make_replay(**settings: Any) -> Replay:
