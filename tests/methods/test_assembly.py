@@ -10,8 +10,8 @@ from tests.methods.replays import make_transitions, seeded
 from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, loss_options, make_replay
 from torchrl_mpfa.methods.assembly import unused_settings
+from torchrl_mpfa.methods.catalogue import RANGES, check_ranges
 from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
-from torchrl_mpfa.methods.ranges import RANGES, check_ranges
 
 NAN = float("nan")
 

@@ -1,4 +1,4 @@
-"""From a method to its replay: buffer, selection, and what the loss has to write."""
+"""The replay of a method: buffer, selection, and the signals that the loss has to write."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
 from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
 from torchrl_mpfa.losses.functional import BEHAVIOR
-from torchrl_mpfa.methods.catalogue import METHODS, Method
+from torchrl_mpfa.methods.catalogue import METHODS, Method, check_ranges
 from torchrl_mpfa.methods.cer import CERSampler
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.halves import uniform_halves
@@ -28,7 +28,6 @@ from torchrl_mpfa.methods.klper import KLPERSelection
 from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_draws
 from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler
-from torchrl_mpfa.methods.ranges import check_ranges
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.methods.reaper import ENDED, EPISODE, ReaPERSampler
 from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection
@@ -67,12 +66,7 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "split": LA3PSampler,
 }
 _SELECTIONS: dict[str, Selection] = {"split": la3p_draws, "halves": uniform_halves}
-_OF_PRIORITIES = (
-    "combination",
-    "floor_quantile",
-    "priority_floor",
-    "replay_penalty",
-)
+_OF_PRIORITIES = ("combination", "floor_quantile", "priority_floor", "replay_penalty")
 WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
     "fusion": set(_FUSIONS),
@@ -84,7 +78,7 @@ WORDS: dict[str, set[str]] = {
     "loss_function": {"l2", "smooth_l1", "pal"},
     "optimizer": {"adam", "radam"},
 }
-"""What the settings of a method that are words may be."""
+"""The words of each setting that is a word."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +90,9 @@ class Replay:
         select: From the buffer to what the updates of one training step are made from.
         signals: The signals that the loss has to write, by name.
         method: The settings that it was made from.
-        entries: What transitions must have beside the usual, by name.
+        entries: Names of the entries that transitions must have beside the usual: ``"episode"``, a
+            number, shape ``[B, 1]``; ``"behavior_mean"``, the action without its noise, ``[B, A]``,
+            and ``"behavior_sigma"``, the standard deviation of that, ``[B, 1]``.
     """
 
     buffer: SignalReplayBuffer
@@ -106,7 +102,7 @@ class Replay:
     entries: tuple[str, ...] = ()
 
     def anneal(self, fraction: float) -> None:
-        """Move what changes over a training: beta of Eq. (10), linearly, and a fusion's weights.
+        """Move beta of Eq. (10), linearly, and the weights of a fusion with a schedule.
 
         Args:
             fraction: How much of the training is done.
@@ -147,9 +143,9 @@ def make_replay(
         storage: Where the transitions lie; by default a new
             :class:`~torchrl_mpfa.SignalTensorStorage`. It must keep the signals of the method.
         device: Device of a new storage; ``"auto"``: that of the first transition.
-        policy: The policy in training, which KLPER and ReF-ER ask what it would do.
-        sigma: Standard deviation of the exploration noise in units of the action, for KLPER; a
-            function tells that of the episode that acts.
+        policy: The policy in training, with whose actions KLPER and ReF-ER compare.
+        sigma: Standard deviation of the exploration noise in units of the action, for KLPER; or a
+            function that gives that of the present episode.
         **settings: Other values for fields of :class:`~torchrl_mpfa.methods.Method`.
 
     Returns:
@@ -186,16 +182,7 @@ def make_replay(
 def buffer_parts(
     method: Method, *, storage: Storage | None = None, device: torch.device | str = "auto"
 ) -> dict[str, Any]:
-    """Storage, sampler and batch size of a method, as arguments of a buffer.
-
-    Args:
-        method: The settings.
-        storage: See :func:`make_replay`.
-        device: See :func:`make_replay`.
-
-    Returns:
-        ``storage``, ``sampler`` and ``batch_size``.
-    """
+    """Storage, sampler and batch size of a method, as arguments of a buffer."""
     kept = [*signals_of(method), *([EPISODE, ENDED] if method.reliability > 0 else [])]
     if storage is None:
         storage = SignalTensorStorage(method.capacity, signals=kept or MPFA_SIGNALS, device=device)
@@ -209,7 +196,7 @@ def buffer_parts(
 
 
 def loss_options(method: str | Method) -> dict[str, Any]:
-    """What a method asks of the loss, as keyword arguments of ``make_ddpg_loss`` and its like.
+    """Keyword arguments of ``make_ddpg_loss`` and its like that a method needs.
 
     Args:
         method: A name, or settings of your own.
@@ -235,14 +222,9 @@ def loss_options(method: str | Method) -> dict[str, Any]:
 
 
 def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
-    """What is set and has no effect.
-
-    A method of one's own may have parameters of a boost or a decay that it does not make; one out
-    of the catalogue may have those that it has there.
-
-    Yields:
-        Name of a setting, what it must be, and name of the setting that is why.
-    """
+    """Settings without effect: name, the value it must have, and the setting that is why."""
+    # A method of one's own may have parameters of a boost or a decay that it does not make; one out
+    # of the catalogue may have those that it has there.
     uniform, default = method.selection in _UNIFORM, Method()
     named = METHODS.get(method.name, method)
     for base, cause, wrong, names in (
@@ -261,11 +243,7 @@ def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
 
 
 def entries_of(method: Method) -> tuple[str, ...]:
-    """What transitions must have beside the usual.
-
-    ``"episode"``, a number, shape ``[B, 1]``; ``"behavior_mean"``, the action without its noise,
-    ``[B, A]``, and ``"behavior_sigma"``, the standard deviation of that, ``[B, 1]``.
-    """
+    """Entries that transitions must have beside the usual, see :class:`Replay`."""
     of_behavior = BEHAVIOR if method.selection == "near_policy" else ()
     return ((EPISODE.name,) if method.reliability > 0 else ()) + of_behavior
 
@@ -282,7 +260,7 @@ def signals_of(method: Method) -> list[Signal]:
 
 
 def learned_signals(method: Method) -> list[str]:
-    """What the loss has to write for the signals of a method."""
+    """Entries that the loss has to write for the signals of a method."""
     keys = [signal.key for signal in signals_of(method) if signal.known_at == "update"]
     return sorted({key[-1] if isinstance(key, tuple) else key for key in keys})
 
@@ -318,7 +296,7 @@ def make_sampler(method: Method) -> SignalSampler | RandomSampler:
 
 
 def make_adjustments(method: Method) -> list[Adjustment]:
-    """What the method does to fused priorities, in this order."""
+    """The adjustments of fused priorities, in their order."""
     made: list[Adjustment] = []
     if method.boost:
         boost = PositiveBoost(
@@ -345,7 +323,7 @@ def make_adjustments(method: Method) -> list[Adjustment]:
 def make_selection(
     method: Method, policy: TensorDictModule | None, sigma: float | Callable[[], float] | None
 ) -> Selection:
-    """From the buffer to what the updates of a training step are made from."""
+    """The selection of a method."""
     if method.selection in _SELECTIONS:
         return _SELECTIONS[method.selection]
     if method.selection == "near_policy" and policy is not None:

@@ -6,8 +6,17 @@ settings, or one more entry in :data:`METHODS`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
+
+from torchrl_mpfa.checks import BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
+
+SWITCH: Rule = (lambda value: isinstance(value, bool), "true or false")
+
+
+def _within(rule: Rule, default: Any) -> Any:
+    """A setting with its range and its default."""
+    return field(default=default, metadata={"rule": rule})
 
 
 @dataclass
@@ -30,54 +39,54 @@ class Method:
     """What is made of the weighted signals: their ``sum`` (Eq. 21) or ``product``, or a
     ``mixture``: each signal has a tree of its own, and its share of a batch. The latter two need
     no scale: ``scaled`` is the same as ``fixed``."""
-    boost: bool = True
+    boost: bool = _within(SWITCH, True)
     """Raise positive transitions, Eq. 22."""
-    decay: bool = True
+    decay: bool = _within(SWITCH, True)
     """Decay positive transitions above the batch mean, Eqs. 23-24."""
-    priority_floor: float = 0.0
+    priority_floor: float = _within(NOT_NEGATIVE, 0.0)
     """Least priority, in units of the reward (LAP's 1); 0: none."""
-    floor_quantile: float = 0.0
+    floor_quantile: float = _within(SHARE, 0.0)
     """Share of the priorities in the buffer below which the floor, and with it the bend of the
     loss, moves; 0: the floor is a constant."""
-    replay_penalty: float = 0.0
+    replay_penalty: float = _within(NOT_NEGATIVE, 0.0)
     """Penalty on replays (HVPER); 0: none."""
-    reliability: float = 0.0
+    reliability: float = _within(NOT_NEGATIVE, 0.0)
     """omega of ReaPER: power of how reliable a TD error is; 0: none. It needs ``prioritized`` and
     no ``mixture``, and transitions must have ``"episode"``."""
     selection: str = "prioritized"
     """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
     ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P),
     ``halves`` (two updates on uniform halves) or ``near_policy`` (ReF-ER)."""
-    far_share: float = 0.1
+    far_share: float = _within(SHARE, 0.1)
     """Share of transitions that may be far from the policy before ``near_policy`` holds it."""
-    far_cutoff: float = 4.0
+    far_cutoff: float = _within(POSITIVE, 4.0)
     """C of ``near_policy``: a ratio of densities of 1 + C or its inverse is far."""
-    recency: float = 3.0
+    recency: float = _within(NOT_NEGATIVE, 3.0)
     """c of ``geometric``: the newest transition is sampled e^c times as often as the oldest."""
-    candidates: int = 1
+    candidates: int = _within(COUNT, 1)
     """Batches of which the most on-policy one is trained on (KLPER)."""
-    replay_cap: int = 1024
+    replay_cap: int = _within(COUNT, 1024)
     """Replays after which ``capped`` excludes a transition."""
-    capacity: int = 100_000
+    capacity: int = _within(COUNT, 100_000)
     """Transitions that the buffer holds (the paper's Table 1)."""
-    batch_size: int = 256
+    batch_size: int = _within(COUNT, 256)
     """Transitions in a batch (the paper's Table 1)."""
-    alpha: float = 0.6
+    alpha: float = _within(NOT_NEGATIVE, 0.6)
     """Priority exponent, Eq. 8, and the exponent of PAL."""
-    beta: float = 0.4
+    beta: float = _within(SHARE, 0.4)
     """Importance exponent at the start, Eq. 10."""
-    beta_end: float = 1.0
+    beta_end: float = _within(SHARE, 1.0)
     """Importance exponent at the end; between the two it rises with the episodes."""
-    eps: float = 0.05
+    eps: float = _within(NOT_NEGATIVE, 0.05)
     """Added to every priority, Eq. 21."""
-    boost_factor: float = 3.0
+    boost_factor: float = _within(POSITIVE, 3.0)
     """phi of Eq. 22; its upper bound where ``boost_target`` is above 0."""
-    boost_target: float = 0.0
+    boost_target: float = _within(BELOW_ONE, 0.0)
     """Share of the total priority that positive transitions are to have, by a phi that follows how
     rare they are in the buffer; 0: phi is fixed."""
     boost_bound: str = "floor"
     """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
-    decay_sharpness: float = 0.01
+    decay_sharpness: float = _within(POSITIVE, 0.01)
     """sigma of Eq. 23."""
     decay_position: str = "batch"
     """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
@@ -86,24 +95,50 @@ class Method:
     ``mean``, the mean reward of the buffer, for rewards of one sign."""
     population: str = "buffer"
     """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
-    max_priority_within_buffer: bool = True
+    max_priority_within_buffer: bool = _within(SWITCH, True)
     """Whether a fresh transition gets the highest priority in the buffer, or the highest ever."""
-    stratified: bool = False
+    stratified: bool = _within(SWITCH, False)
     """Whether a batch takes one transition from each of equal parts of the total priority."""
     importance: str = "critic"
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     loss_function: str = "l2"
     """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``."""
-    target_average: int = 1
+    target_average: int = _within(COUNT, 1)
     """Critics of which the target is the mean, one more kept at each end of an episode."""
     optimizer: str = "adam"
     """``adam`` or ``radam``."""
-    update_block: int = 1
+    update_block: int = _within(COUNT, 1)
     """Actions between two blocks of updates, of which there are as many as otherwise (RUD)."""
-    curiosity: bool = False
+    curiosity: bool = _within(SWITCH, False)
     """Whether rewards get a bonus for what the robot could not foresee (ICM)."""
-    curiosity_scale: float = 0.01
+    curiosity_scale: float = _within(POSITIVE, 0.01)
     """eta of that bonus."""
+
+
+RANGES: dict[str, Rule] = {
+    each.name: each.metadata["rule"] for each in fields(Method) if "rule" in each.metadata
+}
+"""The rule of each setting that is a number or a switch."""
+
+
+def check_ranges(method: Method) -> None:
+    """Reject a number or a switch of a method that is out of its range.
+
+    Args:
+        method: The settings.
+
+    Raises:
+        TypeError: If a setting is not a number, with its name and value.
+        ValueError: If it is out of its range, likewise.
+
+    Examples:
+        >>> check_ranges(Method(priority_floor=-1.0))
+        Traceback (most recent call last):
+        ...
+        ValueError: priority_floor must be finite and not negative, got -1.0
+    """
+    for name, rule in RANGES.items():
+        check(rule, **{name: getattr(method, name)})
 
 
 _PLAIN: dict[str, Any] = {"fusion": "fixed", "boost": False, "decay": False}

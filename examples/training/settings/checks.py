@@ -16,7 +16,7 @@ from mpfa_envs.robots.model import resolve_robot
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule
 from torchrl_mpfa.methods import Method, can_be_remote
 from torchrl_mpfa.methods.assembly import WORDS, unused_settings
-from torchrl_mpfa.methods.ranges import RANGES
+from torchrl_mpfa.methods.catalogue import RANGES
 from training.environments import check_physics, make_training_env
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete

@@ -27,7 +27,7 @@ from tests.integration.comparison.test_compare import InThisProcess
 from tests.integration.tiny_runs import OVERRIDES
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.assembly import unused_settings
-from torchrl_mpfa.methods.ranges import check_ranges
+from torchrl_mpfa.methods.catalogue import check_ranges
 from training import files
 from training.comparison.arms import Arm, with_defaults
 from training.comparison.jobs import Evaluation, Study
