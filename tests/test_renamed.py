@@ -27,9 +27,9 @@ def test_an_old_name_warns_and_is_the_new_one(old, new):
 
 def test_every_old_name_is_on_the_page():
     from mpfa_envs import _RENAMED
-    from torchrl_mpfa.renamed import OF_METHODS, TOP
+    from torchrl_mpfa.renamed import OF_METHODS, OF_SELECTION, TOP
 
-    assert len(ROWS) == len(_RENAMED) + len(OF_METHODS) + len(TOP)
+    assert len(ROWS) == len(_RENAMED) + len(OF_METHODS) + len(OF_SELECTION) + len(TOP)
 
 
 @pytest.mark.parametrize("package", ["torchrl_mpfa", "torchrl_mpfa.methods", "mpfa_envs"])

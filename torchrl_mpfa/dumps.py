@@ -7,17 +7,15 @@ import json
 import os
 import re
 import shutil
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from torchrl_mpfa.saving import write_text_atomically
+from torchrl_mpfa.saving import checksum_of, write_text_atomically
 
 MANIFEST = "manifest.json"
 _FORMAT = 1
-_CHUNK = 1 << 20
 _LOCK = ".lock"
 _ENDINGS = {".json", ".memmap", ".pt"}
 """Of tensors and plain values. TensorDict unpickles what has others, also inside of archives."""
@@ -29,15 +27,9 @@ _EVALUATED = "data_indices.json"
 def new_dump(path: str | Path) -> Iterator[Path]:
     """A new folder inside ``path`` that counts once it is whole, and then replaces the one before.
 
-    Which folder counts stands in ``path/manifest.json``, which is replaced in one step: a crash at
-    any moment leaves the old dump or the new one. What a killed dump left is removed by the next.
-    Of several at once, by threads or processes, each waits for the one before.
-
-    Args:
-        path: The folder of the dump; made if it is not there.
-
-    Yields:
-        The folder to write in.
+    ``path/manifest.json`` names the folder that counts and is replaced in one step: a crash at any
+    moment leaves the old dump or the new one. The next dump removes what a killed one left. Of
+    several at once, by threads or processes, each waits for the one before.
     """
     path = Path(path).absolute()
     path.mkdir(exist_ok=True)
@@ -58,24 +50,14 @@ def new_dump(path: str | Path) -> Iterator[Path]:
 
 
 def seal_dump(path: Path, folder: Path) -> None:
-    """Write size and checksum of every file in ``folder`` to ``path/manifest.json``.
-
-    Raises:
-        ValueError: If there is a link, or a file that could execute something when it is read.
-    """
+    """Write size and checksum of every file in ``folder`` to ``path/manifest.json``."""
     files = {name: _measure(folder / name) for name in _files(folder)}
     manifest = {"format": _FORMAT, "folder": os.path.relpath(folder, path), "files": files}
     write_text_atomically(json.dumps(manifest, indent=1) + "\n", path / MANIFEST)
 
 
 def open_dump(path: str | Path) -> Path:
-    """Compare every file of a dump with its checksum.
-
-    Args:
-        path: What :func:`new_dump` or :func:`seal_dump` was given.
-
-    Returns:
-        The folder in which the files lie.
+    """Compare every file of a dump with its checksum, and return the folder of the files.
 
     Raises:
         FileNotFoundError: If there is no such folder.
@@ -129,10 +111,7 @@ def _files(folder: Path) -> list[str]:
 
 def _measure(file: Path) -> list[int]:
     """Size in bytes and CRC-32 of a file, which is on the disk afterwards."""
-    size, checksum = 0, 0
     with file.open("rb") as opened:
         os.fsync(opened.fileno())
-        while chunk := opened.read(_CHUNK):
-            size += len(chunk)
-            checksum = zlib.crc32(chunk, checksum)
-    return [size, checksum]
+        size = opened.seek(0, os.SEEK_END)
+        return [size, checksum_of(opened, size)]

@@ -11,7 +11,7 @@ TOP: Final[dict[str, str]] = {
     "BatchFacts": "torchrl_mpfa.adjustment.BatchFacts",
     "Counting": "torchrl_mpfa.adjustment.Counting",
     "DirectModule": "torchrl_mpfa.networks.DirectModule",
-    "Draw": "torchrl_mpfa.selection.Draw",
+    "Draw": "torchrl_mpfa.selection.SampledBatch",
     "QLearner": "torchrl_mpfa.TabularQLearner",
     "Selection": "torchrl_mpfa.selection.Selection",
     "SignalLoss": "torchrl_mpfa.losses.SignalLoss",
@@ -24,6 +24,8 @@ TOP: Final[dict[str, str]] = {
     "write_text_atomically": "torchrl_mpfa.saving.write_text_atomically",
 }
 """Names that were in :mod:`torchrl_mpfa`, and where they are."""
+OF_SELECTION: Final[dict[str, str]] = {"Draw": "torchrl_mpfa.selection.SampledBatch"}
+"""Names that were in :mod:`torchrl_mpfa.selection`, and where they are."""
 OF_METHODS: Final[dict[str, str]] = {
     "CappedSampler": "torchrl_mpfa.methods.mw.MWSampler",
     "CombinedSampler": "torchrl_mpfa.methods.cer.CERSampler",
@@ -49,7 +51,7 @@ OF_METHODS: Final[dict[str, str]] = {
     "relative_error": "torchrl_mpfa.methods.hvper.relative_error",
     "relative_value": "torchrl_mpfa.methods.hvper.relative_value",
     "reliability": "torchrl_mpfa.methods.reaper.reliability",
-    "split_draws": "torchrl_mpfa.methods.la3p.la3p_draws",
+    "split_draws": "torchrl_mpfa.methods.la3p.la3p_batches",
     "uniform_halves": "torchrl_mpfa.methods.halves.uniform_halves",
     "value_schedule": "torchrl_mpfa.methods.hvper.value_schedule",
 }

@@ -1,16 +1,19 @@
-"""Writes to entries of transitions that are stored already, which their signals follow."""
+"""TorchRL's buffer with signals that follow writes in place, and a warning of a wrong transform."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
 from tensordict import TensorDict
+from torch import nn
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs.transforms import MultiStepTransform
 
-from torchrl_mpfa.replay_transforms import TransformedReplayBuffer
 from torchrl_mpfa.storages.base import SignalStorageMixin
+from torchrl_mpfa.storages.schema import as_path
 
 
 def _followed(write: Callable[..., Any], told: Callable[..., tuple[Any, Any]]) -> Any:
@@ -34,7 +37,7 @@ def _chosen(data: Any, clone: bool = False, *, keys_to_update: Any = None) -> tu
 _Buffer = TensorDictReplayBuffer
 
 
-class FollowedReplayBuffer(TransformedReplayBuffer):
+class FollowedReplayBuffer(TensorDictReplayBuffer):
     """TorchRL's buffer with signals in its storage that follow every write in place."""
 
     set_ = _followed(_Buffer.set_, lambda key, value: ({key: value}, slice(None)))
@@ -55,3 +58,32 @@ class FollowedReplayBuffer(TransformedReplayBuffer):
             self.set_(index, self._transpose(value) if self.dim_extend > 0 else value)
         else:
             self._set_places(index, value)
+
+    def _initialize_prioritized_sampler(self) -> None:
+        # The last that is done when the parts are made.
+        super()._initialize_prioritized_sampler()
+        _warn_of_steps_past_the_end(self._transform)
+
+    def append_transform(self, transform: Any, *, invert: bool = False) -> Any:
+        """Add a transform at the end, as in TorchRL."""
+        _warn_of_steps_past_the_end(transform)
+        return super().append_transform(transform, invert=invert)
+
+    def insert_transform(self, index: int, transform: Any, *, invert: bool = False) -> Any:
+        """Add a transform at a place, as in TorchRL."""
+        _warn_of_steps_past_the_end(transform)
+        return super().insert_transform(index, transform, invert=invert)
+
+
+def _warn_of_steps_past_the_end(transform: Any) -> None:
+    """Warn of n-step transitions that do not know that their last step ended the episode."""
+    for part in transform.modules() if isinstance(transform, nn.Module) else ():
+        if not isinstance(part, MultiStepTransform) or part.n_steps == 1:
+            continue
+        if any(as_path(key)[-1] == "terminated" for key in part.done_keys):
+            warnings.warn(
+                f"MultiStepTransform with done_keys={part.done_keys} leaves 'terminated' where it "
+                "was, while the next observation moves n steps on: targets are bootstrapped past "
+                "the end of an episode. Set done_keys=['done']",
+                stacklevel=4,
+            )

@@ -88,7 +88,7 @@ def _seal(file: IO[bytes]) -> None:
     The archive's own checksums do not cover its table of contents.
     """
     end = file.seek(0, os.SEEK_END) - len(_NO_COMMENT)
-    checksum = _checksum(file, end)
+    checksum = _hex(file, end)
     file.seek(end)
     if file.read() != _NO_COMMENT:
         raise RuntimeError("torch.save wrote an archive with a comment, which has no room for one")
@@ -97,7 +97,7 @@ def _seal(file: IO[bytes]) -> None:
 
 
 def _check_seal(path: Path) -> None:
-    """Refuse a file whose content is not what was saved."""
+    """Reject a file whose content is not what was saved."""
     with path.open("rb") as file:
         length = len(_NO_COMMENT) + len(_MARK) + 8
         end = file.seek(0, os.SEEK_END) - length
@@ -105,18 +105,22 @@ def _check_seal(path: Path) -> None:
         sealed = file.read()[len(_NO_COMMENT) :]
         if not sealed.startswith(_MARK):
             raise ValueError(f"{path} is cut short, or was not written by save_atomically")
-        if sealed != _MARK + _checksum(file, end):
+        if sealed != _MARK + _hex(file, end):
             raise ValueError(f"{path} is damaged: its checksum is wrong")
 
 
-def _checksum(file: IO[bytes], end: int) -> bytes:
-    """CRC-32 of the first ``end`` bytes, in hexadecimal."""
+def _hex(file: IO[bytes], end: int) -> bytes:
+    return f"{checksum_of(file, end):08x}".encode()
+
+
+def checksum_of(file: IO[bytes], end: int) -> int:
+    """CRC-32 of the first ``end`` bytes of a file."""
     file.seek(0)
     found = 0
     while end > 0 and (chunk := file.read(min(end, 1 << 20))):
         found = zlib.crc32(chunk, found)
         end -= len(chunk)
-    return f"{found:08x}".encode()
+    return found
 
 
 @contextmanager

@@ -8,33 +8,35 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
+
+from torchrl_mpfa.renamed import OF_SELECTION, find
 
 Trains = Literal["both", "critic", "actor"]
 """Who learns from a batch."""
 
 
 @dataclass(frozen=True)
-class Draw:
-    """What one update of a learner is made from.
+class SampledBatch:
+    """A batch of one update of a learner, and what learns from it.
 
     Attributes:
         batch: What is learned from, batch size ``[B]``.
         trains: Who learns from it: ``"both"``, the ``"critic"`` or the ``"actor"`` alone. The
             target networks move with the actor.
         loss_function: Distance of the critic's loss; None: the loss's own.
-        new_step: Whether a new training step begins; false for the further draws of one, which a
-            delay of the actor does not count.
+        new_step: Whether a new training step begins; false for further batches of the same step,
+            which a delay of the actor does not count.
 
     Raises:
         ValueError: If ``trains`` is unknown.
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> Draw(TensorDict({}, [4]), trains="actor").gives_signals
+        >>> SampledBatch(TensorDict({}, [4]), trains="actor").gives_signals
         False
     """
 
@@ -57,34 +59,39 @@ class Draw:
 class Selection(Protocol):
     """How the batches of a training step are chosen; any callable of this form will do.
 
-    The draws come one by one, so that a later one can depend on what an earlier one taught::
+    Batches come one by one, so that one can depend on what was learned from the one before::
 
-        for draw in select(buffer):
-            losses = learner.update(draw)
-            if draw.gives_signals:
-                buffer.update_tensordict_priority(draw.batch)
+        for sampled in select(buffer):
+            losses = learner.update(sampled)
+            if sampled.gives_signals:
+                buffer.update_tensordict_priority(sampled.batch)
     """
 
-    def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+    def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
         """Sample the batches of one training step, each when it is asked for."""
         ...
 
 
-def one_batch(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+def one_batch(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
     """One batch for critic and actor, as the buffer samples it.
 
     Args:
         buffer: The replay buffer.
 
     Yields:
-        One draw.
+        One batch.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage
         >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=4)
         >>> index = buffer.extend(TensorDict({"reward": [[0.0]] * 10}, [10]))
-        >>> [len(draw.batch) for draw in one_batch(buffer)]
+        >>> [len(sampled.batch) for sampled in one_batch(buffer)]
         [4]
     """
-    yield Draw(buffer.sample())
+    yield SampledBatch(buffer.sample())
+
+
+def __getattr__(name: str) -> Any:
+    """Old names, which warn."""
+    return find(__name__, name, OF_SELECTION)

@@ -17,9 +17,9 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.learners.base import Learner
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.selection import Draw, Selection, one_batch
+from torchrl_mpfa.selection import SampledBatch, Selection, one_batch
 
-Prepare = Callable[[Draw], Draw]
+Prepare = Callable[[SampledBatch], SampledBatch]
 
 
 def run_updates(
@@ -34,16 +34,16 @@ def run_updates(
 
     With ``one_batch`` the batches of all updates are sampled in one call, and
     their priorities are written in one at the end; of a transition that was sampled twice the last
-    update counts. Any other selection, and a sampler whose batches are more than rows drawn one by
-    one (stratified, with the newest transition in each), is asked update by update, and priorities
-    are written after each draw.
+    update counts. Any other selection, and a sampler whose batches are more than independent
+    rows (stratified, with the newest transition in each), is asked update by update, and priorities
+    are written after each batch.
 
     Args:
         buffer: Where batches of ``B`` are sampled, its own batch size.
         learner: What is trained.
-        select: From the buffer to the draws of an update.
+        select: From the buffer to the batches of an update.
         updates: Number of updates ``U``.
-        prepare: Applied to each draw before the learner gets it: to move its batch to the learner's
+        prepare: Applied to each batch before the learner gets it: to move it to the learner's
             device, or to add to its rewards. It keeps the rows of the batch and their order.
 
     Returns:
@@ -90,17 +90,17 @@ def run_updates(
 def _one_by_one(
     buffer: TensorDictReplayBuffer, learner: Learner, select: Selection, prepare: Prepare | None
 ) -> tuple[dict[str, Tensor], TensorDictBase]:
-    """One update, whose draws may depend on the priorities that the one before it gave."""
+    """One update, whose batches may depend on the priorities that the one before gave."""
     log: dict[str, Tensor] = {}
     batch: TensorDictBase | None = None
-    for draw in select(buffer):
-        learned, values = _learn(learner, draw, prepare)
+    for sampled in select(buffer):
+        learned, values = _learn(learner, sampled, prepare)
         log.update(values)
-        if draw.gives_signals:
-            batch = _at(learned, draw.batch.device)
+        if sampled.gives_signals:
+            batch = _at(learned, sampled.batch.device)
             buffer.update_tensordict_priority(batch)
     if batch is None:
-        raise ValueError("select must give the critic a draw in each update, got none")
+        raise ValueError("select must give the critic a batch in each update, got none")
     return log, batch
 
 
@@ -117,7 +117,7 @@ def _together(
     sampled = buffer.sample(updates * batch_size)
     home, learned = sampled.device, []
     for part in sampled.split(batch_size):
-        batch, log = _learn(learner, Draw(part), prepare)
+        batch, log = _learn(learner, SampledBatch(part), prepare)
         learned.append(batch)
     if getattr(buffer, "takes_signals", False):
         buffer.update_tensordict_priority(_joined(buffer, learned, home), batches=updates)
@@ -127,13 +127,13 @@ def _together(
 
 
 def _learn(
-    learner: Learner, draw: Draw, prepare: Prepare | None
+    learner: Learner, sampled: SampledBatch, prepare: Prepare | None
 ) -> tuple[TensorDictBase, dict[str, Tensor]]:
-    """The batch of a draw with its signals, and values for the log."""
+    """The batch with its signals, and values for the log."""
     if prepare is not None:
-        draw = prepare(draw)
-    values = learner.update(draw)
-    return draw.batch, values
+        sampled = prepare(sampled)
+    values = learner.update(sampled)
+    return sampled.batch, values
 
 
 def _joined(

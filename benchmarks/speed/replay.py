@@ -30,7 +30,7 @@ from torchrl_mpfa import (
     SignalTensorStorage,
     run_updates,
 )
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 BATCH_SIZE = 256
 OBSERVATION_SIZE = 24
@@ -161,7 +161,7 @@ class _Signals:
         generator = torch.Generator().manual_seed(1)
         self._signals = torch.rand(2, BATCH_SIZE, generator=generator).unbind()
 
-    def update(self, draw: Draw) -> dict[str, torch.Tensor]:
+    def update(self, draw: SampledBatch) -> dict[str, torch.Tensor]:
         """Write signals as the loss writes them."""
         for key, value in zip((TD_ERROR.key, ACTION_GRADIENT.key), self._signals, strict=True):
             draw.batch.set(key, value)

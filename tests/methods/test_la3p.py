@@ -5,7 +5,7 @@ import torch
 
 from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
 from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_draws
+from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches
 from torchrl_mpfa.methods.lap import LAPFloor
 
 ALPHA = 0.4
@@ -34,7 +34,7 @@ def shares_by_hand(errors):
 
 
 def assert_parts(buffer, errors, *, samples):
-    indices = [draw.batch["index"] for draw in la3p_draws(buffer)]
+    indices = [draw.batch["index"] for draw in la3p_batches(buffer)]
     for index, expected in zip(indices, shares_by_hand(errors.tolist()), strict=True):
         assert len(index) == samples
         assert_shares(index, expected, samples=samples)
@@ -69,7 +69,7 @@ def test_the_parts_are_right_in_a_buffer_that_is_not_full_and_after_loading():
 @pytest.mark.parametrize(("fraction", "expected"), [(0.5, (128, 128, 128)), (0.25, (64, 192, 192))])
 def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
     buffer = make_la3p(300, 256, uniform_fraction=fraction)
-    draws = list(la3p_draws(buffer))
+    draws = list(la3p_batches(buffer))
     assert tuple(len(draw.batch) for draw in draws) == expected
     assert [draw.trains for draw in draws] == ["both", "critic", "actor"]
     assert [draw.loss_function for draw in draws][:2] == ["pal", "smooth_l1"]
@@ -78,7 +78,7 @@ def test_critic_and_actor_each_learn_from_a_whole_batch(fraction, expected):
 
 def test_both_halves_of_the_critics_batch_update_priorities():
     buffer = make_la3p(400, 64)
-    for draw in la3p_draws(buffer):
+    for draw in la3p_batches(buffer):
         if not draw.gives_signals:
             continue
         draw.batch["signals", "td_error"] = torch.full((len(draw.batch),), 7.0)
@@ -94,7 +94,7 @@ def test_what_cannot_be_parted_is_refused():
         make_la3p(30, 4).sampler.sizes(1)
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)
     with pytest.raises(TypeError, match="buffer must have an LA3PSampler, got SignalSampler"):
-        next(la3p_draws(other))
+        next(la3p_batches(other))
 
 
 def test_each_part_is_sampled_by_the_priorities_that_the_part_before_it_learned(monkeypatch):
@@ -113,7 +113,7 @@ def test_each_part_is_sampled_by_the_priorities_that_the_part_before_it_learned(
 
     monkeypatch.setattr(sampler, "_sample_slots", spy)
     for step in range(20):
-        for number, draw in enumerate(la3p_draws(buffer)):
+        for number, draw in enumerate(la3p_batches(buffer)):
             part, leaf, inverse = seen.pop()
             assert not seen
             assert part == ("uniform", "prioritized", "inverse")[number]
@@ -131,7 +131,7 @@ def test_each_part_is_sampled_by_the_priorities_that_the_part_before_it_learned(
 def test_the_critics_part_finds_the_large_error_that_the_uniform_part_learned():
     buffer = make_la3p(2000, 400)
     set_signals(buffer, td_error=torch.zeros(2000))
-    draws = la3p_draws(buffer)
+    draws = la3p_batches(buffer)
     first = next(draws)
     slot = int(first.batch["index"][0])
     learned = (first.batch["index"] == slot).float() * 1e9  # To the power of 0.4: 4,000.
@@ -144,7 +144,7 @@ def test_the_critics_part_finds_the_large_error_that_the_uniform_part_learned():
 def test_the_actors_part_finds_the_small_errors_that_the_critics_part_learned():
     buffer = make_la3p(2000, 400)
     set_signals(buffer, td_error=torch.full((2000,), 1e9))
-    draws = la3p_draws(buffer)
+    draws = la3p_batches(buffer)
     next(draws)  # Its priorities stay.
     second = next(draws)
     second.batch["signals", "td_error"] = torch.zeros(len(second.batch))

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from tests.mpfa.losses import BOUNDS, GAMMA, differentiate_at_once, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
 from torchrl_mpfa.saving import load_safely, save_atomically
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -152,7 +152,7 @@ def update_both(learners, seed, **draw):
     for learner in learners:
         torch.manual_seed(seed)  # TD3 has noise in its targets.
         batches.append(make_batch(seed=seed, weighted=True))
-        logs.append(learner.update(Draw(batches[-1], **draw)))
+        logs.append(learner.update(SampledBatch(batches[-1], **draw)))
     return logs, batches
 
 

@@ -18,7 +18,7 @@ from torchrl_mpfa import (
 )
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.networks import make_value_table
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 ACTIONS, SIZE, GAMMA, SCALE = 5, 4, 0.9, 0.1
 
@@ -137,7 +137,7 @@ def test_an_update_of_the_table_is_that_of_a_plain_dict(importance):
             errors.append(abs(error))
         for entry, steps in moves.items():
             table[entry] += 0.5 * sum(steps) / len(steps)
-        learner.update(Draw(batch))
+        learner.update(SampledBatch(batch))
         assert batch["signals", "td_error"].tolist() == pytest.approx(errors, abs=1e-4)
     for (cell, action), value in table.items():
         assert learner.table[cell, action].item() == pytest.approx(value, abs=1e-4)
@@ -181,7 +181,7 @@ def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
         learner.update(spoiled)
     for wrong in ({"trains": "critic"}, {"loss_function": "pal"}):
         with pytest.raises(ValueError, match="one network"):
-            learner.update(Draw(transitions(), **wrong))
+            learner.update(SampledBatch(transitions(), **wrong))
     with pytest.raises(ValueError, match="factor"):
         learner.anneal(1.5)
     for missing in ("action", ("next", "terminated")):

@@ -20,7 +20,7 @@ from torchrl_mpfa import (
     make_td3_loss,
     make_value_network,
 )
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 TRACED = {"compile": {"backend": "eager"}}
 # The function itself: what is traced is refused by the same lines, which one test says.
@@ -85,7 +85,7 @@ def test_after_a_refused_batch_the_next_one_gives_what_it_would_have_given():
 def test_a_batch_for_one_of_them_alone_is_refused_alike(name, options, trains):
     learner = make_learner(name, **options)
     before = snapshot(learner)
-    draw = Draw(spoiled("observation", float("inf")), trains=trains)
+    draw = SampledBatch(spoiled("observation", float("inf")), trains=trains)
     with pytest.raises(ValueError, match="batch must be finite, got inf in 'observation'"):
         learner.update(draw)
     assert same(snapshot(learner), before)
@@ -95,7 +95,7 @@ def test_a_batch_for_one_of_them_alone_is_refused_alike(name, options, trains):
 def test_a_draw_for_whom_there_is_not_is_refused(trains):
     words = re.escape(f"trains must be one of ('both', 'critic', 'actor'), got {trains!r}")
     with pytest.raises(ValueError, match=words):
-        Draw(make_batch(), trains=trains)
+        SampledBatch(make_batch(), trains=trains)
 
 
 @pytest.mark.parametrize(("name", "options"), ALL, ids=IDS)

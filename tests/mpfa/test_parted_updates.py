@@ -16,7 +16,7 @@ from torchrl_mpfa import (
     make_sac_loss,
     make_td3_loss,
 )
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 # The function that torch.compile makes one program of, which it is not asked to: it takes seconds.
 PURE = {"compile": {"disable": True}}
@@ -70,7 +70,7 @@ def after_some_updates(name, **options):
 def test_an_update_of_the_critics_alone_leaves_actor_and_targets_to_the_bit(name, options, fresh):
     learner = make_learner(name, **options) if fresh else after_some_updates(name, **options)
     before, batch = parts(learner), make_batch(seed=7)
-    log = learner.update(Draw(batch, trains="critic", new_step=False))
+    log = learner.update(SampledBatch(batch, trains="critic", new_step=False))
     after = parts(learner)
     assert same(after["actor"], before["actor"])
     assert same(after["targets"], before["targets"])
@@ -86,7 +86,7 @@ def test_an_update_of_the_actor_alone_leaves_the_critics_to_the_bit(name, option
     learner = make_learner(name, **options) if fresh else after_some_updates(name, **options)
     before, batch = parts(learner), make_batch(seed=7)
     entries = set(batch.keys(True, True))
-    log = learner.update(Draw(batch, trains="actor", new_step=False))
+    log = learner.update(SampledBatch(batch, trains="actor", new_step=False))
     after = parts(learner)
     # The decay of their weights must not move them, nor the averages of Adam.
     assert same(after["critic"], before["critic"])
@@ -105,7 +105,7 @@ def test_the_actor_moves_as_in_an_update_of_both(name, options):
     """All gradients of an update are taken at the same networks, so that its halves are alike."""
     both, alone = (after_some_updates(name, **options) for _ in range(2))
     for learner, trains in ((both, "both"), (alone, "actor")):
-        learner.update(Draw(make_batch(seed=7), trains=trains, new_step=False))
+        learner.update(SampledBatch(make_batch(seed=7), trains=trains, new_step=False))
     found, expected = (parts(learner)["actor"]["weights"] for learner in (alone, both))
     for key, value in expected.items():
         torch.testing.assert_close(found[key], value, rtol=1e-5, atol=1e-7)
@@ -114,7 +114,7 @@ def test_the_actor_moves_as_in_an_update_of_both(name, options):
 def test_a_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
     learner, other = (after_some_updates("sac") for _ in range(2))
     torch.manual_seed(3)
-    learner.update(Draw(make_batch(seed=7), trains="actor"))
+    learner.update(SampledBatch(make_batch(seed=7), trains="actor"))
     torch.manual_seed(3)
     loss = other.loss.actor_loss(make_batch(seed=7))[0]
     expected = torch.autograd.grad(loss, other.loss.actor_parameters())
@@ -130,7 +130,7 @@ def test_a_delayed_actor_waits_for_its_training_step_whichever_draw_it_is_in(opt
     for number in range(4):
         for trains, new in step:
             before = parts(learner)
-            log = learner.update(Draw(make_batch(seed=number), trains=trains, new_step=new))
+            log = learner.update(SampledBatch(make_batch(seed=number), trains=trains, new_step=new))
             after = parts(learner)
             moved = [not same(after[p], before[p]) for p in ("critic", "actor", "targets")]
             found.append((*moved, "loss_value" in log, "loss_actor" in log))
@@ -143,8 +143,8 @@ def test_a_delayed_actor_waits_for_its_training_step_whichever_draw_it_is_in(opt
 
 def test_an_actors_draw_that_begins_a_step_is_counted_even_if_nothing_is_due():
     learner = make_learner("td3", policy_delay=2)
-    assert learner.update(Draw(make_batch(), trains="actor")) == {}
-    assert "loss_actor" in learner.update(Draw(make_batch(), trains="actor"))
+    assert learner.update(SampledBatch(make_batch(), trains="actor")) == {}
+    assert "loss_actor" in learner.update(SampledBatch(make_batch(), trains="actor"))
     assert learner.updates == 2
 
 
@@ -157,7 +157,7 @@ def train(learner, steps, begin=0):
             (("both", "pal"), ("critic", "smooth_l1"), ("actor", None))
         ):
             batch = make_batch(seed=3 * number + place)
-            logs.append(learner.update(Draw(batch, trains, distance, new_step=place == 0)))
+            logs.append(learner.update(SampledBatch(batch, trains, distance, new_step=place == 0)))
     return logs
 
 
@@ -199,11 +199,11 @@ def test_a_learner_goes_on_where_it_was_saved_in_the_middle_of_a_step(name, opti
     train(first, 3)
     train(second, 1)
     for trains in ("both", "critic"):
-        first.update(Draw(make_batch(seed=30), trains, new_step=trains == "both"))
+        first.update(SampledBatch(make_batch(seed=30), trains, new_step=trains == "both"))
     second.load_state_dict(deepcopy(first.state_dict()))
     for learner in (first, second):
         torch.manual_seed(5)
-        learner.update(Draw(make_batch(seed=31), "actor", new_step=False))
+        learner.update(SampledBatch(make_batch(seed=31), "actor", new_step=False))
         train(learner, 2, begin=9)
     assert same(first.state_dict(), second.state_dict())
 
@@ -218,5 +218,5 @@ def test_an_update_that_failed_halfway_leaves_no_signals_to_the_next_one(monkeyp
         patch.setattr(torch.autograd, "backward", fail)
         learner.update(make_batch())
     batch = make_batch()
-    learner.update(Draw(batch, trains="actor"))
+    learner.update(SampledBatch(batch, trains="actor"))
     assert "signals" not in batch.keys()  # noqa: SIM118

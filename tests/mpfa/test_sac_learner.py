@@ -12,7 +12,7 @@ from tests.mpfa.losses import make_batch
 from tests.mpfa.sac_networks import critics_of, make_learner, make_networks
 from tests.mpfa.transitions import make_buffer, seeded
 from torchrl_mpfa import Learner, SACLearner, make_sac_loss
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 
 def test_the_target_may_average_over_earlier_critics():
@@ -76,7 +76,7 @@ def test_the_temperature_moves_with_the_actor():
     learner = make_learner()
     found = [learner.loss.log_alpha.item()]
     for trains in ("critic", "actor"):
-        learner.update(Draw(make_batch(), trains=trains))
+        learner.update(SampledBatch(make_batch(), trains=trains))
         found.append(learner.loss.log_alpha.item())
     assert found[0] == found[1] != found[2]
 

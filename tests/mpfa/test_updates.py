@@ -20,7 +20,7 @@ from torchrl_mpfa import (
     run_updates,
 )
 from torchrl_mpfa.methods import METHODS, loss_options, make_replay
-from torchrl_mpfa.selection import Draw, one_batch
+from torchrl_mpfa.selection import SampledBatch, one_batch
 
 OBSERVATION, ACTION = 5, 2
 MANY, BATCH, UPDATES = 4000, 16, 4
@@ -420,9 +420,9 @@ def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_refused():
 
 def test_a_selection_without_a_draw_for_the_critic_is_refused():
     def none(buffer):
-        yield Draw(buffer.sample(), trains="actor")
+        yield SampledBatch(buffer.sample(), trains="actor")
 
-    with pytest.raises(ValueError, match="select must give the critic a draw"):
+    with pytest.raises(ValueError, match="select must give the critic a batch"):
         run_updates(make_buffer(), make_learner(), none)
 
 
@@ -430,7 +430,7 @@ def test_rows_that_are_no_equal_batches_are_refused():
     buffer = make_buffer()
     learner = Counting()
     batch = buffer.sample()
-    learner.update(Draw(batch))
+    learner.update(SampledBatch(batch))
     before = buffer.sampler.priorities()
     with pytest.raises(ValueError, match="16 slots cannot make 3 equal batches"):
         buffer.update_tensordict_priority(batch, batches=3)

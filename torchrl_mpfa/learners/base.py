@@ -18,7 +18,7 @@ from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.learners.states import check_state, naming, refuse_copy, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
-from torchrl_mpfa.selection import Draw, Trains
+from torchrl_mpfa.selection import SampledBatch, Trains
 
 OptimizerName = Literal["adam", "radam"]
 
@@ -29,11 +29,12 @@ class Learner(Protocol):
 
     policy: TensorDictModule
 
-    def update(self, draw: Draw | TensorDictBase) -> dict[str, Tensor]:
+    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """Train on a draw, write the signals in its batch, and give values for the log.
 
         Args:
-            draw: What an update is made from; a batch of size ``[B]`` alone is ``Draw(batch)``.
+            draw: What an update is made from; a batch of size ``[B]`` stands for
+                ``SampledBatch(batch)``.
 
         Returns:
             Detached values for the log, of those losses that were computed.
@@ -125,13 +126,13 @@ class ActorCriticLearner:
         self.optimizer.add_param_group({"params": parameters, "lr": lr})
         self._rates = (*self._rates, lr)
 
-    def update(self, draw: Draw | TensorDictBase) -> dict[str, Tensor]:
+    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """One step of the networks and of the target networks, as far as they are due.
 
         Args:
-            draw: What an update is made from; a batch of size ``[B]`` alone is ``Draw(batch)``. The
-                critics' loss writes the signals in the batch; the target networks move with the
-                actor. If ``draw.new_step`` is false, it is a further batch of the same training
+            draw: What an update is made from; a batch of size ``[B]`` stands for
+                ``SampledBatch(batch)``. The critics' loss writes the signals in the batch; the target
+                networks move with the actor. If ``draw.new_step`` is false, it is a further batch of the same training
                 step, which a delay of the actor does not count.
 
         Returns:
@@ -142,8 +143,8 @@ class ActorCriticLearner:
             RuntimeError: If the batch does not fit the networks.
             ValueError: If a loss is not finite. Nothing of the learner is changed then.
         """
-        if not isinstance(draw, Draw):
-            draw = Draw(draw)
+        if not isinstance(draw, SampledBatch):
+            draw = SampledBatch(draw)
         updates = self.updates + draw.new_step
         trains, log = draw.trains, {}
         due = updates % self.policy_delay == 0

@@ -23,7 +23,7 @@ from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.functional import bootstrap_target
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import TD_ERROR
 
 _ONE_NETWORK = (
@@ -32,13 +32,13 @@ _ONE_NETWORK = (
 )
 
 
-def _whole_batch(draw: Draw | TensorDictBase, name: str) -> TensorDictBase:
+def _whole_batch(draw: SampledBatch | TensorDictBase, name: str) -> TensorDictBase:
     """The batch of a draw that actor and critic share.
 
     Raises:
         ValueError: If the draw is for one of them.
     """
-    if not isinstance(draw, Draw):
+    if not isinstance(draw, SampledBatch):
         return draw
     if draw.trains != "both" or draw.loss_function is not None:
         raise ValueError(
@@ -99,12 +99,12 @@ class DQNLearner:
         self.updates = 0
         """Updates made."""
 
-    def update(self, draw: Draw | TensorDictBase) -> dict[str, Tensor]:
+    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """One step of the network and of the target network.
 
         Args:
-            draw: What is learned from; a batch of size ``[B]`` alone is ``Draw(batch)``. Gets the
-                signal of Eq. (13).
+            draw: What is learned from; a batch of size ``[B]`` stands for
+                ``SampledBatch(batch)``. Gets the signal of Eq. (13).
 
         Returns:
             Detached values for the log.
@@ -227,7 +227,7 @@ class TabularQLearner:
         return found
 
     @torch.no_grad()
-    def update(self, draw: Draw | TensorDictBase) -> dict[str, Tensor]:
+    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """Move the entries that the transitions of a batch belong to.
 
         Args:

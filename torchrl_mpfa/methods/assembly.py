@@ -25,7 +25,7 @@ from torchrl_mpfa.methods.hvper import (
     value_schedule,
 )
 from torchrl_mpfa.methods.klper import KLPERSelection
-from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_draws
+from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches
 from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
@@ -65,7 +65,7 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "capped": MWSampler,
     "split": LA3PSampler,
 }
-_SELECTIONS: dict[str, Selection] = {"split": la3p_draws, "halves": uniform_halves}
+_SELECTIONS: dict[str, Selection] = {"split": la3p_batches, "halves": uniform_halves}
 _OF_PRIORITIES = ("combination", "floor_quantile", "priority_floor", "replay_penalty")
 WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
@@ -331,7 +331,7 @@ def make_selection(
     if policy is not None and sigma is not None and method.candidates > 1:
         choose = KLPERSelection(policy, batches=method.candidates, sigma=sigma)
         return lambda buffer: (
-            replace(draw, batch=choose(draw.batch)) for draw in one_batch(buffer)
+            replace(each, batch=choose(each.batch)) for each in one_batch(buffer)
         )
     return one_batch
 

@@ -10,17 +10,17 @@ from collections.abc import Iterator
 
 from torchrl.data import TensorDictReplayBuffer
 
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 
-def uniform_halves(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+def uniform_halves(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
     """Two updates of critic and actor, each on a half of what the buffer samples.
 
     Args:
         buffer: The buffer, with a uniform sampler and a batch size.
 
     Yields:
-        Two draws of one training step.
+        Two batches of one training step.
 
     Raises:
         ValueError: If a half would be empty.
@@ -31,12 +31,12 @@ def uniform_halves(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
         >>> from torchrl.data import LazyTensorStorage
         >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=8)
         >>> index = buffer.extend(TensorDict({"reward": torch.rand(10)}, [10]))
-        >>> [len(draw.batch) for draw in uniform_halves(buffer)]
+        >>> [len(each.batch) for each in uniform_halves(buffer)]
         [4, 4]
     """
     batch = buffer.sample()
     if len(batch) < 2:
         raise ValueError(f"batch_size must leave no half empty, got {len(batch)}")
     half = len(batch) // 2
-    yield Draw(batch[:half])
-    yield Draw(batch[half:], new_step=False)
+    yield SampledBatch(batch[:half])
+    yield SampledBatch(batch[half:], new_step=False)

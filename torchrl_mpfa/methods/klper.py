@@ -67,7 +67,7 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
 
 
 class KLPERSelection:
-    """Keeps the most on-policy one of several batches that a replay buffer drew as one.
+    """Keeps the most on-policy one of several batches that were sampled as one.
 
     In a training loop::
 

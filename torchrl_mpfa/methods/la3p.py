@@ -19,7 +19,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl_mpfa.checks import check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.saved import wrong
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 Part = Literal["uniform", "prioritized", "inverse"]
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
@@ -29,7 +29,7 @@ _TINY = torch.finfo(torch.double).tiny
 class LA3PSampler(SignalSampler):
     r"""Samples a part of a batch: uniformly, by priority, or by the inverse of the priority.
 
-    Within :meth:`part`, which :func:`la3p_draws` uses, a batch has the size of that part, see
+    Within :meth:`part`, which :func:`la3p_batches` uses, a batch has the size of that part, see
     :meth:`sizes`; outside of it, it is a whole one by priority. All weights are 1.
 
     Args:
@@ -124,18 +124,18 @@ class LA3PSampler(SignalSampler):
             raise wrong("sampler", "_sum_tree", "positive where something was written", 0.0)
 
 
-def la3p_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
     """The three updates of an LA3P step, in the order of the authors' code.
 
     Critic and actor learn from a uniform part of the batch, with the loss PAL; then the critic from
     a part by priority, with the Huber loss; then the actor from one by the inverse. Each is sampled
-    when it is asked for, by priorities that the draw before it is to have updated.
+    when it is asked for, by priorities that the update before it is to have changed.
 
     Args:
         buffer: The buffer, with an :class:`LA3PSampler` and a batch size.
 
     Yields:
-        Three draws.
+        Three batches.
 
     Raises:
         TypeError: If the buffer has another sampler.
@@ -148,10 +148,10 @@ def la3p_draws(buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
         raise ValueError("prefetch must be None with LA3P, whose parts depend on each other")
     with sampler.part("uniform"):
         batch = buffer.sample()
-    yield Draw(batch, loss_function="pal")
+    yield SampledBatch(batch, loss_function="pal")
     with sampler.part("prioritized"):
         batch = buffer.sample()
-    yield Draw(batch, trains="critic", loss_function="smooth_l1", new_step=False)
+    yield SampledBatch(batch, trains="critic", loss_function="smooth_l1", new_step=False)
     with sampler.part("inverse"):
         batch = buffer.sample()
-    yield Draw(batch, trains="actor", new_step=False)
+    yield SampledBatch(batch, trains="actor", new_step=False)

@@ -32,7 +32,7 @@ from torchrl_mpfa.losses.functional import (
 from torchrl_mpfa.methods.acting import actions_of
 from torchrl_mpfa.samplers.states import SavedValues
 from torchrl_mpfa.saved import count, number
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 
 LEAST_SIGMA = 0.2
 """Noise below this counts as this, the authors' own: a policy without any has no ratio."""
@@ -138,14 +138,14 @@ class ReFERSelection:
         return 1.0 + self.cutoff / (1.0 + _CUTOFF_DECAY * batches)
 
     @torch.no_grad()
-    def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[Draw]:
+    def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
         """Sample a batch, and say what of it counts.
 
         Args:
             buffer: The buffer, with a :class:`ReFERSampler`.
 
         Yields:
-            One draw.
+            One batch.
 
         Raises:
             TypeError: If the buffer has another sampler.
@@ -174,4 +174,4 @@ class ReFERSelection:
             rate=min(_RATE * len(batch) / buffer.storage.max_size, 1.0),
         )
         sampler.batches += 1
-        yield Draw(batch)
+        yield SampledBatch(batch)

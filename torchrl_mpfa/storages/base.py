@@ -1,4 +1,4 @@
-"""What makes a TorchRL storage keep signals: the check and the write of transitions, and files."""
+"""Signals beside the data of a TorchRL storage: checks and writes of transitions, and files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SignalStorageMixin:
 
     Every write of a slot resets its signals, whichever writer makes it, so that a transition
     never has those of the one that was there before; nothing of them shows in sampled batches.
-    What does not fit is refused before anything of it is written.
+    Transitions that do not fit are rejected before any of them is written.
     """
 
     signal_table: SignalTable
@@ -44,7 +44,7 @@ class SignalStorageMixin:
     max_size: int
     #: Set by :class:`~torchrl_mpfa.SignalReplayBuffer`: every entry must be there and finite.
     strict = False
-    #: Set by a buffer whose sampler fuses: a write without reward or signal is refused.
+    #: Set by a buffer whose sampler fuses: a write without reward or signal is rejected.
     needs_signals = False
     _allow_nonfinite: Sequence[NestedKey] = ()
     _schema: Schema | None = None
@@ -58,7 +58,7 @@ class SignalStorageMixin:
 
         Returns:
             Their rows of the signal table, or None if they have no entries that could be read; and
-            the entries of the storage with what goes there, or None if TorchRL has to find them.
+            pairs of a stored entry and its new values, or None if TorchRL has to find them.
 
         Raises:
             KeyError: If an entry is missing or unknown, or a reward or signal that the sampler
@@ -89,12 +89,7 @@ class SignalStorageMixin:
         return found.copy() if own else found
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
-        """Write transitions and reset the signals of their slots.
-
-        Raises:
-            KeyError: See :meth:`check`.
-            ValueError: See :meth:`check`.
-        """
+        """Write transitions and reset the signals of their slots, or raise as :meth:`check`."""
         rows, pairs = self.check(_as_batch(data))
         size = len(self)  # type: ignore[arg-type]
         try:
@@ -113,18 +108,10 @@ class SignalStorageMixin:
 
     @contextmanager
     def rewriting(self, entries: Any, index: Any) -> Iterator[None]:
-        """Read rewards and signals again, of which entries are written in place inside of it.
+        """Check entries that are written in place inside of it, and read the signals again.
 
-        Args:
-            entries: What is about to be written, a mapping or tensordict.
-            index: In which of the filled slots; None: TorchRL checks all but whether numbers are
-                finite.
-
-        Raises:
-            IndexError: If a slot is outside.
-            KeyError: If an entry is unknown.
-            ValueError: If shape or dtype of an entry are not those in the storage, a number is not
-                finite, or a signal negative then; all entries are as they were.
+        All entries are as they were if it raises. Without an ``index`` of slots TorchRL checks the
+        entries, but not whether their numbers are finite.
         """
         schema = self._known_schema() if self.strict else None
         if schema is not None and index is None:
@@ -154,14 +141,14 @@ class SignalStorageMixin:
         self.signal_table.rewrite(rows)
 
     def _check_known(self, rows: Tensor) -> None:
-        """Refuse rows of the signal table that lack what the sampler needs."""
+        """Reject rows of the signal table that lack an entry that the sampler needs."""
         if self.needs_signals and (name := self.signal_table.missing(rows)) is not None:
             keys = {s.name: s.key for s in self.signal_table.written}
             key = keys.get(name, self.signal_table.reward_key)
             raise KeyError(f"the transitions lack {name!r}: no finite entry at {key!r}")
 
     def _check_shape(self, data: TensorDictBase) -> None:
-        """Refuse rows of another width than those of a storage of several dimensions."""
+        """Reject rows of another width than those of a storage of several dimensions."""
         if self.ndim == 1 or data.ndim < self.ndim:
             return
         across = data.shape[1 : self.ndim]
@@ -192,7 +179,7 @@ class SignalStorageMixin:
         return self._schema
 
     def _write(self, cursor: Any, data: Any, pairs: Pairs | None) -> bool:
-        """Write what was checked, entry by entry; False if TorchRL's own way is needed."""
+        """Write checked entries one by one; False if TorchRL has to write them."""
         if not (
             self.strict
             and pairs
@@ -236,7 +223,7 @@ class SignalStorageMixin:
         """The data, and the signals under ``"_signals"``.
 
         As in TorchRL the data are not copied: save or copy the state before more is written, after
-        which it is refused.
+        which it is rejected.
         """
         state: dict[str, Any] = super().state_dict()  # type: ignore[misc]
         table = self.signal_table
@@ -244,7 +231,7 @@ class SignalStorageMixin:
         return {**state, **own}
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Refuse a state that does not fit, before anything changes.
+        """Reject a state that does not fit, before anything changes.
 
         Raises:
             KeyError: If the state lacks an entry, or a reward or signal that the sampler needs.
@@ -282,7 +269,7 @@ class SignalStorageMixin:
         ]
         check_entries("storage", state, known)
         self.signal_table.check_state(state["_signals"])
-        # What was saved before there were clocks has none.
+        # The signals of a folder have none.
         if state.get(_CLOCK) not in (None, [state["_signals"]["writes"]]):
             raise ValueError(
                 "the storage was written to since this state of it was made, whose data are the "
@@ -326,7 +313,7 @@ class SignalStorageMixin:
         seal_dump(path, path)
 
     def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read the saved signals, and refuse the folder as :meth:`check_state` does a state."""
+        """Read the saved signals, and reject the folder as :meth:`check_state` does a state."""
         path = open_dump(path)
         if not (path / _FILE).exists():
             raise KeyError(f"'_signals' is missing in the saved storage: no {path / _FILE}")
@@ -353,7 +340,7 @@ class SignalStorageMixin:
         self.signal_table.load_state_dict(state["_signals"])
 
     def __getstate__(self) -> Any:
-        # What is worked out from the data is worked out again from its copy.
+        # The copy describes its own data.
         state: Any = super().__getstate__()
         return {**state, "_schema": None}
 

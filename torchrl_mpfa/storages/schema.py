@@ -1,4 +1,4 @@
-"""What a storage holds, entry by entry, and the check of transitions before they are written."""
+"""Keys, shapes and dtypes of stored transitions, which those that are written must have."""
 
 from __future__ import annotations
 
@@ -23,21 +23,13 @@ _Tree = dict[str, Union["_Entry", "_Tree"]]
 @dataclass(frozen=True)
 class _Entry:
     stored: Tensor
-    row: torch.Size
-    """Shape of one transition's."""
+    row: torch.Size  # Shape of one transition's.
     dtype: torch.dtype
-    finite: bool
-    """Whether NaN and infinities are refused."""
+    finite: bool  # Whether NaN and infinities are rejected.
 
 
 class Schema:
-    """Keys, shapes and dtypes of the transitions in a storage.
-
-    Args:
-        stored: All slots.
-        ndim: How many dimensions of the storage count slots.
-        allow_nonfinite: Entries that may hold NaN and infinities.
-    """
+    """Keys, shapes and dtypes of the transitions in a storage, ``ndim`` dimensions of slots."""
 
     def __init__(
         self, stored: TensorDictBase, ndim: int, allow_nonfinite: Sequence[NestedKey] = ()
@@ -53,20 +45,11 @@ class Schema:
         return self._first is not None and stored.get(self._first[0]) is self._first[1].stored
 
     def check(self, data: TensorDictBase, lead: int, *, whole: bool, some: bool = False) -> Pairs:
-        """Refuse transitions of another form than those in the storage.
-
-        Args:
-            data: The transitions.
-            lead: How many dimensions of ``data`` count transitions.
-            whole: Whether an entry that is missing, unknown or not finite is refused, too.
-            some: Whether entries may be missing all the same.
-
-        Returns:
-            Each entry of the storage with what is to be written to it.
+        """Pairs of a stored entry and its new values, whose first ``lead`` dimensions count rows.
 
         Raises:
-            KeyError: If an entry is missing or unknown.
-            ValueError: If shape or dtype of an entry differ, or a number is not finite.
+            KeyError: If ``whole`` and an entry is unknown, or missing without ``some``.
+            ValueError: If shape or dtype differ, or, if ``whole``, a number is not finite.
         """
         pairs: Pairs = []
         _match(self._tree, data, lead, whole, (), pairs, some)
@@ -76,16 +59,7 @@ class Schema:
 def check_finite_entries(
     data: TensorDictBase, lead: int, allow_nonfinite: Sequence[NestedKey] = ()
 ) -> None:
-    """Refuse a number in the transitions that is not finite, naming its entry and row.
-
-    Args:
-        data: The transitions.
-        lead: How many dimensions of ``data`` count transitions.
-        allow_nonfinite: Entries that may hold NaN and infinities.
-
-    Raises:
-        ValueError: If a floating-point entry holds NaN or an infinity.
-    """
+    """Reject a number in the transitions that is not finite, naming its entry and row."""
     allowed = {as_path(key) for key in allow_nonfinite}
     for key, value in data.items(include_nested=True, leaves_only=True):
         path = as_path(key)

@@ -1,4 +1,4 @@
-"""Saved data of a storage: the check before they are loaded, and the signals read from them."""
+"""Saved data of a storage: their check before they are loaded, and the signals read from them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_mpfa.storages.table import SignalTable
 
 
 def read_metadata(folder: Path) -> tuple[int, bool]:
-    """TorchRL's notes in a folder: the number of filled slots, and whether data are a pytree."""
+    """TorchRL's notes in a folder: number of filled slots, and whether the data are a pytree."""
     found = json.loads((folder / "storage_metadata.json").read_text(encoding="utf-8"))
     return found["len"], bool(found["is_pytree"])
 
@@ -42,20 +42,7 @@ def check_data_state(
     max_size: int,
     allow_nonfinite: Sequence[NestedKey] | None,
 ) -> None:
-    """Reject saved data that a storage cannot take.
-
-    Args:
-        data: The saved data, as a tensor, a tensordict or its state.
-        stored: The data of the storage; None if there are none yet.
-        length: Number of filled slots that are saved.
-        ndim: How many dimensions of the storage count slots.
-        max_size: Capacity of the storage.
-        allow_nonfinite: Entries that may hold NaN and infinities; None if all may.
-
-    Raises:
-        KeyError: If an entry is missing.
-        ValueError: If an entry is unknown, of another shape or dtype, or not finite.
-    """
+    """Reject saved data that a storage, with the data ``stored`` so far, cannot take."""
     saved, mine = _leaves(data), _leaves(stored)
     if not saved:
         if length:
@@ -82,40 +69,16 @@ def check_data_state(
 
 
 def signals_of_data(table: SignalTable, data: Any, length: int) -> dict[str, Any]:
-    """The signals that saved data would have got at their write, as a state of a table.
-
-    Args:
-        table: The table of the storage; it is not changed.
-        data: The saved data, as a tensor, a tensordict or its state, checked for their form.
-        length: Number of filled slots that are saved.
-
-    Returns:
-        What :meth:`SignalTable.load_state_dict` takes. Times go on from those of the table, so
-        that a batch sampled before is known to be old.
-
-    Raises:
-        ValueError: If a reward or a signal is not one finite number per transition.
-    """
+    """The state of a table that had been filled when saved data were written."""
     rows = rows_of_data(table, data, length)
+    # Times go on, so that a batch sampled before is known to be old.
     writes = table.writes + length
     rows[:, table.time_column] = torch.arange(table.writes, writes)
     return {**table.state_dict(), "size": length, "writes": writes, "rows": rows}
 
 
 def rows_of_data(table: SignalTable, data: Any, length: int) -> Tensor:
-    """Rows of a table as they would be read from stored data at their write.
-
-    Args:
-        table: The table; it is not changed.
-        data: As in :func:`signals_of_data`.
-        length: Number of filled slots.
-
-    Returns:
-        The rows of the filled slots.
-
-    Raises:
-        ValueError: If a reward or a signal is not one finite number per transition.
-    """
+    """Rows of a table, which is not changed, read from the filled slots of stored data."""
     leaves = _leaves(data)
     entries = {
         key: leaves[name].reshape(table.capacity, -1)[:length]

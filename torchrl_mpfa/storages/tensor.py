@@ -90,7 +90,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
             self.device = self._device_of_tensors() or torch.device("cpu")
 
     def _device_of_tensors(self) -> torch.device | None:
-        """Device of all entries; None if one is no tensor: texts need TorchRL's way."""
+        """Device of all entries; None if one is no tensor, such as a text: TorchRL reads those."""
         if self._looked_at is not self._storage:
             self._looked_at, self._where = self._storage, _common_device(self._storage)
         return self._where

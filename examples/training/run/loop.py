@@ -19,7 +19,7 @@ from mpfa_envs import Policy, RandomMirror, save_policy
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.saving import save_atomically, write_text_atomically
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 from training import files
 from training.environments import vector_of
 from training.records import (
@@ -282,7 +282,7 @@ class TrainingRun:
         if self._crossed(self.settings.tracking.log_every, begun):
             self.tracker.log_update(self.actions, {**losses, **self._bonus}, self.buffer, batch)
 
-    def _prepared(self, draw: Draw) -> Draw:
+    def _prepared(self, draw: SampledBatch) -> SampledBatch:
         """A draw where the networks are, with the bonus of curiosity in its rewards."""
         device = self.settings.device
         if draw.gives_signals:

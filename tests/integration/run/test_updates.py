@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.integration.tiny_runs import tiny, train
-from torchrl_mpfa.selection import Draw
+from torchrl_mpfa.selection import SampledBatch
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
@@ -43,7 +43,7 @@ def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
 
     updates = 0
 
-    def sees(draw: Draw) -> Draw:
+    def sees(draw: SampledBatch) -> SampledBatch:
         nonlocal updates
         updates += 1
         slots = draw.batch["index"].tolist()
