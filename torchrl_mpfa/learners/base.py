@@ -131,9 +131,9 @@ class ActorCriticLearner:
 
         Args:
             draw: What an update is made from; a batch of size ``[B]`` stands for
-                ``SampledBatch(batch)``. The critics' loss writes the signals in the batch; the target
-                networks move with the actor. If ``draw.new_step`` is false, it is a further batch of the same training
-                step, which a delay of the actor does not count.
+                ``SampledBatch(batch)``. The critics' loss writes the signals in the batch; the
+                target networks move with the actor. If ``draw.new_step`` is false, it is a further
+                batch of the same training step, which a delay of the actor does not count.
 
         Returns:
             Detached values for the log; none where the actor alone is to learn, and is not due.
