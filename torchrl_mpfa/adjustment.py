@@ -117,7 +117,7 @@ def decay_threshold(priority: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class BatchFacts:
-    """What an adjustment may ask of the transitions of a batch.
+    """Facts about the transitions of a batch, for adjustments.
 
     Attributes:
         reward: Signed rewards, shape ``[B]``.

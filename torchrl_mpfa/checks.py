@@ -1,4 +1,4 @@
-"""What bad input is refused by, and the generator that nothing random goes without."""
+"""Argument checks, and the default random generator."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ COUNT: Rule = (
     lambda value: (
         isinstance(value, Integral) and not isinstance(value, bool) and 1 <= int(value) < 2**31
     ),
-    "a positive 31-bit integer",
+    "an integer from 1 to 2147483647",
 )
 
 
 def seeded_generator() -> torch.Generator:
-    """A generator of its own, seeded by the global one so that ``torch.manual_seed`` rules it."""
+    """A new generator, seeded by the global one so that ``torch.manual_seed`` rules it."""
     generator = torch.Generator()
     generator.manual_seed(int(torch.randint(2**62, ())))
     return generator
 
 
 def check(rule: Rule, **values: Any) -> None:
-    """Refuse, by name, values that a rule does not allow.
+    """Reject, by name, values that a rule does not allow.
 
     Raises:
         TypeError: If a value cannot be compared with a number.
@@ -58,13 +58,13 @@ def check(rule: Rule, **values: Any) -> None:
 
 
 def check_counts(**counts: Any) -> None:
-    """Refuse, by name, what is not a positive integer.
+    """Reject, by name, anything but a positive integer.
 
     Examples:
         >>> check_counts(width=64, layers=0)
         Traceback (most recent call last):
         ...
-        ValueError: layers must be a positive 31-bit integer, got 0
+        ValueError: layers must be an integer from 1 to 2147483647, got 0
     """
     check(COUNT, **counts)
 
@@ -85,7 +85,7 @@ def check_index(index: Tensor, size: int) -> Tensor:
 
 
 def check_finite(name: str, value: Tensor) -> None:
-    """Refuse values that are negative or not finite, naming the first."""
+    """Reject values that are negative or not finite, naming the first."""
     wrong = ~((value >= 0) & (value < math.inf))
     if bool(wrong.any()):
         raise ValueError(f"{name} must be finite and not negative, got {value[wrong][0].item()}")

@@ -20,7 +20,7 @@ _LOCK = ".lock"
 _ENDINGS = {".json", ".memmap", ".pt"}
 """Of tensors and plain values. TensorDict unpickles what has others, also inside of archives."""
 _EVALUATED = "data_indices.json"
-"""What TorchRL's compressed storage needs before it executes text of its ``metadata.json``."""
+"""Where this is, TorchRL's compressed storage executes text of its ``metadata.json``."""
 
 
 @contextmanager

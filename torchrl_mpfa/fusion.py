@@ -194,17 +194,17 @@ def fuse_product(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
 
 Combine = Callable[..., Tensor]
 COMBINATIONS: dict[str, Combine] = {"sum": fuse, "product": fuse_product}
-"""What can be made of signals and weights, by name."""
+"""Functions from signals and weights to a priority, by name."""
 
 
 @runtime_checkable
 class Fusion(Protocol):
-    """How the signals are weighted: one weight a signal, out of what the buffer holds.
+    """One weight for each signal, computed from the buffer.
 
     A user's own fusion is any object with this method; it may keep state. The sampler asks for
     weights when enough of the buffer was rewritten, or, if the fusion has an attribute
     ``every_batch`` that is true, at every update. If it has an attribute ``signal_names``, the
-    sampler refuses one that it does not fuse.
+    sampler rejects one that it does not fuse.
     """
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:

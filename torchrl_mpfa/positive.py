@@ -15,7 +15,7 @@ _ENOUGH = 1000
 
 
 def check_level(positive_above: Level) -> None:
-    """Refuse what is neither a finite number nor ``"mean"``."""
+    """Reject a level that is neither a finite number nor ``"mean"``."""
     number = isinstance(positive_above, int | float) and not isinstance(positive_above, bool)
     if positive_above != "mean" and not (number and math.isfinite(positive_above)):
         raise ValueError(
@@ -56,7 +56,7 @@ def level_of(parts: Iterable[object]) -> Level:
 
 
 def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
-    """What to say where all rewards of a buffer are on one side of a level that parts ask for.
+    """A warning if all rewards of a buffer are on one side of a level that parts ask for.
 
     Args:
         rewards: Signed rewards of the buffer, shape ``[N]``.
@@ -64,7 +64,7 @@ def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
             attribute ``positive_above``.
 
     Returns:
-        The sentence; None where both sides are there, where all rewards are equal, which no level
+        The warning; None where both sides are there, where all rewards are equal, which no level
         tells apart, or too few rewards to tell.
     """
     if len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):

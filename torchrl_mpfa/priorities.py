@@ -1,4 +1,4 @@
-r"""What is known of a transition: the signals of Eqs. (12)-(14), and PER's Eqs. (8)-(10).
+r"""Priorities of single transitions: the signals of Eqs. (12)-(14), and PER's Eqs. (8)-(10).
 
 Pure functions, tensors in and tensors out, one equation each. Equation numbers are those of
 Cheng et al. (2023), "Prioritized experience replay in path planning via multi-dimensional

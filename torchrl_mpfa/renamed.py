@@ -59,7 +59,7 @@ OF_METHODS: Final[dict[str, str]] = {
 
 
 def find(package: str, name: str, renamed: dict[str, str]) -> Any:
-    """What an old name of a package stands for.
+    """The new object of an old name of a package.
 
     Raises:
         AttributeError: If there is no such name.

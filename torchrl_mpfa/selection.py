@@ -16,7 +16,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl_mpfa.renamed import OF_SELECTION, find
 
 Trains = Literal["both", "critic", "actor"]
-"""Who learns from a batch."""
+"""The networks that learn from a batch."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class SampledBatch:
     """A batch of one update of a learner, and what learns from it.
 
     Attributes:
-        batch: What is learned from, batch size ``[B]``.
-        trains: Who learns from it: ``"both"``, the ``"critic"`` or the ``"actor"`` alone. The
-            target networks move with the actor.
+        batch: The transitions, batch size ``[B]``.
+        trains: The networks that learn from them: ``"both"``, the ``"critic"`` or the ``"actor"``.
+            The target networks move with the actor.
         loss_function: Distance of the critic's loss; None: the loss's own.
         new_step: Whether a new training step begins; false for further batches of the same step,
             which a delay of the actor does not count.
@@ -57,7 +57,7 @@ class SampledBatch:
 
 @runtime_checkable
 class Selection(Protocol):
-    """How the batches of a training step are chosen; any callable of this form will do.
+    """A choice of the batches of a training step; any callable of this form will do.
 
     Batches come one by one, so that one can depend on what was learned from the one before::
 

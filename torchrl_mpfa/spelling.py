@@ -1,4 +1,4 @@
-"""What a misspelt name was probably meant to be."""
+"""Errors about unknown names, with the nearest known one."""
 
 from __future__ import annotations
 

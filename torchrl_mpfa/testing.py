@@ -132,7 +132,7 @@ def _check_weights(fusion: Fusion, table: SignalTable, index: Tensor) -> None:
     _require(
         torch.allclose(turned.flip(0).double(), found.double()),
         f"weights must follow the order of names: {found.tolist()} for {names}, "
-        f"{turned.tolist()} the other way round",
+        f"{turned.tolist()} in reverse order",
     )
 
 
@@ -155,10 +155,10 @@ def _table(signals: Sequence[Signal | str], *, scale: float, offset: float) -> S
 
 
 def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int = 16) -> None:
-    """Check a sampler in a buffer: frequencies, weights, saving and refusals.
+    """Check a sampler in a buffer: frequencies, weights, saving and rejected input.
 
     Slots are sampled in proportion to the leaves of its tree, weights are finite and in (0, 1],
-    batches after loading equal those without, to the last bit, and a refused update or state
+    batches after loading equal those without, to the last bit, and a rejected update or state
     changes nothing.
 
     Args:
@@ -176,7 +176,7 @@ def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int 
     _train(buffer, 8)
     _check_batch(buffer, batch_size)
     _check_round_trip(buffer, _buffer(make_sampler(), batch_size, seed=1))
-    _check_refusals(buffer)
+    _check_rejections(buffer)
     _check_frequencies(buffer)
 
 
@@ -299,7 +299,7 @@ def _check_round_trip(first: SignalReplayBuffer, second: SignalReplayBuffer) -> 
     first.load_state_dict(third)
 
 
-def _check_refusals(buffer: SignalReplayBuffer) -> None:
+def _check_rejections(buffer: SignalReplayBuffer) -> None:
     sampler, before = buffer.sampler, copy.deepcopy(buffer.state_dict())
     slots = torch.tensor([0, 1])
     calls: list[tuple[str, Callable[[], object]]] = []
@@ -322,8 +322,10 @@ def _check_refusals(buffer: SignalReplayBuffer) -> None:
         except (ValueError, IndexError, TypeError, KeyError):
             pass
         else:
-            _require(False, f"{what} must be refused")
-        _require(_same(before, buffer.state_dict()), f"{what} was refused, but changed the sampler")
+            _require(False, f"{what} must be rejected")
+        _require(
+            _same(before, buffer.state_dict()), f"{what} was rejected, but changed the sampler"
+        )
 
 
 def _check_frequencies(buffer: SignalReplayBuffer) -> None:

@@ -169,7 +169,7 @@ class PriorityGuard(TrainerHookBase):
 
 
 def check_priority_updates(trainer: Trainer, *, replay_buffer: Any | None = None) -> None:
-    """Refuse a trainer whose optimization stepper leaves priorities as they are.
+    """Reject a trainer whose optimization stepper leaves priorities as they are.
 
     Args:
         trainer: The trainer.

@@ -141,7 +141,7 @@ def _joined(
     batches: Sequence[TensorDictBase],
     device: torch.device | None,
 ) -> TensorDictBase:
-    """What priorities are made from, of several batches, shape ``[U * B]``."""
+    """The entries of several batches that priorities are made from, shape ``[U * B]``."""
     sampler = buffer.sampler
     keys = ["index", buffer.priority_key]
     if isinstance(sampler, SignalSampler):

@@ -143,7 +143,7 @@ def test_of_what_a_buffer_draws_one_batch_is_left_with_its_index():
 
 def test_wrong_arguments_are_refused_by_name():
     policy = make_actor(6, 2, width=16)
-    with pytest.raises(ValueError, match="batches must be a positive 31-bit integer, got 0"):
+    with pytest.raises(ValueError, match="batches must be an integer from 1 to 2147483647, got 0"):
         KLPERSelection(policy, batches=0, sigma=0.2)
     with pytest.raises(ValueError, match="sigma must be finite"):
         KLPERSelection(policy, sigma=-1.0)

@@ -130,7 +130,7 @@ def test_a_batch_of_nothing_is_refused(size):
     buffer = make_buffer(8)
     buffer.extend(make_transitions(8))
     with pytest.raises(
-        ValueError, match=f"batch_size must be a positive 31-bit integer, got {size}"
+        ValueError, match=f"batch_size must be an integer from 1 to 2147483647, got {size}"
     ):
         buffer.sampler.sample(buffer.storage, size)
 

@@ -86,7 +86,7 @@ def test_sizes_below_one_are_refused(argument):
     sizes = {"observation_size": 3, "action_size": 2, argument: 0}
     for make in (make_actor, make_critic):
         with pytest.raises(
-            ValueError, match=f"{argument} must be a positive 31-bit integer, got 0"
+            ValueError, match=f"{argument} must be an integer from 1 to 2147483647, got 0"
         ):
             make(**sizes)
 

@@ -171,7 +171,7 @@ def test_sequences_are_refused_where_signals_are_fused():
 @pytest.mark.parametrize("wrong", [-1, 0, "a", 2.5, True])
 def test_a_batch_size_that_is_no_count_is_refused_before_anything_is_made(wrong):
     with pytest.raises(
-        ValueError, match=f"batch_size must be a positive 31-bit integer, got {wrong!r}"
+        ValueError, match=f"batch_size must be an integer from 1 to 2147483647, got {wrong!r}"
     ):
         SignalReplayBuffer(storage=SignalTensorStorage(8), batch_size=wrong)
 
@@ -245,12 +245,20 @@ NO_NUMBER = "must be a number, got"
             -1.0,
             "final_init must be finite and no",
         ),
-        (lambda value: make_actor(3, 2, width=value), 2**31, "width must be a positive 31-bit int"),
-        (SignalTensorStorage, 2**31, "max_size must be a positive 31-bit integer, got 2147483648"),
+        (
+            lambda value: make_actor(3, 2, width=value),
+            2**31,
+            "width must be an integer from 1 to 2",
+        ),
+        (
+            SignalTensorStorage,
+            2**31,
+            "max_size must be an integer from 1 to .*, got 2147483648",
+        ),
         (
             lambda value: MPFASampler(value),
             10**30,
-            "max_capacity must be a positive 31-bit integer",
+            "max_capacity must be an integer from 1 to 2147483647",
         ),
         (sac_loss, torch.nan, "alpha_init must be positive and finite, got nan"),
         (buffer_with_generator, "seed", "generator must be a torch.Generator, got 'seed'"),

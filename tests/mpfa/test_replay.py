@@ -385,6 +385,6 @@ def test_a_batch_size_that_is_no_count_is_refused(wrong):
     buffer = make_buffer()
     buffer.extend(make_transitions(10))
     with pytest.raises(
-        ValueError, match=f"batch_size must be a positive 31-bit integer, got {wrong}"
+        ValueError, match=f"batch_size must be an integer from 1 to 2147483647, got {wrong}"
     ):
         buffer.sample(wrong)

@@ -47,5 +47,5 @@ def test_sampled_actions_and_densities_are_torchrls(loc):
 
 
 def test_a_policy_without_units_is_refused():
-    with pytest.raises(ValueError, match="width must be a positive 31-bit integer, got 0"):
+    with pytest.raises(ValueError, match="width must be an integer from 1 to 2147483647, got 0"):
         make_stochastic_actor(5, 2, width=0)

@@ -250,7 +250,7 @@ def test_a_priority_function_that_gives_a_negative_signal_is_refused():
 def test_arguments_out_of_range_are_refused(kind):
     for size in (0, -1, True, 2.5):
         with pytest.raises(
-            ValueError, match=f"max_size must be a positive 31-bit integer, got {size}"
+            ValueError, match=f"max_size must be an integer from 1 to 2147483647, got {size}"
         ):
             kind(size)
     with pytest.raises(ValueError, match="signals must be one or more different signals"):

@@ -181,9 +181,9 @@ class LoadsAnything(SignalSampler):
         (SamplesTooFew, "a batch must have 16 integer slots"),
         (KeepsACountToItself, "must sample as the one that saved it"),
         (ForgetsAlpha, "must have that state"),
-        (TakesEverything, "a priority of nan must be refused"),
-        (ChangesFirst, "was refused, but changed the sampler"),
-        (LoadsAnything, "a state without .* must be refused"),
+        (TakesEverything, "a priority of nan must be rejected"),
+        (ChangesFirst, "was rejected, but changed the sampler"),
+        (LoadsAnything, "a state without .* must be rejected"),
     ],
 )
 def test_broken_samplers_are_caught(broken, message):

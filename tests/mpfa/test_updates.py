@@ -396,7 +396,7 @@ def test_a_batch_size_of_several_batches_is_not_warned_of(recwarn):
 
 @pytest.mark.parametrize("updates", [0, -1, 1.5, True])
 def test_a_number_of_updates_that_is_none_is_refused(updates):
-    with pytest.raises(ValueError, match=r"updates must be a positive 31-bit integer, got"):
+    with pytest.raises(ValueError, match=r"updates must be an integer from 1 to 2147483647, got"):
         run_updates(make_buffer(), make_learner(), updates=updates)
 
 

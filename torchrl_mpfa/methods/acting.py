@@ -1,4 +1,4 @@
-"""What the current policy would do where transitions of a buffer began."""
+"""Actions of the current policy at the observations of stored transitions."""
 
 from __future__ import annotations
 

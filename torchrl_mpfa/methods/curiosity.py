@@ -48,7 +48,7 @@ def _network(*sizes: int) -> nn.Sequential:
 class Curiosity(nn.Module):
     r"""Adds the bonus to the rewards of a sampled batch, and trains its models on it.
 
-    The bonus is computed anew whenever a transition is sampled, so that it fades as the models
+    The bonus is computed whenever a transition is sampled, so that it fades as the models
     learn; what the buffer keeps is the reward of the environment. To be called on a batch before
     the learner is: ``("next", "reward")`` gets the bonus on top, the reward alone stays at
     ``("next", "extrinsic_reward")``, and the bonus is at ``("next", "intrinsic_reward")``. The

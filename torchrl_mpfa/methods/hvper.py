@@ -25,7 +25,7 @@ from torchrl_mpfa.signals import Signal
 
 
 def relative_value(value: Tensor) -> Tensor:
-    """How high Q is within its batch, ``V``: the sigmoid of its standard score.
+    """Q relative to its batch, ``V``: the sigmoid of its standard score.
 
     Args:
         value: Q, shape ``[B]``.
@@ -43,7 +43,7 @@ def relative_value(value: Tensor) -> Tensor:
 
 
 def relative_error(td_error: Tensor) -> Tensor:
-    r"""How large the TD error is within its batch, ``T``: its share of the largest.
+    r"""TD error relative to its batch, ``T``: its share of the largest.
 
     Args:
         td_error: :math:`|\delta|`, shape ``[B]``.

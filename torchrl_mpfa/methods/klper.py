@@ -26,7 +26,7 @@ _LEAST_VARIANCE = 1e-3
 
 
 def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
-    r"""How far actions are from the policy's, against noise of a known variance.
+    r"""Divergence of stored actions from the policy's, against noise of a known variance.
 
     A Gaussian with mean :math:`m` and covariance :math:`C` is fitted to the deviations of each
     batch. With the eigenvalues :math:`\lambda_i` of :math:`C`, but none below :math:`v`, the

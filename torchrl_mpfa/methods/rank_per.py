@@ -17,7 +17,7 @@ from torchrl_mpfa.saved import Entry, count
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
-    r"""What a transition is sampled in proportion to, :math:`(1 / \mathrm{rank}(i))^\alpha`.
+    r"""Share of a transition by its rank, :math:`(1 / \mathrm{rank}(i))^\alpha`.
 
     Args:
         rank: Places by falling priority, counted from 1, shape ``[B]``.

@@ -1,4 +1,4 @@
-"""A mixture of samplings: each signal has a tree of its own, and its part of every batch."""
+"""A mixture: each signal has its own tree, and its part of every batch."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class MixtureSampler(SignalSampler):
 
     Args:
         *args: As :class:`~torchrl_mpfa.SignalSampler`.
-        **kwargs: As :class:`~torchrl_mpfa.SignalSampler`. The fusion tells the shares; one that
-            divides signals by their scale is refused, as they have none here.
+        **kwargs: As :class:`~torchrl_mpfa.SignalSampler`. The fusion gives the shares; one that
+            divides signals by their scale is rejected, as they have none here.
 
     Raises:
         ValueError: If an argument is out of its range.

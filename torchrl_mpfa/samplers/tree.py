@@ -352,7 +352,7 @@ class TreeSampler(SavedTrees):
             self._set(kept, value, highest)
 
     def _inherited(self, slots: Tensor, value: Tensor) -> Tensor:
-        """Which rows only get the highest priority that fresh ones have anyway, shape ``[B]``.
+        """Rows that only get the highest priority, which fresh ones have anyway, shape ``[B]``.
 
         TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
         transitions that they find in a storage, and for batches without a priority.
@@ -384,12 +384,12 @@ class TreeSampler(SavedTrees):
         self._write_leaves(slots, self._leaf(priority))
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
-        """Write what slots are sampled in proportion to, shape ``[B]``."""
+        """Write leaves, to which slots are sampled in proportion, shape ``[B]``."""
         self._sum_tree[slots] = leaf
         self._min_tree[slots] = leaf
 
     def _leaf(self, priority: Tensor) -> Tensor:
-        """What slots are sampled in proportion to, priorities to the power of alpha, ``[B]``."""
+        """Leaves of slots, their priorities to the power of alpha, shape ``[B]``."""
         return priority.pow(self._alpha)
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:

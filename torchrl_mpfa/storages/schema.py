@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 INDEX_KEY = "index"
-"""Where TorchRL's writers put the slot of a transition; in-place writes come without it."""
+"""Entry in which TorchRL's writers put the slot; in-place writes come without it."""
 
 Pairs = list[tuple[Tensor, Tensor]]
 _Path = tuple[str, ...]

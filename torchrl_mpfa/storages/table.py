@@ -233,11 +233,11 @@ class SignalTable:
         counts.index_add_(0, index, self._one.expand(index.shape))
 
     def written_at(self, index: Tensor) -> Tensor:
-        """When each slot was written, as a count of writes, shape ``[B]``."""
+        """Time of writing of each slot, as a count of writes, shape ``[B]``."""
         return self.rows[:, self.time_column].index_select(0, index)
 
     def state_dict(self) -> dict[str, Any]:
-        """What is needed to restore the table; tensors and plain values only."""
+        """Everything that restores the table; tensors and plain values only."""
         return {
             "capacity": self.capacity,
             "names": list(self.names),
@@ -269,7 +269,7 @@ class SignalTable:
         return [*self.names, "signed reward", "replay count", "time of writing"]
 
     def _column_entries(self, writes: int) -> list[Entry]:
-        """What the saved numbers of each column must be, of which NaN is not known yet."""
+        """The entries of a saved table, by column; NaN stands for what is not known yet."""
         *signals, reward, replays, times = self._columns()
 
         def below(high: float, found: Tensor) -> Tensor:

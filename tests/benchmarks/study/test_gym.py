@@ -321,7 +321,7 @@ def test_a_signal_lets_the_run_that_is_under_way_end_and_begins_no_other(
         (["--seeds", "-1"], "seed must be from 0 to 9999, got -1"),
         (["--seeds", "1", "1"], "--seeds has 1 twice"),
         (["--jobs", "0"], "--jobs must be at least 1, got 0"),
-        (["--actions", "0"], "actions must be a positive 31-bit integer, got 0"),
+        (["--actions", "0"], "actions must be an integer from 1 to 2147483647, got 0"),
         (["--actions", "10"], "actions must be a multiple of 4, got 10"),
     ],
 )
