@@ -137,6 +137,10 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ),
         ({"method": "cer", "reliability": 0.2}, "reliability must be 0.0 with selection='newest'"),
         ({"method": "per", "floor_quantile": 0.5}, "floor_quantile .* with priority_floor=0.0,"),
+        (
+            {"method": "rank_per", "combination": "mixture"},
+            "combination 'mixture' needs selection='prioritized', got 'rank'",
+        ),
         ({"method": "klper"}, "method 'klper' needs policy and sigma"),
         ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
     ],

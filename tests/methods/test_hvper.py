@@ -130,14 +130,3 @@ def test_what_was_overwritten_meanwhile_is_none_of_its_batch():
     assert relative_errors(1, errors, stale=[1])[[0, 2, 3]].tolist() == [0.25, 0.5, 1.0]
     errors = torch.tensor([1.0, 2.0, 100.0, torch.nan])
     assert relative_errors(2, errors, stale=[2, 3])[:2].tolist() == [0.5, 1.0]
-
-
-def test_what_is_out_of_range_is_refused():
-    with pytest.raises(ValueError, match="penalty must be finite and not negative, got -1"):
-        HVPERPenalty(penalty=-1)
-    with pytest.raises(ValueError, match="floor must be positive"):
-        HVPERPenalty(floor=0)
-    with pytest.raises(ValueError, match=r"final_share must be in \[0, 1\], got 2"):
-        value_schedule(final_share=2)
-    with pytest.raises(ValueError, match=r"fraction must be in \[0, 1\], got 1.5"):
-        value_schedule().anneal(1.5)

@@ -88,8 +88,6 @@ def test_both_halves_of_the_critics_batch_update_priorities():
 
 
 def test_what_cannot_be_parted_is_refused():
-    with pytest.raises(ValueError, match=r"uniform_fraction must be in \(0, 1\), got 1.0"):
-        make_la3p(4, 4, uniform_fraction=1.0)
     with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
         make_la3p(30, 4).sampler.sizes(1)
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)

@@ -1,6 +1,5 @@
 """LAP's floor of the priorities."""
 
-import pytest
 import torch
 
 from tests.methods.replays import assert_shares, make_buffer, seeded, set_signals
@@ -20,9 +19,3 @@ def test_probabilities_are_those_of_the_larger_of_error_and_one():
     assert (errors < 1).any()
     assert (errors > 1).any()
     assert_shares(buffer.sample()["index"], expected, samples=50_000)
-
-
-@pytest.mark.parametrize("floor", [0.0, -1.0, float("inf")])
-def test_a_floor_that_is_not_positive_is_refused(floor):
-    with pytest.raises(ValueError, match="floor must be positive and finite"):
-        LAPFloor(floor)

@@ -107,8 +107,3 @@ def test_weights_are_those_of_the_shares():
     shares = shares_by_hand(errors.tolist())
     expected = (shares[batch["index"]] / shares.min()).pow(-0.5)
     torch.testing.assert_close(batch["priority_weight"].double(), expected)
-
-
-def test_a_negative_refresh_is_refused():
-    with pytest.raises(ValueError, match="rank_refresh must be finite and not negative, got -1"):
-        make_sampler(4, rank_refresh=-1)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tests.methods.replays import assert_shares, seeded, set_signals
 from torchrl_mpfa import SignalSampler, SignalTensorStorage
 from torchrl_mpfa.methods import make_replay
-from torchrl_mpfa.methods.reaper import ReaPERSampler, reliability
+from torchrl_mpfa.methods.reaper import reliability
 
 OMEGA, ALPHA, EPS = 0.4, 0.8, 0.05
 
@@ -230,11 +230,6 @@ def test_what_is_missing_is_named():
         replay.buffer.extend(make_rows([0, 0]).exclude(("next", "done")))
     with pytest.raises(ValueError, match=r"signals \['episode', 'ended'\] of the sampler are not"):
         make_replay("reaper", storage=SignalTensorStorage(10, signals=["td_error"]))
-    with pytest.raises(ValueError, match="exponent must be positive and finite, got 0"):
-        ReaPERSampler(10, 0.3, 0.4, exponent=0.0)
-    sampler, storage = ReaPERSampler(10, 0.3, 0.4), SignalTensorStorage(10, signals=["td_error"])
-    with pytest.raises(ValueError, match=r"must keep the signals \['episode', 'ended'\], got"):
-        sampler.bind(storage)
     for settings in ({"selection": "rank"}, {"combination": "mixture"}):
         with pytest.raises(ValueError, match=r"reliability must be 0.0 with .* got 0.3"):
             make_replay("reaper", **settings)

@@ -144,13 +144,20 @@ def test_a_state_of_another_sampler_is_refused(trained, method):
         second.load_state_dict([1])
 
 
-def test_a_sampler_of_one_priority_refuses_the_state_of_one_that_fuses_signals():
-    sampler = TreeSampler(12, 0.6, 0.4)
+@pytest.mark.parametrize(
+    ("mine", "theirs", "message"),
+    [
+        (TreeSampler, MPFASampler, "'_kind' .* must be 'proportional', got 'signals'"),
+        (MPFASampler, TreeSampler, "'_kind' .* must be 'signals', got 'proportional'"),
+    ],
+)
+def test_a_sampler_of_one_priority_and_one_of_signals_reject_each_others_state(
+    mine, theirs, message
+):
+    sampler = mine(12, 0.6, 0.4)
     before = sampler.state_dict()
-    with pytest.raises(
-        ValueError, match="'_kind' of the saved sampler must be 'proportional', got 'signals'"
-    ):
-        sampler.load_state_dict(MPFASampler(12).state_dict())
+    with pytest.raises(ValueError, match=message):
+        sampler.load_state_dict(theirs(12, 0.6, 0.4).state_dict())
     assert same(before, sampler.state_dict())
 
 

@@ -12,7 +12,6 @@ from tests.mpfa.transitions import same
 from torchrl_mpfa import (
     MixtureSampler,
     PositiveBoost,
-    ScaledFusion,
     SignalReplayBuffer,
     SignalSampler,
     SignalTensorStorage,
@@ -228,13 +227,7 @@ def test_a_product_passes_the_checks_of_a_sampler_and_a_mixture_goes_on_where_it
         assert first.sample()["index"].equal(second.sample()["index"])
 
 
-def test_what_cannot_be_combined_is_refused():
-    with pytest.raises(ValueError, match="combination 'mixture' needs selection='prioritized'"):
-        make_replay("rank_per", combination="mixture")
-    with pytest.raises(ValueError, match="unknown combination 'sums'"):
-        SignalSampler(4, 0.6, 0.4, combination="sums")
-    with pytest.raises(ValueError, match="fusion of a mixture must not be scaled"):
-        MixtureSampler(4, 0.6, 0.4, fusion=ScaledFusion(FixedFusion()))
+def test_a_saved_mixture_without_a_tree_for_each_signal_is_rejected():
     first, second = (MixtureSampler(4, 0.6, 0.4, EPS, signals=SIGNALS) for _ in range(2))
     for value in (None, {"reward": {}}, {name: {} for name in SIGNALS}):
         before = second.state_dict()

@@ -242,9 +242,3 @@ def test_transitions_with_gradients_are_stored_without():
         data["action"] = data["action"].requires_grad_()
         buffer.extend(data)
     assert not buffer.sample()["action"].requires_grad
-
-
-@pytest.mark.parametrize("size", [-1, 0, 2.5, [3], "4"])
-def test_a_batch_size_that_is_none_is_refused_by_name(size, buffer):
-    with pytest.raises(ValueError, match=r"batch_size must be an integer from 1 to 21474.*, got "):
-        buffer.sample(size)

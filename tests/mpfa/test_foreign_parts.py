@@ -18,12 +18,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import (
-    EntropyFusion,
-    FixedFusion,
     MPFASampler,
-    ScaledFusion,
-    ScheduledFusion,
-    SignalSampler,
     SignalTensorStorage,
 )
 from torchrl_mpfa.samplers import TreeSampler
@@ -64,29 +59,6 @@ def test_a_buffer_and_storage_of_ours_need_no_warning():
 
 
 @pytest.mark.parametrize(
-    ("fusion", "name"),
-    [
-        (FixedFusion({"td_eror": 1.0}), "'td_eror': did you mean 'td_error'"),
-        (ScaledFusion(FixedFusion({"td_eror": 1.0})), "'td_eror': did you mean 'td_error'"),
-        (EntropyFusion(reward_signals=("rewrd",)), "'rewrd': did you mean 'reward'"),
-        (ScheduledFusion({"td_error": 1.0}, {"valu": 1.0}), "'valu'"),
-    ],
-)
-def test_a_fusion_that_names_a_signal_that_is_not_fused_is_refused(fusion, name):
-    with pytest.raises(ValueError, match=f"unknown signal of the fusion {name}"):
-        SignalSampler(8, 0.6, 0.4, signals=["reward", "td_error"], fusion=fusion)
-
-
-def test_a_fusion_of_nothing_is_refused():
-    with pytest.raises(TypeError, match="values must be a weight for each signal, got None"):
-        FixedFusion(None)
-    with pytest.raises(TypeError, match="fusion must have a method 'weights', got None"):
-        ScaledFusion(None)
-    with pytest.raises(TypeError, match="reward_signals must be names, got 'reward'"):
-        EntropyFusion(reward_signals="reward")
-
-
-@pytest.mark.parametrize(
     "index",
     [
         torch.tensor([True, False, True]),
@@ -123,16 +95,6 @@ def test_priorities_whose_sum_overflows_are_refused(alpha):
     assert same(before, sampler.state_dict())
     sampler.update_priority([3], torch.tensor([2e38]))  # Would overflow in single precision.
     assert sampler.priorities(torch.tensor([3])).item() == pytest.approx(2e38)
-
-
-@pytest.mark.parametrize("size", [0, -1])
-def test_a_batch_of_nothing_is_refused(size):
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
-    with pytest.raises(
-        ValueError, match=f"batch_size must be an integer from 1 to 2147483647, got {size}"
-    ):
-        buffer.sampler.sample(buffer.storage, size)
 
 
 def test_a_refused_update_changes_nothing_at_all():

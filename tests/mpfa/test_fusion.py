@@ -81,12 +81,6 @@ def test_positive_may_mean_above_a_level_or_above_the_mean():
     assert cured.tolist() == pytest.approx([1 / 3] * 3)
 
 
-@pytest.mark.parametrize("entropy", [reward_entropy, positive_entropy])
-def test_entropies_refuse_an_empty_population(entropy):
-    with pytest.raises(ValueError, match="reward must hold at least one transition"):
-        entropy(torch.empty(0))
-
-
 def test_reward_entropy_does_not_change_with_scale_and_offset():
     rewards = torch.randn(100, generator=seeded(7), dtype=torch.double)
     torch.testing.assert_close(reward_entropy(rewards * 3 + 5), reward_entropy(rewards))
@@ -103,12 +97,6 @@ def test_entropy_weights_are_equal_when_no_entropy_says_anything():
 
 def test_a_zero_entropy_gets_no_weight():
     assert entropy_weights(torch.tensor([0.7, 0.0, 0.0])).tolist() == [1.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize("wrong", [-0.1, math.nan, math.inf])
-def test_entropy_weights_refuse_what_is_no_entropy(wrong):
-    with pytest.raises(ValueError, match="entropies must be finite and not negative"):
-        entropy_weights(torch.tensor([0.5, wrong]))
 
 
 def test_fused_priority_of_a_hand_example():
@@ -163,28 +151,8 @@ def test_a_signal_of_ones_own_gets_the_entropy_of_positive_training_unless_told_
     assert named.entropies(names, table, index).tolist() == found.flip(0).tolist()
 
 
-@pytest.mark.parametrize(
-    ("argument", "value"),
-    [("population", "world"), ("positive_above", "both"), ("floor", -0.1), ("floor", 1.0)],
-)
-def test_entropy_fusion_refuses_what_is_out_of_range(argument, value):
-    with pytest.raises(ValueError, match=rf"{argument} must be .*got '?{value}"):
-        EntropyFusion(**{argument: value})
-
-
 def test_fixed_fusion_gives_its_weights_by_name_and_none_to_the_others():
     weights = FixedFusion({"reward": 0.3, "td_error": 2.0}).weights(NAMES, None, None)
     assert weights.tolist() == pytest.approx([2.0, 0.0, 0.3])
     assert isinstance(FixedFusion(), Fusion)
     assert isinstance(EntropyFusion(), Fusion)
-
-
-@pytest.mark.parametrize("wrong", [-1.0, math.nan, math.inf])
-def test_fixed_fusion_refuses_a_wrong_weight(wrong):
-    with pytest.raises(ValueError, match=f"weight of 'td_error' must be .*got {wrong}"):
-        FixedFusion({"td_error": wrong})
-
-
-def test_fixed_fusion_refuses_weights_that_are_all_zero():
-    with pytest.raises(ValueError, match="values must have a positive weight"):
-        FixedFusion({"td_error": 0.0})

@@ -61,9 +61,3 @@ def test_a_sampler_tells_its_fusion_how_much_of_the_training_is_done():
         buffer.sampler.anneal(fraction)
         train_rounds(buffer, 1)
         assert buffer.sampler.weights["td_error"] == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("fraction", [-0.1, 1.1])
-def test_a_fraction_outside_of_the_training_is_refused(fraction):
-    with pytest.raises(ValueError, match=rf"fraction must be in \[0, 1\], got {fraction}"):
-        ScheduledFusion({"td_error": 1.0}, {"td_error": 1.0}).anneal(fraction)

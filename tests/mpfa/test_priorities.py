@@ -34,12 +34,6 @@ def test_action_gradient_priority_is_the_chosen_norm_of_each_row(order, expected
     assert found.tolist() == pytest.approx([expected, 0.0])
 
 
-@pytest.mark.parametrize("order", [0.0, -1.0, math.nan])
-def test_action_gradient_priority_refuses_an_order_that_is_no_norm(order):
-    with pytest.raises(ValueError, match=f"order must be positive, got {order}"):
-        action_gradient_priority(torch.ones(1, 2), order=order)
-
-
 def test_the_action_gradient_norm_does_not_change_when_axes_are_swapped():
     gradient = torch.randn(50, 2, generator=seeded())
     swapped = action_gradient_priority(gradient.flip(1))

@@ -378,13 +378,3 @@ def test_a_priority_key_that_would_take_a_signal_away_is_refused(key):
 
 def test_the_paper_signal_of_the_reward_is_its_absolute_value():
     assert REWARD.priority(torch.tensor([-2.0])).tolist() == [2.0]
-
-
-@pytest.mark.parametrize("wrong", [0, -1, 2.5, True])
-def test_a_batch_size_that_is_no_count_is_refused(wrong):
-    buffer = make_buffer()
-    buffer.extend(make_transitions(10))
-    with pytest.raises(
-        ValueError, match=f"batch_size must be an integer from 1 to 2147483647, got {wrong}"
-    ):
-        buffer.sample(wrong)

@@ -276,22 +276,6 @@ def test_weights_are_counted_over_the_whole_buffer_and_not_the_batch():
     assert buffer.sampler.weights["td_error"] == pytest.approx(beta)
 
 
-@pytest.mark.parametrize(
-    ("argument", "value", "error"),
-    [
-        ("entropy_refresh", -1.0, ValueError),
-        ("signals", [], ValueError),
-        ("fusion", object(), TypeError),
-        ("adjustments", [3], TypeError),
-        ("alpha", -0.1, ValueError),
-        ("max_capacity", 2.5, ValueError),
-    ],
-)
-def test_arguments_out_of_range_are_refused(argument, value, error):
-    with pytest.raises(error, match=argument):
-        MPFASampler(**{"max_capacity": 8, argument: value})
-
-
 def test_defaults_are_those_of_the_paper():
     sampler = MPFASampler(8)
     assert (sampler.alpha, sampler.beta, sampler._eps) == (0.6, 0.4, 0.05)

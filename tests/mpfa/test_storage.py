@@ -246,26 +246,6 @@ def test_a_priority_function_that_gives_a_negative_signal_is_refused():
     assert len(storage) == 0
 
 
-@pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
-def test_arguments_out_of_range_are_refused(kind):
-    for size in (0, -1, True, 2.5):
-        with pytest.raises(
-            ValueError, match=f"max_size must be an integer from 1 to 2147483647, got {size}"
-        ):
-            kind(size)
-    with pytest.raises(ValueError, match="signals must be one or more different signals"):
-        kind(4, signals=[])
-    with pytest.raises(ValueError, match="signals must be one or more different signals"):
-        kind(4, signals=["td_error", "td_error"])
-
-
-def test_a_signal_refuses_an_empty_name_and_an_unknown_time():
-    with pytest.raises(ValueError, match="name must not be empty"):
-        Signal("")
-    with pytest.raises(ValueError, match="known_at must be 'update' or 'write', got 'never'"):
-        Signal("novelty", known_at="never")
-
-
 def test_memory_mapped_signals_lie_in_the_scratch_folder(tmp_path):
     storage = SignalMemmapStorage(8, scratch_dir=tmp_path)
     storage.set(torch.arange(3), make_transitions(3))

@@ -187,16 +187,6 @@ def test_an_empty_buffer_and_priorities_of_zero_cannot_be_sampled():
         sampler.sample(storage, 2)
 
 
-@pytest.mark.parametrize(
-    ("argument", "value"),
-    [("max_capacity", 0), ("alpha", -1.0), ("beta", math.nan), ("eps", math.inf)],
-)
-def test_arguments_out_of_range_are_refused(argument, value):
-    arguments = {"max_capacity": 4, "alpha": 0.6, "beta": 0.4, argument: value}
-    with pytest.raises(ValueError, match=f"{argument} must be .*got {value}"):
-        TreeSampler(**arguments)
-
-
 def test_a_batch_of_one_can_be_sampled_from_a_buffer_of_one():
     # The tree gives a bare number for one slot, which has no pow.
     sampler = TreeSampler(1, 0.6, 0.4)

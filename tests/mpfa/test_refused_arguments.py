@@ -1,0 +1,194 @@
+"""Arguments that cannot be: each error names the argument and its value."""
+
+import math
+
+import pytest
+import torch
+
+from torchrl_mpfa import (
+    EntropyFusion,
+    FixedFusion,
+    MixtureSampler,
+    MPFASampler,
+    PositiveBoost,
+    PositiveDecay,
+    ScaledFusion,
+    ScheduledFusion,
+    Signal,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalSampler,
+    SignalTensorStorage,
+    make_actor,
+    make_critic,
+    make_sac_loss,
+    make_stochastic_actor,
+)
+from torchrl_mpfa.fusion import entropy_weights, positive_entropy, reward_entropy
+from torchrl_mpfa.priorities import action_gradient_priority
+from torchrl_mpfa.samplers import TreeSampler
+from torchrl_mpfa.signals import as_signals
+
+NAN, INF = math.nan, math.inf
+NO_NUMBER = "must be a number, got"
+NO_COUNT = "must be an integer from 1 to 2147483647, got"
+NOT_POSITIVE = "must be positive and finite, got"
+NEGATIVE = "must be finite and not negative"
+FEW_SIGNALS = "signals must be one or more different signals"
+
+
+def tree_sampler(**given):
+    return TreeSampler(**{"max_capacity": 4, "alpha": 0.6, "beta": 0.4, **given})
+
+
+def sampler(**given):
+    signals = {"signals": ["reward", "td_error"]}
+    return SignalSampler(**{"max_capacity": 8, "alpha": 0.6, "beta": 0.4, **signals, **given})
+
+
+def mpfa_sampler(**given):
+    return MPFASampler(**{"max_capacity": 8, **given})
+
+
+def mixture(fusion):
+    return MixtureSampler(4, 0.6, 0.4, fusion=fusion)
+
+
+def buffer(**given):
+    return SignalReplayBuffer(storage=SignalTensorStorage(8), **given)
+
+
+def weight(value):
+    return FixedFusion({"td_error": value})
+
+
+def anneal(fraction):
+    ScheduledFusion({"td_error": 1.0}, {"td_error": 1.0}).anneal(fraction)
+
+
+def gradient(order):
+    return action_gradient_priority(torch.ones(1, 2), order=order)
+
+
+def actor(**given):
+    return make_actor(3, 2, **given)
+
+
+def sac_loss(alpha_init):
+    networks = make_stochastic_actor(3, 2, width=8), make_critic(3, 2, width=8)
+    return make_sac_loss(*networks, alpha_init=alpha_init)
+
+
+def misspelt(name):
+    return f"unknown signal of the fusion {name}"
+
+
+ROWS = [
+    (tree_sampler, {"max_capacity": 0}, f"max_capacity {NO_COUNT} 0"),
+    (tree_sampler, {"alpha": -1.0}, f"alpha {NEGATIVE}, got -1.0"),
+    (tree_sampler, {"beta": NAN}, f"beta {NEGATIVE}, got nan"),
+    (tree_sampler, {"eps": INF}, f"eps {NEGATIVE}, got inf"),
+    (mpfa_sampler, {"max_capacity": 2.5}, f"max_capacity {NO_COUNT} 2.5"),
+    (mpfa_sampler, {"max_capacity": 10**30}, f"max_capacity {NO_COUNT} 1000"),
+    (mpfa_sampler, {"alpha": -0.1}, f"alpha {NEGATIVE}, got -0.1"),
+    (mpfa_sampler, {"entropy_refresh": -1.0}, f"entropy_refresh {NEGATIVE}, got -1.0"),
+    (mpfa_sampler, {"signals": []}, FEW_SIGNALS),
+    (mpfa_sampler, {"fusion": object()}, "fusion must have a method 'weights', got object"),
+    (mpfa_sampler, {"adjustments": [3]}, "adjustments must be callable, got int"),
+    (sampler, {"combination": "sums"}, "unknown combination 'sums'"),
+    (sampler, {"fusion": FixedFusion({"td_eror": 1.0})}, misspelt("'td_eror': did you mean 'td_e")),
+    (
+        sampler,
+        {"fusion": ScaledFusion(FixedFusion({"td_eror": 1.0}))},
+        misspelt("'td_eror': did you mean 'td_error'"),
+    ),
+    (
+        sampler,
+        {"fusion": EntropyFusion(reward_signals=("rewrd",))},
+        misspelt("'rewrd': did you mean 'reward'"),
+    ),
+    (sampler, {"fusion": ScheduledFusion({"td_error": 1.0}, {"valu": 1.0})}, misspelt("'valu'")),
+    (mixture, {"fusion": ScaledFusion(FixedFusion())}, "fusion of a mixture must not be scaled"),
+    (buffer, {"generator": "seed"}, "generator must be a torch.Generator, got 'seed'"),
+    *[
+        (kind, {"max_size": size}, f"max_size {NO_COUNT} {size}")
+        for kind in (SignalTensorStorage, SignalMemmapStorage)
+        for size in (0, -1, True, 2.5, 2**31)
+    ],
+    *[
+        (kind, {"max_size": 4, "signals": signals}, FEW_SIGNALS)
+        for kind in (SignalTensorStorage, SignalMemmapStorage)
+        for signals in ([], ["td_error", "td_error"])
+    ],
+    (Signal, {"name": ""}, "name must not be empty"),
+    (
+        Signal,
+        {"name": "novelty", "known_at": "never"},
+        "known_at must be 'update' or 'write', got 'never'",
+    ),
+    (Signal, {"name": "a", "priority": "abs"}, "priority must be a function, got 'abs'"),
+    (as_signals, {"signals": "novelty"}, "must be a list of signals or their names, got 'novelty'"),
+    (as_signals, {"signals": [1]}, r"signals must be a list of signals or their names, got \[1\]"),
+    (EntropyFusion, {"population": "world"}, "population must be .*got 'world'"),
+    (EntropyFusion, {"positive_above": "both"}, "positive_above must be .*got 'both'"),
+    (EntropyFusion, {"floor": -0.1}, "floor must be .*got -0.1"),
+    (EntropyFusion, {"floor": 1.0}, "floor must be .*got 1.0"),
+    (EntropyFusion, {"floor": [0.1]}, rf"floor {NO_NUMBER} \[0.1\]"),
+    (EntropyFusion, {"reward_signals": 5}, "reward_signals must be names, got 5"),
+    (EntropyFusion, {"reward_signals": "reward"}, "reward_signals must be names, got 'reward'"),
+    *[
+        (weight, {"value": value}, f"weight of 'td_error' {NEGATIVE}, got {value}")
+        for value in (-1.0, NAN, INF)
+    ],
+    (weight, {"value": "1"}, f"weight of 'td_error' {NO_NUMBER} '1'"),
+    (weight, {"value": 0.0}, "values must have a positive weight"),
+    (FixedFusion, {"values": None}, "values must be a weight for each signal, got None"),
+    (ScaledFusion, {"fusion": None}, "fusion must have a method 'weights', got None"),
+    *[
+        (anneal, {"fraction": value}, rf"fraction must be in \[0, 1\], got {value}")
+        for value in (-0.1, 1.1)
+    ],
+    *[
+        (adjust, {"positive_above": level}, "positive_above must be a finite number or 'mean', got")
+        for adjust in (PositiveBoost, PositiveDecay)
+        for level in ("median", None, NAN, True)
+    ],
+    *[
+        (adjust, {argument: value}, f"{argument} {NOT_POSITIVE} {value}")
+        for adjust, argument in ((PositiveBoost, "boost"), (PositiveDecay, "sharpness"))
+        for value in (0.0, -1.0, INF, NAN)
+    ],
+    (PositiveBoost, {"bound": "wall"}, "bound must be .*got 'wall'"),
+    (PositiveBoost, {"target_share": 1.0}, r"target_share must be in \[0, 1\), got 1.0"),
+    (
+        PositiveBoost,
+        {"boost": 0.5, "target_share": 0.3},
+        r"boost must be at least 1 with a target_share, got 0\.5",
+    ),
+    (PositiveDecay, {"position": "front"}, "position must be .*got 'front'"),
+    (PositiveDecay, {"sharpness": "much"}, f"sharpness {NO_NUMBER} 'much'"),
+    (PositiveDecay, {"sharpness": torch.rand(2)}, f"sharpness {NO_NUMBER} tensor"),
+    (PositiveDecay, {"sharpness": None}, f"sharpness {NO_NUMBER} None"),
+    *[
+        (entropy, {"reward": torch.empty(0)}, "reward must hold at least one transition")
+        for entropy in (reward_entropy, positive_entropy)
+    ],
+    *[
+        (entropy_weights, {"entropies": torch.tensor([0.5, value])}, f"entropies {NEGATIVE}")
+        for value in (-0.1, NAN, INF)
+    ],
+    *[
+        (gradient, {"order": value}, f"order must be positive, got {value}")
+        for value in (0.0, -1.0, NAN)
+    ],
+    (actor, {"final_init": "0"}, f"final_init {NO_NUMBER} '0'"),
+    (actor, {"final_init": -1.0}, f"final_init {NEGATIVE}"),
+    (actor, {"width": 2**31}, f"width {NO_COUNT}"),
+    (sac_loss, {"alpha_init": NAN}, f"alpha_init {NOT_POSITIVE} nan"),
+]
+
+
+@pytest.mark.parametrize(("make", "given", "message"), ROWS)
+def test_an_argument_that_cannot_be_is_named_with_its_value(make, given, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        make(**given)
