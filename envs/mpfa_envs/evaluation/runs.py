@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-    """All that a policy must be: a function from observation to action."""
+    """A policy: a function from observation to action."""
 
 ENVS_AT_ONCE = 64
 """Episodes that run together by default, if the policy is known to take many observations."""
@@ -36,12 +36,7 @@ class Driver(Protocol):
     """A policy with privileged access to the environment that the robot is in."""
 
     def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Get ready for an episode.
-
-        Args:
-            env: Where it has begun; ``env.worlds[robot]`` and ``env.tasks[robot]`` say which.
-            robot: Number of the robot.
-        """
+        """Prepare for the episode of a robot, ``env.tasks[robot]`` in ``env.worlds[robot]``."""
 
     def drive(
         self,
@@ -49,15 +44,12 @@ class Driver(Protocol):
         robots: NDArray[np.int64],
         observations: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Choose actions.
+        """Actions ``[N, 2]`` of the N robots whose episodes run, by number.
 
         Args:
-            env: Where the robots are, ``env.poses``.
-            robots: Numbers of the N robots whose episodes are running.
-            observations: What they sense, ``[N, O]``.
-
-        Returns:
-            Actions, ``[N, 2]``.
+            env: The environment; ``env.poses`` says where the robots are.
+            robots: Numbers of the robots, ``[N]``.
+            observations: Their observations, ``[N, O]``.
         """
 
 
@@ -69,7 +61,7 @@ class Blind:
         self.alone = alone
 
     def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Get ready for an episode, which takes nothing."""
+        """Nothing is prepared."""
 
     def drive(
         self,
@@ -200,6 +192,11 @@ def run_tasks(
         envs_at_once = ENVS_AT_ONCE if takes_many else 1
     check_count("envs_at_once", envs_at_once)
     driver = as_driver(policy, alone=envs_at_once == 1)
+    # Each task has its own seed, whichever robot drives it.
+    tasks = [
+        each._replace(seed=number) if each.seed is None else each
+        for number, each in enumerate(tasks)
+    ]
     results: dict[int, EpisodeResult] = {}
     arguments = {"collision_distance": "contact", **env_arguments}
     arguments["autoreset_mode"] = AutoresetMode.DISABLED
@@ -214,11 +211,11 @@ def run_tasks(
         for env, numbers in fleets:
             _check(env, tasks, numbers)
         for env, numbers in fleets:
-            for ended in _drive(env, driver, tasks, deque(numbers)):
-                results[ended.number] = _result(tasks, ended)
+            for robot, number, result in _drive(env, driver, tasks, deque(numbers)):
+                results[number] = result
                 advance()
                 if on_end:
-                    on_end(env, ended.robot, ended.number)
+                    on_end(env, robot, number)
     return [results[number] for number in range(len(tasks))]
 
 
@@ -241,27 +238,16 @@ def _by_time_limit(tasks: Sequence[WorldTask]) -> dict[int | None, list[int]]:
 
 
 def _room_for(worlds: Sequence[World]) -> World:
-    """An empty room as long and as wide as the largest: what bounds the observations."""
+    """An empty room of the largest width and depth, which bounds the observations."""
     sides = zip(*(world.size for world in worlds), strict=True)
     width, depth = (max(each) for each in sides)
     return World(name="empty", size=(max(width, 10.0), max(depth, 10.0)))
 
 
-class _Ended(NamedTuple):
-    """An episode that has ended."""
-
-    robot: int
-    number: int
-    """Of the task."""
-    info: dict[str, NDArray[Any]]
-    plan_s: float
-    decision_s: float
-
-
 def _drive(
     env: VectorNavigationEnv, driver: Driver, tasks: Sequence[WorldTask], waiting: deque[int]
-) -> Iterator[_Ended]:
-    """Drive the tasks that wait."""
+) -> Iterator[tuple[int, int, EpisodeResult]]:
+    """Drive the tasks that wait; numbers of robot and task, and the result, as each one ends."""
     at_work = np.full(env.num_envs, -1)
     planned, decided = np.zeros(env.num_envs), np.zeros(env.num_envs)
     decisions = np.zeros(env.num_envs, dtype=np.int64)
@@ -287,8 +273,8 @@ def _drive(
         observations, _, terminated, truncated, info = env.step(actions, only=running)
         for robot in np.flatnonzero(running & (terminated | truncated)).tolist():
             number, at_work[robot] = int(at_work[robot]), -1
-            mean = float(decided[robot] / decisions[robot])
-            yield _Ended(robot, number, info, float(planned[robot]), mean)
+            times = float(planned[robot]), float(decided[robot] / decisions[robot])
+            yield robot, number, _result(tasks, number, robot, info, *times)
 
 
 def _begin(
@@ -299,28 +285,26 @@ def _begin(
 ) -> NDArray[np.float32]:
     """Put robots at the start of their tasks; observations of all robots, ``[N, O]``."""
     chosen = [
-        int(number) if begins else None for number, begins in zip(at_work, begun, strict=True)
+        tasks[number] if begins else None
+        for number, begins in zip(at_work.tolist(), begun, strict=True)
     ]
-    observations, _ = env.reset(
-        # The seed is that of walkers and noise: each task has its own, whichever robot drives it.
-        seed=[None if number is None else _seed(tasks, number) for number in chosen],
-        options={
-            "reset_mask": begun,
-            "worlds": [None if number is None else tasks[number].world for number in chosen],
-            "tasks": [None if number is None else tasks[number].task for number in chosen],
-        },
+    seeds, worlds, pairs = (
+        [None if each is None else getattr(each, name) for each in chosen]
+        for name in ("seed", "world", "task")
     )
-    return observations
+    options = {"reset_mask": begun, "worlds": worlds, "tasks": pairs}
+    return env.reset(seed=seeds, options=options)[0]
 
 
-def _seed(tasks: Sequence[WorldTask], number: int) -> int:
-    """The seed of a task's walkers and noise."""
-    seed = tasks[number].seed
-    return number if seed is None else seed
-
-
-def _result(tasks: Sequence[WorldTask], ended: _Ended) -> EpisodeResult:
-    robot, number, info = ended.robot, ended.number, ended.info
+def _result(
+    tasks: Sequence[WorldTask],
+    number: int,
+    robot: int,
+    info: dict[str, NDArray[Any]],
+    plan_s: float,
+    decision_s: float,
+) -> EpisodeResult:
+    """Read the result of a task that a robot has driven."""
     world = tasks[number].world
     driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
     success = bool(info["success"][robot])
@@ -334,8 +318,8 @@ def _result(tasks: Sequence[WorldTask], ended: _Ended) -> EpisodeResult:
         shortest_path=shortest,
         min_clearance=float(info["min_clearance"][robot]),
         spl=spl(success, path_length=driven, shortest_path=shortest),
-        plan_s=ended.plan_s,
-        decision_s=ended.decision_s,
+        plan_s=plan_s,
+        decision_s=decision_s,
         world=world.name,
         **({name: float(info[name][robot]) for name in ENCOUNTERS} if world.walkers else {}),
     )
