@@ -9,8 +9,8 @@ from operator import index
 from typing import Any, Final
 
 MOST: Final = 100_000
-"""No count is larger unless it says so: of robots, episodes, worlds, rays, scans. What they stand
-for is made one by one or held at once, so that a slip of the pen takes all time or memory."""
+"""Largest count by default: robots, episodes, worlds, rays and scans are made one by one or held at
+once, and a typing error must not take all time or memory."""
 
 
 def check_number(name: str, value: Any) -> float:
@@ -27,7 +27,7 @@ def check_number(name: str, value: Any) -> float:
 
 
 def all_finite(values: Iterable[Any]) -> bool:
-    """Tell whether all are finite numbers; neither text nor a truth value is one."""
+    """Tell whether all are finite numbers, which text and truth values are not."""
     try:
         return all(math.isfinite(value) and not isinstance(value, bool) for value in values)
     except (TypeError, ValueError, OverflowError):
@@ -65,11 +65,11 @@ def check_count(name: str, value: Any, *, least: int = 1, most: float = MOST) ->
 
 
 def check_seed(value: Any) -> int:
-    """A seed, an integer of any size that is not negative."""
+    """An integer of any size that is not negative."""
     return check_count("seed", value, least=0, most=math.inf)
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The question that ends an error about an unknown name; empty if no known one is near."""
+    """A question about the nearest known name; empty if none is near."""
     near = get_close_matches(str(name), list(known), n=1)
     return f"did you mean {near[0]!r}?" if near else ""

@@ -16,7 +16,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def njit(function: _Function) -> _Function:
-    """Compile a function of numbers and arrays, and keep the code on disk where that can be."""
+    """Compile a function of numbers and arrays, cached on disk where possible."""
     # Arithmetic is not reordered, and a division by zero gives infinity or NaN as in NumPy. Where
     # there is no Numba the loop stays as it is, with the same results.
     # The compiled function releases the interpreter's lock.

@@ -1,4 +1,4 @@
-"""Reading files that may be anything, and replacing none but those of the same kind."""
+"""Files that may be anything: reading them, and replacing only those of the same kind."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def read_file(path: Path, most: int) -> bytes:
 def check_replaceable(
     path: Path, load: Callable[[Path], object], what: str, *, overwrite: bool
 ) -> None:
-    """Check that a path is free, or that what would be replaced there is of the same kind."""
+    """Check that a path is free or holds a file of the same kind."""
     if overwrite or not os.path.lexists(path):
         return
     try:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArray[Any]:
-    """Copy an array of the shape and kind of another from a state; it must be finite."""
+    """Copy a finite array from a state; its shape and dtype are those of another."""
     values = np.array(state.get(name), dtype=like.dtype if name in state else object)
     if values.shape != like.shape:
         raise ValueError(f"{name} of the state must have shape {like.shape}, got {values.shape}")
@@ -22,7 +22,7 @@ def read_array(state: Mapping[str, Any], name: str, like: NDArray[Any]) -> NDArr
 
 
 def read_list(state: Mapping[str, Any], name: str, robots: int) -> Sequence[Any]:
-    """Read a list of a state that has an entry for each robot."""
+    """Read a list with an entry for each robot from a state."""
     values = state.get(name)
     if not isinstance(values, list | tuple) or len(values) != robots:
         found = len(values) if isinstance(values, list | tuple) else repr(values)

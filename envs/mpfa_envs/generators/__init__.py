@@ -1,4 +1,4 @@
-"""Worlds without end: a generator's name and a seed are the same world for everyone, for ever.
+"""Generators of worlds: a generator's name and a seed give everyone the same world, for ever.
 
 A generator is a function of a source of randomness and a difficulty. :func:`generate_world` seeds
 it, and samples again where no robot can drive. Seeds for training, validation and test are apart
@@ -11,7 +11,7 @@ import random
 import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Final, Literal, TypeAlias, get_args
+from typing import Final, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
@@ -59,7 +59,7 @@ _NAME = re.compile(r"([a-z]+)(?:-(validation|test))?-([0-9]{1,9})(?:@(1|0?\.[0-9
 
 
 def register_generator(name: str, generator: Generator) -> None:
-    """Add a generator of your own, for this process.
+    """Add a generator, for this process.
 
     Its name then stands wherever that of a built-in one does: ``world="pillars"`` is a new world in
     each episode, ``"pillars-7"`` world 7, ``"pillars:test"`` the tasks of its test worlds.
@@ -128,7 +128,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
     Returns:
         The world, in which there is a task for a TurtleBot2 with 0.07 m to spare. It is called
         ``"bars-7"``, ``"bars-test-7"`` or, with a difficulty, ``"bars-7@0.5"``, which
-        :func:`~mpfa_envs.worlds.builtin.resolve_world` understands.
+        :func:`~mpfa_envs.generators.resolve.resolve_world` understands.
 
     Raises:
         TypeError: If a generator of your own gives something else.
@@ -141,33 +141,28 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
         >>> NavigationEnv(world="bars-7", physics="kinematic").world == world
         True
     """
-    generator = _generator(name)
-    check_count("seed", seed, least=0, most=len(get_args(Split)) * _SPLIT_SIZE - 1)
-    if difficulty is not None:
-        difficulty = check_share("difficulty", difficulty)
-    for attempt in range(_ATTEMPTS):
-        rng = _source(name, int(seed), attempt)
-        # Rooms are as they were before there were others, so that their seeds mean the same.
-        own = 0.5 if name in _HALFWAY else rng.random()
-        world = generator(rng, own if difficulty is None else difficulty)
-        if not isinstance(world, World):
-            raise TypeError(f"generator {name!r} must give a World, got {type(world).__name__}")
-        if _can_be_driven(world):
-            return world.renamed(_world_name(name, int(seed), difficulty))
-    raise ValueError(
-        f"world {_world_name(name, seed, difficulty)!r} cannot be made: none of {_ATTEMPTS} "
-        "attempts has a start and a goal with a path between them"
-    )
-
-
-def _generator(name: str) -> Generator:
-    """The generator of a name."""
     if name not in GENERATORS:
         hint = did_you_mean(name, GENERATORS)
         raise ValueError(
             f"generator must be one of {list(GENERATORS)}, got {name!r}{hint and f' ({hint})'}"
         )
-    return GENERATORS[name]
+    check_count("seed", seed, least=0, most=len(get_args(Split)) * _SPLIT_SIZE - 1)
+    if difficulty is not None:
+        difficulty = check_share("difficulty", difficulty)
+    world_name = _world_name(name, int(seed), difficulty)
+    for attempt in range(_ATTEMPTS):
+        rng = _source(name, int(seed), attempt)
+        # Rooms are as they were before there were others, so that their seeds mean the same.
+        own = 0.5 if name in _HALFWAY else rng.random()
+        world = GENERATORS[name](rng, own if difficulty is None else difficulty)
+        if not isinstance(world, World):
+            raise TypeError(f"generator {name!r} must give a World, got {type(world).__name__}")
+        if has_task(FreeGrid(world, distance=ROBOT_DISTANCE)):
+            return world.renamed(world_name)
+    raise ValueError(
+        f"world {world_name!r} cannot be made: none of {_ATTEMPTS} attempts has a start and a goal "
+        "with a path between them"
+    )
 
 
 def _source(name: str, seed: int, attempt: int) -> random.Random:
@@ -187,23 +182,15 @@ def _world_name(name: str, seed: int, difficulty: float | None) -> str:
     return f"{name}{middle}-{index}@{np.format_float_positional(difficulty, trim='-')}"
 
 
-def _can_be_driven(world: World) -> bool:
-    """Tell whether there is a task for a TurtleBot2 with something to spare."""
-    return has_task(FreeGrid(world, distance=ROBOT_DISTANCE))
-
-
 def world_of_name(name: str) -> World | None:
     """Make the world that a name such as ``"bars-test-7"`` stands for."""
     found = _NAME.fullmatch(name)
     if found is None or found[1] not in GENERATORS:
         return None
-    generator, _, index, difficulty = found.groups()
-    split: Split = "train"
-    if found[2] is not None:
-        split = "validation" if found[2] == "validation" else "test"
+    generator, split, index, difficulty = found.groups()
     return generate_world(
         generator,
-        world_seed(split, int(index)),
+        world_seed(cast("Split", split or "train"), int(index)),
         difficulty=None if difficulty is None else float(difficulty),
     )
 
@@ -240,7 +227,7 @@ def split_worlds(
 def generator_tasks(
     name: str, split: Split, *, worlds: int = 100, tasks: int = 4
 ) -> list[tuple[World, Task]]:
-    """Make the tasks that policies are compared on, fixed for ever.
+    """Make the tasks of a generator that policies are compared on, fixed for ever.
 
     Args:
         name: A generator, one of :data:`GENERATORS`.
@@ -265,7 +252,7 @@ def generator_tasks(
     pairs = []
     for index, world in enumerate(split_worlds(name, split, worlds)):
         grid = FreeGrid(world, distance=ROBOT_DISTANCE)
-        # A stream of its own: training with this seed must not meet these tasks.
+        # Training with this seed must not meet these tasks.
         kind = int.from_bytes(name.encode(), "big")
         rng = np.random.default_rng((_TASK_STREAM, kind, world_seed(split, index)))
         pairs += [(world, sample_task_on_grid(grid, rng)[0]) for _ in range(tasks)]

@@ -32,7 +32,7 @@ def rooms(rng: random.Random, difficulty: float) -> World:
     placed: list[Box] = []
     for _ in range(_ATTEMPTS):
         box = _sample_box(rng)
-        if _leaves_way(box, placed, passage):
+        if _leaves_passages(box, placed, passage):
             placed.append(box)
             if len(placed) == boxes:
                 break
@@ -59,8 +59,8 @@ def _sample_box(rng: random.Random) -> Box:
     return Box(x - width / 2, y - depth / 2, x + width / 2, y + depth / 2)
 
 
-def _leaves_way(box: Box, others: list[Box], passage: float) -> bool:
-    """Whether a box touches a wall or leaves a passage to it, and one to every other box."""
+def _leaves_passages(box: Box, others: list[Box], passage: float) -> bool:
+    """Tell whether a box touches or is a passage away from each wall and every other box."""
     walls = (box.x_min + _HALF, _HALF - box.x_max, box.y_min + _HALF, _HALF - box.y_max)
     return not any(0.0 < gap < passage for gap in walls) and all(
         _gap(box, other) >= passage for other in others

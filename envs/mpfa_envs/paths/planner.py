@@ -1,9 +1,9 @@
 """Shortest paths of a disc-shaped robot among the obstacles of a world.
 
 Obstacles are grown by the robot's radius, and A* searches the graph of lines of sight between
-their corners. Where a path bends around a corner the true optimum is an arc; ours follows a polygon
+their corners. Where a path bends around a corner the optimum is an arc; ours follows a polygon
 around it, at most 3 % longer on that arc: 7 mm per right angle at a radius of 0.18 m. All else is
-exact, so there is no grid and no resolution, and where the straight line is free it is the answer.
+exact: there is no grid, and a free straight line is the answer.
 
 Lines of sight grow with the square of the corners. :func:`shortest_length` therefore asks the grid
 of :mod:`~mpfa_envs.paths.distance` in worlds with many.
@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpfa_envs.checks import check_positive
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.worlds.shapes import Point
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.paths.distance import FreeGrid
     from mpfa_envs.worlds.world import World
 
 _TOUCH = 1e-9
@@ -111,52 +111,30 @@ class PathPlanner:
         self._neighbors: dict[int, list[tuple[int, float]]] = {}
 
     def is_straight(self, start: Point, goal: Point) -> bool:
-        """Tell whether the disc can take the straight line.
-
-        Args:
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Whether the line is free.
-        """
+        """Tell whether the disc can take the straight line between two positions [m]."""
         return bool(self._visible(start, np.array([goal]))[0])
 
     def find(self, start: Point, goal: Point) -> list[Point] | None:
-        """Find the shortest path.
-
-        Args:
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Corners of the path from start to goal [m], or None if there is none.
-        """
-        for point in (start, goal):
-            if self.world.clearance(*point) < self.radius - _TOUCH:
-                return None
+        """Corners of the shortest path between two positions [m], with both; None without one."""
+        if not self._fits(start, goal):
+            return None
         if self.is_straight(start, goal):
             return [start, goal]
         return self._search(start, goal)
 
     def is_reachable(self, start: Point, goal: Point) -> bool:
-        """Tell whether there is a path, which is quicker than finding the shortest.
-
-        Args:
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Whether there is one.
-        """
-        for point in (start, goal):
-            if self.world.clearance(*point) < self.radius - _TOUCH:
-                return False
+        """Tell whether there is a path, which is quicker than finding the shortest."""
+        if not self._fits(start, goal):
+            return False
         if self.is_straight(start, goal):
             return True
         groups = self._groups
         from_start = set(groups[self._visible(start, self._nodes)].tolist())
         return not from_start.isdisjoint(groups[self._visible(goal, self._nodes)].tolist())
+
+    def _fits(self, *points: Point) -> bool:
+        """Tell whether the disc can be at all of these positions."""
+        return all(self.world.clearance(*at) >= self.radius - _TOUCH for at in points)
 
     @cached_property
     def _groups(self) -> NDArray[np.int64]:
@@ -169,7 +147,7 @@ class PathPlanner:
             frontier = [first]
             while frontier:
                 x, y = self._nodes[frontier.pop()]
-                # Only what is in no group yet is looked for, which soon is little.
+                # Only corners without a group are tested, which soon are few.
                 left = np.flatnonzero(groups < 0)
                 found = left[self._visible((x, y), self._nodes[left])]
                 groups[found] = first
@@ -177,15 +155,7 @@ class PathPlanner:
         return groups
 
     def length(self, start: Point, goal: Point) -> float:
-        """Measure the shortest path.
-
-        Args:
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Length [m]; infinite if there is no path.
-        """
+        """Length of the shortest path between two positions [m]; infinite if there is none."""
         path = self.find(start, goal)
         if path is None:
             return math.inf
@@ -334,9 +304,6 @@ def _length_on_grid(world: World, radius: float, start: Point, goal: Point) -> f
 @lru_cache(maxsize=4)
 def grid_for(world: World, distance: float) -> FreeGrid:
     """Share one grid, and its graph of several megabytes, among the users of a world."""
-    # Imported here because it needs Numba, which takes half a second, and many worlds do not.
-    from mpfa_envs.paths.distance import FreeGrid
-
     large = world.size[0] * world.size[1] > 250.0
     return FreeGrid(world, distance=distance, resolution=min((1 + large) * _FINE, distance))
 

@@ -29,7 +29,7 @@ class AntColony:
     :math:`\tau_{ij}\,\eta_{ij}^{\beta}`, where :math:`\tau` is the pheromone of the move and
     :math:`\eta_{ij} = e^{-(l_{ij} + h_j - h_i) / r}` falls with the detour of the move, of length
     :math:`l`: :math:`h` is the straight line to the goal, :math:`r` the side of a cell. An ant
-    without such a neighbor goes back the way it came, so that each one arrives if there is a path.
+    without such a neighbor goes back a step, so that each one arrives if there is a path.
     Loops are cut off its path wherever a later cell is next to an earlier one. Then the pheromone
     :math:`\tau \leftarrow (1 - \rho)\,\tau` evaporates and the shortest path so far, in every other
     iteration the shortest of the iteration, gets :math:`\rho` on each of its moves; it stays

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _STEP: Final = 0.1
-"""Distance of the places on an arc that are looked at [m]."""
+"""Distance between the places on an arc that are tested [m]."""
 _ALONG: Final = 1.0
 """Greatest distance for which a path is followed [m]: its direction is known for little more."""
 
@@ -140,17 +140,7 @@ class DynamicWindow:
         """Arguments of the environments that it drives in, unless others are given."""
 
     def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Choose wheel speeds.
-
-        Args:
-            observation: Observations, shape ``[..., O]``.
-
-        Returns:
-            Actions, shape ``[..., 2]``.
-
-        Raises:
-            ValueError: If the observations have another size, or are not finite.
-        """
+        """Actions ``[..., 2]`` for observations ``[..., O]``, which must be finite."""
         observation = np.asarray(observation, dtype=np.float32)
         if observation.ndim == 0 or observation.shape[-1] != self.observation_size:
             raise ValueError(
@@ -192,7 +182,7 @@ class DynamicWindow:
         # A wheel that slips, or stands as in the beginning, has speeds that cannot be asked for.
         now = np.clip(now, robot.min_wheel_speed, robot.max_wheel_speed)
         changes = np.abs(self.pairs - now).max(axis=1)
-        # Where so few speeds are looked at that none is near enough, the nearest.
+        # The nearest where none of few samples is near enough.
         return np.flatnonzero(changes <= max(self.change, changes.min()) + 1e-9)
 
     def _rim_clearances(

@@ -1,4 +1,4 @@
-"""A driver that knows the world: it plans a path when an episode begins, and follows it."""
+"""A driver that plans a path on the known map when an episode begins, and follows it."""
 
 from __future__ import annotations
 
@@ -72,12 +72,7 @@ class MapPlanner:
         self._grids: dict[tuple[float, float], FreeGrid] = {}
 
     def begin(self, env: VectorNavigationEnv, robot: int) -> None:
-        """Plan the path of an episode.
-
-        Args:
-            env: Where the episode has begun.
-            robot: Number of the robot.
-        """
+        """Plan the path of a robot's episode, which has begun."""
         task = env.tasks[robot]
         if task is None:
             raise ValueError(f"robot {robot} must have begun an episode to plan for")
@@ -90,31 +85,13 @@ class MapPlanner:
         robots: NDArray[np.int64],
         observations: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Follow the paths.
-
-        Args:
-            env: Whose poses are read.
-            robots: Numbers of the N robots whose episodes are running.
-            observations: Their observations, ``[N, O]``; not read.
-
-        Returns:
-            Actions, ``[N, 2]``.
-        """
+        """Actions that follow the paths of the N robots, ``[N, 2]``; observations are not read."""
         poses = env.poses
         actions = [self._pursuits[robot].act(*poses[robot].tolist()) for robot in robots.tolist()]
         return np.array(actions, dtype=np.float32)
 
     def plan(self, world: World, start: Point, goal: Point) -> tuple[list[Point], FreeGrid]:
-        """Plan a path.
-
-        Args:
-            world: The room and its obstacles.
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Positions from the start to the goal [m], and the grid that they were found on.
-        """
+        """Positions of a path from start to goal [m], and the grid that it was found on."""
         for clearance, resolution in (
             (self.clearance, self.resolution),
             (self.clearance, min(_FINE, self.resolution)),

@@ -29,9 +29,9 @@ _BEHIND: Final = math.radians(120.0)
 _RIM: Final = 0.03
 """Clearance that the robot's rim keeps if it can [m]."""
 _ARC: Final = 0.5
-"""Length of the arcs that are looked at [m]."""
+"""Length of the arcs that are tested [m]."""
 _CURVATURES: Final = 41
-"""Number of arcs that are looked at."""
+"""Number of arcs that are tested."""
 
 
 class PurePursuit:
@@ -87,16 +87,7 @@ class PurePursuit:
         self._arcs = (along * np.sinc(half / math.pi))[..., None] * directions
 
     def act(self, x: float, y: float, heading: float) -> tuple[float, float]:
-        """Choose the speeds of the wheels.
-
-        Args:
-            x: Position [m].
-            y: Position [m].
-            heading: Direction of the robot's front [rad].
-
-        Returns:
-            Left and right wheel, from -1, the slowest, to 1, the fastest.
-        """
+        """Speeds of left and right wheel at a pose [m, m, rad], from -1, the slowest, to 1."""
         ahead_x, ahead_y = self._point_ahead(x, y)
         angle = math.remainder(math.atan2(ahead_y - y, ahead_x - x) - heading, math.tau)
         if abs(angle) > _BESIDE:

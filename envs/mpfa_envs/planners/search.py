@@ -1,4 +1,4 @@
-"""Shortest paths on the grid of a known world, by two libraries' graph searches."""
+"""Shortest paths on the grid of a known world, by graph searches of two libraries."""
 
 from __future__ import annotations
 
@@ -27,17 +27,7 @@ class Search(Protocol):
     """Finds a path between two positions over the free cells of a grid."""
 
     def __call__(self, grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-        """Find a path.
-
-        Args:
-            grid: The grid.
-            start: Position (x, y) [m].
-            goal: Position (x, y) [m].
-
-        Returns:
-            Positions from the start to the goal, with centers of cells between them [m]; None if
-            there is no path.
-        """
+        """Positions from start to goal (x, y), with centers of cells between [m]; None if none."""
 
 
 def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
@@ -85,7 +75,7 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
     """
     if not grid.free.any():
         return None
-    # Imported here because it takes long, and whoever evaluates a policy does not need it.
+    # Imported here because it takes long, and evaluating a policy does not need it.
     from networkx import NetworkXNoPath
     from networkx import astar_path as search
 

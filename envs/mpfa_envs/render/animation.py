@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _LEAST_DELAY: Final = 20
-"""Below this players of GIFs take a delay of their own [ms]."""
+"""Players of GIFs ignore shorter delays [ms]."""
 _KIT: Final = 64
-"""Colors of a palette that are of :mod:`mpfa_envs.scene.colors` at most."""
+"""Greatest number of colors of :mod:`mpfa_envs.scene.colors` in a palette."""
 
 
 def write_animation(

@@ -39,7 +39,7 @@ def plot_seeds(
     limits: tuple[float, float] | None = (0.0, 1.0),
     title: str = "",
 ) -> None:
-    """Plot the mean of runs and what surrounds it, and when each first reached a level.
+    """Plot the mean of runs with its band, and the step at which each first reached a level.
 
     The mean goes to the end of the shortest run. On the line of the level, a tick marks the step at
     which a run first reached it, a triangle the median of all runs, if at least half of them did;
@@ -122,7 +122,7 @@ def draw_seeds(
 
 
 def seed_band(curves: Sequence[Curve]) -> tuple[Array, Array, Array, Array]:
-    """Steps, mean and the ends of its 95 % interval of runs where all have values, ``[T]``."""
+    """Steps that all runs have, their mean and the ends of its 95 % interval, ``[T]``."""
     checked = [_checked(curve) for curve in curves]
     first = max(steps[0] for steps, _ in checked)
     last = min(steps[-1] for steps, _ in checked)
@@ -138,7 +138,7 @@ def seed_band(curves: Sequence[Curve]) -> tuple[Array, Array, Array, Array]:
 
 
 def first_step(curve: Curve, level: float) -> float:
-    """Step at which a run first has a value of a level or more; infinite if it never has."""
+    """Step at which a run first reaches a level; infinite if it never does."""
     steps, values = _checked(curve)
     reached = np.flatnonzero(values >= level)
     return float(steps[reached[0]]) if len(reached) else math.inf
@@ -156,7 +156,7 @@ def _checked(curve: Curve) -> tuple[Array, Array]:
 
 
 def _mark_level(axis: Any, steps: Sequence[float], level: float, style: Mapping[str, str]) -> float:
-    """Mark when runs reached the level, and the median of them, which it returns."""
+    """Mark the steps at which runs reached the level and return their median."""
     reached = [step for step in steps if math.isfinite(step)]
     axis.plot(reached, [level] * len(reached), "|", color=style["color"], ms=9, mew=1.2, zorder=3)
     median = float(np.median(steps))
@@ -277,7 +277,7 @@ def look(place: int) -> dict[str, str]:
 
 
 def _thousands(value: float, _: object) -> str:
-    """A number of steps in few letters."""
+    """A number of steps, short."""
     for unit, size in (("M", 1e6), ("k", 1e3)):
         if abs(value) >= size:
             return f"{value / size:.3g}{unit}"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mpfa_envs.tasks.sets import WorldTask
 
 _RECENT = 10.0
-"""Time for which speeds are seen [s]."""
+"""Time span of the wheel speeds [s]."""
 
 
 class Film(NamedTuple):

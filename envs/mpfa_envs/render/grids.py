@@ -1,4 +1,4 @@
-"""Cells of a room: where they are, what a robot senses in them, and how they are colored."""
+"""Cells of a room: their centers, observations in them, and their colors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _ROBOTS: Final = 64
-"""Places that are observed together; each may need a map."""
+"""Number of places observed together; each may need a map."""
 Heading = float | Literal["goal"]
 """Heading of all robots [rad], or that each of them faces the goal."""
 
@@ -48,7 +48,7 @@ def observe_room(
     spacing: float = 0.2,
     **env_arguments: Any,
 ) -> tuple[Array, NDArray[np.float32]]:
-    """Observations of a robot that stands here and there in a room.
+    """Observations of a robot at places all over a room.
 
     Args:
         world: A name, the path of a YAML file or a world.

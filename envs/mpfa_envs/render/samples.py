@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _FEW = 3
-"""A cell with fewer transitions has no mean that says anything."""
+"""Least number of transitions of a cell whose mean is shown."""
 
 
 def render_samples(

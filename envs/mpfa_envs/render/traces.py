@@ -23,11 +23,11 @@ class Panel(NamedTuple):
     lines: Mapping[str, Sequence[float]]
     """The numbers by the name of their line; one without a name needs no legend."""
     last: int | None = None
-    """Steps that are seen at a time, up to the present one; None: those of the whole episode."""
+    """Number of steps shown, up to the present one; None: the whole episode."""
 
 
 _LEFT, _RIGHT, _TOP, _BELOW = (FINE * n for n in (44, 14, 30, 22))
-"""Around the axes of a panel, in fine pixels."""
+"""Margins of a panel in fine pixels."""
 _SMALL: Final = 11
 
 

@@ -173,7 +173,7 @@ def shown_episodes(outcomes: Sequence[str], *, most: int) -> list[int]:
 
 
 def _spaced(numbers: Sequence[int], count: int) -> list[int]:
-    """At most so many of some numbers, from the first to the last."""
+    """Evenly spaced numbers, ``count`` at most, with the first and the last."""
     if len(numbers) <= count:
         return list(numbers)
     places = np.linspace(0, len(numbers) - 1, count).round().astype(int)

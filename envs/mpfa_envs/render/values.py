@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Observations = NDArray[np.float32]
 
 _ARROW_TIME = 1.0
-"""An arrow is as long as the path of so much time [s]."""
+"""Time of the path that an arrow shows [s]."""
 
 
 def render_values(

@@ -25,7 +25,7 @@ VERMILION: Final = (213, 94, 0)
 PURPLE: Final = (204, 121, 167)
 
 LINES: Final = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK)
-"""Of lines side by side, in the order in which they are taken; yellow is too pale on white."""
+"""Colors of lines, in order; yellow is too pale on white."""
 
 PAPER: Final = (255, 255, 255, 255)
 FLOOR: Final = (250, 249, 246, 255)
@@ -43,7 +43,7 @@ RIVAL: Final = (*VERMILION, 255)
 RAY: Final = (*SKY, 190)
 RAY_AREA: Final = (*SKY, 34)
 TRAIL: Final = (*BLUE, 255)
-WAY: Final = (*PURPLE, 255)
+PATH: Final = (*PURPLE, 255)
 MET: Final = (*PURPLE, 70)
 WALKER: Final = (*ORANGE, 255)
 WALKER_EDGE: Final = (138, 92, 0, 255)
@@ -53,7 +53,7 @@ OUTCOMES: Final[dict[str, Color]] = {
     "collision": (*VERMILION, 235),
     "timeout": (*PURPLE, 235),
 }
-"""Of the paths of episodes, by how they ended."""
+"""Colors of paths by the end of their episode."""
 
 VIRIDIS: Final = np.array(
     [

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from mpfa_envs.scene.canvas import Canvas, Point
-from mpfa_envs.scene.colors import MET, RAY, RAY_AREA, RIVAL, TRAIL, WAY
+from mpfa_envs.scene.colors import MET, PATH, RAY, RAY_AREA, RIVAL, TRAIL
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,12 +37,12 @@ def render_scene(
     Args:
         world: The room and its obstacles.
         robot: The robot.
-        pose: Where it is, (x, y, heading) [m, m, rad].
-        goal: Where it should go (x, y) [m].
+        pose: Pose of the robot (x, y, heading) [m, m, rad].
+        goal: Position of the goal (x, y) [m].
         goal_radius: Distance that reaches the goal [m].
-        trail: Where it has been (x, y) [m].
+        trail: Its positions so far (x, y) [m].
         rays: Angles in the robot's frame [rad] and ranges [m] of its lidar.
-        sketch: What the robot remembers, if it makes a map.
+        sketch: The robot's map, if it makes one.
         walkers: (x, y), the speeds in both directions and the radius [m, m/s] of each walker,
             ``[K, 5]``.
         rival: Pose and trail of a second robot in the same room, in another color.
@@ -70,7 +70,7 @@ def render_scene(
         with canvas.layer():
             for at_x, at_y in sketch.blocked:
                 canvas.rectangle(at_x - half, at_y - half, at_x + half, at_y + half, fill=MET)
-        canvas.line([(x, y), *sketch.path], WAY, 1.5)
+        canvas.line([(x, y), *sketch.path], PATH, 1.5)
     if rays is not None:
         ends = [
             (x + reach * math.cos(heading + angle), y + reach * math.sin(heading + angle))

@@ -1,4 +1,4 @@
-"""The strip below a picture: a title, what the colors mean, how many there are of each."""
+"""The strip below a picture: title, legend and counts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HEIGHT: Final = 28
-"""Of the strip [px]."""
+"""Height of the strip [px]."""
 _MARGIN, _AFTER_TITLE, _BEFORE_LABEL, _AFTER_LABEL = (FINE * n for n in (8, 18, 15, 16))
 """Spaces in fine pixels."""
 _BAR: Final = FINE * 90

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Window:
-    """A window that opens with the first picture, and tells which keys are held."""
+    """A window that opens with the first picture and knows the keys that are held."""
 
     # Without a screen, SDL_VIDEODRIVER=dummy lets it run and show nothing.
 
@@ -39,7 +39,7 @@ class Window:
         self.pressed: list[str] = []
         """Names of the keys that were pressed since the last picture."""
         self.closed = False
-        """Whether the user closed it, or pressed Escape; it shows nothing more then."""
+        """Set once the user has closed it or pressed Escape; it shows nothing more then."""
 
     def show(self, picture: NDArray[np.uint8]) -> bool:
         """Show a picture, ``[height, width, 3]``, when due; tell whether the window is open."""

@@ -1,9 +1,10 @@
-"""Tasks: where an episode starts and where its goal lies."""
+"""Starts and goals of episodes: sampled, or read from the options of a reset."""
 
 from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from mpfa_envs.checks import check_count, check_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.planner import grid_for, is_small, planner_for, shortest_length
+from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.robots.model import (
     PAPER_CLEARANCE,
     RobotModel,
@@ -72,34 +74,19 @@ def sample_task(
         >>> len(task.start), len(task.goal)
         (3, 2)
     """
-    asked = collision_distance, min_goal_distance, detour_chance
+    asked = {"min_goal_distance": min_goal_distance, "detour_chance": detour_chance}
+
+    def on_grid() -> Task:
+        return sample_task_on_grid(grid_for(world, collision_distance), rng, **asked)[0]
+
     if not is_small(world):
-        return _sample_cells(world, rng, *asked)
+        return on_grid()
     try:
-        return _sample_points(world, rng, *asked)
+        return _sample_points(world, rng, collision_distance, **asked)
     except ValueError:
-        try:
-            return _sample_cells(world, rng, *asked)
-        except ValueError:
-            pass
+        with suppress(ValueError):
+            return on_grid()
         raise
-
-
-def _sample_cells(
-    world: World,
-    rng: np.random.Generator,
-    collision_distance: float,
-    min_goal_distance: float,
-    detour_chance: float,
-) -> Task:
-    """Sample a task on a grid, which is quick in any world, and finds the rarest."""
-    # Imported here because it needs Numba, which takes half a second, and many worlds do not.
-    from mpfa_envs.paths.tasks import sample_task_on_grid
-
-    grid = grid_for(world, collision_distance)
-    return sample_task_on_grid(
-        grid, rng, min_goal_distance=min_goal_distance, detour_chance=detour_chance
-    )[0]
 
 
 def _sample_points(
@@ -267,7 +254,7 @@ def evaluation_pairs(
         if collision_distance is None
         else resolve_collision_distance(collision_distance, robot)
     )
-    # A stream of its own: an environment with the same seed must not train on these tasks.
+    # An environment with the same seed must not train on these tasks.
     rng = np.random.default_rng((_EVALUATION_STREAM, seed))
     return [
         sample_task(world, rng, collision_distance=distance, min_goal_distance=min_goal_distance)

@@ -21,7 +21,7 @@ from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import Box, Cylinder, World
 
 BARN_WORLDS: Final = tuple(range(5, 300, 15))
-"""The benchmark's own numbers of the worlds."""
+"""Numbers of the worlds in the benchmark."""
 _FILE: Final = Path(__file__).parents[1] / "data" / "barn" / "barn_sample.npz"
 _RADIUS: Final = 0.075
 _CENTER: Final = (-2.25, 7.0)
@@ -30,7 +30,7 @@ _SIZE: Final = (10.0, 15.0)
 
 
 def barn_task() -> Task:
-    """Give the benchmark's start and goal, the same in all of its worlds.
+    """Start and goal of the benchmark, the same in all of its worlds.
 
     The robot starts in the corridor, faces the field and has its goal 10 m ahead, 3.5 m behind it.
 

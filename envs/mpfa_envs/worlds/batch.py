@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class GridArrays(NamedTuple):
-    """The maps that robots drive in; of each table only the first columns and rows count."""
+    """Maps of the robots' worlds; each fills the first columns and rows of its table."""
 
     left: NDArray[np.int16]
     """The nearest occupied column to the left, ``[maps, most columns, most rows]``."""
@@ -31,7 +31,7 @@ class GridArrays(NamedTuple):
 
 
 class BatchArrays(NamedTuple):
-    """Shapes by robot; of each row only the first few count, and no others are looked at."""
+    """Shapes by robot; only the first ``counts`` of each row are read."""
 
     half_sizes: NDArray[np.float64]
     """Half the width and the depth of the rooms [m], ``[N, 2]``."""
@@ -82,7 +82,7 @@ class WorldBatch:
 
     @property
     def standing(self) -> BatchArrays:
-        """The same arrays, in which only what stands counts."""
+        """The same arrays with counts that leave out walkers."""
         return self._rooms._replace(counts=self._standing)
 
     def __len__(self) -> int:
@@ -116,7 +116,7 @@ class WorldBatch:
             self._set_grid(robot, world.occupancy)
 
     def _set_grid(self, robot: int, grid: OccupancyGrid) -> None:
-        """Let a robot drive in a map, which it shares with others in the same one."""
+        """Put a robot into a map, which it shares with other robots there."""
         grids = self._grids
         if grid not in grids:
             used = {int(number) for number in self._rooms.grid_of if number >= 0}
@@ -145,7 +145,7 @@ def _grid_arrays(grids: Sequence[OccupancyGrid]) -> GridArrays:
 
 
 def _widened(table: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """A copy with room for at least so many shapes a robot, and half as many as now to spare."""
+    """A copy with room for more shapes a robot, at least one and a half times as many."""
     most = max(count, table.shape[1] * 3 // 2)
     wider = np.zeros((len(table), most, *table.shape[2:]), dtype=table.dtype)
     wider[:, : table.shape[1]] = table

@@ -49,7 +49,7 @@ def clearance_of_shapes(
     x: float,
     y: float,
 ) -> float:
-    """Measure the distance from a point to the nearest shape of some or wall [m]; 0 in a box."""
+    """Measure the distance from a point to the nearest shape or wall [m]; zero in a box."""
     nearest = min(half_size[0] - abs(x), half_size[1] - abs(y))
     square = math.inf
     for index in range(boxes.shape[0]):

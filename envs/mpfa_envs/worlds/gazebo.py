@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 _LARGEST_FILE: Final = 20_000_000
 """Longest text that is read [bytes]."""
 _DEEPEST: Final = 100
-"""Elements in each other, at most."""
+"""Greatest depth of nested elements."""
 _FLOOR: Final = 0.01
-"""Greatest height of an obstacle that a robot drives over [m]."""
+"""A robot drives over obstacles up to this height [m]."""
 _FARTHEST: Final = 1e9
-"""No number is as large as this [m, rad]."""
+"""Numbers must be smaller than this [m, rad]."""
 _STRAIGHT: Final = 1e-6
-"""Angles below this are none [rad]."""
+"""Smaller angles count as zero [rad]."""
 
 
 @dataclass(slots=True)
@@ -50,16 +50,16 @@ class _Element:
         return "".join(self.pieces).strip()
 
     def all(self, tag: str) -> Iterator[_Element]:
-        """Its children of a kind."""
+        """Its children with a tag."""
         return (child for child in self.children if child.tag == tag)
 
     def first(self, tag: str) -> _Element | None:
-        """The first of them; None if there is none."""
+        """Its first child with a tag; None without one."""
         return next(self.all(tag), None)
 
 
 class _Pose(NamedTuple):
-    """A pose: x, y, z [m] and the turn around the upright [rad]."""
+    """A pose: x, y, z [m] and yaw [rad]."""
 
     x: float = 0.0
     y: float = 0.0
@@ -67,7 +67,7 @@ class _Pose(NamedTuple):
     yaw: float = 0.0
 
     def __matmul__(self, inner: _Pose) -> _Pose:
-        """The pose in the room of what has a pose in this one."""
+        """Compose two poses: the inner one is given in the frame of this one."""
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         return _Pose(
             self.x + cosine * inner.x - sine * inner.y,
@@ -87,19 +87,18 @@ def load_gazebo_world(
     """Read the boxes and cylinders of a Gazebo world.
 
     They are those of the collisions of static models, models in models included, where the
-    ``state`` of the file puts them. What is left out is counted in a warning: includes, models that
-    may move, meshes and other geometry, what is tilted, poses in frames that
-    have a name, and those whose turn is written as a quaternion.
+    ``state`` of the file puts them. A warning counts parts that are left out: includes, models that
+    may move, meshes and other geometry, tilted parts, poses in named frames, and poses with a
+    quaternion.
 
     Args:
         path: A ``.world`` or ``.sdf`` file, or one that is compressed (``.gz``).
         size: Width and depth of the room [m]. None: as large as the obstacles need.
-        center: What lies in the middle of the room, in the file's coordinates [m]. None: the middle
-            of the obstacles.
-        height: What begins above this is no obstacle [m], and what ends in the floor is none.
+        center: Middle of the room in the file (x, y) [m]. None: that of the obstacles.
+        height: Shapes that begin above this are no obstacles [m], nor are those below the floor.
 
     Returns:
-        The world, called as the file.
+        The world, with the name of the file.
 
     Raises:
         WorldFileError: If the file cannot be read, is no world of SDF, defines entities, or the
@@ -128,7 +127,7 @@ def load_gazebo_world(
 
 
 def _read(path: Path) -> bytes:
-    """Read a file, or what is compressed in it, up to the largest size."""
+    """Read a file, decompressed if it ends in .gz, up to the largest size."""
     try:
         content = read_file(path, _LARGEST_FILE)
         if path.suffix.lower() == ".gz":
@@ -141,9 +140,9 @@ def _read(path: Path) -> bytes:
 
 
 def _parse(path: Path, text: bytes) -> _Element:
-    """Read the elements; without a document type there are no entities that could grow."""
+    """Read the elements; a document type, which could define entities, is rejected."""
     parser = expat.ParserCreate()
-    parser.buffer_text = True  # Else each line end is a piece of its own.
+    parser.buffer_text = True  # Else each line end is a separate piece.
     document = _Element("", {}, 1)
     open_ones = [document]
 
@@ -187,7 +186,7 @@ class _Reader:
         self.left_out: Counter[str] = Counter()
 
     def state(self, state: _Element | None) -> dict[str, _Element]:
-        """Poses of models by name, if the file gives them apart."""
+        """Poses of models by name, if the file has them in a separate state."""
         models = () if state is None else state.all("model")
         places = ((model.attributes.get("name", ""), model.first("pose")) for model in models)
         return {name: pose for name, pose in places if pose is not None}
@@ -219,7 +218,7 @@ class _Reader:
             self.model(part, place, static=static)
 
     def _pose(self, pose: _Element | None) -> _Pose | None:
-        """Read a pose; None if what is there is left out."""
+        """Read a pose; None if it is of a kind that is left out."""
         if pose is None:
             return _Pose()
         if pose.attributes.get("frame") or pose.attributes.get("relative_to"):
@@ -246,11 +245,11 @@ class _Reader:
                     self._lengths(kind, "radius", 1)[0],
                     self._lengths(kind, "length", 1)[0],
                 )
-                if self._is_in_the_way(pose.z, length):
+                if self._is_met(pose.z, length):
                     self.shapes.append(Cylinder(pose.x, pose.y, radius))
             elif kind.tag == "box":
                 width, depth, tall = self._lengths(kind, "size", 3)
-                if self._is_in_the_way(pose.z, tall):
+                if self._is_met(pose.z, tall):
                     try:
                         self.shapes.append(_turned_box(pose, width, depth))
                     except ValueError as error:  # A side vanishes beside where it is.
@@ -258,8 +257,8 @@ class _Reader:
             elif kind.tag != "plane":  # The ground.
                 self.left_out[f"geometries of the kind {kind.tag}"] += 1
 
-    def _is_in_the_way(self, middle: float, length: float) -> bool:
-        """Tell whether a robot meets what stands upright around a height [m]."""
+    def _is_met(self, middle: float, length: float) -> bool:
+        """Tell whether a robot meets an upright shape with its middle at a height [m]."""
         return middle + length / 2 > _FLOOR and middle - length / 2 < self._height
 
     def _lengths(self, element: _Element, tag: str, count: int) -> list[float]:
@@ -304,7 +303,7 @@ def _room(
     size: tuple[float, float] | None,
     center: tuple[float, float] | None,
 ) -> World:
-    """Put a room around obstacles, and them in its frame."""
+    """Put a room around obstacles, and move them into its frame."""
     bounds = [shape.bounds for shape in shapes]
     if center is None:
         center = (0.0, 0.0)

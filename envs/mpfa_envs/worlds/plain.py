@@ -38,7 +38,7 @@ def walker_to_plain(walker: Walker) -> dict[str, Any]:
 
 
 def world_from_plain(values: dict[str, Any]) -> World:
-    """Make a world of what :func:`world_to_plain` gave."""
+    """Make a world again from plain values."""
     try:
         return World(
             name=values["name"],
@@ -63,7 +63,7 @@ def world_from_plain(values: dict[str, Any]) -> World:
 
 
 def fingerprint(world: World) -> str:
-    """Tell a world from others, those of its name included."""
+    """Name and hash of a world, which differs even from worlds with its name."""
     # 1 and 1.0 are the same number, but not the same text.
     values = json.loads(json.dumps(world_to_plain(world), default=float), parse_int=float)
     return f"{world.name} ({hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]})"

@@ -38,18 +38,18 @@ if TYPE_CHECKING:
 Mode = Literal["trinary", "scale", "raw"]
 """Meanings of shades between the thresholds."""
 Unknown = Literal["occupied", "free"]
-"""Readings of cells of which the map knows nothing."""
+"""Readings of unknown cells."""
 _KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _FORMATS: Final = ("PPM", "PNG", "BMP")
 """Kinds of images; PGM is among the first."""
 _LARGEST_IMAGE: Final = 2**28
-"""A larger file is no image of so few cells [bytes]."""
+"""Size of the largest image file that is read [bytes]."""
 _RESOLUTION: Final = 0.05
-"""Side of a cell of a map that is written of shapes [m]."""
+"""Side of a cell in maps of worlds with shapes [m]."""
 _FREE: Final = 254
 """Shade of a free cell, as ROS's map_saver writes it."""
 _UNKNOWN: Final = 205
-"""Shade by which it marks a cell of which it knows nothing; p is 0.196."""
+"""Shade of an unknown cell there; p is 0.196."""
 
 
 class _Rule(NamedTuple):
@@ -64,8 +64,8 @@ class _Rule(NamedTuple):
 def read_map(
     path: Path, root: yaml.Node | None = None, *, unknown: Unknown = "occupied"
 ) -> OccupancyGrid:
-    """Read the cells of a map of ROS, a room of what the map knows of."""
-    # What lies around the outermost free cells, and the cells that touch them, is cut off.
+    """Read the cells of a map of ROS."""
+    # The room ends one cell beyond the outermost free cells.
     if unknown not in get_args(Unknown):
         raise ValueError(f"unknown must be one of {get_args(Unknown)}, got {unknown!r}")
     root = read_nodes(path) if root is None else root
@@ -130,7 +130,7 @@ class _Reader(NodeReader):
         return value
 
     def origin(self, node: yaml.Node) -> tuple[float, float]:
-        """Read where the lower left corner is (x, y) [m]."""
+        """Read the position of the lower left corner (x, y) [m]."""
         values = self.items(node, "origin")
         if len(values) != 3:
             raise self.error(node, f"origin must be [x, y, yaw], got {len(values)} entries")
@@ -142,7 +142,7 @@ class _Reader(NodeReader):
         return x, y
 
     def rule(self, entries: Mapping[str, yaml.Node]) -> _Rule:
-        """Read how shades become cells."""
+        """Read the rule that turns shades into cells."""
         mode = "trinary"
         if "mode" in entries:
             mode = self.text(entries["mode"], "mode")

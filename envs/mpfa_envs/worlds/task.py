@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 START_SLACK = 0.15
-"""A start is at least this much farther from an obstacle than a collision is [m]."""
+"""Clearance of a start beyond that of a collision [m]."""
 
 
 class Task(NamedTuple):

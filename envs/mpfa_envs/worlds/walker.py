@@ -15,21 +15,21 @@ Behavior = Literal["straight", "waypoints", "orca"]
 """Rule by which a walker chooses its path."""
 
 MOST_WALKERS: Final = 100
-"""No world has more walkers."""
+"""Greatest number of walkers in a world."""
 MOST_WAYPOINTS: Final = 100
-"""No walker has more waypoints."""
+"""Greatest number of waypoints of a walker."""
 FASTEST: Final = 5.0
-"""No walker is faster [m/s]."""
+"""Greatest speed of a walker [m/s]."""
 _NARROWEST: Final = 0.01
-"""No walker is thinner [m]: it moves by its radius at a time, lest it get through a thin wall."""
+"""Least radius [m]: a walker moves by its radius at a time, so as not to pass a thin wall."""
 PERSONAL_SPACE: Final = 0.5
 """A robot that comes nearer to a walker, rim to rim, is in its personal space [m]."""
 FAR: Final = 10.0
 """A walker that is farther from a robot than this does not count [m]."""
 _SHORTEST_LEG: Final = 1e-3
-"""No two waypoints in a row are nearer: a step would lead around them countless times [m]."""
+"""Least distance between two waypoints in a row: a step must not go around countless times [m]."""
 HORIZON: Final = 10.0
-"""No collision that lies farther ahead is looked for [s]."""
+"""Collisions are predicted up to this time ahead [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,8 @@ class Walker:
             waypoints, no faster than its speed, around obstacles, other walkers and the robot
             (:class:`~mpfa_envs.walkers.orca.OrcaRoom`), which needs
             ``pip install 'torchrl-mpfa[orca]'``.
-        waypoints: Where a walker goes that is not ``"straight"`` (x, y) [m], two at least.
+        waypoints: Positions (x, y) between which walkers other than ``"straight"`` go [m], at least
+            two.
 
     Raises:
         ValueError: If a number is out of its range, the behavior is unknown or the waypoints do

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 __all__ = ["MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
 
 MOST_OBSTACLES: Final = 1000
-"""No room has more obstacles."""
+"""Greatest number of obstacles in a room."""
 _APART: Final = 0.05
-"""Places of a line whose clearance is looked at are this far apart, at most [m]."""
+"""Greatest distance between the points of a line whose clearance is measured [m]."""
 _PARTS: Final[Mapping[str, type[Shape | Walker]]] = {
     "boxes": Box,
     "cylinders": Cylinder,
@@ -62,7 +62,7 @@ class World:
     """A walled room around the origin, x to the right and y up, with obstacles.
 
     Args:
-        name: What messages and pictures call it.
+        name: Name in messages and pictures.
         size: Inner width and depth (x, y) [m], at most 1,000 each; the walls stand around it.
         boxes: Obstacles with sides parallel to the walls.
         cylinders: Round obstacles.
@@ -70,8 +70,8 @@ class World:
             are at most 1,000.
         start_regions: Where an episode may start; empty: anywhere in the room.
         goal_regions: Where a goal may lie; empty: anywhere in the room.
-        walkers: What moves, at most 100. All else that is said of a world, its clearance, its
-            paths, its tasks, is said of the obstacles, which stand.
+        walkers: Moving obstacles, at most 100; clearance, paths and tasks of a world do not count
+            them.
         occupancy: Cells of a map, as large as the room, the occupied ones of which are obstacles
             too, any number of them.
 
@@ -118,7 +118,7 @@ class World:
         self._check_walkers()
 
     def _check_kinds(self) -> None:
-        """Reject fields of another kind, and make tuples of lists, as worlds are keys."""
+        """Reject fields of other types, and turn lists into tuples, which can be hashed."""
         if not isinstance(self.name, str):
             raise ValueError(f"name must be text, got {self.name!r}")
         size = tuple(self.size) if isinstance(self.size, Iterable) else ()
@@ -154,17 +154,17 @@ class World:
     def from_map(
         path: str | os.PathLike[str], *, unknown: Literal["occupied", "free"] = "occupied"
     ) -> World:
-        """Read a map of ROS as a world, whose room is what the map knows of.
+        """Read a map of ROS as a world, whose room is the known part of the map.
 
-        What lies around the outermost free cells, and the cells that touch them, is cut off.
+        The room ends one cell beyond the outermost free cells.
 
         Args:
             path: The YAML file; the image's path in it is relative to its folder.
-            unknown: What cells are of which the map knows nothing.
+            unknown: How unknown cells are read.
 
         Returns:
-            The world, called as the file. ``world.occupancy.center`` is where its (0, 0) is on the
-            map.
+            The world, with the name of the file. ``world.occupancy.center`` is the position of its
+            (0, 0) on the map.
 
         Raises:
             WorldFileError: If a file cannot be read or is no map; the message names the line.
@@ -192,7 +192,7 @@ class World:
         save_map(self, path, resolution=resolution)
 
     def __hash__(self) -> int:
-        """Worlds are keys of caches, and hundreds of obstacles are hashed once only."""
+        """Hash once: worlds are keys of caches and may have hundreds of obstacles."""
         return self._hash
 
     @cached_property
@@ -202,11 +202,11 @@ class World:
         return hash((self.size, self.obstacles, *regions, self.walkers, self.occupancy))
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the hash, which differs between processes as those of texts and None do."""
+        """Fields without the hash, which differs between processes."""
         return {name: value for name, value in self.__dict__.items() if name != "_hash"}
 
     def renamed(self, name: str) -> World:
-        """Give the same world another name; what was computed of it is kept."""
+        """Copy the world under another name, with all that has been computed of it."""
         world = copy.copy(self)
         # The dataclass is frozen; this is the copy's only change, before it is used.
         object.__setattr__(world, "name", name)

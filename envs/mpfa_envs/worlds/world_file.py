@@ -14,6 +14,7 @@ import yaml
 
 from mpfa_envs.files import check_replaceable, write_atomically
 from mpfa_envs.worlds.plain import walker_to_plain
+from mpfa_envs.worlds.ros_map import read_map
 from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
 from mpfa_envs.worlds.walker import Walker
 from mpfa_envs.worlds.world import World
@@ -63,9 +64,6 @@ def load_world(path: str | os.PathLike[str]) -> World:
     path = Path(path)
     root = read_nodes(path)
     if is_map(root):
-        # Imported here because most worlds are no maps.
-        from mpfa_envs.worlds.ros_map import read_map
-
         grid = read_map(path, root)
         return World(name=path.stem, size=grid.size, occupancy=grid)
     return _Reader(path).world(root)

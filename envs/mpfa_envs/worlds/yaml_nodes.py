@@ -14,7 +14,7 @@ from mpfa_envs.files import read_file
 _LARGEST_FILE: Final = 1_000_000
 """Longest text that is read [bytes]."""
 _MOST_ENTRIES: Final = 1000
-"""No list has more: a line of ten letters may stand for a polygon of a hundred corners."""
+"""Longest list: with aliases, a line of ten letters can stand for a hundred corners."""
 
 
 class WorldFileError(ValueError):
@@ -22,7 +22,7 @@ class WorldFileError(ValueError):
 
 
 def read_nodes(path: Path) -> yaml.Node | None:
-    """Read a file as nodes, which carry line numbers, and of which no tag can run anything."""
+    """Read a file as nodes, which have line numbers and never run code."""
     try:
         content = read_file(path, _LARGEST_FILE)
     except OSError as error:
@@ -47,7 +47,7 @@ def parse_nodes(content: bytes, path: Path) -> yaml.Node | None:
 
 
 def read_number(text: str) -> float:
-    """The number that a text stands for, or NaN: Python also takes ``1_0`` and foreign digits."""
+    """Read a number, NaN for other text: Python also accepts ``1_0`` and non-ASCII digits."""
     try:
         return float(text) if text.isascii() and "_" not in text else math.nan
     except ValueError:
@@ -99,7 +99,7 @@ class NodeReader:
         return list(node.value)
 
     def number(self, node: yaml.Node, what: str, unit: str = " in meters") -> float:
-        """Read a finite number; the unit is what an error says behind "a number"."""
+        """Read a finite number; errors name the unit after "a number"."""
         value = read_number(node.value) if isinstance(node, yaml.ScalarNode) else math.nan
         if not math.isfinite(value):
             got = node.value if isinstance(node, yaml.ScalarNode) else "something else"
@@ -107,7 +107,7 @@ class NodeReader:
         return value
 
     def text(self, node: yaml.Node, what: str) -> str:
-        """Read a word or more."""
+        """Read text that is not empty."""
         if not isinstance(node, yaml.ScalarNode) or not node.value.strip():
             raise self.error(node, f"{what} must be text")
         return str(node.value)
