@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 ENCOUNTERS = ("walker_distance", "intrusion_time", "time_to_collision")
-"""The measures of walkers in the info of an environment and in a result."""
+"""Measures of encounters with walkers in the info of an environment and in a result."""
 _LEVEL = 0.95
 _RESAMPLES = 2000
 
@@ -53,7 +53,7 @@ class EpisodeResult:
 
     @property
     def outcome(self) -> Literal["success", "collision", "timeout"]:
-        """Its end in a word."""
+        """The end of the episode in a word."""
         if self.success:
             return "success"
         return "collision" if self.collision else "timeout"

@@ -31,7 +31,7 @@ from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 
 Generator: TypeAlias = Callable[[random.Random, float], World]
-"""Samples a world of a difficulty in [0, 1]."""
+"""A function that samples a world of a difficulty in [0, 1]."""
 Split = Literal["train", "validation", "test"]
 """Uses of a seed."""
 
@@ -49,11 +49,11 @@ _registered = dict(_BUILT_IN)
 GENERATORS: Final[Mapping[str, Generator]] = MappingProxyType(_registered)
 """The generators by name; :func:`register_generator` adds one."""
 ROBOT_DISTANCE: Final = 0.25
-"""In every world there is a task whose path keeps this: a TurtleBot2 with 0.07 m to spare [m]."""
+"""Every world has a task whose path has this clearance: a TurtleBot2 with 0.07 m to spare [m]."""
 _SPLIT_SIZE: Final = 10**9
 _ATTEMPTS: Final = 100
 _HALFWAY: Final = ("rooms", "crowd")
-"""Generators whose worlds have a difficulty of 0.5 unless told otherwise."""
+"""Generators with a default difficulty of 0.5."""
 _TASK_STREAM: Final = 7312590
 _NAME = re.compile(r"([a-z]+)(?:-(validation|test))?-([0-9]{1,9})(?:@(1|0?\.[0-9]+|0))?")
 
@@ -92,7 +92,7 @@ def register_generator(name: str, generator: Generator) -> None:
 
 
 def world_seed(split: Split, index: int) -> int:
-    """Give the seed of a world of a split.
+    """Seed of a world of a split.
 
     Args:
         split: ``"train"``, ``"validation"`` or ``"test"``.

@@ -1,4 +1,4 @@
-"""Parts that the generators share: rooms, and shapes cut to them."""
+"""Sizes of rooms, and shapes cut to them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import random
 from mpfa_envs.worlds.world import Box, Cylinder, Polygon
 
 _LEAST_SIDE = 0.05
-"""A box that a wall cuts to less than this is left out [m]."""
+"""Least side of a box that a wall cuts [m]."""
 
 
 def between(low: float, high: float, difficulty: float) -> float:

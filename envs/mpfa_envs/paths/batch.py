@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class FieldArrays(NamedTuple):
-    """Path lengths by robot; of each table only the first columns and rows count."""
+    """Path lengths by robot; each field fills the first columns and rows of its table."""
 
     values: NDArray[np.float32]
     """Length of the path to the goal from each cell [m], ``[N, most columns, most rows]``."""

@@ -1,4 +1,4 @@
-"""The shortest path from everywhere in a world to a goal, on a grid.
+"""Shortest paths from everywhere in a world to a goal, on a grid.
 
 Where :mod:`~mpfa_envs.paths.planner` answers one question exactly, a field answers it for all cells
 at once, and in milliseconds however many obstacles there are. Moves lead from a free cell to its 16
@@ -37,18 +37,18 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 RESOLUTION: Final = 0.1
-"""Side of a cell unless another is asked for [m]."""
+"""Default side of a cell [m]."""
 _MOST_CELLS: Final = 4_000_000
 _MARGIN: Final = 3
 """Cells by which a window is wider than the longest path."""
 
 
 class FreeGrid:
-    """Square cells over a room, and which of them a disc's center may be in.
+    """Square cells over a room, some of them free for a disc's center.
 
     Args:
         world: The room and its obstacles.
-        distance: What a free cell's center keeps from every obstacle and wall [m].
+        distance: Least clearance of a free cell's center [m].
         resolution: Side of a cell [m], no longer than the distance, so that no move steps over a
             wall. None: 0.1 m, or the distance if that is less.
 
@@ -235,7 +235,7 @@ class DistanceField:
         reach = min(longest / STEP_SCALE / grid.resolution, max(grid.free.shape))
         wide = math.ceil(reach) + _MARGIN
         self.first = max(i - wide, 0), max(j - wide, 0)
-        """Column and row of the grid that the window begins with."""
+        """First column and row of the grid in the window."""
         self.window = tuple(
             slice(first, at + wide + 1) for first, at in zip(self.first, (i, j), strict=True)
         )
@@ -258,7 +258,7 @@ class DistanceField:
 
     @cached_property
     def filled(self) -> NDArray[np.float32]:
-        """The same in single precision; cells without a path have what the nearest other has."""
+        """Lengths in single precision; cells without a path have that of the nearest with one."""
         return fill_from_nearest(self.lengths.astype(np.float32))
 
     def at(self, x: float, y: float) -> float:

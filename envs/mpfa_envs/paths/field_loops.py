@@ -1,4 +1,4 @@
-"""Shortest paths over the cells of a grid from one place, up to a longest length."""
+"""Lengths of shortest paths over the cells of a grid from one place, up to a limit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _BUCKETS: Final = 8
-"""More than a move can lead ahead, which is three."""
+"""Number of buckets; a move leads three ahead at most."""
 
 
 @njit
@@ -25,7 +25,7 @@ def path_lengths(
     step: float,  # [m]
     limit: float,  # [m]
 ) -> NDArray[np.float64]:
-    """Lengths of the shortest paths to all cells that are near enough [m], ``[nx, ny]``."""
+    """Lengths of the shortest paths to all cells within the limit [m], ``[nx, ny]``."""
     # They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the
     # shortest move: no cell of a bucket is reached by a shorter path through another one of it, so
     # that they need not be sorted (Dial 1969).

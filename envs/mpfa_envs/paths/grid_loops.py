@@ -1,4 +1,4 @@
-"""Loops over the cells of a grid: clearances, neighbors, and what lies nearest."""
+"""Loops over the cells of a grid: clearances, neighbors, nearest values, interpolation."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _measure_outline(
     outline: NDArray[np.float64],
     inside: NDArray[np.bool_],
 ) -> None:
-    """Write a column's squared distances from a polygon's outline [m²], and what is inside."""
+    """Write a column's squared distances from a polygon's outline [m²] and the points inside."""
     for j in range(len(ys)):
         outline[j] = math.inf
         inside[j] = False
@@ -149,7 +149,7 @@ def clearance_grid(
     for i in range(nx):
         if i > 0:
             # From one column to the next a distance grows by no more than the step between them,
-            # so that what is farther away than this is nearest to no point of the column.
+            # so that shapes farther away than this are nearest to no point of the column.
             reach = max(found[i - 1].max(), 0.0) + 1.001 * (xs[i] - xs[i - 1])
         for j in range(ny):
             nearest[j] = min(half_size[0] - abs(xs[i]), half_size[1] - abs(ys[j]))

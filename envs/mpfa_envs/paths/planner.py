@@ -32,7 +32,7 @@ _TOUCH = 1e-9
 _CORNER_ANGLES = np.radians([15.0, 45.0, 75.0])
 """Three tangents to the quarter circle around a corner meet its polygon at these angles [rad]."""
 _WIDEST_ANGLE = math.pi / 6
-"""Between two corners of the polygon around any other corner [rad]; the same for a right angle."""
+"""Widest angle between two corners of the polygon around any other corner [rad]."""
 _CIRCLE_CORNERS = 16
 """Corners of the polygon around a cylinder."""
 _MOST_CORNERS = 500
@@ -133,7 +133,7 @@ class PathPlanner:
         return not from_start.isdisjoint(groups[self._visible(goal, self._nodes)].tolist())
 
     def _fits(self, *points: Point) -> bool:
-        """Tell whether the disc can be at all of these positions."""
+        """Tell whether the disc fits at all of these positions."""
         return all(self.world.clearance(*at) >= self.radius - _TOUCH for at in points)
 
     @cached_property
@@ -267,7 +267,7 @@ def _polygon(
 
 
 def is_small(world: World) -> bool:
-    """Tell whether paths are planned exactly in a world, and not on a grid."""
+    """Tell whether a world has few enough corners for exact paths."""
     if world.occupancy is not None:
         return False
     corners = 12 * len(world.boxes) + _CIRCLE_CORNERS * len(world.cylinders)

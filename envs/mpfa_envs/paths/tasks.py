@@ -1,4 +1,4 @@
-"""Tasks over the cells of a grid: in milliseconds, however full or large a world is."""
+"""Tasks sampled over the cells of a grid, in milliseconds in any world."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import Box, World
 
 LONGEST_PATH: Final = 20.0
-"""No sampled task in a map has a longer path [m]: a field over the whole map would be too large."""
+"""Longest path of a sampled task in a map [m]: a field over the whole map would be too large."""
 _ROOMY: Final = 0.1
-"""Share of the free cells with the usual clearance that a world must have to be asked for it."""
+"""Least share of free cells with the usual clearance at which starts and goals keep it."""
 _GOALS: Final = 30
-"""Goals that are tried before a world is said to have no task."""
+"""Number of goals tried before a world counts as without a task."""
 _GOALS_IN_MAP: Final = 100
-"""The same in a map, of which a window is looked at each time."""
+"""The same in a map, where each is tried in a window."""
 _DETOURS: Final = 5
-"""Goals that are tried for a detour before a straight path will do."""
+"""Number of goals tried for a detour before a straight path is taken."""
 
 
 def sample_task_on_grid(
@@ -52,13 +52,13 @@ def sample_task_on_grid(
     Args:
         place: A grid, or a world, of which one is made.
         rng: Source of randomness.
-        distance: What the path keeps from obstacles [m]; for a world only.
+        distance: Least clearance of the path [m]; for a world only.
         min_goal_distance: Least distance between start and goal [m].
         max_goal_distance: Longest path between them [m].
         detour_chance: Chance that the task must be a detour, if the world has any: its path is more
             than 1.08 times the straight line and 0.3 m.
-        start_clearance: What the start keeps from obstacles [m]. None: 0.15 m more than the path,
-            or no more than it where fewer than a tenth of the free cells have that.
+        start_clearance: Least clearance of the start [m]. None: 0.15 m more than the path's, or the
+            same where fewer than a tenth of the free cells have that.
         goal_clearance: The same of the goal.
 
     Returns:
@@ -141,7 +141,7 @@ def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
 
 
 def _as_grid(place: FreeGrid | World, distance: float | None) -> FreeGrid:
-    """The grid that is meant."""
+    """The grid itself, or one over the world."""
     if isinstance(place, FreeGrid):
         if distance is not None:
             raise ValueError(f"distance must be None for a grid, which has one, got {distance}")

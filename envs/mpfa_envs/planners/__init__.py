@@ -39,7 +39,7 @@ PLANNERS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """The planners by name, each in a sentence."""
 _COARSE: Final = 0.2
-"""Side of the ants' cells [m]: a walk over twice as many steps tells them little more."""
+"""Side of the ants' cells [m]: finer ones double their steps and improve little."""
 
 
 def make_planner(

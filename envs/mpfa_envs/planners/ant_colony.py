@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.shapes import Point
 
 _MOST_MOVES: Final = 16
-"""Of a cell: straight, diagonal and a knight's."""
+"""Greatest number of moves from a cell: straight, diagonal and a knight's."""
 
 
 class AntColony:
@@ -44,7 +44,7 @@ class AntColony:
         iterations: Number of iterations.
         evaporation: Share ρ of the pheromone that evaporates in an iteration.
         greed: Exponent β of the path ahead.
-        least_pheromone: What a move keeps, of at most one.
+        least_pheromone: Least pheromone of a move; the most is one.
         seed: Seed of the ants' choices; the same path is found each time.
         time_limit: No iteration begins later than this [s]. It is a guard: a search that it ends
             depends on the speed of the machine.
@@ -116,7 +116,7 @@ class AntColony:
         last: int,
         rng: np.random.Generator,
     ) -> list[list[int]]:
-        """Let the ants walk; the paths of those that arrive, without what they took back."""
+        """Let the ants walk; paths of those that arrive, without the moves that they took back."""
         count, ants = len(neighbors), self.ants
         # One more cell, where no ant may go, stands for the neighbors that a cell lacks.
         visited = np.zeros((ants, count + 1), dtype=np.bool_)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _STEP: Final = 0.1
 """Distance between the places on an arc that are tested [m]."""
 _ALONG: Final = 1.0
-"""Greatest distance for which a path is followed [m]: its direction is known for little more."""
+"""Longest part of a path that is followed [m]: its direction holds for little more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +31,11 @@ class WindowScore:
     heading: float = 1.0
     """Weight of driving towards the goal, or along the path on the robot's map."""
     clearance: float = 0.15
-    """Weight of the distance from what the lidar meets."""
+    """Weight of the distance from lidar hits."""
     speed: float = 0.1
     """Weight of the forward speed."""
     roomy: float = 0.4
-    """A clearance of the rim of this or more is as good as any [m]."""
+    """Clearances of the rim above this score alike [m]."""
     least: float = 0.03
     """An arc with less clearance of the rim collides [m]."""
 

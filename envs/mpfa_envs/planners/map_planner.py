@@ -20,24 +20,24 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 _LEAST_CLEARANCE: Final = 0.02
-"""Clearance of a path where there is none with the wanted one [m]."""
+"""Clearance tried where no path has the wanted one [m]."""
 _FINE: Final = 0.05
-"""Side of a cell of the grid that is made then [m]."""
+"""Side of a cell of the grid for it [m]."""
 
 
 class MapPlanner:
     """Plans on the known map and follows the path, a :class:`~mpfa_envs.evaluation.runs.Driver`.
 
-    It knows all obstacles of the world and where the robot is, neither of which is in the
-    observation: what it reaches is a ceiling for those that have the lidar alone.
+    It knows all obstacles and the robot's pose, neither of which is in the observation: its results
+    are a ceiling for policies that have the lidar alone.
 
     Where no path keeps the clearance it takes one that keeps less, on finer cells, and where there
     is none at all it drives at the goal.
 
     Args:
         search: Finds a path.
-        robot: What drives.
-        clearance: What a path keeps of the robot's rim from obstacles [m].
+        robot: The robot.
+        clearance: Least clearance of the robot's rim on a path [m].
         resolution: Side of a cell of the grid [m].
         look_ahead: Of the :class:`~mpfa_envs.planners.PurePursuit` [m].
 
@@ -104,7 +104,7 @@ class MapPlanner:
         return [start, goal], grid
 
     def _grid_of(self, world: World, distance: float, resolution: float) -> FreeGrid:
-        """The grid of a world; kept for the next task, as several follow in the same world."""
+        """The grid of a world, kept as the next task is often in the same world."""
         kept = self._grids.get((distance, resolution))
         if kept is None or kept.world is not world:
             kept = FreeGrid(world, distance=distance, resolution=resolution)

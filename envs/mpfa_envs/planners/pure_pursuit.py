@@ -1,4 +1,4 @@
-"""A follower of paths: it drives at a point ahead on the path, on the arc that leads there."""
+"""Following a path: driving at a point ahead on it, on the arc that leads there."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.shapes import Point
 
 _SPACING: Final = 0.05
-"""Distance of the points that a path is made of [m]."""
+"""Distance between the points of a path [m]."""
 _WINDOW: Final = 2.0
 """Length of the path ahead that is searched for the robot's place [m]."""
 _BESIDE: Final = math.radians(60.0)
-"""A point farther to the side than this is turned to on the tightest circle [rad]."""
+"""To a point farther to the side the robot turns on its tightest circle [rad]."""
 _BEHIND: Final = math.radians(120.0)
 """A point farther to the side than this is behind the robot [rad]."""
 _RIM: Final = 0.03

@@ -1,4 +1,4 @@
-"""The reward of the task, Eq. (25) of the paper, and the seam for another one.
+"""The reward of the task, Eq. (25) of the paper, or a function in its place.
 
 The equation is from https://doi.org/10.3389/fnbot.2023.1281166.
 """
@@ -22,12 +22,12 @@ far away, and a critic that is a little too smooth would rather circle than arri
 
 
 class StepOutcome(NamedTuple):
-    """Results of one step, which a reward depends on."""
+    """Results of one step, the argument of a reward function."""
 
     previous_distance: float
     """Distance to the goal before the step, straight or as ``progress`` measures it [m]."""
     distance: float
-    """The same after the step [m]."""
+    """Distance after the step [m]."""
     success: bool
     """The goal was reached in this step."""
     collision: bool
@@ -47,7 +47,7 @@ class RewardTerms(NamedTuple):
     collision: float = 0.0
     progress: float = 0.0
     other: float = 0.0
-    """Your own reward beside the paper's three terms."""
+    """A term of your own beside the paper's three."""
 
     @property
     def total(self) -> float:
@@ -116,7 +116,7 @@ def resolve_reward(
 
 
 def read_terms(terms: Any) -> RewardTerms:
-    """Read what a reward function gave."""
+    """Check the terms that a reward function returned."""
     try:
         goal, collision, progress, other = terms
         # It takes no text, which float would read as a number.
@@ -129,7 +129,7 @@ def read_terms(terms: Any) -> RewardTerms:
 
 
 def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
-    """Read what Eq. (25) pays."""
+    """Rewards of Eq. (25) for goal, collision and a meter; None for another function."""
     function = reward.func if isinstance(reward, partial) else reward
     if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
         return None

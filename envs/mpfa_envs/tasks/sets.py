@@ -1,4 +1,4 @@
-"""The tasks that policies are compared on: of a world, of a generator's worlds, of a benchmark."""
+"""Sets of tasks that policies are compared on: of a world, a generator or a benchmark."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mpfa_envs.robots.model import RobotModel
 
 TASKS_PER_WORLD: Final = 4
-"""In each world of a generator."""
+"""Number of tasks in each world of a generator."""
 _STANDARD_TIME_STEP: Final = 0.1
 """Unit of time limits [s]."""
 GENERATED_MAX_STEPS: Final = 1500
@@ -30,14 +30,14 @@ _OF_A_GENERATOR: Final = 400
 
 
 class WorldTask(NamedTuple):
-    """One episode to drive, and where."""
+    """One episode to drive and its world."""
 
     world: World
     task: Task
     max_steps: int | None = None
     """Time limit in steps of 0.1 s, whatever the environment's; None: that of the environment."""
     seed: int | None = None
-    """Of walkers and noise; None: the number of the task among those that are driven."""
+    """Seed of walkers and noise; None: the number of the task among those that are driven."""
 
     def limit(self, env_arguments: Mapping[str, Any]) -> dict[str, int]:
         """The time limit as an argument of an environment; nothing where that has its own.
@@ -63,7 +63,7 @@ def world_tasks(
     seed: int = 0,
     robot: str | RobotModel = "turtlebot2",
 ) -> list[WorldTask]:
-    """Make the tasks that a name stands for, the same for everyone.
+    """Make the tasks of a name, the same for everyone.
 
     Args:
         name: A world, as in :class:`~mpfa_envs.NavigationEnv`, with tasks of

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_CELLS: Final = 16_000_000
-"""No map has more cells, which is 4,000 x 4,000."""
+"""Most cells of a map, 4,000 x 4,000."""
 LONGEST_SIDE: Final = 30_000
-"""Nor more columns or rows: places in them are numbers of 16 bits."""
+"""Most columns or rows: their numbers have 16 bits."""
 _FARTHEST: Final = 255
-"""Distances between cells are told up to this [cells]."""
+"""Greatest distance to an occupied cell in the tables [cells]."""
 
 
 class CellArrays(NamedTuple):
@@ -44,11 +44,11 @@ class OccupancyGrid:
     Two grids are equal if all their numbers are.
 
     Args:
-        occupied: Which cells are occupied, shape ``[columns, rows]``, the first column at the left
+        occupied: True for an occupied cell, shape ``[columns, rows]``, the first column at the left
             and the first row at the bottom.
         resolution: Side of a cell [m].
-        origin: Where the lower left corner is in the frame of the map (x, y) [m]. The world's own
-            frame begins in the middle of the room.
+        origin: Position of the lower left corner on the map (x, y) [m]; the origin of the world is
+            the middle of the room.
 
     Raises:
         ValueError: If there is no cell or there are too many, or a number is out of its range.
@@ -130,7 +130,7 @@ class OccupancyGrid:
 
     @cached_property
     def digest(self) -> bytes:
-        """A number of 256 bits that no other grid has."""
+        """Hash of the grid, 256 bits."""
         numbers = repr((self.occupied.shape, self.resolution, self.origin)).encode()
         return hashlib.sha256(numbers + np.packbits(self.occupied).tobytes()).digest()
 
@@ -156,17 +156,7 @@ class OccupancyGrid:
 
     @staticmethod
     def from_plain(values: dict[str, Any]) -> OccupancyGrid:
-        """Make a grid of what :attr:`plain` gave.
-
-        Args:
-            values: Its fields by name.
-
-        Returns:
-            The grid, the same object for equal values while it is among the last few.
-
-        Raises:
-            ValueError: If they are not those of a grid.
-        """
+        """Make a grid from :attr:`plain`, the same object for the same recent values."""
         try:
             columns, rows = (int(side) for side in values["shape"])
             x, y = values["origin"]

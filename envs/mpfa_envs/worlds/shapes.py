@@ -13,9 +13,9 @@ Point = tuple[float, float]
 """A position (x, y) [m]."""
 
 LARGEST_SIDE: Final = 1000.0
-"""No room is wider or deeper than this [m]."""
+"""Greatest width and depth of a room [m]."""
 MOST_VERTICES: Final = 100
-"""No polygon has more vertices: each pair of its edges is looked at."""
+"""Most vertices of a polygon, whose edges are compared in pairs."""
 
 
 class Bounds(NamedTuple):
@@ -139,7 +139,7 @@ class Polygon:
 
     @property
     def edges(self) -> list[tuple[float, float, float, float]]:
-        """Edges (x0, y0, x1, y1) [m], counter-clockwise: what is left of each is inside."""
+        """Edges (x0, y0, x1, y1) [m], counter-clockwise: the inside is left of each."""
         following = (*self.vertices[1:], self.vertices[0])
         return [(*one, *other) for one, other in zip(self.vertices, following, strict=True)]
 
@@ -165,12 +165,12 @@ class Polygon:
 
     @property
     def is_convex(self) -> bool:
-        """Whether the footprint has no dents."""
+        """True if the footprint has no dents."""
         return _is_convex(self.vertices)
 
 
 Shape = Box | Cylinder | Polygon
-"""Anything that can stand in a world."""
+"""Any obstacle but a map."""
 
 
 def _signed_area(vertices: tuple[Point, ...]) -> float:
