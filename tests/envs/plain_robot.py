@@ -8,6 +8,7 @@ import numpy as np
 
 from mpfa_envs import Lidar, Polygon, Task, World
 from mpfa_envs.env.config import TaskConfig
+from tests.envs.shapes import distance
 
 
 class PlainRobot:
@@ -19,7 +20,7 @@ class PlainRobot:
         x, y, heading = task.start
         self.motion = x, y, math.remainder(heading, math.tau), 0.0, 0.0
         self.steps, self.path_length, self.over = 0, 0.0, False
-        self.min_clearance = world.clearance(x, y) - config.robot.radius
+        self.min_clearance = distance(x, y, world) - config.robot.radius
 
     @property
     def distance(self) -> float:
@@ -40,7 +41,7 @@ class PlainRobot:
         self.motion = drive_arc(before, left, right, self.config)
         self.steps += 1
         self.path_length += math.dist(before[:2], self.motion[:2])
-        clearance = self.world.clearance(*self.motion[:2])
+        clearance = distance(*self.motion[:2], self.world)
         self.min_clearance = min(self.min_clearance, clearance - self.config.robot.radius)
         self.success = self.distance <= self.config.goal_radius
         self.collision = not self.success and clearance <= self.config.collision_distance

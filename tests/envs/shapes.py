@@ -1,4 +1,4 @@
-"""Worlds of random shapes, however they lie."""
+"""Worlds of random shapes, however they lie, and distances in them by plain geometry."""
 
 from __future__ import annotations
 
@@ -46,3 +46,35 @@ def _polygon(rng: np.random.Generator) -> Polygon:
             (x + r * math.cos(a), y + r * math.sin(a)) for r, a in zip(radii, angles, strict=True)
         )
     )
+
+
+def inside(x: float, y: float, polygon: Polygon) -> bool:
+    """Tell by the sum of angles whether an outline winds around a point."""
+    angles = [math.atan2(b - y, a - x) for a, b in polygon.vertices]
+    turns = [
+        math.remainder(b - a, math.tau)
+        for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
+    ]
+    return abs(sum(turns)) > 1.0
+
+
+def to_segment(x: float, y: float, edge: tuple[float, float, float, float]) -> float:
+    x0, y0, x1, y1 = edge
+    length = math.dist((x0, y0), (x1, y1))
+    along = ((x - x0) * (x1 - x0) + (y - y0) * (y1 - y0)) / length
+    foot = min(max(along, 0.0), length) / length
+    return math.dist((x, y), (x0 + foot * (x1 - x0), y0 + foot * (y1 - y0)))
+
+
+def distance(x: float, y: float, world: World) -> float:
+    """Signed distance to the nearest obstacle or wall, one edge after the other; 0 in a box."""
+    found = [world.size[0] / 2 - abs(x), world.size[1] / 2 - abs(y)]
+    for box in world.boxes:
+        across, up = max(box.x_min - x, x - box.x_max), max(box.y_min - y, y - box.y_max)
+        found.append(math.hypot(max(across, 0.0), max(up, 0.0)))
+    for cylinder in world.cylinders:
+        found.append(math.dist((x, y), (cylinder.x, cylinder.y)) - cylinder.radius)
+    for polygon in world.polygons:
+        gap = min(to_segment(x, y, edge) for edge in polygon.edges)
+        found.append(-gap if inside(x, y, polygon) else gap)
+    return min(found)

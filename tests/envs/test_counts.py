@@ -1,4 +1,4 @@
-"""Counts that would take all time or memory are refused, wherever they are given."""
+"""Counts that would take all time or memory are rejected, wherever they are given."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def of_a_policy(**env_arguments: object) -> Callable[[], object]:
         ("max_steps", of_a_policy(max_steps=MANY)),
     ],
 )
-def test_a_count_without_measure_is_refused_at_once(name: str, call: Callable[[], object]) -> None:
+def test_a_count_beyond_bounds_is_rejected_at_once(name: str, call: Callable[[], object]) -> None:
     with pytest.raises(ValueError, match=rf"^{name} must be at most 1000*, got [0-9]+$"):
         call()
 
@@ -81,7 +81,7 @@ def test_a_seed_may_be_as_large_as_any() -> None:
         (lambda: NavigationEnv(physics="kinematic", memory="x"), "memory must be one of .*got 'x'"),
     ],
 )
-def test_what_an_observation_has_not_is_refused_by_all_who_read_it(
+def test_parts_that_observations_lack_are_rejected_by_their_readers(
     call: Callable[[], object], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -137,23 +139,6 @@ def test_a_goal_off_the_free_cells_is_reached_from_the_nearest() -> None:
     field = DistanceField(FreeGrid(WORLDS["B"], distance=0.25), (0.0, 3.75))
     i, j = field.grid.index(0.0, 3.2)
     assert field.lengths[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
-    closet = World(name="closet", size=(0.3, 0.3))
-    with pytest.raises(ValueError, match="grid must have a free cell, and 'closet' has none"):
-        DistanceField(FreeGrid(closet, distance=0.2), (0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"distance": 0.0}, "distance must be positive"),
-        ({"distance": 0.25, "resolution": -0.1}, "resolution must be positive"),
-        ({"distance": 0.05, "resolution": 0.1}, "at most the distance, 0.05 m, got 0.1"),
-        ({"distance": 0.25, "resolution": 0.001}, "at most 4000000 cells"),
-    ],
-)
-def test_an_impossible_grid_is_rejected(arguments: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        FreeGrid(WORLDS["A"], **arguments)
 
 
 def test_tasks_keep_what_they_are_asked_for() -> None:
@@ -209,23 +194,40 @@ def test_the_same_generator_gives_the_same_task() -> None:
     assert tasks[0] == tasks[1]
 
 
+CLOSET = World(name="closet", size=(0.3, 0.3))
+GRID = partial(FreeGrid, WORLDS["A"])
+SAMPLE = partial(sample_task_on_grid, rng=np.random.default_rng(0))
+IN_A = partial(SAMPLE, WORLDS["A"], distance=0.3)
+
+
 @pytest.mark.parametrize(
-    ("place", "arguments", "message"),
+    ("call", "message"),
     [
-        (WORLDS["A"], {}, "distance must be given for a world, got None"),
-        (FreeGrid(WORLDS["A"], distance=0.3), {"distance": 0.2}, "distance must be None for a"),
-        (WORLDS["A"], {"distance": 0.3, "min_goal_distance": 0}, "min_goal_distance must be pos"),
-        (WORLDS["A"], {"distance": 0.3, "max_goal_distance": 1.0}, "max_goal_distance must be a"),
-        (WORLDS["A"], {"distance": 0.3, "detour_chance": 2}, r"detour_chance must be in \[0, 1\]"),
-        (WORLDS["A"], {"distance": 0.3, "min_goal_distance": 30}, "'A' has no start and goal"),
-        (World(name="closet", size=(0.5, 0.5)), {"distance": 0.3}, "'closet' has no start and"),
+        (partial(GRID, distance=0.0), "distance must be positive"),
+        (partial(GRID, distance=0.25, resolution=-0.1), "resolution must be positive"),
+        (partial(GRID, distance=0.05, resolution=0.1), "at most the distance, 0.05 m, got 0.1"),
+        (partial(GRID, distance=0.25, resolution=0.001), "at most 4000000 cells"),
+        (
+            lambda: DistanceField(FreeGrid(CLOSET, distance=0.2), (0.0, 0.0)),
+            "grid must have a free cell, and 'closet' has none",
+        ),
+        (partial(SAMPLE, WORLDS["A"]), "distance must be given for a world, got None"),
+        (
+            lambda: SAMPLE(FreeGrid(WORLDS["A"], distance=0.3), distance=0.2),
+            "distance must be None for a",
+        ),
+        (partial(IN_A, min_goal_distance=0), "min_goal_distance must be pos"),
+        (partial(IN_A, max_goal_distance=1.0), "max_goal_distance must be a"),
+        (partial(IN_A, detour_chance=2), r"detour_chance must be in \[0, 1\]"),
+        (partial(IN_A, min_goal_distance=30), "'A' has no start and goal"),
+        (partial(SAMPLE, CLOSET, distance=0.3), "'closet' has no start and"),
     ],
 )
-def test_an_impossible_task_is_rejected(
-    place: World | FreeGrid, arguments: dict[str, float], message: str
+def test_an_impossible_grid_field_or_task_is_rejected(
+    call: Callable[[], object], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        sample_task_on_grid(place, np.random.default_rng(0), **arguments)
+        call()
 
 
 def test_a_world_has_a_task_or_none() -> None:

@@ -1,4 +1,4 @@
-"""Worlds of Gazebo: what is read of them, what is left out, and what is refused."""
+"""Worlds of Gazebo: what is read, what is left out, and what is rejected."""
 
 import gzip
 import math
@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from mpfa_envs import Box, NavigationEnv, WorldFileError
+from mpfa_envs import NavigationEnv, WorldFileError
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.worlds.barn import barn_task, barn_world
 from mpfa_envs.worlds.gazebo import load_gazebo_world
@@ -198,10 +198,3 @@ def test_other_files_and_too_small_rooms_are_rejected(tmp_path):
         load_gazebo_world(
             write(tmp_path, model(CYLINDER, "9 0 0 0 0 0")), size=(4, 4), center=(0, 0)
         )
-
-
-def test_boxes_are_read_with_their_edges(tmp_path):
-    world = load_gazebo_world(
-        write(tmp_path, model("<box><size>2 1 1</size></box>", "1 2 0 0 0 0"))
-    )
-    assert world.boxes[0].bounds == pytest.approx(Box(-1.0, -0.5, 1.0, 0.5).bounds)

@@ -18,7 +18,7 @@ from mpfa_envs.robots.drives import KinematicDrives
 from mpfa_envs.worlds.batch import WorldBatch
 from mpfa_envs.worlds.clearance_loops import clearance_at
 from tests.envs.plain_robot import drive_arc, scan
-from tests.envs.shapes import random_shapes
+from tests.envs.shapes import distance, random_shapes
 
 MIXES = [
     {},
@@ -82,14 +82,16 @@ def test_any_number_of_rays_sees_boxes_all_around(
 
 
 @pytest.mark.parametrize("mix", MIXES, ids=str)
-def test_the_clearance_is_that_of_the_world(mix: dict[str, int]) -> None:
+def test_clearances_are_those_of_plain_geometry(mix: dict[str, int]) -> None:
     rng = np.random.default_rng(2)
     worlds = [random_shapes(rng, **mix) for _ in range(200)]
     points = somewhere(rng, 200)[:, :2]
     arrays = WorldBatch(worlds).arrays
     measured = [clearance_at(arrays, i, *points[i]) for i in range(200)]
-    expected = [world.clearance(*point) for world, point in zip(worlds, points, strict=True)]
+    expected = [distance(*point, world) for world, point in zip(worlds, points, strict=True)]
     np.testing.assert_allclose(measured, expected, atol=1e-12)
+    one = [world.clearance(*point) for world, point in zip(worlds, points, strict=True)]
+    assert one == measured
 
 
 def test_arcs_are_those_of_plain_geometry() -> None:
@@ -127,11 +129,11 @@ def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
     code = (
         "import numba\n"
         "real = numba.njit\n"
-        "def refuse(*args, cache=False, **kwargs):\n"
+        "def reject(*args, cache=False, **kwargs):\n"
         "    if cache:\n"
         "        raise RuntimeError('cannot cache function: no locator available')\n"
         "    return real(*args, **kwargs)\n"
-        "numba.njit = refuse\n"
+        "numba.njit = reject\n"
         "from mpfa_envs.compiled import njit\n"
         "print(njit(lambda x: 2.0 * x)(3.0))\n"
     )

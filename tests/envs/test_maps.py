@@ -370,7 +370,7 @@ def test_wheels_drive_in_a_map_as_among_boxes(scattered):
         env.close()
 
 
-def test_a_map_is_drawn(scattered):
+def test_a_map_is_rendered(scattered):
     env = NavigationEnv(world=scattered[0], physics="kinematic", render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()

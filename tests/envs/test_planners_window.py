@@ -193,31 +193,6 @@ def test_a_map_leads_it_out_of_a_pocket() -> None:
     assert success == {"none": False, "map": True}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"samples": 1}, "samples must be an integer of at least 2, got 1"),
-        ({"length": 0.0}, r"length must be positive, got 0\.0"),
-        ({"acceleration": -1.0}, r"acceleration must be positive, got -1\.0"),
-    ],
-)
-def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DynamicWindow(**arguments)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("seen", "message"),
-    [
-        (np.zeros(27, np.float32), r"shape \[..., 24\], got \(27,\)"),
-        (np.full(24, np.nan, np.float32), "observation must be finite"),
-    ],
-)
-def test_bad_observations_are_rejected(seen: np.ndarray, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DynamicWindow()(seen)
-
-
 def test_few_speeds_of_slow_wheels_include_the_nearest() -> None:
     # The speeds of a wheel are 0.05, 0.2, 0.35 and 0.5 m/s, and none is within 0.02 m/s of it.
     window = DynamicWindow(samples=4, acceleration=0.1)

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.speed.convex import convex_parts
 from mpfa_envs import Box, Cylinder, Lidar, Polygon, World
+from tests.envs.shapes import distance, inside
 
 DENTED = Polygon(((-2.0, -1.0), (1.5, -1.5), (0.5, 0.0), (2.0, 1.0), (-1.0, 2.0), (-0.5, 0.5)))
 TRIANGLE = Polygon(((2.0, 2.0), (4.0, 2.5), (3.0, 4.0)))
@@ -15,33 +16,6 @@ OVERLAPPING = Polygon(((0.0, -3.0), (1.0, -3.0), (1.0, 0.5), (0.0, 0.5)))
 
 def polygon_world(*polygons: Polygon) -> World:
     return World(name="polygons", polygons=polygons)
-
-
-def inside(x: float, y: float, polygon: Polygon) -> bool:
-    """Whether the outline winds around a point: the sum of the angles at which it is seen."""
-    angles = [math.atan2(b - y, a - x) for a, b in polygon.vertices]
-    turns = [
-        math.remainder(b - a, math.tau)
-        for a, b in zip(angles, angles[1:] + angles[:1], strict=True)
-    ]
-    return abs(sum(turns)) > 1.0
-
-
-def to_segment(x: float, y: float, edge: tuple[float, float, float, float]) -> float:
-    x0, y0, x1, y1 = edge
-    length = math.dist((x0, y0), (x1, y1))
-    along = ((x - x0) * (x1 - x0) + (y - y0) * (y1 - y0)) / length
-    foot = min(max(along, 0.0), length) / length
-    return math.dist((x, y), (x0 + foot * (x1 - x0), y0 + foot * (y1 - y0)))
-
-
-def distance(x: float, y: float, world: World) -> float:
-    """Signed distance to the nearest polygon or wall, one edge after the other."""
-    found = [world.size[0] / 2 - abs(x), world.size[1] / 2 - abs(y)]
-    for polygon in world.polygons:
-        gap = min(to_segment(x, y, edge) for edge in polygon.edges)
-        found.append(-gap if inside(x, y, polygon) else gap)
-    return min(found)
 
 
 def test_vertices_are_kept_counter_clockwise() -> None:
@@ -55,33 +29,6 @@ def test_vertices_are_kept_counter_clockwise() -> None:
 def test_only_a_polygon_without_dents_is_convex() -> None:
     assert TRIANGLE.is_convex and not DENTED.is_convex
     assert Polygon(((0, 0), (1, 0), (2, 1), (1, 2), (0, 1))).is_convex
-
-
-@pytest.mark.parametrize(
-    ("vertices", "message"),
-    [
-        (((0, 0), (1, 1)), "3 to 100 vertices, got 2"),
-        (tuple((math.cos(i), math.sin(i)) for i in range(101)), "3 to 100 vertices, got 101"),
-        (((0, 0), (1, 1), (1, math.inf)), "two finite numbers a vertex"),
-        (((0, 0), (1, 1), (1,)), "two finite numbers a vertex"),
-        (((0, 0), (1, 1), (2, 2)), "must have an area"),
-        (((0, 0), (1, 1), (1, 0), (0, 1)), "does not cross"),
-        (((0, 0), (2, 0), (2, 2), (1, 2), (1, -1), (0, 1)), "does not cross"),
-        (((0, 0), (2, 0), (2, 2), (1, 0), (0, 2)), "does not cross or touch itself"),
-        (((0, 0), (2, 0), (2, 0), (0, 2)), "does not cross or touch itself"),
-        (((0, 0), (2, 0), (1, 0), (1, 2)), "does not cross or touch itself"),
-        # A pentagram turns left at each of its points, twice around.
-        (tuple((math.cos(i * 2.513), math.sin(i * 2.513)) for i in range(5)), "does not cross"),
-    ],
-)
-def test_a_shape_that_is_no_polygon_is_rejected(vertices: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Polygon(vertices)
-
-
-def test_a_polygon_outside_of_the_room_is_rejected() -> None:
-    with pytest.raises(ValueError, match="polygons must lie in the room"):
-        polygon_world(Polygon(((4.0, 0.0), (5.1, 0.0), (4.0, 1.0))))
 
 
 def test_clearances_of_polygons_are_those_of_their_edges() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +17,14 @@ from mpfa_envs.render import (
     RIVAL,
     TRAIL,
     WALL,
+    Panel,
+    plot_histograms,
+    plot_seeds,
     render_methods,
+    render_samples,
+    render_traces,
     render_trajectories,
+    render_values,
     shown_episodes,
     tiled,
     viridis,
@@ -97,21 +105,76 @@ def test_a_narrow_world_has_its_whole_legend_below_it() -> None:
     assert left > 100
 
 
+BLACK = np.zeros((40, 40, 3), np.uint8)
+FIELD = partial(render_values, "A", goal=(3.0, 3.0), spacing=2.0)
+PLACES = np.zeros((2, 2))
+EDGES = np.geomspace(1e-2, 1e2, 5)
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("call", "message"),
     [
-        (([], [(0, 0)], []), "must have one entry per episode, got 0, 1 and 0"),
-        (([[(0, 0)]], [(0, 0)], ["lost"]), "outcomes must be among .*got 'lost'"),
+        (
+            partial(render_trajectories, "A", [], [(0, 0)], []),
+            "must have one entry per episode, got 0, 1 and 0",
+        ),
+        (
+            partial(render_trajectories, "A", [[(0, 0)]], [(0, 0)], ["lost"]),
+            "outcomes must be among .*got 'lost'",
+        ),
+        (
+            partial(render_trajectories, "A", [], [], [], size=3),
+            "size must be an integer of at least 32, got 3",
+        ),
+        (partial(render_trajectories, "A", [], [], [], most=0), "most must be .*got 0"),
+        (
+            partial(render_methods, "A", {"one": [[]]}, [(1, 1)], {"two": ["success"]}),
+            r"same methods, got .'one'. and .'two'.",
+        ),
+        (partial(tiled, []), "pictures must not be empty"),
+        (partial(write_animation, [], "b.gif"), "frames must not be empty"),
+        (
+            partial(write_animation, [BLACK], "b.gif", palette_size=300),
+            "palette_size must be at most 256, got 300",
+        ),
+        (partial(FIELD, values=lambda _: np.zeros(3)), "values must give a finite number for each"),
+        (
+            partial(FIELD, values=lambda seen: np.full(len(seen), np.nan)),
+            "values must give a finite number",
+        ),
+        (partial(FIELD, actions=lambda _: np.zeros((2, 2))), "actions must have shape"),
+        (partial(FIELD, values=len, spacing=0.0), "spacing must be"),
+        (partial(FIELD, values=len, heading="north"), "heading must be"),
+        (partial(render_samples, "A", np.zeros((0, 2)), [], []), "positions must have shape"),
+        (partial(render_samples, "A", PLACES, [1.0], [1, 1]), "priorities must have shape"),
+        (partial(render_samples, "A", PLACES, [1.0, np.nan], [1, 1]), "priorities must be finite"),
+        (partial(render_samples, "A", PLACES, [1.0, 1.0], [2]), "sampled must be numbers below 2"),
+        (partial(render_samples, "A", PLACES, [1.0, 1.0], [0.5]), "sampled must be 2 counts or"),
+        (
+            partial(render_traces, [Panel("Q", {"": []})], 0, step_time=0.2),
+            "equally long and not empty",
+        ),
+        (partial(plot_seeds, {}, "b.png"), "runs must hold a curve"),
+        (partial(plot_seeds, {"one": [([0, 1], [0.0])]}, "b.png"), "must be equally many"),
+        (partial(plot_seeds, {"one": [([0, 0], [0.0, 1.0])]}, "b.png"), "steps of a run must rise"),
+        (
+            partial(plot_seeds, {"one": [([0], [0.0])]}, "b.png", band="range"),
+            "band must be 'interval' or 'runs', got 'range'",
+        ),
+        (
+            partial(plot_histograms, {"priority": ([0, 1], EDGES, np.zeros((20, 4)))}, "b.png"),
+            r"counts of 'priority' must have shape \(2, 4\)",
+        ),
+        (partial(plot_histograms, {}, "b.png"), "histories must not be empty"),
     ],
 )
-def test_bad_lists_are_rejected(arguments: tuple[list, ...], message: str) -> None:
+def test_bad_arguments_of_a_picture_are_rejected(
+    call: Callable[[], object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
-        render_trajectories(WORLDS["A"], *arguments)
-
-
-def test_a_bad_size_is_rejected() -> None:
-    with pytest.raises(ValueError, match="size must be an integer of at least 32, got 3"):
-        render_trajectories("A", [], [], [], size=3)
+        call()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_shows_boxes_cylinders_and_polygons() -> None:
@@ -140,9 +203,9 @@ def test_a_goal_is_surrounded_by_the_disc_that_reaches_it() -> None:
 
 
 def test_a_failure_ends_in_a_cross_or_hollow_square() -> None:
-    ways = [[(-4, 0), (0, 0)]] * 2
+    paths = [[(-4, 0), (0, 0)]] * 2
     crossed, squared = (
-        render_trajectories("A", ways[:1], [(4.0, 4.0)], [outcome])
+        render_trajectories("A", paths[:1], [(4.0, 4.0)], [outcome])
         for outcome in ("collision", "timeout")
     )
     color = OUTCOMES["collision"][:3]
@@ -153,10 +216,10 @@ def test_a_failure_ends_in_a_cross_or_hollow_square() -> None:
 
 
 def test_of_many_episodes_twenty_are_shown_and_all_are_counted() -> None:
-    ways = [np.array([(-4.9 + 0.2 * n, -3.0), (-4.9 + 0.2 * n, 3.0)]) for n in range(48)]
+    paths = [np.array([(-4.9 + 0.2 * n, -3.0), (-4.9 + 0.2 * n, 3.0)]) for n in range(48)]
     goals = [(-4.9 + 0.2 * n, 4.0) for n in range(48)]
     few, all_of_them = (
-        render_trajectories("A", ways, goals, ["success"] * 48, most=most, goal_radius=0.01)
+        render_trajectories("A", paths, goals, ["success"] * 48, most=most, goal_radius=0.01)
         for most in (20, 48)
     )
     blue = np.array(OUTCOMES["success"][:3])
@@ -168,8 +231,6 @@ def test_of_many_episodes_twenty_are_shown_and_all_are_counted() -> None:
 
     assert lines(few) == 20
     assert lines(all_of_them) == 48
-    with pytest.raises(ValueError, match=r"most must be .*got 0"):
-        render_trajectories("A", ways, goals, ["success"] * 48, most=0)
 
 
 def test_up_to_half_of_the_shown_episodes_are_failures() -> None:
@@ -184,10 +245,10 @@ def test_up_to_half_of_the_shown_episodes_are_failures() -> None:
 
 
 def test_methods_stand_side_by_side_with_the_same_episodes() -> None:
-    way, goals = [[(-4.0, 0.0), (4.0, 0.0)]], [(4.0, 0.0)]
+    path, goals = [[(-4.0, 0.0), (4.0, 0.0)]], [(4.0, 0.0)]
     picture = render_methods(
         "A",
-        {"one": way, "two": way},
+        {"one": path, "two": path},
         goals,
         {"one": ["success"], "two": ["collision"]},
         columns=2,
@@ -197,8 +258,6 @@ def test_methods_stand_side_by_side_with_the_same_episodes() -> None:
     left, right = pixel(picture, 0.0, 0.0), pixel(picture[:, 488:], 0.0, 0.0)
     np.testing.assert_allclose(left, OUTCOMES["success"][:3], atol=90)
     np.testing.assert_allclose(right, OUTCOMES["collision"][:3], atol=90)
-    with pytest.raises(ValueError, match=r"same methods, got .'one'. and .'two'."):
-        render_methods("A", {"one": way}, goals, {"two": ["success"]})
 
 
 def test_pictures_are_put_row_by_row_with_white_between_them() -> None:
@@ -207,8 +266,6 @@ def test_pictures_are_put_row_by_row_with_white_between_them() -> None:
     assert whole.shape == (24, 44, 3)
     assert whole[5, 5, 0] == 0 and whole[5, 30, 0] == 20 and whole[20, 5, 0] == 40
     assert whole[5, 22, 0] == whole[12, 5, 0] == whole[20, 30, 0] == 255
-    with pytest.raises(ValueError, match="pictures must not be empty"):
-        tiled([])
 
 
 def test_a_small_goal_keeps_its_color_in_an_animation(tmp_path: Path) -> None:
@@ -238,11 +295,6 @@ def test_an_animation_is_thinned_and_keeps_its_last_frame(tmp_path: Path) -> Non
         animation.seek(10)
         shown = np.asarray(animation.convert("RGB")).astype(int)
         assert abs(shown - frames[-1]).max() <= 12
-    with pytest.raises(ValueError, match="frames must not be empty"):
-        write_animation([], tmp_path / "b.gif")
-    with pytest.raises(ValueError, match="palette_size must be at most 256, got 300"):
-        write_animation(frames, tmp_path / "b.gif", palette_size=300)
-    assert not (tmp_path / "b.gif").exists()
 
 
 def test_a_second_robot_has_another_color() -> None:

@@ -1,4 +1,4 @@
-"""Walkers in files and as arguments: what comes back equal, and what is refused."""
+"""Walkers in files and as arguments: what comes back equal, and what is rejected."""
 
 from __future__ import annotations
 

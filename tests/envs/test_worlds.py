@@ -12,6 +12,7 @@ import pytest
 from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, Walker, World
 from mpfa_envs.paths.planner import planner_for
 from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
+from tests.envs.shapes import distance
 
 
 def test_clearance_is_the_distance_to_the_nearest_face() -> None:
@@ -24,6 +25,11 @@ def test_clearance_is_the_distance_to_the_nearest_face() -> None:
     assert world.clearance(4.9, -3.0) == pytest.approx(0.1)
     assert world.clearance(1.5, 1.5) == 0.0
     assert world.clearance(6.0, 0.0) == pytest.approx(-1.0)
+
+
+def around(count: int, turn: float = 1.0) -> tuple[tuple[float, float], ...]:
+    """Corners on a circle, each turned from the one before [rad]."""
+    return tuple((math.cos(i * turn), math.sin(i * turn)) for i in range(count))
 
 
 @pytest.mark.parametrize(
@@ -41,6 +47,25 @@ def test_clearance_is_the_distance_to_the_nearest_face() -> None:
         (lambda: Cylinder(None, 0, 1), "cylinder must have finite numbers, got .*None"),
         (lambda: Polygon(3), "polygon must have a list of vertices, got 3"),
         (lambda: Polygon(("ab", "cd", "ef")), "polygon must have two finite numbers .*'ab'"),
+        (lambda: Polygon(((0, 0), (1, 1))), "3 to 100 vertices, got 2"),
+        (lambda: Polygon(around(101)), "3 to 100 vertices, got 101"),
+        (lambda: Polygon(((0, 0), (1, 1), (1, math.inf))), "two finite numbers a vertex"),
+        (lambda: Polygon(((0, 0), (1, 1), (1,))), "two finite numbers a vertex"),
+        (lambda: Polygon(((0, 0), (1, 1), (2, 2))), "must have an area"),
+        (lambda: Polygon(((0, 0), (1, 1), (1, 0), (0, 1))), "does not cross"),
+        (
+            lambda: Polygon(((0, 0), (2, 0), (2, 2), (1, 2), (1, -1), (0, 1))),
+            "does not cross or touch itself",
+        ),
+        (lambda: Polygon(((0, 0), (2, 0), (2, 2), (1, 0), (0, 2))), "does not cross or touch"),
+        (lambda: Polygon(((0, 0), (2, 0), (2, 0), (0, 2))), "does not cross or touch itself"),
+        (lambda: Polygon(((0, 0), (2, 0), (1, 0), (1, 2))), "does not cross or touch itself"),
+        # A pentagram turns left at each of its points, twice around.
+        (lambda: Polygon(around(5, 2.513)), "does not cross"),
+        (
+            lambda: World(name="x", polygons=(Polygon(((4, 0), (5.1, 0), (4, 1))),)),
+            "polygons must lie in the room",
+        ),
         (lambda: World(name=None), "name must be text, got None"),
         (lambda: World(name="x", size=8), "size must be two positive lengths, got 8"),
         (lambda: World(name="x", size=("1", "2")), "size must be two positive .*'1'"),
@@ -52,7 +77,7 @@ def test_clearance_is_the_distance_to_the_nearest_face() -> None:
         (lambda: World(name="x", occupancy=3), "occupancy must be an OccupancyGrid, got 3"),
     ],
 )
-def test_a_bad_shape_is_rejected(make: object, message: str) -> None:
+def test_a_bad_shape_or_world_is_rejected(make: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -230,7 +255,7 @@ def test_clearances_of_many_points_are_those_of_each() -> None:
     )
     points = np.random.default_rng(0).uniform(-6.0, 6.0, (500, 2))
     found = world.clearances(points)
-    expected = [world.clearance(x, y) for x, y in points.tolist()]
+    expected = [distance(x, y, world) for x, y in points.tolist()]
     # In a box the one says 0, the other how deep.
     np.testing.assert_allclose(np.where(np.array(expected) == 0.0, 0.0, found), expected)
     assert world.clearances(np.array([[-3.0, 0.5]])) == pytest.approx(-1.0)
