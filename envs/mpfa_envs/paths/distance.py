@@ -282,7 +282,7 @@ class DistanceField:
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Columns and rows in the window, and which cells lie in it."""
         cells = cells - self.first
-        return cells, ((cells >= 0) & (cells < shape)).all(axis=1)
+        return cells, np.asarray(((cells >= 0) & (cells < shape)).all(axis=1))
 
 
 def _with_neighbors(free: NDArray[np.bool_], i: int, j: int) -> NDArray[np.int64]:

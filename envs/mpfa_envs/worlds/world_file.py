@@ -85,7 +85,7 @@ class _Reader(NodeReader):
             raise self.error(root, "size is missing; it is a list [width, depth] in meters")
         with self.at(entries["size"]):
             room = World(name=name, size=self.pair(entries["size"], "size", "[width, depth]"))
-        obstacles = {
+        obstacles: dict[str, Any] = {
             key: self.parts(entries, key, room, key) for key in ("boxes", "cylinders", "polygons")
         }
         with self.at(root):
@@ -124,11 +124,12 @@ class _Reader(NodeReader):
     ) -> tuple[Any, ...]:
         """Read a list of parts, each of which fits in the world by itself."""
         read = {"polygons": self.polygon, "walkers": self.walker}.get(key, self.shape)
-        parts = []
+        parts: list[Any] = []
         for node in self.nodes(entries, key):
             with self.at(node):
                 parts.append(read(node, key))
-                replace(world, **{field: (parts[-1],)})
+                alone: dict[str, Any] = {field: (parts[-1],)}
+                replace(world, **alone)
         return tuple(parts)
 
     def shape(self, node: yaml.Node, key: str) -> Box | Cylinder:
