@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 ENCOUNTERS = ("walker_distance", "intrusion_time", "time_to_collision")
 """Measures of encounters with walkers in the info of an environment and in a result."""

@@ -7,10 +7,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.vector import VectorNavigationEnv
@@ -21,11 +22,8 @@ from mpfa_envs.robots.drives import Physics
 from mpfa_envs.tasks.sets import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-    """A policy: a function from observation to action."""
+Action = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""A policy: a function from observation to action."""
 
 ENVS_AT_ONCE = 64
 """Episodes that run together by default, if the policy is known to take many observations."""

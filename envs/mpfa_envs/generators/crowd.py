@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 import random
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from mpfa_envs.generators.placing import between, cut_box, fit_cylinder, sample_size
+from mpfa_envs.worlds.shapes import Point
 from mpfa_envs.worlds.walker import Walker
 from mpfa_envs.worlds.world import Box, Cylinder, World
-
-if TYPE_CHECKING:
-    from mpfa_envs.worlds.shapes import Point
 
 _CORNERS: Final = 3
 """Waypoints of a round."""

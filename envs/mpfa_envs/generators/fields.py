@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, label
 
 from mpfa_envs.generators.placing import between
 from mpfa_envs.worlds.world import Cylinder, World
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _OPEN: Final = 1.2
 """Depth of the strips without cylinders at both ends [m]."""

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mpfa_envs.checks import check_number, check_positive
@@ -30,11 +31,7 @@ from mpfa_envs.paths.grid_loops import (
     number_cells,
 )
 from mpfa_envs.worlds.cell_loops import lower_clearances
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import World
 
 RESOLUTION: Final = 0.1
 """Default side of a cell [m]."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.compiled import njit
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _BUCKETS: Final = 8
 """Number of buckets; a move leads three ahead at most."""

@@ -14,18 +14,14 @@ from __future__ import annotations
 import heapq
 import math
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.worlds.shapes import Point
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import World
 
 _TOUCH = 1e-9
 """A line that grazes a grown obstacle by less than this does not cross it [m]."""

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label
 
 from mpfa_envs.checks import check_positive, check_share
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.worlds.task import START_SLACK, Task
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import Box, World
+from mpfa_envs.worlds.world import Box, World
 
 LONGEST_PATH: Final = 20.0
 """Longest path of a sampled task in a map [m]: a field over the whole map would be too large."""

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_seed, check_share
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners.search import centers
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.paths.distance import FreeGrid
-    from mpfa_envs.worlds.shapes import Point
+from mpfa_envs.worlds.shapes import Point
 
 _MOST_MOVES: Final = 16
 """Greatest number of moves from a cell: straight, diagonal and a knight's."""

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.robots.model import RobotModel, resolve_robot
 from mpfa_envs.sensing.observation import DISTANCE_SCALE, Memory, observation_slices
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _STEP: Final = 0.1
 """Distance between the places on an arc that are tested [m]."""

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
+from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners.pure_pursuit import PurePursuit
+from mpfa_envs.planners.search import Search
 from mpfa_envs.robots.model import TRAINING_CLEARANCE, RobotModel, resolve_robot
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.env.vector import VectorNavigationEnv
-    from mpfa_envs.planners.search import Search
-    from mpfa_envs.worlds.shapes import Point
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.shapes import Point
+from mpfa_envs.worlds.world import World
 
 _LEAST_CLEARANCE: Final = 0.02
 """Clearance tried where no path has the wanted one [m]."""

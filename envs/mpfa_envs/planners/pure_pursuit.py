@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.paths.distance import FreeGrid
-    from mpfa_envs.robots.model import RobotModel
-    from mpfa_envs.worlds.shapes import Point
+from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.worlds.shapes import Point
 
 _SPACING: Final = 0.05
 """Distance between the points of a path [m]."""

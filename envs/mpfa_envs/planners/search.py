@@ -12,11 +12,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.grid_loops import STEP_SCALE
+from mpfa_envs.worlds.shapes import Point
 
 if TYPE_CHECKING:
     import networkx
-
-    from mpfa_envs.worlds.shapes import Point
 
 _START: Final = -1
 _GOAL: Final = -2

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.scene import colors
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
 
 _LEAST_DELAY: Final = 20
 """Players of GIFs ignore shorter delays [ms]."""

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.scene.colors import LINES, VIRIDIS
 
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 Curve = tuple[Any, Any]
 """Steps and values of one run, each of shape ``[T]``."""

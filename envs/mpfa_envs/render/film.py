@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
+from mpfa_envs.env.vector import VectorNavigationEnv
+from mpfa_envs.evaluation.runs import Action, Driver
 from mpfa_envs.render.traces import Panel, render_traces
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.env.vector import VectorNavigationEnv
-    from mpfa_envs.evaluation.runs import Action, Driver
-    from mpfa_envs.tasks.sets import WorldTask
+from mpfa_envs.tasks.sets import WorldTask
 
 _RECENT = 10.0
 """Time span of the wheel speeds [s]."""

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_number, check_positive
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.scene.canvas import Canvas
 from mpfa_envs.scene.colors import viridis
+from mpfa_envs.worlds.world import World
 
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import World
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _ROBOTS: Final = 64
 """Number of places observed together; each may need a map."""

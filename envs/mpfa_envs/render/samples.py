@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+import os
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.generators.resolve import resolve_world
@@ -14,15 +16,9 @@ from mpfa_envs.scene.canvas import Canvas
 from mpfa_envs.scene.colors import shares_of
 from mpfa_envs.scene.strip import HEIGHT, Scale, strip_width, titled, write_strip
 from mpfa_envs.scene.tiles import tiled
+from mpfa_envs.worlds.world import World
 
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import World
-
-    Array = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 _FEW = 3
 """Least number of transitions of a cell whose mean is shown."""

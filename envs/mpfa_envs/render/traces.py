@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from mpfa_envs.scene.canvas import FINE, font
 from mpfa_envs.scene.colors import GRID, LINES, PAPER, TEXT
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 class Panel(NamedTuple):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.generators.resolve import resolve_world
@@ -13,13 +15,7 @@ from mpfa_envs.scene.canvas import Canvas, Point
 from mpfa_envs.scene.colors import GOAL, GOAL_AREA, GOAL_EDGE, OUTCOMES, ROBOT_FRONT, TRAIL
 from mpfa_envs.scene.strip import HEIGHT, Entry, Key, Mark, Title, strip_width, titled, write_strip
 from mpfa_envs.scene.tiles import tiled
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world import World
 
 Outcome = Literal["success", "collision", "timeout"]
 """The end of an episode."""

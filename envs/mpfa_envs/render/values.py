@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.generators.resolve import resolve_world
@@ -15,15 +17,9 @@ from mpfa_envs.robots.model import RobotModel, resolve_robot
 from mpfa_envs.scene.canvas import FINE, Canvas, Point
 from mpfa_envs.scene.colors import ROBOT_FRONT, TEXT, shares_of
 from mpfa_envs.scene.strip import HEIGHT, Entry, Facing, Scale, strip_width, titled, write_strip
+from mpfa_envs.worlds.world import World
 
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.world import World
-
-    Observations = NDArray[np.float32]
+Observations = NDArray[np.float32]
 
 _ARROW_TIME = 1.0
 """Time of the path that an arrow shows [s]."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from mpfa_envs.scene.colors import (
@@ -27,12 +28,8 @@ from mpfa_envs.scene.colors import (
     WALL,
     Color,
 )
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.occupancy import OccupancyGrid
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.world import World
 
 Point = tuple[float, float]
 

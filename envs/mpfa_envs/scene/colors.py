@@ -6,12 +6,10 @@ blindness; values have viridis, whose lightness rises with the value.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 Color = tuple[int, int, int, int]
 """Red, green, blue and opacity, each from 0 to 255."""

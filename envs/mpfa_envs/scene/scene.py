@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.scene.canvas import Canvas, Point
 from mpfa_envs.scene.colors import MET, PATH, RAY, RAY_AREA, RIVAL, TRAIL
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from mpfa_envs.robots.model import RobotModel
-    from mpfa_envs.sensing.map_memory import Sketch
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.sensing.map_memory import Sketch
+from mpfa_envs.worlds.world import World
 
 
 def render_scene(

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from mpfa_envs.scene.canvas import FINE, Canvas, font
 from mpfa_envs.scene.colors import ROBOT, ROBOT_FRONT, TEXT, Color, viridis
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 HEIGHT: Final = 28
 """Height of the strip [px]."""

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 def tiled(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,11 +21,7 @@ from mpfa_envs.robots.model import (
     resolve_robot,
 )
 from mpfa_envs.worlds.task import START_SLACK, Task
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from mpfa_envs.worlds.world import Box, World
+from mpfa_envs.worlds.world import Box, World
 
 GOAL_CLEARANCE = 0.5
 """No goal lies nearer to an obstacle or a wall than this [m]."""

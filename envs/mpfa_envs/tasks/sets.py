@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast, get_args
+from typing import Any, Final, NamedTuple, cast, get_args
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.generators import GENERATORS, Split, generator_tasks
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.tasks.sampling import evaluation_pairs
 from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
-
-if TYPE_CHECKING:
-    from mpfa_envs.robots.model import RobotModel
 
 TASKS_PER_WORLD: Final = 4
 """Number of tasks in each world of a generator."""

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.occupancy import OccupancyGrid
-    from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.occupancy import OccupancyGrid
+from mpfa_envs.worlds.world import World
 
 
 class GridArrays(NamedTuple):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from mpfa_envs.worlds.world import Box, World
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 def _world(name: str, *boxes: tuple[float, float, float, float]) -> World:

@@ -8,13 +8,11 @@ steps, and beside a wall one for each cell. Where it enters an occupied cell is 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.compiled import njit
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 @njit

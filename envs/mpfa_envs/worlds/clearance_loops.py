@@ -6,13 +6,12 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.compiled import njit
 from mpfa_envs.worlds.cell_loops import clearance_of_cells
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from mpfa_envs.worlds.batch import BatchArrays
 
 

@@ -9,18 +9,16 @@ import os
 import warnings
 import zlib
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 from xml.parsers import expat
 
 from mpfa_envs.files import read_file
 from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon, Shape
 from mpfa_envs.worlds.world import World
 from mpfa_envs.worlds.yaml_nodes import WorldFileError, read_number
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _LARGEST_FILE: Final = 20_000_000
 """Longest text that is read [bytes]."""

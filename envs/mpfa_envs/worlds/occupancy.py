@@ -8,14 +8,12 @@ import math
 import zlib
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_number, check_positive
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MOST_CELLS: Final = 16_000_000
 """Most cells of a map, 4,000 x 4,000."""

@@ -15,11 +15,13 @@ from __future__ import annotations
 import io
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from PIL import Image
 
 from mpfa_envs.checks import check_positive
@@ -29,10 +31,6 @@ from mpfa_envs.worlds.shapes import LARGEST_SIDE
 from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, read_nodes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
     from mpfa_envs.worlds.world import World
 
 Mode = Literal["trinary", "scale", "raw"]

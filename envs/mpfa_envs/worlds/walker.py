@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 from mpfa_envs.checks import all_finite
-
-if TYPE_CHECKING:
-    from mpfa_envs.worlds.shapes import Point
+from mpfa_envs.worlds.shapes import Point
 
 Behavior = Literal["straight", "waypoints", "orca"]
 """Rule by which a walker chooses its path."""

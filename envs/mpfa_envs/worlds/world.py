@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpfa_envs.checks import all_finite
 from mpfa_envs.worlds.occupancy import OccupancyGrid
-from mpfa_envs.worlds.shapes import LARGEST_SIDE, Box, Cylinder, Polygon, Shape
+from mpfa_envs.worlds.shapes import LARGEST_SIDE, Box, Cylinder, Point, Polygon, Shape
 from mpfa_envs.worlds.walker import MOST_WALKERS, Walker
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from mpfa_envs.worlds.shapes import Point
 
 __all__ = ["MOST_OBSTACLES", "Box", "Cylinder", "Polygon", "World", "WorldArrays"]
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import yaml
@@ -19,9 +19,6 @@ from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon
 from mpfa_envs.worlds.walker import Walker
 from mpfa_envs.worlds.world import World
 from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, is_map, parse_nodes, read_nodes
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 _SHAPES: Final[Mapping[str, tuple[str, ...]]] = {
     "boxes": ("x_min", "x_max", "y_min", "y_max"),
