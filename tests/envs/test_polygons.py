@@ -31,16 +31,6 @@ def test_only_a_polygon_without_dents_is_convex() -> None:
     assert Polygon(((0, 0), (1, 0), (2, 1), (1, 2), (0, 1))).is_convex
 
 
-def test_clearances_of_polygons_are_those_of_their_edges() -> None:
-    world = polygon_world(DENTED, TRIANGLE, OVERLAPPING)
-    points = np.random.default_rng(0).uniform(-5.5, 5.5, (600, 2))
-    expected = [distance(x, y, world) for x, y in points.tolist()]
-    assert sum(gap < 0 for gap in expected) > 100
-    np.testing.assert_allclose(world.clearances(points), expected, atol=1e-12)
-    each = [world.clearance(x, y) for x, y in points.tolist()]
-    np.testing.assert_allclose(each, expected, atol=1e-12)
-
-
 def test_convex_parts_make_up_the_polygon() -> None:
     assert convex_parts(TRIANGLE) == [TRIANGLE]
     rng = np.random.default_rng(0)
@@ -85,41 +75,6 @@ def test_arrays_hold_the_numbers_of_all_obstacles() -> None:
     assert [part.shape for part in empty] == [(2,), (0, 4), (0, 3), (0, 4), (0,)]
     for part in (*world.arrays[:4], *empty[:4]):
         assert part.dtype == np.float64 and part.flags.c_contiguous
-
-
-def nearest_hit(x: float, y: float, angle: float, world: World, reach: float) -> float:
-    """Where the first step of a millimeter leaves the free space, refined by halving."""
-    low = 0.0
-    while low < reach:
-        high = low + max(0.001, 0.999 * distance(*at(x, y, angle, low), world))
-        if distance(*at(x, y, angle, high), world) <= 0.0:
-            for _ in range(40):
-                middle = (low + high) / 2
-                if distance(*at(x, y, angle, middle), world) <= 0.0:
-                    high = middle
-                else:
-                    low = middle
-            return min(high, reach)
-        low = high
-    return reach
-
-
-def at(x: float, y: float, angle: float, reach: float) -> tuple[float, float]:
-    return x + reach * math.cos(angle), y + reach * math.sin(angle)
-
-
-def test_the_lidar_sees_the_nearest_edge_of_polygons() -> None:
-    world = polygon_world(DENTED, TRIANGLE, OVERLAPPING)
-    lidar = Lidar(world, max_range=6.0)
-    rng = np.random.default_rng(0)
-    scans = 0
-    while scans < 12:
-        x, y, heading = rng.uniform(-5.0, 5.0, 3).tolist()
-        if world.clearance(x, y) < 0.05:
-            continue
-        scans += 1
-        expected = [nearest_hit(x, y, heading + a, world, 6.0) for a in lidar.angles[::3]]
-        np.testing.assert_allclose(lidar.cast(x, y, heading)[::3], expected, atol=2e-3)
 
 
 def test_in_a_polygon_all_ranges_are_zero() -> None:

@@ -252,6 +252,7 @@ def test_clearances_of_many_points_are_those_of_each() -> None:
         size=(10.0, 6.0),
         boxes=(Box(-4.0, -2.0, -1.0, 2.0), Box(-2.0, -1.0, 0.0, 1.0)),
         cylinders=(Cylinder(2.0, 0.0, 1.0),),
+        polygons=(Polygon(((0.5, -2.5), (4.0, -2.0), (2.0, -1.5), (4.0, 2.5), (0.5, 1.0))),),
     )
     points = np.random.default_rng(0).uniform(-6.0, 6.0, (500, 2))
     found = world.clearances(points)

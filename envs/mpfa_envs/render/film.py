@@ -7,11 +7,12 @@ from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.evaluation.runs import Action, Driver
+from mpfa_envs.evaluation.runs import Action, Driver, as_driver
 from mpfa_envs.render.traces import Panel, render_traces
 from mpfa_envs.tasks.sets import WorldTask
 
@@ -60,6 +61,7 @@ def film_episode(
 
     Examples:
         >>> import numpy as np
+    from gymnasium.vector import AutoresetMode
         >>> from mpfa_envs import world_tasks
         >>> from mpfa_envs.render import film_episode
         >>> ahead = lambda observations: np.ones((len(observations), 2), np.float32)
@@ -126,12 +128,6 @@ def drive_episode(
     Yields:
         Each decision before it is carried out, and the end.
     """
-    # Imported here because gymnasium takes a moment, and other pictures do without it.
-    from gymnasium.vector import AutoresetMode
-
-    from mpfa_envs.env.vector import VectorNavigationEnv
-    from mpfa_envs.evaluation.runs import as_driver
-
     arguments = {"collision_distance": "contact", **getattr(policy, "env_arguments", {})}
     arguments |= episode.limit({**arguments, **env_arguments})
     arguments |= {**env_arguments, "world": episode.world, "render_mode": "rgb_array"}

@@ -11,9 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_number, check_positive
+from mpfa_envs.env.config import TaskConfig
+from mpfa_envs.env.episodes import Episode
+from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.scene.canvas import Canvas
 from mpfa_envs.scene.colors import viridis
+from mpfa_envs.walkers.starts import start_walkers
+from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 
 Array = NDArray[np.float64]
@@ -67,13 +72,6 @@ def observe_room(
         >>> poses.shape, observations.shape
         ((100, 3), (100, 24))
     """
-    # Imported here because gymnasium takes a moment, and other pictures do without it.
-    from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.env.episodes import Episode
-    from mpfa_envs.env.robots import RobotBatch
-    from mpfa_envs.walkers.starts import start_walkers
-    from mpfa_envs.worlds.task import Task
-
     if heading != "goal":
         check_number("heading", heading)
     world = replace(resolve_world(world), walkers=())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Final
 
@@ -144,9 +145,18 @@ class Canvas:
             pixels = [self.at(*point) for point in points]
             self.draw.line(pixels, fill=color, width=round(width * FINE), joint="curve")
 
-    def layer(self) -> Layer:
-        """Open a transparent layer; leaving it lays it over the picture."""
-        return Layer(self)
+    @contextmanager
+    def layer(self) -> Iterator[None]:
+        """Draw on a transparent layer, which is laid over the picture at the end."""
+        below = self.image
+        self.image = Image.new("RGBA", below.size, (0, 0, 0, 0))
+        self.draw = ImageDraw.Draw(self.image)
+        yield
+        # A layer is empty but for a small part, which takes less time.
+        box = self.image.getbbox()
+        if box is not None:
+            below.alpha_composite(self.image, box[:2], box)
+        self.image, self.draw = below, ImageDraw.Draw(below)
 
     def goal(self, x: float, y: float, radius: float | None = None) -> None:
         """Draw a goal as the paper does, a square of 0.4 m, and the disc that reaches it."""
@@ -188,26 +198,6 @@ class Canvas:
         """The finished picture, shape ``[height, width, 3]``."""
         picture = self.image.convert("RGB").resize(self._shape, Image.Resampling.BOX)
         return np.asarray(picture, dtype=np.uint8).copy()
-
-
-class Layer:
-    """Redirects a canvas to a transparent picture and lays it over on leaving."""
-
-    def __init__(self, canvas: Canvas) -> None:
-        self._canvas = canvas
-        self._below = canvas.image
-
-    def __enter__(self) -> None:
-        self._canvas.image = Image.new("RGBA", self._below.size, (0, 0, 0, 0))
-        self._canvas.draw = ImageDraw.Draw(self._canvas.image)
-
-    def __exit__(self, *error: object) -> None:
-        # A layer is empty but for a small part, which takes less time.
-        box = self._canvas.image.getbbox()
-        if box is not None:
-            self._below.alpha_composite(self._canvas.image, box[:2], box)
-        self._canvas.image = self._below
-        self._canvas.draw = ImageDraw.Draw(self._below)
 
 
 @cache
