@@ -101,7 +101,7 @@ def test_no_files_import_each_other_in_a_circle(package):
 
 
 ROOMS = (
-    {"checks", "files", "compiled", "saved"},
+    {"checks", "files", "compiled", "saved", "tables"},
     {"worlds"},
     {"paths", "robots"},
     {"generators", "sensing"},

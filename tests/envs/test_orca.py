@@ -90,7 +90,7 @@ def test_a_velocity_into_a_wall_is_not_driven(
     # The wall is at 5 m, and the walker's radius 0.25 m.
     for x, speed, moves in ((4.7, 1.0, False), (4.6, 1.0, True), (4.9, -1.0, True)):
         state = {"states": np.array([[[x, 0.0, speed, 0.0]]]), "targets": targets}
-        batch.load(batch.read(state, list(worlds)))
+        batch.read(state, list(worlds))()
         velocity[0] = speed
         batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
         expected = (x + 0.1 * speed, speed) if moves else (x, 0.0)

@@ -93,8 +93,8 @@ def test_a_server_can_be_closed_twice() -> None:
     ("change", "message"),
     [
         ({"radius": 0.0}, "radius must be positive, got 0.0"),
-        ({"mass": math.inf}, "mass must be finite, got inf"),
-        ({"mass": "heavy"}, "mass must be a number, got 'heavy'"),
+        ({"mass": math.inf}, "mass must be a finite number, got inf"),
+        ({"mass": "heavy"}, "mass must be a finite number, got 'heavy'"),
         ({"name": ""}, "name must be a non-empty string, got ''"),
         ({"wheel_base": 1.0}, "wheel_base must be at most the diameter 0.36, got 1.0"),
         ({"wheel_radius": 0.3}, "wheel_radius must be at most half the height"),

@@ -18,17 +18,16 @@ def batch_with(state: list[float]) -> dict[str, np.ndarray]:
     return {"states": np.array([[state]]), "targets": np.zeros((1, 1), dtype=np.int64)}
 
 
-@pytest.mark.parametrize("way", ["load", "begin"])
-def test_a_walker_does_not_cross_a_wall_of_another_world(way: str) -> None:
+@pytest.mark.parametrize("by", ["load", "begin"])
+def test_a_walker_that_is_moved_looks_around_again(by: str) -> None:
     batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
     batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
-    middle = batch.read(batch_with([0.0, 0.0, 1.0, 0.0]), [HALL])
-    batch.load(middle)
+    batch.read(batch_with([0.0, 0.0, 1.0, 0.0]), [HALL])()
     everyone, nobody = np.ones(1, dtype=np.bool_), np.zeros((1, 5))
     for _ in range(5):  # Now it knows that nothing is near.
         batch.move(everyone, nobody)
-    if way == "load":
-        batch.load(batch.read(batch_with([19.5, 0.0, 1.0, 0.0]), [HALL]))
+    if by == "load":
+        batch.read(batch_with([19.5, 0.0, 1.0, 0.0]), [HALL])()
     else:
         batch._worlds[0] = World(name="cell", size=(2.0, 2.0), walkers=HALL.walkers)
         batch.begin(0, start_walkers(batch._worlds[0], (0.5, 0.5), np.random.default_rng(0)))
@@ -41,10 +40,8 @@ def test_a_walker_does_not_cross_a_wall_of_another_world(way: str) -> None:
 def test_a_map_is_shown_no_walker_by_a_noisy_lidar_either() -> None:
     world = World(name="two", walkers=(Walker(radius=0.4), Walker(radius=0.4)))
     batch = WalkerBatch(WorldBatch([world]), radius=0.18, time_step=0.1)
-    batch.load(batch.read(
-        {"states": np.array([[[2.0, 0.5, 0.3, 0.0], [1.5, -1.0, 0.3, 0.0]]]),
-         "targets": np.zeros((1, 2), dtype=np.int64)}, [world],
-    ))  # fmt: skip
+    states = np.array([[[2.0, 0.5, 0.3, 0.0], [1.5, -1.0, 0.3, 0.0]]])
+    batch.read({"states": states, "targets": np.zeros((1, 2), dtype=np.int64)}, [world])()
     lidar, rng, seen, met = Lidar(world, noise=0.1), np.random.default_rng(0), 0, 0
     pose, motions, circles = (0.0, 0.0, 0.0), np.zeros((1, 5)), batch.circles(0)
     hits = lidar.cast(*pose, moving=circles) < lidar.cast(*pose)
@@ -62,5 +59,5 @@ def test_a_bad_state_is_rejected_before_anything_changes() -> None:
     batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
     before = batch.of(0)
     with pytest.raises(ValueError, match="states of the state must be finite"):
-        batch.load(batch.read(batch_with([np.nan, 0.0, 1.0, 0.0]), [HALL]))
+        batch.read(batch_with([np.nan, 0.0, 1.0, 0.0]), [HALL])
     np.testing.assert_array_equal(batch.of(0), before)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,36 +18,22 @@ if TYPE_CHECKING:
     from mpfa_envs.deploy.card import Card
 
 
-class _Rays:
-    """Rays for :class:`~mpfa_envs.sensing.map_memory.MapMemory` that change from scan to scan."""
-
-    def __init__(self, max_range: float) -> None:
-        self.angles = np.zeros(1)
-        self.max_range = max_range
-
-
-class _Square:
-    """A room for it of which only the size is known."""
-
-    def __init__(self, side: float) -> None:
-        self.size = side, side
-
-
 class MapPath:
     """A square map around a place, of a side [m], and the path over it to the goal."""
 
     def __init__(self, card: Card, *, size: float) -> None:
         # Without it the loops over the map would run, a thousand times too slowly.
         import_module("numba")
-        lidar = _Rays(card.max_range)
+        # The rays come with each scan, and of the room only the size is known.
+        lidar: Any = SimpleNamespace(angles=np.zeros(1), max_range=card.max_range)
         self._memory = MapMemory(1, card.robot, lidar)
-        self._square = _Square(size)
+        self._room: Any = SimpleNamespace(size=(size, size))
         self._center = np.zeros(2)
 
     def begin(self, center: tuple[float, float]) -> None:
         """Forget all, and map around another place [m]."""
         self._center[:] = center
-        self._memory.begin(0, self._square)
+        self._memory.begin(0, self._room)
 
     def warm_up(self) -> None:
         """Have the loops compiled, which takes seconds the first time."""

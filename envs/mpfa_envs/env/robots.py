@@ -25,8 +25,9 @@ from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.saved import read_array, read_list
 from mpfa_envs.sensing.map_memory import MapMemory
-from mpfa_envs.sensing.observation import INFO_TYPES
+from mpfa_envs.sensing.observation import FLAGS, NUMBERS
 from mpfa_envs.sensing.observation_loops import observe_all
+from mpfa_envs.tables import grown
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.batch import WorldBatch
@@ -45,10 +46,6 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.task import Task
     from mpfa_envs.worlds.world import World
 
-FLAGS = tuple(name for name, kind in INFO_TYPES.items() if kind is bool)
-"""Flags of the info dictionary, in the order of the tables."""
-NUMBERS = tuple(name for name, kind in INFO_TYPES.items() if kind is float)
-"""Its numbers, likewise."""
 _TRAIL = 500
 """Time steps that there is room for at first."""
 _NO_PATHS = np.zeros((0, 3))
@@ -164,7 +161,9 @@ class RobotBatch:
         """Hold the wheel speeds [m/s], ``[N, 2]``, of the moving robots, ``[N]``, for an action."""
         episodes, worlds, running = self.episodes, self.worlds.arrays, moving.copy()
         episodes.numbers[REWARD : REWARD + 4, moving] = 0.0
-        self._lengthen_trails(int(episodes.steps.max()) + self._config.action_repeat)
+        last = int(episodes.steps.max()) + self._config.action_repeat
+        if last >= self.trails.shape[1]:
+            self.trails = grown(self.trails, 2 * last + 1)
         for _ in range(self._config.action_repeat):
             self.walkers.move(running, episodes.motions)
             driven = speeds if self.noise is None else self.noise.drive(speeds, running, rngs)
@@ -211,8 +210,10 @@ class RobotBatch:
                 )
             if task is not None and fields is not None:
                 fields[index] = distance_field(world, self._config.collision_distance, task.goal)
-        walkers = self.walkers.read(state.get("walkers", {}), worlds)
-        drives = self.drives.read(state.get("drives", {}))
+        starts = np.array([(0.0, 0.0, 0.0) if task is None else task.start for task in tasks])
+        starts[:, 2] = [math.remainder(heading, math.tau) for heading in starts[:, 2]]
+        load_walkers = self.walkers.read(state.get("walkers", {}), worlds)
+        load_drives = self.drives.read(state.get("drives", {}), starts)
         # The compiled loops write a trail at the number of its steps.
         steps, most = values["steps"], self._config.max_steps
         if steps.min() < 0 or steps.max() > most:
@@ -221,19 +222,15 @@ class RobotBatch:
         trails = read_array(state, "trails", np.zeros((len(tasks), last + 1, 2)))
         if self.memory is not None:
             self.memory.load_state_dict(state.get("memory", {}))
-        self._lengthen_trails(last)
+        self.trails = grown(self.trails, last + 1)
         self.trails[:, : last + 1] = trails
         for name, array in arrays.items():
             array[...] = values[name]
         self.tasks, self._fields = tasks, fields
-        starts = np.zeros((len(tasks), 3))
-        for index, (world, task) in enumerate(zip(worlds, tasks, strict=True)):
+        for index, world in enumerate(worlds):
             self.worlds[index] = world
-            if task is not None:
-                x, y, heading = task.start
-                starts[index] = x, y, math.remainder(heading, math.tau)
-        self.walkers.load(walkers)
-        self.drives.load(drives, starts, self.episodes.motions.copy())
+        load_walkers()
+        load_drives()
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays that a robot's episode is in, by name."""
@@ -321,10 +318,3 @@ class RobotBatch:
             )
             for index, (x, y, heading) in enumerate(self.episodes.motions[:, :3].tolist())
         )
-
-    def _lengthen_trails(self, steps: int) -> None:
-        """Make room for so many time steps."""
-        if steps >= self.trails.shape[1]:
-            longer = np.zeros((len(self.trails), 2 * steps + 1, 2))
-            longer[:, : self.trails.shape[1]] = self.trails
-            self.trails = longer

@@ -14,9 +14,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.env.robots import FLAGS, NUMBERS
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.sensing.observation import INFO_TYPES
+from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
 
 if TYPE_CHECKING:
     import os

@@ -25,10 +25,10 @@ from mpfa_envs.env.inputs import (
     spawn_generators,
 )
 from mpfa_envs.env.live_view import LiveView
-from mpfa_envs.env.robots import FLAGS, NUMBERS, RobotBatch
+from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.env.step_loops import outcomes
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.sensing.observation import INFO_TYPES
+from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 

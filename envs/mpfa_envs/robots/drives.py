@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
 from mpfa_envs.robots.motion_loops import drive_arcs
 from mpfa_envs.saved import read_array
+from mpfa_envs.tables import grown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -29,50 +31,36 @@ _SERVERS: Final = 32
 """Physics servers at most."""
 
 
-class Drives(Protocol):
-    """Motion of many robots, as :class:`~mpfa_envs.VectorNavigationEnv` uses it."""
+class Drives:
+    """Motion of many robots; the base class holds nothing, as the motions say where they are."""
 
     def place(self, index: int, x: float, y: float, heading: float) -> None:
         """Put a robot at rest at a pose [m, m, rad]."""
-        ...
 
     def move(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
-        ...
+        raise NotImplementedError
 
     def state_dict(self) -> dict[str, Any]:
         """State that brings the robots back to where they are in their episodes."""
-        ...
+        return {}
 
-    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
-        ...
-
-    def load(
-        self,
-        arrays: Mapping[str, NDArray[Any]],
-        starts: NDArray[np.float64],
-        motions: NDArray[np.float64],
-    ) -> None:
-        """Bring them there from their starts ``[N, 3]``."""
-        ...
+    def read(self, state: Mapping[str, Any], starts: NDArray[np.float64]) -> Callable[[], None]:
+        """Check what :meth:`state_dict` gave; the result loads it, from starts ``[N, 3]``."""
+        return lambda: None
 
     def close(self) -> None:
-        """Release what the drives hold."""
-        ...
+        """Release what is held; a second call does nothing."""
 
 
-class KinematicDrives:
+class KinematicDrives(Drives):
     """Moves robots on exact arcs: the wheels have their speed at once and never slip."""
 
     def __init__(self, robot: RobotModel, *, time_step: float) -> None:
         self._wheel_base = robot.wheel_base
         self._time_step = time_step
-
-    def place(self, index: int, x: float, y: float, heading: float) -> None:
-        """Nothing is held: the motions say where the robots are."""
 
     def move(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
@@ -80,27 +68,8 @@ class KinematicDrives:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
         drive_arcs(motions, running, speeds, self._wheel_base, self._time_step)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing is held."""
-        return {}
 
-    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """Nothing is held."""
-        return {}
-
-    def load(
-        self,
-        arrays: Mapping[str, NDArray[Any]],
-        starts: NDArray[np.float64],
-        motions: NDArray[np.float64],
-    ) -> None:
-        """Nothing is held."""
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-class WheelDrives:
+class WheelDrives(Drives):
     """Moves robots by PyBullet: motors turn the wheels, friction moves the robot."""
 
     # Up to 32 robots have a physics server each and drive the same bits as alone. A server takes 35
@@ -151,12 +120,16 @@ class WheelDrives:
         for number in {index % len(self._simulations) for index in moving}:
             self._simulations[number].step()
         for index in moving:
-            motions[index] = _motion(self._simulation_of(index), self._names[index])
+            x, y, heading, speed_x, speed_y, turn = self._simulation_of(index).robot_motion(
+                self._names[index]
+            )
+            forward = speed_x * math.cos(heading) + speed_y * math.sin(heading)
+            motions[index] = x, y, heading, forward, turn
 
     def _remember(self, running: NDArray[np.bool_], speeds: NDArray[np.float64]) -> None:
         """Keep what the robots have driven since the start of their episodes."""
         if self._counts.max() == self._driven.shape[1]:
-            self._driven = np.concatenate((self._driven, np.zeros_like(self._driven)), axis=1)
+            self._driven = grown(self._driven, 2 * self._driven.shape[1])
         self._driven[running, self._counts[running]] = speeds[running]
         self._counts[running] += 1
 
@@ -165,43 +138,34 @@ class WheelDrives:
         counts = self._counts.copy()
         return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
 
-    def read(self, state: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
+    def read(self, state: Mapping[str, Any], starts: NDArray[np.float64]) -> Callable[[], None]:
+        """Check what :meth:`state_dict` gave; the result drives the episodes again."""
         counts = read_array(state, "counts", self._counts)
         if counts.min() < 0:
             raise ValueError(f"counts of the state must not be negative, got {counts.tolist()}")
         speeds = read_array(state, "speeds", np.zeros((len(counts), counts.max(), 2)))
-        return {"counts": counts, "speeds": speeds}
+        return partial(self._drive_again, counts, speeds, starts)
 
-    def load(
+    def _drive_again(
         self,
-        arrays: Mapping[str, NDArray[Any]],
-        starts: NDArray[np.float64],  # (x, y, heading) [N, 3] [m, m, rad]
-        motions: NDArray[np.float64],  # [N, 5]
+        counts: NDArray[np.int64],  # time steps so far, [N]
+        speeds: NDArray[np.float64],  # of the wheels in them [m/s], [N, steps, 2]
+        starts: NDArray[np.float64],  # (x, y, heading) [m, m, rad], [N, 3]
     ) -> None:
-        """Drive the episodes again from their starts."""
-        counts, speeds = arrays["counts"], arrays["speeds"]
-        last = int(counts.max())
+        last, motions = int(counts.max()), np.zeros((len(counts), 5))
         # All end at once; one that has driven for a shorter time is placed later.
         for step in range(last + 1):
             for index in np.flatnonzero(counts == last - step).tolist():
                 self.place(index, *starts[index].tolist())
-            if step == last:
-                return
-            running = step >= last - counts
-            now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
-            self.move(motions, running, now)
+            if step < last:
+                running = step >= last - counts
+                now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
+                self.move(motions, running, now)
 
     def close(self) -> None:
         """Shut the physics servers down; a second call does nothing."""
         for simulation in self._simulations:
             simulation.close()
-
-
-def _motion(simulation: Simulation, name: str) -> tuple[float, ...]:
-    """Pose and speeds (x, y, heading, forward, turning) of a simulated robot."""
-    x, y, heading, speed_x, speed_y, turn = simulation.robot_motion(name)
-    return x, y, heading, speed_x * math.cos(heading) + speed_y * math.sin(heading), turn
 
 
 def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:

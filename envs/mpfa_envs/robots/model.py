@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from mpfa_envs.checks import all_finite, did_you_mean
+from mpfa_envs.checks import all_finite, check_number, check_positive, did_you_mean
+from mpfa_envs.robots.motion_loops import scale_actions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +28,7 @@ class RobotModel:
     """A disc-shaped robot with two driven wheels on one axle through its center.
 
     Args:
-        name: What error messages and bodies are called.
+        name: Name in error messages.
         radius: Radius of the footprint [m].
         height: Height of the body [m].
         mass: Mass of the whole robot [kg].
@@ -60,17 +61,13 @@ class RobotModel:
     max_wheel_speed: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"name must be a non-empty string, got {self.name!r}")
+        for field in fields(self)[1:]:
             value = getattr(self, field.name)
-            if field.name == "name":
-                if not isinstance(value, str) or not value:
-                    raise ValueError(f"name must be a non-empty string, got {value!r}")
-            elif isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ValueError(f"{field.name} must be a number, got {value!r}")
-            elif not math.isfinite(value):
-                raise ValueError(f"{field.name} must be finite, got {value}")
-            elif field.name != "min_wheel_speed" and value <= 0:
-                raise ValueError(f"{field.name} must be positive, got {value}")
+            if not isinstance(value, (int, float)):
+                raise ValueError(f"{field.name} must be a finite number, got {value!r}")
+            (check_number if field.name == "min_wheel_speed" else check_positive)(field.name, value)
         if self.wheel_base > 2 * self.radius:
             raise ValueError(
                 f"wheel_base must be at most the diameter {2 * self.radius}, got {self.wheel_base}"
@@ -116,13 +113,11 @@ class RobotModel:
         values = np.asarray(action, dtype=np.float64)
         if values.shape != (2,):
             raise ValueError(f"action must have shape (2,), got {values.shape}")
-        left, right = values.tolist()
-        if math.isnan(left) or math.isnan(right):
+        speeds = np.empty((1, 2))
+        if not scale_actions(values[None], self.min_wheel_speed, self.max_wheel_speed, speeds):
             raise ValueError(f"action must not hold NaN, got {action!r}")
-        left, right = min(max(left, -1.0), 1.0), min(max(right, -1.0), 1.0)
-        slow, fast = self.min_wheel_speed, self.max_wheel_speed
-        middle, span = (fast + slow) / 2, (fast - slow) / 2
-        return middle + span * left, middle + span * right
+        left, right = speeds[0].tolist()
+        return left, right
 
     def urdf(self) -> str:
         """Write the robot as URDF text made of primitives.
@@ -197,50 +192,16 @@ def _escape(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
 
 
+_MEASURES = tuple(field.name for field in fields(RobotModel)[1:])
 ROBOTS: Final[Mapping[str, RobotModel]] = {
-    robot.name: robot
-    for robot in (
-        RobotModel(
-            name="turtlebot2",
-            radius=0.18,
-            height=0.42,
-            mass=6.3,
-            wheel_base=0.23,
-            wheel_radius=0.035,
-            min_wheel_speed=0.05,
-            max_wheel_speed=0.5,
-        ),
-        RobotModel(
-            name="burger",
-            radius=0.105,
-            height=0.192,
-            mass=1.0,
-            wheel_base=0.16,
-            wheel_radius=0.033,
-            min_wheel_speed=0.022,
-            max_wheel_speed=0.22,
-        ),
-        RobotModel(
-            name="waffle",
-            radius=0.22,
-            height=0.141,
-            mass=1.8,
-            wheel_base=0.287,
-            wheel_radius=0.033,
-            min_wheel_speed=0.026,
-            max_wheel_speed=0.26,
-        ),
-        RobotModel(
-            name="turtlebot4",
-            radius=0.175,
-            height=0.351,
-            mass=3.9,
-            wheel_base=0.233,
-            wheel_radius=0.03575,
-            min_wheel_speed=0.031,
-            max_wheel_speed=0.306,
-        ),
-    )
+    name: RobotModel(name=name, **dict(zip(_MEASURES, row, strict=True)))
+    for name, row in {
+        # radius, height, mass, wheel_base, wheel_radius, min_wheel_speed, max_wheel_speed
+        "turtlebot2": (0.18, 0.42, 6.3, 0.23, 0.035, 0.05, 0.5),
+        "burger": (0.105, 0.192, 1.0, 0.16, 0.033, 0.022, 0.22),
+        "waffle": (0.22, 0.141, 1.8, 0.287, 0.033, 0.026, 0.26),
+        "turtlebot4": (0.175, 0.351, 3.9, 0.233, 0.03575, 0.031, 0.306),
+    }.items()
 }
 """The robots that have a name. As for the TurtleBot2, no wheel stops or turns backwards."""
 

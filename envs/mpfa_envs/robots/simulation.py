@@ -6,8 +6,9 @@ import math
 import platform
 import tempfile
 import weakref
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 try:
     import pybullet
@@ -19,8 +20,6 @@ except ImportError as error:
     ) from error
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from mpfa_envs.robots.model import RobotModel
 
 _ROBOTS = 64
@@ -40,17 +39,12 @@ class Simulation:
     ) -> None:
         self.bodies: dict[str, int] = {}
         """Names of the bodies and the engine's numbers for them."""
-        self._client: int = pybullet.connect(pybullet.DIRECT)
-        # A server takes 34 MB: one whose owner was dropped without close() must go as well.
-        self._release = weakref.finalize(self, _disconnect, self._client)
+        self._server = _Server()
         self._wheels: dict[str, list[int]] = {}
         self._rest_height = 0.0
-        self._configure(time_step, substeps)
-        self._add_plane()
-
-    def _configure(self, time_step: float, substeps: int) -> None:
-        pybullet.setGravity(0, 0, -9.81, physicsClientId=self._client)
-        pybullet.setPhysicsEngineParameter(
+        server = self._server
+        server.setGravity(0, 0, -9.81)
+        server.setPhysicsEngineParameter(
             fixedTimeStep=time_step,
             numSubSteps=substeps,
             # The solver stops once an iteration changes next to nothing: 1.6 times faster than
@@ -61,8 +55,10 @@ class Simulation:
             deterministicOverlappingPairs=1,
             # Robots that do not touch are solved apart, so that none depends on what others do.
             minimumSolverIslandSize=1,
-            physicsClientId=self._client,
         )
+        plane = server.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[0, 0, 1])
+        self.bodies["floor"] = server.createMultiBody(baseCollisionShapeIndex=plane)
+        server.changeDynamics(self.bodies["floor"], -1, lateralFriction=1.0)
 
     def __reduce__(self) -> NoReturn:
         """Reject copies and pickles: a copy would have the same server and robots."""
@@ -75,44 +71,31 @@ class Simulation:
     @property
     def client(self) -> int:
         """PyBullet's number of this server; -1 once it is closed."""
-        return self._client
-
-    def _add_plane(self) -> None:
-        plane = pybullet.createCollisionShape(
-            pybullet.GEOM_PLANE, planeNormal=[0, 0, 1], physicsClientId=self._client
-        )
-        self.bodies["floor"] = pybullet.createMultiBody(
-            baseCollisionShapeIndex=plane, physicsClientId=self._client
-        )
-        pybullet.changeDynamics(
-            self.bodies["floor"], -1, lateralFriction=1.0, physicsClientId=self._client
-        )
+        return self._server.number if self._server.close.alive else -1
 
     def add_robot(self, robot: RobotModel, *, name: str = "robot") -> None:
         """Load a robot from its URDF. Several of them pass through each other."""
+        server = self._server
         # The engine reads URDF from files only.
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
             path.write_text(robot.urdf(), encoding="utf-8")
-            body = pybullet.loadURDF(
-                str(path),
-                # Without it the engine guesses moments of inertia from the shapes.
-                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-                physicsClientId=self._client,
-            )
+            # Without the flag the engine guesses moments of inertia from the shapes.
+            body = server.loadURDF(str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
         self.bodies[name] = body
         # The engine's position of a body is its center of mass.
-        dynamics = pybullet.getDynamicsInfo(body, -1, physicsClientId=self._client)
-        self._rest_height = dynamics[3][2]
+        self._rest_height = server.getDynamicsInfo(body, -1)[3][2]
         links: dict[str, int] = {"base": -1}
-        for joint in range(pybullet.getNumJoints(body, physicsClientId=self._client)):
-            info = pybullet.getJointInfo(body, joint, physicsClientId=self._client)
-            links[info[12].decode()] = joint
+        for joint in range(server.getNumJoints(body)):
+            links[server.getJointInfo(body, joint)[12].decode()] = joint
         self._wheels[name] = [links["left_wheel"], links["right_wheel"]]
         if len(self._wheels) > 1:
-            self._part_robots(links.values())
+            # Robots touch everything but each other.
+            for other in self._wheels:
+                for link in links.values():
+                    server.setCollisionFilterGroupMask(self.bodies[other], link, _ROBOTS, ~_ROBOTS)
         for part, link in links.items():
-            pybullet.changeDynamics(
+            server.changeDynamics(
                 body,
                 link,
                 # The casters slide; the wheels alone hold the ground.
@@ -122,65 +105,62 @@ class Simulation:
                 jointDamping=0.0,
                 # A robot that fell asleep would wake up a step late.
                 activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=self._client,
             )
-
-    def _part_robots(self, links: Iterable[int]) -> None:
-        """Let robots touch everything but each other."""
-        for robot in self._wheels:
-            for link in links:
-                pybullet.setCollisionFilterGroupMask(
-                    self.bodies[robot], link, _ROBOTS, ~_ROBOTS, physicsClientId=self._client
-                )
 
     def place_robot(self, x: float, y: float, heading: float, *, name: str = "robot") -> None:
         """Put a robot at rest at a pose [m, m, rad], without traces of earlier motion."""
-        body, client = self.bodies[name], self._client
+        body, server = self.bodies[name], self._server
         for wheel in self._wheels[name]:
-            pybullet.resetJointState(body, wheel, 0.0, 0.0, physicsClientId=client)
-        pybullet.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=client)
-        half = heading / 2
-        turned = [0.0, 0.0, math.sin(half), math.cos(half)]
+            server.resetJointState(body, wheel, 0.0, 0.0)
+        server.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0])
+        turned = [0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)]
         # Contacts outlive a move to another place. High above the floor the engine drops them.
         for height in (100.0, self._rest_height):
-            place = [x, y, height]
-            pybullet.resetBasePositionAndOrientation(body, place, turned, physicsClientId=client)
-            pybullet.performCollisionDetection(physicsClientId=client)
+            server.resetBasePositionAndOrientation(body, [x, y, height], turned)
+            server.performCollisionDetection()
         self.set_wheel_speeds(0.0, 0.0, name=name)
 
     def set_wheel_speeds(self, left: float, right: float, *, name: str = "robot") -> None:
         """Command the motors; forward is positive [rad/s]."""
-        pybullet.setJointMotorControlArray(
+        self._server.setJointMotorControlArray(
             self.bodies[name],
             self._wheels[name],
             pybullet.VELOCITY_CONTROL,
             targetVelocities=[left, right],
             forces=[_MOTOR_TORQUE, _MOTOR_TORQUE],
-            physicsClientId=self._client,
         )
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by a number of time steps."""
         for _ in range(count):
-            pybullet.stepSimulation(physicsClientId=self._client)
+            self._server.stepSimulation()
 
     def robot_motion(self, name: str = "robot") -> tuple[float, float, float, float, float, float]:
         """Pose (x, y, heading) [m, m, rad] and speeds in x, in y and turning [m/s, rad/s]."""
-        body, client = self.bodies[name], self._client
-        (x, y, _), (qx, qy, qz, qw) = pybullet.getBasePositionAndOrientation(
-            body, physicsClientId=client
-        )
-        (vx, vy, _), (_, _, turn) = pybullet.getBaseVelocity(body, physicsClientId=client)
+        body = self.bodies[name]
+        (x, y, _), (qx, qy, qz, qw) = self._server.getBasePositionAndOrientation(body)
+        (vx, vy, _), (_, _, turn) = self._server.getBaseVelocity(body)
         heading = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
         return x, y, heading, vx, vy, turn
 
     def close(self) -> None:
         """Shut the server down; a second call does nothing."""
-        self._release()
-        self._client = -1
+        self._server.close()
 
 
-def _disconnect(client: int) -> None:
+class _Server:
+    """PyBullet's functions for a server of its own."""
+
+    def __init__(self) -> None:
+        self.number: int = pybullet.connect(pybullet.DIRECT)
+        # A server takes 34 MB: one whose owner was dropped without close() must go as well.
+        self.close = weakref.finalize(self, _disconnect, self.number)
+
+    def __getattr__(self, name: str) -> Any:
+        return partial(getattr(pybullet, name), physicsClientId=self.number)
+
+
+def _disconnect(number: int) -> None:
     """Shut a server down, if it lives."""
-    if pybullet.isConnected(physicsClientId=client):
-        pybullet.disconnect(physicsClientId=client)
+    if pybullet.isConnected(physicsClientId=number):
+        pybullet.disconnect(physicsClientId=number)

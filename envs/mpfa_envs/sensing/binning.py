@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpfa_envs.checks import check_count
 from mpfa_envs.sensing.observation import observation_slices
 
 if TYPE_CHECKING:
@@ -57,9 +58,7 @@ class Binning:
             if not (rising and all(map(math.isfinite, bounds))):
                 raise ValueError(f"{name} must be finite and rise, got {bounds}")
         for name in ("groups", "directions", "sectors", "observation_size"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a positive integer, got {value!r}")
+            object.__setattr__(self, name, check_count(name, getattr(self, name)))
         if self.groups > self.sectors:
             raise ValueError(f"groups must be at most {self.sectors} sectors, got {self.groups}")
         known = observation_slices(self.sectors)["angular_speed"].stop

@@ -15,6 +15,7 @@ import numpy as np
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_share
 from mpfa_envs.sensing.lidar_loops import cast_rays
+from mpfa_envs.sensing.observation_loops import sector_range
 from mpfa_envs.worlds.batch import WorldBatch
 
 if TYPE_CHECKING:
@@ -215,14 +216,5 @@ class Lidar:
         Returns:
             Range of each sector [m], shape ``[sectors]``.
         """
-        if self.rays_per_sector == 1:
-            return ranges
-        rays = ranges.reshape(self.sectors, self.rays_per_sector)
-        if self.reduction == "min":
-            return np.asarray(rays.min(axis=1))
-        # np.median costs as much as the whole scan.
-        rays = np.sort(rays, axis=1)
-        middle = self.rays_per_sector // 2
-        if self.rays_per_sector % 2:
-            return rays[:, middle].copy()
-        return np.asarray((rays[:, middle - 1] + rays[:, middle]) / 2)
+        median = self.reduction == "median"
+        return np.array([sector_range(rays, median) for rays in np.split(ranges, self.sectors)])

@@ -81,11 +81,11 @@ def remember(
                 across = directions[0, ray] * cosine - directions[1, ray] * sine
                 up = directions[0, ray] * sine + directions[1, ray] * cosine
                 changed |= _enter(levels, u + reach * across, v + reach * up, blocked, near)
-        i, j = _cell(u, nx), _cell(v, ny)
+        i, j = cell_of(u, nx), cell_of(v, ny)
         if costs[i, j] == UNKNOWN or (changed and not _costs_the_same(levels, costs, i, j)):
             goal = (
-                _cell((goals[robot, 0] - maps.origins[robot, 0]) / resolution, nx),
-                _cell((goals[robot, 1] - maps.origins[robot, 1]) / resolution, ny),
+                cell_of((goals[robot, 0] - maps.origins[robot, 0]) / resolution, nx),
+                cell_of((goals[robot, 1] - maps.origins[robot, 1]) / resolution, ny),
             )
             _find_paths(levels, goal, (i, j), costs, links)
         ahead_i, ahead_j, ends = _look_ahead(levels, costs, i, j)
@@ -100,7 +100,7 @@ def remember(
 
 
 @njit
-def _cell(place: float, count: int) -> int:
+def cell_of(place: float, count: int) -> int:
     """The column or row of a place, the nearest one for a place outside."""
     return min(max(math.floor(place + 0.5), 0), count - 1)
 

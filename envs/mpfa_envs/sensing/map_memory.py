@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from mpfa_envs.saved import read_array
-from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, follow_path, remember
+from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, cell_of, follow_path, remember
+from mpfa_envs.tables import grown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.robots.model import RobotModel
+    from mpfa_envs.sensing.lidar import Lidar
+    from mpfa_envs.worlds.world import World
 
 RESOLUTION: Final = 0.1
 """Side of a cell [m]."""
@@ -25,23 +28,6 @@ _BLOCKED: Final = 0.06
 """Clearance of the robot's rim below which a cell is blocked [m]."""
 _NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
-
-
-class Rays(Protocol):
-    """The rays that a map is made from: a :class:`~mpfa_envs.Lidar`, or one of a real robot."""
-
-    angles: NDArray[np.float64]
-    """Direction of each ray in the robot's frame [rad], ``[rays]``."""
-    max_range: float
-    """Range of a ray that meets nothing [m]."""
-
-
-class Place(Protocol):
-    """The mapped room: a :class:`~mpfa_envs.World`, or a size alone."""
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Width and depth [m]."""
 
 
 class Sketch(NamedTuple):
@@ -69,8 +55,8 @@ class MapMemory:
 
     Args:
         count: Number of robots N.
-        robot: Whose radius decides where its center fits.
-        lidar: What the robots see by.
+        robot: Robot whose radius decides where its center fits.
+        lidar: The robots' lidar; its ``angles`` and ``max_range`` count.
 
     Examples:
         >>> from mpfa_envs import Box, Lidar, World
@@ -85,7 +71,7 @@ class MapMemory:
         (True, True)
     """
 
-    def __init__(self, count: int, robot: RobotModel, lidar: Rays) -> None:
+    def __init__(self, count: int, robot: RobotModel, lidar: Lidar) -> None:
         self.arrays = MapArrays(
             np.zeros((count, 0, 0), dtype=np.uint8),
             np.zeros((count, 0, 0), dtype=np.int32),
@@ -97,16 +83,17 @@ class MapMemory:
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
         self._lengths = RESOLUTION, robot.radius + _BLOCKED, robot.radius + _NEAR, lidar.max_range
 
-    def begin(self, index: int, world: Place) -> None:
+    def begin(self, index: int, world: World) -> None:
         """Forget what a robot has seen.
 
         Args:
             index: Number of the robot.
-            world: Where its next episode is; the map has room for it.
+            world: Room of its next episode, for whose ``size`` the map is made.
         """
         sides = [math.ceil(side / RESOLUTION) + 2 * _MARGIN for side in world.size]
-        self._make_room(*sides)
         arrays = self.arrays
+        levels, costs = grown(arrays.levels, *sides), grown(arrays.costs, *sides)
+        self.arrays = arrays = arrays._replace(levels=levels, costs=costs)
         arrays.shapes[index] = sides
         arrays.origins[index] = [-(side - 1) / 2 * RESOLUTION for side in sides]
         arrays.levels[index] = 0
@@ -148,25 +135,20 @@ class MapMemory:
 
         Args:
             index: Number of the robot.
-            x: Where it is [m].
-            y: Where it is [m].
+            x: Position [m].
+            y: Position [m].
         """
         columns, rows = self.arrays.shapes[index]
         levels = self.arrays.levels[index, :columns, :rows]
         costs = self.arrays.costs[index, :columns, :rows]
         origin = self.arrays.origins[index]
-        places = [
-            np.argwhere(levels == BLOCKED),
-            follow_path(levels, costs, *self._cell(index, x, y)),
-        ]
-        blocked, path = ((origin + RESOLUTION * cells).tolist() for cells in places)
-        return Sketch([(u, v) for u, v in blocked], [(u, v) for u, v in path], RESOLUTION)
-
-    def _cell(self, index: int, x: float, y: float) -> tuple[int, int]:
-        """Column and row of a position in a robot's map."""
-        place = (np.array((x, y)) - self.arrays.origins[index]) / RESOLUTION
-        cell = np.clip(np.floor(place + 0.5).astype(int), 0, self.arrays.shapes[index] - 1)
-        return int(cell[0]), int(cell[1])
+        u, v = (np.array((x, y)) - origin) / RESOLUTION
+        path = follow_path(levels, costs, cell_of(u, columns), cell_of(v, rows))
+        places, along = (
+            [(across, up) for across, up in (origin + RESOLUTION * cells).tolist()]
+            for cells in (np.argwhere(levels == BLOCKED), path)
+        )
+        return Sketch(places, along, RESOLUTION)
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """The maps and the paths, as arrays."""
@@ -191,16 +173,3 @@ class MapMemory:
         arrays = {name: read_array(state, name, like) for name, like in likes.items()}
         self._paths = read_array(state, "ways", self._paths)
         self.arrays = MapArrays(**arrays)
-
-    def _make_room(self, columns: int, rows: int) -> None:
-        """Have maps of so many cells at least."""
-        levels = self.arrays.levels
-        most = max(columns, levels.shape[1]), max(rows, levels.shape[2])
-        if most == levels.shape[1:]:
-            return
-        wider = {}
-        for name in ("levels", "costs"):
-            old = getattr(self.arrays, name)
-            wider[name] = np.zeros((len(old), *most), dtype=old.dtype)
-            wider[name][:, : old.shape[1], : old.shape[2]] = old
-        self.arrays = self.arrays._replace(**wider)

@@ -25,8 +25,9 @@ SPEED_BOUND: Final = 2.0
 PATH_BOUND: Final = 10.0
 """The scaled length of the path is clipped to this: it is very long where all paths are blocked."""
 
-_FLAGS = ("success", "collision", "timeout")
-_NUMBERS = (
+FLAGS: Final[tuple[str, ...]] = ("success", "collision", "timeout")
+"""Flags of the info dictionary, in the order of the tables."""
+NUMBERS: Final[tuple[str, ...]] = (
     "reward_goal",
     "reward_collision",
     "reward_progress",
@@ -43,9 +44,10 @@ _NUMBERS = (
     "intrusion_time",
     "time_to_collision",
 )
+"""Its numbers, likewise."""
 INFO_TYPES: Final[dict[str, type[bool] | type[float]]] = {
-    **dict.fromkeys(_FLAGS, bool),
-    **dict.fromkeys(_NUMBERS, float),
+    **dict.fromkeys(FLAGS, bool),
+    **dict.fromkeys(NUMBERS, float),
 }
 """Keys of the info dictionary of every reset and step, with the type of their value."""
 

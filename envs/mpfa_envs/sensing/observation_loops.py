@@ -47,13 +47,9 @@ def observe_all(
             seen[index] = seen[index - sectors] if index >= start + sectors else seen[index - start]
         for sector in range(sectors):
             first = sector * count
-            if median:
-                nearest = _middle(ranges[robot, first : first + count])
-            else:
-                nearest = ranges[robot, first]
-                for ray in range(first + 1, first + count):
-                    nearest = min(nearest, ranges[robot, ray])
-            seen[sector] = near / max(nearest, near)
+            seen[sector] = near / max(
+                sector_range(ranges[robot, first : first + count], median), near
+            )
         if fresh[robot]:
             for index in range(start, seen.shape[0]):
                 seen[index] = seen[(index - start) % sectors]
@@ -76,10 +72,15 @@ def observe_all(
 
 
 @njit
-def _middle(rays: NDArray[np.float64]) -> float:
-    """Median of a sector's rays."""
-    ordered = np.sort(rays)
-    half = rays.shape[0] // 2
-    if rays.shape[0] % 2 == 1:
-        return ordered[half]
-    return 0.5 * (ordered[half - 1] + ordered[half])
+def sector_range(rays: NDArray[np.float64], median: bool) -> float:
+    """Range of a sector by its rays: their median, or the nearest."""
+    if median:
+        ordered = np.sort(rays)
+        half = rays.shape[0] // 2
+        if rays.shape[0] % 2 == 1:
+            return ordered[half]
+        return 0.5 * (ordered[half - 1] + ordered[half])
+    nearest = rays[0]
+    for ray in range(1, rays.shape[0]):
+        nearest = min(nearest, rays[ray])
+    return nearest

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.saved import read_array
+from mpfa_envs.tables import grown
 from mpfa_envs.walkers.loops import (
     ORCA,
     STRAIGHT,
@@ -20,7 +21,7 @@ from mpfa_envs.walkers.loops import (
 from mpfa_envs.walkers.orca import OrcaRoom
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 _MARGIN: Final = 0.05
 """A ray that ends this near to a walker, and three deviations of its noise, met it [m]."""
-_CHANGING: Final = ("states", "targets")
 _BEHAVIORS: Final = {"straight": STRAIGHT, "waypoints": WAYPOINTS, "orca": ORCA}
 
 
@@ -56,13 +56,7 @@ class WalkerBatch:
 
     def begin(self, index: int, starts: WalkerStarts) -> None:
         """Put the walkers of a robot's world where they start."""
-        self._set(index, self._worlds[index])
-        states, targets = starts
-        count = len(states)
-        if not count:
-            return
-        self._arrays.states[index, :count], self._arrays.targets[index, :count] = states, targets
-        self._place(index)
+        self._set(index, self._worlds[index], starts)
 
     def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
         """Let walkers walk for one time step."""
@@ -118,43 +112,42 @@ class WalkerBatch:
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """Positions, speeds and targets of the walkers; the worlds have the rest."""
-        return {name: getattr(self._arrays, name).copy() for name in _CHANGING}
+        return {"states": self._arrays.states.copy(), "targets": self._arrays.targets.copy()}
 
-    def read(self, state: Mapping[str, Any], worlds: list[World]) -> dict[str, NDArray[Any]]:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
+    def read(self, state: Mapping[str, Any], worlds: list[World]) -> Callable[[], None]:
+        """Check what :meth:`state_dict` gave for some worlds; the result loads it."""
         most = np.shape(state.get("states", ()))[1:2]
         need = max((len(world.walkers) for world in worlds), default=0)
         if len(most) != 1 or most[0] < need:
             raise ValueError(f"states of the state must have rows for {need} walkers")
-        likes = {
-            "states": np.zeros((len(worlds), *most, 4)),
-            "targets": np.zeros((len(worlds), *most), dtype=np.int64),
-        }
-        found = {name: read_array(state, name, like) for name, like in likes.items()}
-        for world, targets in zip(worlds, found["targets"], strict=True):
-            for walker, target in zip(world.walkers, targets.tolist(), strict=False):
+        states = read_array(state, "states", np.zeros((len(worlds), *most, 4)))
+        targets = read_array(state, "targets", np.zeros((len(worlds), *most), dtype=np.int64))
+        for world, row in zip(worlds, targets.tolist(), strict=True):
+            for walker, target in zip(world.walkers, row, strict=False):
                 # The compiled loops do not look where an array ends.
                 if not 0 <= target < max(len(walker.waypoints), 1):
                     raise ValueError(
                         f"targets of the state must be numbers of waypoints, got {target} for "
                         f"{walker}"
                     )
-        return found
 
-    def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Put the walkers of all worlds where :meth:`read` says that they are."""
-        for index, world in enumerate(self._worlds):
-            self._set(index, world)
-            count = len(world.walkers)
-            for name in _CHANGING:
-                getattr(self._arrays, name)[index, :count] = arrays[name][index, :count]
-            self._place(index)
+        def load() -> None:
+            for index, world in enumerate(worlds):
+                count = len(world.walkers)
+                self._set(index, world, (states[index, :count], targets[index, :count]))
 
-    def _set(self, index: int, world: World) -> None:
-        """Take in the walkers of a world."""
+        return load
+
+    def _set(self, index: int, world: World, starts: WalkerStarts) -> None:
+        """Take in the walkers of a robot's world, and write where they are into its circles."""
         count = len(world.walkers)
-        self._make_room(count, max((len(each.waypoints) for each in world.walkers), default=0))
-        arrays = self._arrays
+        points = max((len(each.waypoints) for each in world.walkers), default=0)
+        self._arrays = arrays = WalkerArrays(
+            **{
+                name: grown(table, *(count, points)[: 2 if name == "waypoints" else 1])
+                for name, table in self._arrays._asdict().items()
+            }
+        )
         arrays.counts[index] = count
         self._rooms.pop(index, None)
         if any(walker.behavior == "orca" for walker in world.walkers):
@@ -166,26 +159,7 @@ class WalkerBatch:
             arrays.waypoint_counts[index, number] = points
             if points:
                 arrays.waypoints[index, number, :points] = walker.waypoints
-
-    def _place(self, index: int) -> None:
-        """Write where the walkers of a robot are into the circles of its world."""
-        count = self._arrays.counts[index]
+        arrays.states[index, :count], arrays.targets[index, :count] = starts
+        arrays.slacks[index] = 0.0
         first = self._worlds.standing.counts[index, 1]
-        places = self._arrays.states[index, :count, :2]
-        self._worlds.arrays.circles[index, first : first + count, :2] = places
-        self._arrays.slacks[index] = 0.0
-
-    def _make_room(self, walkers: int, waypoints: int) -> None:
-        """Have rows for so many walkers and waypoints at least."""
-        _, most, most_points, _ = self._arrays.waypoints.shape
-        if walkers <= most and waypoints <= most_points:
-            return
-        sides = max(walkers, most), max(waypoints, most_points)
-        wider = {}
-        for name, old in self._arrays._asdict().items():
-            new = old.shape[:1] + sides[: old.ndim - 1] + old.shape[3:]
-            if name in ("states", "bodies"):
-                new = (len(old), sides[0], old.shape[2])
-            wider[name] = np.zeros(new, dtype=old.dtype)
-            wider[name][tuple(map(slice, old.shape))] = old
-        self._arrays = WalkerArrays(**wider)
+        self._worlds.arrays.circles[index, first : first + count, :2] = starts[0][:, :2]
