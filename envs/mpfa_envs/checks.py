@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 from operator import index
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 MOST: Final = 100_000
 """Largest count by default: robots, episodes, worlds, rays and scans are made one by one or held at
@@ -62,6 +62,13 @@ def check_count(name: str, value: Any, *, least: int = 1, most: float = MOST) ->
     if number > most:
         raise ValueError(f"{name} must be at most {most}, got {value!r}")
     return number
+
+
+def check_choice(name: str, value: Any, kinds: Any) -> Any:
+    """One of the values of a ``Literal``."""
+    if value not in get_args(kinds):
+        raise ValueError(f"{name} must be one of {get_args(kinds)}, got {value!r}")
+    return value
 
 
 def check_seed(value: Any) -> int:

@@ -6,7 +6,6 @@ import gymnasium
 import numpy as np
 import pytest
 
-import mpfa_envs.generators
 from mpfa_envs import (
     ENV_IDS,
     GENERATORS,
@@ -17,6 +16,7 @@ from mpfa_envs import (
     VectorNavigationEnv,
     World,
 )
+from mpfa_envs.env import episodes
 from mpfa_envs.generators import generate_world
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
@@ -138,12 +138,12 @@ def test_a_world_without_a_task_is_replaced_and_counted(monkeypatch: pytest.Monk
             return full
         return generate_world(name, seed, difficulty=difficulty)
 
-    monkeypatch.setattr(mpfa_envs.generators, "generate_world", sometimes)
+    monkeypatch.setattr(episodes, "generate_world", sometimes)
     env = make(2, "bars")
-    assert env.worlds_refused == 0
+    assert env.worlds_rejected == 0
     env.reset(seed=0)
     env.reset()
-    assert env.worlds_refused == 2 * 4
+    assert env.worlds_rejected == 2 * 4
     assert len(asked) == 3 * 5
     assert all(world.name != "full" for world in env.worlds)
 

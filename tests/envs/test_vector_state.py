@@ -72,7 +72,7 @@ def test_what_follows_is_the_same_to_the_bit(case: dict[str, Any]) -> None:
     assert drive(other, 45, 100) == expected
     assert other.tasks == env.tasks and other.worlds == env.worlds
     assert [other.trail(i) for i in range(4)] == [env.trail(i) for i in range(4)]
-    assert other.worlds_refused == env.worlds_refused
+    assert other.worlds_rejected == env.worlds_rejected
     env.close()
     other.close()
 

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial, reduce
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from mpfa_envs.checks import check_count, check_number, check_positive
+from mpfa_envs.checks import check_choice, check_count, check_number, check_positive
 from mpfa_envs.files import read_file
 from mpfa_envs.robots.model import RobotModel
+from mpfa_envs.sensing.lidar import Reduction
 from mpfa_envs.sensing.observation import (
     DISTANCE_SCALE,
     GOAL_CLOSENESS_DISTANCE,
     PATH_BOUND,
     SPEED_BOUND,
+    Memory,
     observation_slices,
 )
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Mapping
 
 FORMAT: Final = 1
 SCALES: Final = {
@@ -31,7 +35,23 @@ SCALES: Final = {
     "way_bound": PATH_BOUND,
 }
 """The scales of the observation that are the same for all policies, as cards have them."""
-_REDUCTIONS = ("min", "median", "single")
+_ENTRIES: Final[Mapping[str, tuple[str, Callable[[str, Any], Any]]]] = {
+    "observation_size": ("observation.size", check_count),
+    "action_size": ("action.size", check_count),
+    "sectors": ("lidar.sectors", check_count),
+    "field_of_view": ("lidar.field_of_view", check_positive),
+    "reduction": ("lidar.reduction", partial(check_choice, kinds=Reduction)),
+    "max_range": ("lidar.max_range", check_positive),
+    "closeness_distance": ("scales.closeness_distance", check_positive),
+    "memory": ("memory", partial(check_choice, kinds=Memory)),
+    "history": ("history", partial(check_count, least=0)),
+    "robot": ("robot", lambda _, values: RobotModel(**values)),
+    "period": ("limits.period", check_positive),
+    "goal_radius": ("limits.goal_radius", check_positive),
+    "env_arguments": ("env_arguments", lambda _, values: dict(values)),
+    "training": ("training", lambda _, values: dict(values)),
+}
+"""Where the fields of a card are in its JSON file, and how they are read."""
 _LARGEST = 2**28
 """A file larger than this is no policy [bytes]."""
 _LARGEST_CARD = 2**24
@@ -95,47 +115,27 @@ class Card:
     def _of(cls, document: Mapping[str, Any]) -> Card:
         if document["format"] != FORMAT:
             raise ValueError(f"format must be {FORMAT}, got {document['format']!r}")
-        lidar, scales, limits = (document[name] for name in ("lidar", "scales", "limits"))
         for name, value in SCALES.items():
-            if scales[name] != value:
-                raise ValueError(f"scales.{name} must be {value}, got {scales[name]!r}")
+            if document["scales"][name] != value:
+                raise ValueError(f"scales.{name} must be {value}, got {document['scales'][name]!r}")
         card = cls(
-            observation_size=check_count("observation.size", document["observation"]["size"]),
-            action_size=check_count("action.size", document["action"]["size"]),
-            sectors=check_count("lidar.sectors", lidar["sectors"]),
-            field_of_view=check_positive("lidar.field_of_view", lidar["field_of_view"]),
-            reduction=lidar["reduction"],
-            max_range=check_positive("lidar.max_range", lidar["max_range"]),
-            closeness_distance=check_positive(
-                "scales.closeness_distance", scales["closeness_distance"]
-            ),
-            memory=document["memory"],
-            history=check_count("history", document["history"], least=0),
-            robot=RobotModel(**document["robot"]),
-            period=check_positive("limits.period", limits["period"]),
-            goal_radius=check_positive("limits.goal_radius", limits["goal_radius"]),
-            env_arguments=dict(document["env_arguments"]),
-            training=dict(document["training"]),
+            **{
+                field: read(entry, reduce(getitem, entry.split("."), document))
+                for field, (entry, read) in _ENTRIES.items()
+            }
         )
         if card.field_of_view > 360.0:
             raise ValueError(f"lidar.field_of_view must be at most 360, got {card.field_of_view}")
-        if card.reduction not in _REDUCTIONS:
-            raise ValueError(f"lidar.reduction must be one of {_REDUCTIONS}: {card.reduction!r}")
         if card.action_size != 2:
             raise ValueError(f"action.size must be 2, a left and a right wheel: {card.action_size}")
-        if card.observation_size != card._sensed:
+        memory: Any = card.memory
+        parts = observation_slices(card.sectors, memory=memory, history=card.history)
+        if card.observation_size != (sensed := max(part.stop for part in parts.values())):
             raise ValueError(
-                f"observation.size must be {card._sensed}, of {card.sectors} sectors, history "
+                f"observation.size must be {sensed}, of {card.sectors} sectors, history "
                 f"{card.history} and memory {card.memory!r}, got {card.observation_size}"
             )
         return card
-
-    @property
-    def _sensed(self) -> int:
-        """Numbers that such a robot senses."""
-        memory: Any = self.memory
-        parts = observation_slices(self.sectors, memory=memory, history=self.history)
-        return max(part.stop for part in parts.values())
 
 
 def card_file(path: str | os.PathLike[str]) -> Path:

@@ -29,16 +29,14 @@ class MapPath:
         self._memory = MapMemory(1, card.robot, lidar)
         self._room: Any = SimpleNamespace(size=(size, size))
         self._center = np.zeros(2)
+        # The loops are compiled by their first call, which takes seconds.
+        self.begin((0.0, 0.0))
+        self.sense((0.0, 0.0, 0.0), (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
 
     def begin(self, center: tuple[float, float]) -> None:
         """Forget all, and map around another place [m]."""
         self._center[:] = center
         self._memory.begin(0, self._room)
-
-    def warm_up(self) -> None:
-        """Have the loops compiled, which takes seconds the first time."""
-        self.begin((0.0, 0.0))
-        self.sense((0.0, 0.0, 0.0), (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
 
     def look_again(self) -> None:
         """The goal has moved: no path to it is known."""
@@ -47,11 +45,9 @@ class MapPath:
     def sense(
         self, pose: tuple[float, float, float], goal: tuple[float, float], points: Points
     ) -> NDArray[np.float64]:
-        """Enter points; direction (x, y) in the robot's frame and length of the path, ``[3]``."""
+        """Enter points; direction (x, y) for the robot and length of the path, ``[1, 3]``."""
         motion = np.zeros((1, 5))
         motion[0, :2], motion[0, 2] = np.subtract(pose[:2], self._center), pose[2]
         goals = np.subtract(goal, self._center)[None]
         directions = np.stack((np.cos(points.angles), np.sin(points.angles)))
-        paths = self._memory.remember(motion, goals, points.ranges[None], directions=directions)
-        found: NDArray[np.float64] = paths[0]
-        return found
+        return self._memory.remember(motion, goals, points.ranges[None], directions=directions)

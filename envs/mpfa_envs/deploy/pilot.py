@@ -104,7 +104,12 @@ class Pilot:
         self.sectors = Sectors(card, mount=mount, unseen=unseen, silent=silent)
         self._network = network
         self._map_size = check_positive("map_size", map_size)
-        self._map = self._make_map(self._map_size)
+        self._map: MapPath | None = None
+        if card.memory == "map":
+            # Imported here because it needs Numba, and compiled before the first decision is due.
+            from mpfa_envs.deploy.map_path import MapPath
+
+            self._map = MapPath(card, size=self._map_size)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
@@ -213,16 +218,16 @@ class Pilot:
         _pair("pose", (x, y))
         linear, angular = check_finite("speeds", speeds, 2)
         card = self.card
-        taken = None if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
+        taken = (x, y, heading) if scan_pose is None else check_finite("scan_pose", scan_pose, 3)
         center = self._center or (x, y)
         self._check_on_map(self._goal, center)
         ranges, points = self.sectors.read(scan)
-        path = None
+        path = np.zeros((0, 3))
         if self._map is not None:
             if self._fresh:
                 self._map.begin(center)
                 self._center = center
-            if taken is not None and taken != (x, y, heading):
+            if taken != (x, y, heading):
                 points = points.seen_from((x, y, heading), taken, card.max_range)
             path = self._map.sense((x, y, heading), self._goal, points)
         robot = card.robot
@@ -235,7 +240,7 @@ class Pilot:
             ranges[None],
             False,
             (card.closeness_distance, robot.max_wheel_speed, robot.max_angular_speed),
-            np.zeros((0, 3)) if path is None else path[None],
+            path,
             card.sectors,
             card.history,
             self._observation,
@@ -284,16 +289,6 @@ class Pilot:
                 f"goal must be on the map, {self._map_size:g} m (map_size) around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
-
-    def _make_map(self, size: float) -> MapPath | None:
-        """The map, if the policy has one; compiled before the first decision is due."""
-        if self.card.memory != "map":
-            return None
-        from mpfa_envs.deploy.map_path import MapPath
-
-        path = MapPath(self.card, size=size)
-        path.warm_up()
-        return path
 
 
 def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_positive
+from mpfa_envs.checks import check_choice, check_positive
 from mpfa_envs.deploy.card import check_finite
 
 if TYPE_CHECKING:
@@ -124,12 +124,10 @@ class Sectors:
         unseen: float | None = None,
         silent: Silent = "refuse",
     ) -> None:
-        if silent not in get_args(Silent):
-            raise ValueError(f"silent must be one of {get_args(Silent)}, got {silent!r}")
         self.card = card
         self.mount = check_finite("mount", mount, 3)
         self.unseen = None if unseen is None else check_positive("unseen", unseen)
-        self.silent = silent
+        self.silent: Silent = check_choice("silent", silent, Silent)
         self._edge = 0.5 * math.radians(card.field_of_view)
         width = 2.0 * self._edge / card.sectors
         self._width = width

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 import numpy as np
 from gymnasium.spaces import Box as BoxSpace
 
-from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.checks import (
+    check_choice,
+    check_count,
+    check_number,
+    check_positive,
+    check_share,
+)
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import ROBOTS, RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
@@ -38,6 +44,18 @@ The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, 
 """
 _MOST_STEPS: Final = 1_000_000
 """No episode has more time steps: a policy that never arrives must come to an end."""
+_CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
+    "physics": partial(check_choice, kinds=Physics),
+    "progress": partial(check_choice, kinds=Progress),
+    "progress_scale": check_number,
+    "max_steps": partial(check_count, most=_MOST_STEPS),
+    "time_step": check_positive,
+    "action_repeat": check_count,
+    "goal_radius": check_positive,
+    "closeness_distance": check_positive,
+    "min_goal_distance": check_positive,
+    "detour_chance": check_share,
+}
 _EMPTY: Final = World(name="empty")
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
 _PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale")
@@ -115,32 +133,15 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         """Check all fields; the first that is out of its range is named."""
-        for name, kinds in (("physics", Physics), ("progress", Progress)):
-            if getattr(self, name) not in get_args(kinds):
-                raise ValueError(
-                    f"{name} must be one of {get_args(kinds)}, got {getattr(self, name)!r}"
-                )
         robot = resolve_robot(self.robot)
-        scale = check_number("progress_scale", self.progress_scale)
-        resolved: dict[str, Any] = {
-            "robot": robot,
-            "progress_scale": scale,
-            "max_steps": check_count("max_steps", self.max_steps, most=_MOST_STEPS),
-            "time_step": check_positive("time_step", self.time_step),
-            "action_repeat": check_count("action_repeat", self.action_repeat),
-            "goal_radius": check_positive("goal_radius", self.goal_radius),
-            "min_goal_distance": check_positive("min_goal_distance", self.min_goal_distance),
-            "detour_chance": check_share("detour_chance", self.detour_chance),
-            "collision_distance": resolve_collision_distance(self.collision_distance, robot),
-            "closeness_distance": (
-                robot.collision_distance
-                if self.closeness_distance is None
-                else check_positive("closeness_distance", self.closeness_distance)
-            ),
-            "noise": resolve_noise(self.noise),
-        }
-        for name, value in resolved.items():
-            object.__setattr__(self, name, value)
+        distance = resolve_collision_distance(self.collision_distance, robot)
+        if self.closeness_distance is None:
+            self._set("closeness_distance", robot.collision_distance)
+        self._set("robot", robot)
+        self._set("collision_distance", distance)
+        self._set("noise", resolve_noise(self.noise))
+        for name, check in _CHECKS.items():
+            self._set(name, check(name, getattr(self, name)))
         if not self.min_goal_distance > self.goal_radius:
             raise ValueError(
                 f"min_goal_distance must be above goal_radius = {self.goal_radius}, "
@@ -155,9 +156,13 @@ class TaskConfig:
                 f"{robot.name!r} drives no farther than collision_distance = "
                 f"{self.collision_distance} m at its fastest, got {self.time_step}"
             )
-        object.__setattr__(self, "lidar", self._read_lidar())
+        self._set("lidar", self._read_lidar())
         # They check what was given.
         _ = self.reward_function, self.observation_slices
+
+    def _set(self, name: str, value: Any) -> None:
+        """Set a field of the frozen dataclass, before it is used."""
+        object.__setattr__(self, name, value)
 
     def _read_lidar(self) -> dict[str, Any]:
         """The arguments of the lidar, with its noise."""

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.generators import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.planner import shortest_length
-from mpfa_envs.paths.tasks import LONGEST_PATH
+from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.saved import read_list
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers
@@ -25,7 +26,6 @@ from mpfa_envs.worlds.world import World
 
 if TYPE_CHECKING:
     from mpfa_envs.env.config import TaskConfig
-    from mpfa_envs.paths.distance import DistanceField, FreeGrid
     from mpfa_envs.walkers.starts import WalkerStarts
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
@@ -51,22 +51,8 @@ class Episode(NamedTuple):
     """Starts of the walkers."""
 
 
-class Whereabouts(NamedTuple):
-    """The robots' progress through the worlds of a generator."""
-
-    rejected: int
-    """Worlds that had no task."""
-    left: list[int]
-    """Episodes that each robot still has in its world."""
-    worlds: list[World | None]
-    """That world, where there are any left."""
-
-
 def _grid_of(world: World, distance: float) -> FreeGrid:
     """Make the grid of a world."""
-    # Imported here because it needs Numba, which takes half a second.
-    from mpfa_envs.paths.distance import FreeGrid
-
     return FreeGrid(world, distance=distance)
 
 
@@ -76,41 +62,8 @@ _kept_grid_of = lru_cache(maxsize=4)(_grid_of)
 
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
     """Measure the paths to a goal that keep a distance [m]; on a map only around the goal."""
-    from mpfa_envs.paths.distance import DistanceField
-
     longest = math.inf if world.occupancy is None else LONGEST_PATH
     return DistanceField(_kept_grid_of(world, distance), goal, longest)
-
-
-@contextmanager
-def keeping(rngs: Iterable[np.random.Generator]) -> Iterator[None]:
-    """Restore sources of randomness if an error is raised."""
-    before = [(rng, rng.bit_generator.state) for rng in rngs]
-    try:
-        yield
-    except BaseException:
-        for rng, state in before:
-            rng.bit_generator.state = state
-        raise
-
-
-def sample_episode(
-    config: TaskConfig, world: World, rng: np.random.Generator, task: Task | None = None
-) -> Episode:
-    """Sample an episode in a fixed world, with a task of its own or the given one."""
-    distance = config.collision_distance
-    if task is None:
-        task = sample_task(
-            world,
-            rng,
-            collision_distance=distance,
-            min_goal_distance=config.min_goal_distance,
-            detour_chance=config.detour_chance,
-        )
-    length = shortest_length(world, config.robot.radius, task.start[:2], task.goal)
-    along = config.progress == "shortest_path"
-    field = distance_field(world, distance, task.goal) if along else None
-    return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
 
 
 class EpisodeSource:
@@ -130,12 +83,17 @@ class EpisodeSource:
         self.rejected = 0
         """Worlds of the generator that had no task."""
         self._config = config
-        self._max_goal_distance = check_goal_distance(config.min_goal_distance, max_goal_distance)
+        least, most = config.min_goal_distance, max_goal_distance
+        if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
+            raise ValueError(
+                f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"
+            )
+        self._max_goal_distance = float(most)
         self._episodes_per_world = check_count("episodes_per_world", episodes_per_world)
         if split not in ("train", "validation"):
             raise ValueError(f"split must be 'train' or 'validation', got {split!r}")
         self._split = split
-        self._generator = resolve_generator(world)
+        self._generator = _generator_of(world)
         if difficulty is not None:
             check_share("difficulty", difficulty)
             if self._generator is None:
@@ -166,17 +124,19 @@ class EpisodeSource:
         renewed: Iterable[int] = (),  # in a new world, as after a seed
     ) -> list[Episode]:
         """Sample the next episodes of some robots, or none if one of them has none."""
-        before = Whereabouts(self.rejected, list(self._left), list(self._worlds))
+        before = self.rejected, list(self._left), list(self._worlds)
+        states = [(rngs[robot], rngs[robot].bit_generator.state) for robot in robots]
         try:
-            with keeping(rngs[robot] for robot in robots):
-                for robot in renewed:
-                    self.forget(robot)
-                return [
-                    self._sample_next(each, rngs[each], None if given is None else given[each])
-                    for each in robots
-                ]
+            for robot in renewed:
+                self.forget(robot)
+            return [
+                self._sample_next(each, rngs[each], None if given is None else given[each])
+                for each in robots
+            ]
         except BaseException:
-            self.load(before)
+            self.rejected, self._left, self._worlds = before
+            for rng, state in states:
+                rng.bit_generator.state = state
             raise
 
     def _sample_next(
@@ -225,38 +185,33 @@ class EpisodeSource:
             "worlds": [world_to_plain(world) if left and world else None for world, left in kept],
         }
 
-    def read(self, state: Mapping[str, Any]) -> Whereabouts:
-        """Check what :meth:`state_dict` gave, before :meth:`load` takes it."""
+    def read(self, state: Mapping[str, Any]) -> Callable[[], None]:
+        """Check what :meth:`state_dict` gave; the result loads it."""
         counts, values = (read_list(state, name, len(self._left)) for name in ("left", "worlds"))
+        rejected = check_count("refused", state.get("refused"), least=0, most=math.inf)
         left = [check_count("left", count, least=0) for count in counts]
         worlds = [None if each is None else world_from_plain(each) for each in values]
         if any(count and world is None for count, world in zip(left, worlds, strict=True)):
             raise ValueError("worlds of the state must hold a world wherever left is not 0")
-        return Whereabouts(
-            check_count("refused", state.get("refused"), least=0, most=math.inf), left, worlds
-        )
 
-    def load(self, found: Whereabouts) -> None:
-        """Go on from what :meth:`read` gave."""
-        self.rejected, self._left = found.rejected, found.left
-        if self._generator:
-            self._worlds = found.worlds
+        def load() -> None:
+            self.rejected, self._left = rejected, left
+            if self._generator:
+                self._worlds = worlds
 
-    def check(self, world: World, task: Task | None) -> Task | None:
-        """Reject a world that is too large, or a task that cannot be driven."""
+        return load
+
+    def check_world(self, world: World) -> None:
+        """Reject a world that is too large."""
         if world.diagonal > self.diagonal:
             raise ValueError(
                 f"world {world.name!r} must be at most {self.diagonal:.4g} m from corner to "
                 f"corner, as the observations are bounded, got {world.diagonal:.4g} m"
             )
-        return None if task is None else self._read_task(world, *task)
 
     def check_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
-        """Read a task in a world, and reject it likewise."""
-        self.check(world, None)
-        return self._read_task(world, start, goal)
-
-    def _read_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
+        """Read a task in a world, and reject one that cannot be driven."""
+        self.check_world(world)
         config = self._config
         return check_task(
             world,
@@ -284,25 +239,33 @@ class EpisodeSource:
 
     def _new_world(self, rng: np.random.Generator) -> World:
         """The next world of the generator."""
-        from mpfa_envs.generators import generate_world, world_seed
-
         seed = world_seed(self._split, int(rng.integers(10**9)))
         world = generate_world(str(self._generator), seed, difficulty=self._difficulty)
-        self.check(world, None)
+        self.check_world(world)
         return world
 
     def _sample_in(
         self, world: World, rng: np.random.Generator, task: Task | None = None
     ) -> Episode:
-        """Sample an episode in a fixed world."""
+        """Sample an episode in a fixed world, with a task of its own or the given one."""
         if task is None and math.isfinite(self._max_goal_distance):
             return self._sample_on_grid(world, rng)
-        return sample_episode(self._config, world, rng, task)
+        config = self._config
+        distance = config.collision_distance
+        task = task or sample_task(
+            world,
+            rng,
+            collision_distance=distance,
+            min_goal_distance=config.min_goal_distance,
+            detour_chance=config.detour_chance,
+        )
+        length = shortest_length(world, config.robot.radius, task.start[:2], task.goal)
+        along = config.progress == "shortest_path"
+        field = distance_field(world, distance, task.goal) if along else None
+        return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
 
     def _sample_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
         """Sample an episode over the cells of a grid, in milliseconds however full the world is."""
-        from mpfa_envs.paths.tasks import sample_task_on_grid
-
         config = self._config
         task, field = sample_task_on_grid(
             (_grid_of if self._generator else _kept_grid_of)(world, config.collision_distance),
@@ -316,10 +279,8 @@ class EpisodeSource:
         return Episode(world, task, length, kept, start_walkers(world, task.start[:2], rng))
 
 
-def resolve_generator(world: object) -> str | None:
+def _generator_of(world: object) -> str | None:
     """The name of a generator, or None for fixed worlds."""
-    from mpfa_envs.generators import GENERATORS
-
     if not isinstance(world, str):
         return None
     if world in GENERATORS:
@@ -341,12 +302,3 @@ def _resolve_worlds(world: WorldChoice | Sequence[WorldChoice]) -> list[World]:
             raise ValueError("world must hold at least one world, got an empty sequence")
         return [resolve_world(each) for each in world]
     return [resolve_world(world)]
-
-
-def check_goal_distance(least: float, most: float) -> float:
-    """A greatest path length that is above the least distance between start and goal [m]."""
-    if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
-        raise ValueError(
-            f"max_goal_distance must be above min_goal_distance = {least}, got {most!r}"
-        )
-    return float(most)

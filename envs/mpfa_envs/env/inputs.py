@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from mpfa_envs.generators.resolve import resolve_world
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from mpfa_envs.env.episodes import EpisodeSource
     from mpfa_envs.worlds.task import Task
     from mpfa_envs.worlds.world import World
 
@@ -44,8 +45,7 @@ def read_reset_mask(options: Mapping[str, Any] | None, robots: int) -> NDArray[n
 def read_tasks(
     options: Mapping[str, Any] | None,
     robots: int,
-    world_of: Callable[[int], World | None],  # that a robot stays in; None: a generator's
-    check: Callable[[World, Task | None], Task | None],  # rejects what cannot be driven
+    source: EpisodeSource,
 ) -> list[tuple[World, Task | None] | None]:
     """World and task for each robot: None where nothing is fixed, no task for a world alone."""
     worlds, tasks = (_read_list(options, key, robots) for key in ("worlds", "tasks"))
@@ -55,12 +55,13 @@ def read_tasks(
             found.append(None)
             continue
         try:
-            world = world_of(robot) if choice is None else resolve_world(choice)
+            world = source.fixed(robot) if choice is None else resolve_world(choice)
             if world is None:
                 raise ValueError(
                     f"a task must come with a world where these are a generator's, got {task}"
                 )
-            found.append((world, check(world, task)))
+            source.check_world(world)
+            found.append((world, None if task is None else source.check_task(world, *task)))
         except ValueError as error:
             raise ValueError(f"robot {robot}: {error}") from error
     return found

@@ -74,7 +74,7 @@ class RobotBatch:
             flags=np.zeros((len(FLAGS), count), dtype=np.bool_),
             steps=np.zeros(count, dtype=np.int64),
             clearances=np.zeros(count),
-            ways=np.zeros((2, count)),
+            remaining=np.zeros((2, count)),
         )
         """Their episodes so far."""
         self.running = np.zeros(count, dtype=np.bool_)
@@ -125,7 +125,7 @@ class RobotBatch:
         episodes.flags[:, index] = False
         episodes.steps[index] = 0
         episodes.clearances[index] = clearance
-        episodes.ways[:, index] = remaining
+        episodes.remaining[:, index] = remaining
         numbers = episodes.numbers[:, index]
         numbers[:] = 0.0
         numbers[SHORTEST_PATH] = max(episode.shortest_path - self._config.goal_radius, 0.0)
@@ -235,7 +235,8 @@ class RobotBatch:
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays that a robot's episode is in, by name."""
         return {
-            **self.episodes._asdict(),
+            # Saved states have the name that the remaining paths had first.
+            **{"ways" if n == "remaining" else n: a for n, a in self.episodes._asdict().items()},
             "running": self.running,
             "observations": self.observations,
             "ranges": self.ranges,
@@ -247,8 +248,8 @@ class RobotBatch:
         episodes = self.episodes
         for index in np.flatnonzero(running).tolist():
             outcome = StepOutcome(
-                float(episodes.ways[1, index]),
-                float(episodes.ways[0, index]),
+                float(episodes.remaining[1, index]),
+                float(episodes.remaining[0, index]),
                 bool(episodes.flags[0, index]),
                 bool(episodes.flags[1, index]),
                 float(episodes.clearances[index]),

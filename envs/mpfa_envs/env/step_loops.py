@@ -49,7 +49,7 @@ class EpisodeArrays(NamedTuple):
     """Time steps so far, ``[N]``."""
     clearances: NDArray[np.float64]
     """Distance of the robots' rims from the nearest obstacle or wall [m], ``[N]``."""
-    ways: NDArray[np.float64]
+    remaining: NDArray[np.float64]
     """The rest of the path to the goal, as the progress is measured, now and before the last time
     step [m], ``[2, N]``."""
 
@@ -82,7 +82,10 @@ def judge(
         flags[TIMEOUT, robot] = not (success or collision) and steps >= max_steps
         clearance = to_obstacle - radius
         episodes.clearances[robot] = clearance
-        episodes.ways[1, robot], episodes.ways[0, robot] = episodes.ways[0, robot], distance
+        episodes.remaining[1, robot], episodes.remaining[0, robot] = (
+            episodes.remaining[0, robot],
+            distance,
+        )
         numbers[SIM_TIME, robot] = steps * time_step
         numbers[PATH_LENGTH, robot] += moved
         numbers[MIN_CLEARANCE, robot] = min(numbers[MIN_CLEARANCE, robot], clearance)
@@ -108,7 +111,7 @@ def settle(
         elif flags[COLLISION, robot]:
             numbers[REWARD + 1, robot] += payments[1]
         else:
-            approach = episodes.ways[1, robot] - episodes.ways[0, robot]
+            approach = episodes.remaining[1, robot] - episodes.remaining[0, robot]
             numbers[REWARD + 2, robot] += payments[2] * approach
         ended = flags[SUCCESS, robot] or flags[COLLISION, robot] or flags[TIMEOUT, robot]
         running[robot] = not ended
@@ -142,7 +145,7 @@ def measure_remaining(
     for robot in range(running.shape[0]):
         if running[robot]:
             nx, ny = fields.shapes[robot, 0], fields.shapes[robot, 1]
-            episodes.ways[0, robot] = interpolate(
+            episodes.remaining[0, robot] = interpolate(
                 fields.values[robot, :nx, :ny],
                 fields.origins[robot, 0],
                 fields.origins[robot, 1],

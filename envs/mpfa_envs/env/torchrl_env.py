@@ -77,22 +77,22 @@ class NavigationTorchEnv(EnvBase):
         info_keys: Iterable[str] | None = None,
         **kwargs: Any,
     ) -> None:
-        _check_num_envs(num_envs)
         keys = list(INFO_TYPES if info_keys is None else info_keys)
         for key in keys:
             if key not in INFO_TYPES:
                 raise ValueError(f"info_keys must be among {list(INFO_TYPES)}, got {key!r}")
-        batch_size = torch.Size([] if num_envs is None else [num_envs])
+        robots = 1 if num_envs is None else num_envs
+        env = VectorNavigationEnv(robots, autoreset_mode=AutoresetMode.DISABLED, **kwargs)
+        batch_size = torch.Size([] if num_envs is None else [env.num_envs])
         super().__init__(device=device, batch_size=batch_size)
-        self.env = VectorNavigationEnv(
-            num_envs or 1, autoreset_mode=AutoresetMode.DISABLED, **kwargs
-        )
+        self.env = env
         """The robots, in the order of the batch."""
         self._flag_names = [name for name in FLAGS if name in keys]
         self._number_names = [name for name in NUMBERS if name in keys]
         self._flag_rows = [FLAGS.index(name) for name in self._flag_names]
         self._number_rows = [NUMBERS.index(name) for name in self._number_names]
-        self._forget_tasks()
+        self._worlds: list[World | None] = [None] * env.num_envs
+        self._tasks: list[Task | None] = [None] * env.num_envs
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -148,10 +148,6 @@ class NavigationTorchEnv(EnvBase):
         if not 0 <= index < self.env.num_envs:
             raise IndexError(f"index must be in [0, {self.env.num_envs}), got {index}")
         self._worlds[index], self._tasks[index] = self.env.check_task(index, start, goal, world)
-
-    def _forget_tasks(self) -> None:
-        self._worlds: list[World | None] = [None] * self.env.num_envs
-        self._tasks: list[Task | None] = [None] * self.env.num_envs
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -290,10 +286,10 @@ def make_navigation_env(
         (torch.Size([3, 24]), torch.Size([3, 1]))
         >>> env.close()
     """
-    _check_num_envs(num_envs)
     if parallel:
         if num_envs is None:
             raise ValueError("num_envs must be a positive integer with parallel=True, got None")
+        check_count("num_envs", num_envs)
         if isinstance(world, list | tuple) and len(world) > 1:
             raise ValueError(
                 f"world must be one, or the name of a generator, with parallel=True, got {world}"
@@ -308,8 +304,3 @@ def make_navigation_env(
     if seed is not None:
         env.set_seed(seed)
     return env
-
-
-def _check_num_envs(num_envs: int | None) -> None:
-    if num_envs is not None:
-        check_count("num_envs", num_envs)

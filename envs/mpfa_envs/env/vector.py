@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -146,9 +147,16 @@ class VectorNavigationEnv(
         return list(self._batch.worlds)
 
     @property
-    def worlds_refused(self) -> int:
-        """Number of worlds of the generator that were rejected, as they had no task."""
+    def worlds_rejected(self) -> int:
+        """Number of worlds of the generator that were replaced, as they had no task."""
         return self._source.rejected
+
+    @property
+    def worlds_refused(self) -> int:
+        """Old name of :attr:`worlds_rejected`, which stays for one version."""
+        message = "worlds_refused is now worlds_rejected"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return self.worlds_rejected
 
     @property
     def tasks(self) -> list[Task | None]:
@@ -255,7 +263,7 @@ class VectorNavigationEnv(
         """
         seeded = read_seed(seed, self.num_envs)
         chosen = read_reset_mask(options, self.num_envs)
-        given = read_tasks(options, self.num_envs, self._source.fixed, self._source.check)
+        given = read_tasks(options, self.num_envs, self._source)
         if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
         robots = np.flatnonzero(chosen).tolist()
@@ -324,7 +332,7 @@ class VectorNavigationEnv(
             self._begin(robots, self._source.sample(robots, self._rngs))
 
     def _begin(self, robots: Sequence[int], episodes: Sequence[Episode]) -> None:
-        """Start the next episodes of some robots."""
+        """Start these episodes of some robots."""
         for index, episode in zip(robots, episodes, strict=True):
             self._batch.begin(index, episode, self._rngs[index])
 
@@ -383,9 +391,9 @@ class VectorNavigationEnv(
         """
         state = check_alike(state, self._describe())
         rngs = read_generators(state.get("rngs"), self.num_envs, begun=state["begun"])
-        worlds = self._source.read(state["source"])
+        load_source = self._source.read(state["source"])
         self._batch.load_state_dict(state["batch"])
-        self._source.load(worlds)
+        load_source()
         self._rngs, self._begun = rngs, state["begun"]
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

@@ -40,8 +40,19 @@ class Linear:
         return outputs
 
 
+class _SameSize:
+    """A layer with as many outputs as inputs, and as many of each of its weights."""
+
+    def output_size(self, input_size: int | None) -> int | None:
+        """Check the shapes, and give the number of outputs."""
+        for name, value in arrays_of(self).items():
+            input_size = value.size if input_size is None else input_size
+            _check_shape(name, value, input_size)
+        return input_size
+
+
 @dataclass(frozen=True)
-class LayerNorm:
+class LayerNorm(_SameSize):
     """``y = (x - mean) / sqrt(variance + eps) * weight + bias`` over the last dimension."""
 
     weight: NDArray[np.float32]
@@ -57,44 +68,33 @@ class LayerNorm:
         found: NDArray[np.float64] = centered / np.sqrt(variance + self.eps)
         return found * self.weight + self.bias
 
-    def output_size(self, input_size: int | None) -> int:
+    def output_size(self, input_size: int | None) -> int | None:
         """Check the shapes, and give the number of outputs."""
-        size = self.weight.size if input_size is None else input_size
-        _check_shape("weight", self.weight, size)
-        _check_shape("bias", self.bias, size)
         if not (math.isfinite(self.eps) and self.eps > 0):
             raise ValueError(f"eps must be positive, got {self.eps}")
-        return size
+        return super().output_size(input_size)
 
 
 @dataclass(frozen=True)
-class ReLU:
+class ReLU(_SameSize):
     """``y = max(x, 0)``."""
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of any shape."""
         return np.maximum(x, 0.0)
 
-    def output_size(self, input_size: int | None) -> int | None:
-        """The number of inputs."""
-        return input_size
-
 
 @dataclass(frozen=True)
-class Tanh:
+class Tanh(_SameSize):
     """``y = tanh(x)``."""
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of any shape."""
         return np.tanh(x)
 
-    def output_size(self, input_size: int | None) -> int | None:
-        """The number of inputs."""
-        return input_size
-
 
 @dataclass(frozen=True)
-class Scale:
+class Scale(_SameSize):
     """``y = center + half x``, from [-1, 1] to the bounds of the actions."""
 
     center: NDArray[np.float32]
@@ -105,13 +105,6 @@ class Scale:
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """From ``[N, size]`` to the same shape."""
         return self.center + self.half * x
-
-    def output_size(self, input_size: int | None) -> int:
-        """Check the shapes, and give the number of outputs."""
-        size = self.center.size if input_size is None else input_size
-        _check_shape("center", self.center, size)
-        _check_shape("half", self.half, size)
-        return size
 
 
 @dataclass(frozen=True)
@@ -192,7 +185,7 @@ def check_layers(layers: Sequence[Layer]) -> tuple[int, int]:
     return int(inputs), int(size or 0)
 
 
-def arrays_of(layer: Layer) -> dict[str, NDArray[np.float32]]:
+def arrays_of(layer: Any) -> dict[str, NDArray[np.float32]]:
     """The weights of a layer by name."""
     values = {field.name: getattr(layer, field.name) for field in fields(layer)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -7,18 +7,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_positive, check_seed
+from mpfa_envs.checks import check_choice, check_count, check_positive, check_seed
 from mpfa_envs.deploy.card import check_finite
 from mpfa_envs.deploy.sectors import Scan
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.robots.drives import make_drives
+from mpfa_envs.robots.drives import Physics, make_drives
 from mpfa_envs.robots.model import RobotModel, resolve_robot
 from mpfa_envs.sensing.lidar import Lidar
 
 if TYPE_CHECKING:
     import os
 
-    from mpfa_envs.robots.drives import Physics
     from mpfa_envs.worlds.world import World
 
 
@@ -60,8 +59,7 @@ class SimulatedRobot:
         first, last = check_finite("field", field, 2)
         if check_count("rays", rays, least=2) and not first < last:
             raise ValueError(f"field must rise, got {field}")
-        if physics not in ("wheels", "kinematic"):
-            raise ValueError(f"physics must be 'wheels' or 'kinematic', got {physics!r}")
+        check_choice("physics", physics, Physics)
         self._field = first, last
         # Its rays go from left to right around its middle, those of a scan from right to left.
         view = math.degrees(last - first) * rays / (rays - 1)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mpfa_envs.checks import check_count, check_number, check_positive, check_share
+from mpfa_envs.checks import check_choice, check_count, check_number, check_positive, check_share
 from mpfa_envs.sensing.lidar_loops import cast_rays
 from mpfa_envs.sensing.observation_loops import sector_range
 from mpfa_envs.worlds.batch import WorldBatch
@@ -67,12 +67,10 @@ class Lidar:
         field_of_view: float = 180.0,
         dropout: float = 0.0,
     ) -> None:
-        if reduction not in get_args(Reduction):
-            raise ValueError(f"reduction must be one of {get_args(Reduction)}, got {reduction!r}")
         self.sectors = check_count("sectors", sectors)
         count = check_count("rays_per_sector", rays_per_sector)
         self.rays_per_sector = 1 if reduction == "single" else count
-        self.reduction = reduction
+        self.reduction: Reduction = check_choice("reduction", reduction, Reduction)
         self.max_range = check_positive("max_range", max_range)
         self.noise = check_number("noise", noise)
         if self.noise < 0:

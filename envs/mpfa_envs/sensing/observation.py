@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from mpfa_envs.checks import check_count
+from mpfa_envs.checks import check_choice, check_count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,8 +73,7 @@ def observation_slices(
         >>> observation_slices()["goal_direction"]
         slice(18, 20, None)
     """
-    if memory not in get_args(Memory):
-        raise ValueError(f"memory must be one of {get_args(Memory)}, got {memory!r}")
+    check_choice("memory", memory, Memory)
     widths = {
         "lidar": check_count("sectors", sectors),
         "goal_direction": 2,
