@@ -60,9 +60,3 @@ def test_the_time_limit_counts_time_steps() -> None:
     over = [env.step([-1.0, -1.0])[3] for _ in range(3)]
     assert over == [False, False, True]
     assert len(env.trail) == 11
-
-
-@pytest.mark.parametrize("value", [0, -1, 1.5, True])
-def test_a_repeat_that_is_no_positive_integer_is_rejected(value: object) -> None:
-    with pytest.raises(ValueError, match=f"action_repeat must be a positive integer, got {value}"):
-        NavigationEnv(action_repeat=value)  # type: ignore[arg-type]

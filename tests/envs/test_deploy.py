@@ -189,25 +189,6 @@ def test_a_decision_takes_a_few_milliseconds_at_most(tmp_path: Path) -> None:
     assert sorted(times)[10] < 5e-3
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"robot": "waffle"}, "learned with a robot of radius 0.18 m, waffle has 0.22 m"),
-        ({"robot": "burger", "pace": 0.5}, "pace must be above 0 and at most 0.44, as burger"),
-        ({"pace": 0.0}, "pace must be above 0"),
-        ({"silent": "near"}, "silent must be one of"),
-        ({"mount": (0.0, 1.0)}, "mount must be 3 numbers, got 2"),
-        ({"unseen": -1.0}, "unseen must be positive, got -1.0"),
-        ({"map_size": math.inf}, "map_size must be a finite number, got inf"),
-    ],
-)
-def test_what_does_not_fit_the_card_is_rejected(
-    tmp_path: Path, options: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        Pilot.load(exported(tmp_path), **options)
-
-
 def test_bad_numbers_are_rejected_by_name(tmp_path: Path) -> None:
     pilot = Pilot.load(exported(tmp_path))
     scan, still = Scan(-2.0, 0.01, np.ones(400)), ((0.0, 0.0, 0.0), (0.0, 0.0))

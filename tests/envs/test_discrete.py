@@ -22,7 +22,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.policies.layers import Choice, Linear, Table
 from mpfa_envs.policies.policy import PolicyFileError
-from mpfa_envs.robots.discrete import WHEEL_PAIRS, mirrored_places
+from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from mpfa_envs.sensing.binning import Binning
 from mpfa_envs.sensing.observation import observation_slices
 
@@ -75,26 +75,6 @@ def test_a_mirrored_choice_has_its_wheels_swapped():
     assert found["action"].dtype == torch.long
 
 
-@pytest.mark.parametrize(
-    ("pairs", "word"),
-    [
-        ([(1.0, 1.0)], "two or more"),
-        ([(1.0, 1.0), (2.0, 1.0)], r"\[-1, 1\]"),
-        ([(1.0, math.nan), (0.0, 1.0)], r"\[-1, 1\]"),
-        ([(1.0, 1.0), (1.0, 1.0)], "different"),
-        ([1.0, 0.5], "pairs"),
-    ],
-)
-def test_impossible_pairs_are_rejected(pairs, word):
-    with pytest.raises(ValueError, match=word):
-        DiscreteWheels(pairs)
-
-
-def test_pairs_without_their_mirror_images_have_no_mirror():
-    with pytest.raises(ValueError, match="mirror image"):
-        mirrored_places([(1.0, 1.0), (0.0, 1.0)])
-
-
 def test_a_cell_is_that_of_a_plain_loop():
     binning = Binning(groups=3, closeness=(0.25, 0.6), directions=8, distances=(0.1, 0.4))
     rng = np.random.default_rng(0)
@@ -118,22 +98,6 @@ def test_a_cell_is_that_of_a_plain_loop():
         assert cell == expected
     assert len(set(found.tolist())) > 30
     assert binning.cells == 27 * 8 * 3 > found.max()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"groups": 0},
-        {"groups": 19},
-        {"closeness": (0.5, 0.5)},
-        {"distances": (math.nan,)},
-        {"directions": 2.5},
-        {"observation_size": 23},
-    ],
-)
-def test_impossible_bins_are_rejected(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Binning(**wrong)
 
 
 def table(**more):

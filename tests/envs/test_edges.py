@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import pytest
 
-from mpfa_envs import Box, NavigationEnv, Task, VectorNavigationEnv, World
+from mpfa_envs import Box, NavigationEnv, VectorNavigationEnv, World
 from mpfa_envs.worlds.plain import world_to_plain
 
 
@@ -37,37 +34,24 @@ def test_a_replacement_world_is_kept_for_as_many_episodes() -> None:
     assert len(set(names[:3])) == 1 and names[3] != names[0]
 
 
-@pytest.mark.parametrize("many", [True, False])
-def test_a_goal_reached_in_the_last_step_is_no_timeout(many: bool) -> None:
-    task = Task((0.0, 0.0, 0.0), (2.02, 0.0))
+def test_a_goal_reached_in_the_last_step_is_no_timeout() -> None:
     ends = []
     for max_steps in (500, 31, 30):  # The goal is 1.52 m away, and a step is 0.05 m.
-        arguments: dict[str, Any] = {"physics": "kinematic", "max_steps": max_steps}
-        if many:
-            env: Any = VectorNavigationEnv(1, **arguments)
-            env.reset(options={"tasks": [task]})
-        else:
-            env = NavigationEnv(**arguments)
-            env.reset(options=task._asdict())
+        env = NavigationEnv(physics="kinematic", max_steps=max_steps)
+        env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (2.02, 0.0)})
         ended = truncated = False
         while not (ended or truncated):
-            _, _, ended, truncated, info = env.step(np.ones((1, 2)) if many else np.ones(2))
-        ends.append((bool(ended), bool(truncated), bool(np.all(info["success"]))))
-    assert ends == [(True, False, True), (True, False, True), (False, True, False)]
+            _, _, ended, truncated, info = env.step([1.0, 1.0])
+        ends.append((ended, truncated, info["success"], info["timeout"]))
+    assert ends == [(True, False, True, False)] * 2 + [(False, True, False, True)]
 
 
-@pytest.mark.parametrize("many", [True, False])
-def test_a_robot_at_the_very_collision_distance_has_collided(many: bool) -> None:
-    arguments: dict[str, Any] = {
-        "physics": "kinematic", "time_step": 0.125, "action_repeat": 1, "collision_distance": 0.25
-    }  # fmt: skip
-    task = Task((4.0, 0.0, 0.0), (-4.0, 0.0))  # A step is 1/16 m: 12 of them are exact.
-    if many:
-        env: Any = VectorNavigationEnv(1, **arguments)
-        env.reset(options={"tasks": [task]})
-    else:
-        env = NavigationEnv(**arguments)
-        env.reset(options=task._asdict())
-    ended = [env.step(np.ones((1, 2)) if many else np.ones(2))[2] for _ in range(12)]
-    assert env._batch.episodes.motions[0, 0] == 4.75 if many else env.trail[-1] == (4.75, 0.0)
-    assert [bool(each) for each in ended] == [False] * 11 + [True]
+def test_a_robot_at_the_very_collision_distance_has_collided() -> None:
+    env = NavigationEnv(
+        physics="kinematic", time_step=0.125, action_repeat=1, collision_distance=0.25
+    )
+    # A step is 1/16 m: 12 of them are exact.
+    env.reset(options={"start": (4.0, 0.0, 0.0), "goal": (-4.0, 0.0)})
+    ended = [env.step([1.0, 1.0])[2] for _ in range(12)]
+    assert env.trail[-1] == (4.75, 0.0)
+    assert ended == [False] * 11 + [True]

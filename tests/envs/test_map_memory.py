@@ -170,11 +170,6 @@ def test_the_map_extends_the_observation_and_changes_nothing_else() -> None:
         env.close()
 
 
-def test_an_unknown_memory_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"memory must be one of \('none', 'map'\), got 'lstm'"):
-        NavigationEnv(memory="lstm")  # type: ignore[arg-type]
-
-
 def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     env = NavigationEnv(
         world=POCKET, physics="kinematic", memory="map", render_mode="rgb_array", max_steps=20

@@ -94,12 +94,6 @@ def test_stored_data_stays_and_samples_follow_the_seed() -> None:
     assert first["observation"].equal(sample(0.5, seed=3)[1]["observation"])
 
 
-@pytest.mark.parametrize("chance", [-0.1, 1.5, float("nan")])
-def test_a_chance_out_of_range_is_rejected(chance: float) -> None:
-    with pytest.raises(ValueError, match=r"chance must be (in \[0, 1\]|a finite number), got"):
-        RandomMirror(chance=chance)
-
-
 def test_the_action_without_noise_is_mirrored_with_the_action() -> None:
     rows = TensorDict(
         {

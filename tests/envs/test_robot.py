@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
-import pybullet
 import pytest
 
 from benchmarks.speed.bullet_world import BulletWorld
@@ -79,33 +77,6 @@ def test_a_drive_does_not_depend_on_earlier_ones_however_short() -> None:
         assert driven(drives[1]) == expected
     for drive in drives:
         drive.drives.close()
-
-
-def test_a_server_can_be_closed_twice() -> None:
-    simulation = BulletWorld(WORLDS["B"])
-    client = simulation.client
-    simulation.close()
-    simulation.close()
-    assert not pybullet.isConnected(physicsClientId=client)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"radius": 0.0}, "radius must be positive, got 0.0"),
-        ({"mass": math.inf}, "mass must be a finite number, got inf"),
-        ({"mass": "heavy"}, "mass must be a finite number, got 'heavy'"),
-        ({"name": ""}, "name must be a non-empty string, got ''"),
-        ({"wheel_base": 1.0}, "wheel_base must be at most the diameter 0.36, got 1.0"),
-        ({"wheel_radius": 0.3}, "wheel_radius must be at most half the height"),
-        ({"min_wheel_speed": 0.5}, "min_wheel_speed must be below max_wheel_speed = 0.5, got 0.5"),
-    ],
-)
-def test_a_robot_with_impossible_measures_is_rejected(
-    change: dict[str, object], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(ROBOTS["turtlebot2"], **change)
 
 
 def test_the_turtlebot2_has_the_measures_of_the_paper() -> None:

@@ -197,21 +197,6 @@ def test_info_keys_choose_what_is_handed_on() -> None:
     assert "info" not in bare.reset()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
-        ({"parallel": True}, "num_envs must be a positive integer with parallel=True, got None"),
-        ({"parallel": True, "num_envs": 2, "world": ["A", "B"]}, "world must be one, .*, got"),
-        ({"info_keys": ("succes",)}, "info_keys must be among .*got 'succes'"),
-        ({"max_steps": -1}, "max_steps must be a positive integer, got -1"),
-    ],
-)
-def test_a_bad_argument_is_named(arguments: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_navigation_env(**{"world": "A", "physics": "kinematic"} | arguments)
-
-
 def test_the_specs_hold_in_the_worlds_of_a_generator() -> None:
     env = make_navigation_env(
         "mixed", num_envs=3, physics="kinematic", progress="shortest_path", max_steps=20, seed=0
@@ -239,14 +224,6 @@ def test_a_task_can_come_with_its_world() -> None:
     env.reset(TensorDict({"_reset": torch.tensor([[True], [True]])}, [2]))
     assert [world.name == "test" for world in env.env.worlds] == [False, True]
     assert env.env.tasks[1] == pair
-
-
-def test_a_mask_resets_the_robots_that_it_names() -> None:
-    env = make_navigation_env("A", num_envs=3, physics="kinematic", seed=0)
-    env.reset()
-    before = env.env.poses
-    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
-    assert (env.env.poses == before).all(axis=1).tolist() == [True, False, True]
 
 
 def test_batches_of_robots_can_be_collected_and_flattened() -> None:

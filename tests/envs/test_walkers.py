@@ -1,4 +1,4 @@
-"""Walkers: their ways against plain geometry, and both environments against each other."""
+"""Walkers: their paths against plain geometry, and what robots see of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from mpfa_envs import (
     Cylinder,
     Lidar,
     NavigationEnv,
-    Polygon,
     VectorNavigationEnv,
     Walker,
     World,
@@ -25,24 +24,11 @@ from mpfa_envs import (
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import WALKER
 from mpfa_envs.sensing.map_memory import MapMemory
-from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.walkers.loops import time_to_collision
 from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.batch import WorldBatch
-
-ROUND = ((-3.0, 0.5), (3.0, 0.5), (3.0, -3.0))
-BUSY = World(
-    name="busy",
-    boxes=(Box(1.0, 1.0, 2.0, 3.0),),
-    cylinders=(Cylinder(-2.0, -2.0, 0.5),),
-    polygons=(Polygon(((-3.0, 1.5), (-1.5, 2.0), (-3.0, 3.0))),),
-    walkers=(
-        *(Walker(speed=0.2 + 0.1 * number, radius=0.2) for number in range(4)),
-        *(Walker(behavior="waypoints", waypoints=ROUND, speed=speed) for speed in (0.3, 0.5)),
-    ),
-)
-STANDING = replace(BUSY, walkers=())
+from tests.envs.busy import BUSY, POLITE, ROUND, STANDING
 
 
 def batch_of(world: World, seed: int = 0, time_step: float = 0.1) -> WalkerBatch:
@@ -85,9 +71,9 @@ def test_straight_walkers_run_into_nothing_and_never_stop_for_long(seed: int) ->
         for other in range(one):
             apart = np.hypot(*(seen[:, one, :2] - seen[:, other, :2]).T) - 0.4
             assert apart.min() > -0.06  # Both may take a stride at once.
-    way = np.hypot(*np.diff(seen[:, :, :2], axis=0).transpose(2, 0, 1)).sum(axis=0)
+    path = np.hypot(*np.diff(seen[:, :, :2], axis=0).transpose(2, 0, 1)).sum(axis=0)
     speeds = np.array([walker.speed for walker in world.walkers])
-    np.testing.assert_array_less(0.9 * 100 * speeds, way)
+    np.testing.assert_array_less(0.9 * 100 * speeds, path)
     assert (np.hypot(seen[..., 2], seen[..., 3]) - speeds).max() < 1e-9
 
 
@@ -107,10 +93,10 @@ def test_a_walker_goes_its_round_at_its_speed() -> None:
     def along(place: np.ndarray) -> float:
         """How far along the round a place is [m]."""
         for first, last, before in zip(corners, corners[1:], ends, strict=False):
-            way = np.hypot(*(last - first))
-            share = (place - first) @ (last - first) / way**2
+            leg = np.hypot(*(last - first))
+            share = (place - first) @ (last - first) / leg**2
             if 0.0 <= share <= 1.0 and np.allclose(first + share * (last - first), place):
-                return before + share * way
+                return before + share * leg
         raise AssertionError(place)
 
     start = along(batch.of(0)[5, :2])
@@ -141,61 +127,6 @@ def test_a_walker_that_fits_nowhere_is_told_of() -> None:
         batch_of(replace(world, walkers=(Walker(),)))
 
 
-def assert_same_episode(world: World, seed: int, **arguments: object) -> set[str]:
-    """Drive one robot in both environments; how its episodes ended."""
-    given = {"physics": "kinematic", "collision_distance": "contact", "max_steps": 200} | arguments
-    one, many = NavigationEnv(world=world, **given), VectorNavigationEnv(2, world=world, **given)
-    rng, ends = np.random.default_rng(seed), set()
-    observation, info = one.reset(seed=seed)
-    seen, infos = many.reset(seed=[seed, seed + 1])
-    for _ in range(100):
-        np.testing.assert_allclose(seen[0], observation, atol=1e-9)
-        np.testing.assert_allclose(many.walkers(0), one.walkers, atol=1e-9)
-        for name in INFO_TYPES:
-            assert infos[name][0] == pytest.approx(info[name], abs=1e-9), name
-        action = rng.uniform(-0.3, 1.0, 2).astype(np.float32)
-        observation, reward, terminated, truncated, info = one.step(action)
-        seen, rewards, *_, infos = many.step(np.stack((action, -action)))
-        assert rewards[0] == pytest.approx(reward, abs=1e-9)
-        if terminated or truncated:
-            ends.add(next(name for name in ("success", "collision", "timeout") if info[name]))
-            observation, info = one.reset()
-            seen, _, _, _, infos = many.step(np.stack((action, -action)))
-    one.close()
-    many.close()
-    return ends
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{}, {"lidar": {"noise": 0.02}, "memory": "map"}, {"progress": "shortest_path"}],
-    ids=lambda arguments: "-".join(arguments) or "defaults",
-)
-def test_a_robot_among_walkers_drives_alike_in_both_environments(
-    arguments: dict[str, object],
-) -> None:
-    ends = set().union(*(assert_same_episode(BUSY, seed, **arguments) for seed in range(2)))
-    assert "collision" in ends
-
-
-POLITE = replace(
-    BUSY,
-    name="polite",
-    walkers=(
-        *(
-            Walker(behavior="orca", waypoints=points, radius=0.2, speed=0.4)
-            for points in (
-                ROUND,
-                ROUND[::-1],
-                ((-4.0, -4.0), (4.0, -4.0)),
-                ((4.0, -4.0), (-4.0, -4.0)),
-            )
-        ),
-        Walker(radius=0.2),
-    ),
-)
-
-
 def test_walkers_that_avoid_each_other_do_not_collide() -> None:
     pytest.importorskip("pyrvo", reason="an extra")
     seen = walk(batch_of(POLITE), 1500)
@@ -203,8 +134,8 @@ def test_walkers_that_avoid_each_other_do_not_collide() -> None:
     for one in range(4):
         for other in range(one):
             assert np.hypot(*(seen[:, one, :2] - seen[:, other, :2]).T).min() > 0.38
-    way = np.hypot(*np.diff(seen[:, :4, :2], axis=0).transpose(2, 0, 1)).sum(axis=0)
-    assert way.min() > 0.7 * 150 * 0.4
+    path = np.hypot(*np.diff(seen[:, :4, :2], axis=0).transpose(2, 0, 1)).sum(axis=0)
+    assert path.min() > 0.7 * 150 * 0.4
     assert np.hypot(seen[:, :4, 2], seen[:, :4, 3]).max() < 0.401
 
 
@@ -224,30 +155,10 @@ def test_a_walker_that_avoids_others_goes_around_the_robot() -> None:
     assert min(places) < -2.0 and max(places) > 2.0
 
 
-def test_orca_walkers_are_alike_in_both_environments_and_resume() -> None:
-    pytest.importorskip("pyrvo", reason="an extra")
-    assert_same_episode(POLITE, 1)
-    given: dict[str, Any] = {"world": POLITE, "physics": "kinematic"}
-    env, other = VectorNavigationEnv(2, **given), VectorNavigationEnv(2, **given)
-    env.reset(seed=0)
-    actions = np.full((2, 2), -0.5, dtype=np.float32)
-    for _ in range(15):
-        env.step(actions)
-    other.load_state_dict(env.state_dict())
-    for _ in range(15):
-        np.testing.assert_array_equal(env.step(actions)[0], other.step(actions)[0])
-        np.testing.assert_array_equal(env.walkers(1), other.walkers(1))
-
-
 def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrvo", None)
     with pytest.raises(ImportError, match=r"behavior='orca' needs pyrvo: pip install .*\[orca\]"):
         batch_of(POLITE)
-
-
-def test_wheels_meet_the_same_walkers_in_both_environments() -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
-    assert_same_episode(BUSY, 1, physics="wheels", collision_distance=0.25)
 
 
 def frozen(world: World, walkers: np.ndarray) -> World:
@@ -296,50 +207,20 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
     assert not (rows[0] & ~rows[1]).any()
 
 
-def test_a_restored_state_continues_to_the_bit() -> None:
-    few = replace(BUSY, name="few", walkers=BUSY.walkers[3:5])
-
-    def make(worlds: list[World]) -> VectorNavigationEnv:
-        return VectorNavigationEnv(3, world=worlds, physics="kinematic", lidar={"noise": 0.02})
-
-    def drive(env: VectorNavigationEnv, first: int, last: int) -> bytes:
-        seen = []
-        for step in range(first, last):
-            actions = np.random.default_rng(step).uniform(-0.3, 1.0, (3, 2)).astype(np.float32)
-            observations, rewards, *_, infos = env.step(actions)
-            seen += [observations, rewards, infos["walker_distance"], infos["intrusion_time"]]
-            seen += [env.walkers(index) for index in range(3)]
-        return b"".join(array.tobytes() for array in seen)
-
-    env, other = make([BUSY, few, STANDING]), make([BUSY, few, STANDING])
+def test_a_state_of_other_walkers_is_rejected_and_changes_nothing() -> None:
+    env = VectorNavigationEnv(1, world=BUSY, physics="kinematic")
     env.reset(seed=1)
-    drive(env, 0, 30)
-    state = env.state_dict()
-    expected = drive(env, 30, 80)
-    other.reset(seed=2, options={"worlds": [STANDING, BUSY, few]})
-    drive(other, 0, 5)
-    other.load_state_dict(state)
-    assert drive(other, 30, 80) == expected
-    before = other.walkers(0)
+    before, state = env.walkers(0), env.state_dict()
     targets = state["batch"]["walkers"]["targets"]
     targets[targets > 0] = 3  # A round of three ends at 2.
+    env.reset(seed=2)
+    before = env.walkers(0)
     with pytest.raises(ValueError, match="targets of the state must be numbers"):
-        other.load_state_dict(state)
+        env.load_state_dict(state)
     del state["batch"]["walkers"]["states"]
     with pytest.raises(ValueError, match="states of the state must have rows for 6 walkers"):
-        other.load_state_dict(state)
-    np.testing.assert_array_equal(other.walkers(0), before)
-
-
-def test_walkers_do_not_depend_on_how_many_robots_there_are() -> None:
-    seen = []
-    for robots in (1, 5):
-        env = VectorNavigationEnv(robots, world=BUSY, physics="kinematic")
-        env.reset(seed=4)
-        for _ in range(20):
-            env.step(np.full((robots, 2), 0.3, dtype=np.float32))
-        seen.append(env.walkers(0))
-    np.testing.assert_array_equal(*seen)
+        env.load_state_dict(state)
+    np.testing.assert_array_equal(env.walkers(0), before)
 
 
 def test_the_walkers_of_a_robot_that_waits_stand_still() -> None:
@@ -428,13 +309,11 @@ def test_results_tell_of_walkers_if_there_are_any() -> None:
 
 def test_a_picture_shows_the_walkers_where_they_are() -> None:
     given: dict[str, Any] = {"physics": "kinematic", "render_mode": "rgb_array"}
-    one, many = NavigationEnv(world=BUSY, **given), VectorNavigationEnv(1, world=BUSY, **given)
-    one.reset(seed=0)
-    many.reset(seed=[0])
-    picture = one.render()
+    env = NavigationEnv(world=BUSY, **given)
+    env.reset(seed=0)
+    picture = env.render()
     assert picture is not None
-    np.testing.assert_array_equal(many.render()[0], picture)  # type: ignore[index]
-    for x, y, speed_x, speed_y, radius in one.walkers.tolist():
+    for x, y, speed_x, speed_y, radius in env.walkers.tolist():
         # Beside the line that shows where it goes.
         aside = 0.5 * radius / math.hypot(speed_x, speed_y)
         at = x - aside * speed_y, y + aside * speed_x

@@ -104,18 +104,3 @@ def test_it_touches_what_it_meets_until_it_is_placed_elsewhere() -> None:
     assert robot.touched
     robot.place((0.0, 0.0, 1.0))
     assert not robot.touched and robot.motion == (0.0, 0.0, 1.0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"physics": "none"}, "physics must be 'wheels' or 'kinematic', got 'none'"),
-        ({"rays": 1}, "rays must be an integer of at least 2, got 1"),
-        ({"field": (1.0, 1.0)}, r"field must rise, got \(1.0, 1.0\)"),
-        ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
-        ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
-    ],
-)
-def test_bad_robot_arguments_are_rejected(options: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SimulatedRobot("A", **{"physics": "kinematic", **options})  # type: ignore[arg-type]

@@ -355,21 +355,6 @@ def test_an_action_that_is_not_finite_stops_it() -> None:
     assert order.reason.startswith("the network's action must be finite, got")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"stop_distance": -0.1}, "stop_distance must not be negative, got -0.1"),
-        ({"stop_distance": math.nan}, "stop_distance must be a finite number, got nan"),
-        ({"scan_timeout": 0.0}, "scan_timeout must be positive, got 0.0"),
-        ({"odometry_timeout": math.inf}, "odometry_timeout must be a finite number, got inf"),
-        ({"check_period": 0.0}, "check_period must be positive, got 0.0"),
-    ],
-)
-def test_bad_limits_are_rejected(options: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make(**options)
-
-
 def names(**values: Any) -> SimpleNamespace:
     return SimpleNamespace(**values)
 

@@ -8,14 +8,18 @@ import os
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from mpfa_envs.deploy.card import CardError, read_exported
+from mpfa_envs.deploy.network import Network
 from mpfa_envs.files import check_replaceable, read_file, write_atomically
 from mpfa_envs.policies.layers import KINDS, arrays_of
-from mpfa_envs.policies.onnx_policy import OnnxPolicy
 from mpfa_envs.policies.policy import Policy, PolicyFileError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 FILE_NAME: Final = "policy.npz"
 """Name of the file in the folder of a run."""
@@ -141,3 +145,26 @@ def _read(content: bytes) -> Policy:
 def _file(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     return path / FILE_NAME if path.is_dir() else path
+
+
+class OnnxPolicy(Policy):
+    """An exported policy with its card beside it; onnxruntime computes it."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        try:
+            card, content = read_exported(path)
+            self._network = Network(content, card.observation_size, card.action_size)
+        except CardError as error:
+            raise PolicyFileError(str(error)) from error
+        self.observation_size, self.action_size = card.observation_size, card.action_size
+        self.layers = ()
+        self.card: dict[str, Any] = dict(card.training)
+        self.env_arguments: dict[str, Any] = dict(card.env_arguments)
+
+    def _choose(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        # One at a time: a quantized network finds its scales in all rows that it is given.
+        actions = [self._network(row[None]) for row in rows]
+        return np.concatenate(actions or [np.empty((0, self.action_size), np.float32)])
+
+    def __repr__(self) -> str:
+        return f"OnnxPolicy({self.observation_size} -> {self.action_size})"

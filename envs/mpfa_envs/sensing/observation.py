@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -25,6 +26,17 @@ SPEED_BOUND: Final = 2.0
 PATH_BOUND: Final = 10.0
 """The scaled length of the path is clipped to this: it is very long where all paths are blocked."""
 
+_BOUNDS: Final = {
+    "lidar": (0.0, 1.0),
+    "goal_direction": (-1.0, 1.0),
+    "goal_closeness": (0.0, 1.0),
+    "goal_distance": (0.0, math.inf),
+    "linear_speed": (-SPEED_BOUND, SPEED_BOUND),
+    "angular_speed": (-SPEED_BOUND, SPEED_BOUND),
+    "way_direction": (-1.0, 1.0),
+    "way_length": (0.0, PATH_BOUND),
+    "lidar_history": (0.0, 1.0),
+}
 FLAGS: Final[tuple[str, ...]] = ("success", "collision", "timeout")
 """Flags of the info dictionary, in the order of the tables."""
 NUMBERS: Final[tuple[str, ...]] = (
@@ -101,12 +113,9 @@ def observation_bounds(
     sectors: int, diagonal: float, *, memory: Memory = "none", history: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The least and the greatest observation, ``[O]``, in a room with this diagonal [m]."""
-    far = diagonal / DISTANCE_SCALE
-    low = [0.0] * sectors + [-1.0, -1.0, 0.0, 0.0, -SPEED_BOUND, -SPEED_BOUND]
-    high = [1.0] * sectors + [1.0, 1.0, 1.0, far, SPEED_BOUND, SPEED_BOUND]
-    if memory == "map":
-        low += [-1.0, -1.0, 0.0]
-        high += [1.0, 1.0, PATH_BOUND]
-    low += [0.0] * sectors * history
-    high += [1.0] * sectors * history
+    low, high = [], []
+    for name, part in observation_slices(sectors, memory=memory, history=history).items():
+        width = part.stop - part.start
+        low += [_BOUNDS[name][0]] * width
+        high += [diagonal / DISTANCE_SCALE if name == "goal_distance" else _BOUNDS[name][1]] * width
     return np.array(low, dtype=np.float32), np.array(high, dtype=np.float32)

@@ -1,0 +1,230 @@
+"""Arguments that environments, robots, senses and policies reject: a row each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpfa_envs import (
+    ROBOTS,
+    WORLDS,
+    DiscreteWheels,
+    Lidar,
+    Mirror,
+    NavigationEnv,
+    RandomMirror,
+    RobotNoise,
+    TaskConfig,
+    VectorNavigationEnv,
+    World,
+    make_navigation_env,
+)
+from mpfa_envs.deploy import Pilot
+from mpfa_envs.ros.controller import Controller
+from mpfa_envs.ros.simulated_robot import SimulatedRobot
+from mpfa_envs.sensing.binning import Binning
+from tests.envs.exported import card
+
+Rows = list[tuple[Mapping[str, Any], str]]
+
+
+def ahead(seen: np.ndarray) -> np.ndarray:
+    return np.ones((1, 2), np.float32)
+
+
+def one(**arguments: Any) -> NavigationEnv:
+    return NavigationEnv(**{"physics": "kinematic"} | arguments)
+
+
+def many(**arguments: Any) -> VectorNavigationEnv:
+    return VectorNavigationEnv(**{"num_envs": 2, "physics": "kinematic"} | arguments)
+
+
+def torchrl(**arguments: Any) -> object:
+    return make_navigation_env(**{"physics": "kinematic"} | arguments)
+
+
+def pilot(**arguments: Any) -> Pilot:
+    return Pilot(card(), ahead, **arguments)
+
+
+def controller(**arguments: Any) -> Controller:
+    return Controller(pilot(), **arguments)
+
+
+TASK: Rows = [
+    ({"robot": "burgr"}, "robot must be .*got 'burgr' .did you mean 'burger'"),
+    ({"physics": "magic"}, "physics must be one of .*got 'magic'"),
+    ({"progress": "path"}, "progress must be one of .*got 'path'"),
+    ({"max_steps": 0}, "max_steps must be a positive integer, got 0"),
+    ({"max_steps": True}, "max_steps must be a positive integer, got True"),
+    ({"action_repeat": 0}, "action_repeat must be a positive integer, got 0"),
+    ({"action_repeat": -1}, "action_repeat must be a positive integer, got -1"),
+    ({"action_repeat": 1.5}, "action_repeat must be a positive integer, got 1.5"),
+    ({"action_repeat": True}, "action_repeat must be a positive integer, got True"),
+    ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
+    ({"time_step": "1"}, "time_step must be a finite number, got '1'"),
+    ({"time_step": None}, "time_step must be a finite number, got None"),
+    ({"time_step": 0.6}, "time_step must be at most 0.5 s, .*collision_distance = 0.25 .*got 0.6"),
+    ({"goal_radius": math.nan}, "goal_radius must be a finite number, got nan"),
+    ({"min_goal_distance": 0.3}, "min_goal_distance must be above goal_radius = 0.5, got 0.3"),
+    ({"closeness_distance": 0.0}, "closeness_distance must be positive, got 0.0"),
+    ({"detour_chance": 1.1}, r"detour_chance must be in \[0, 1\], got 1.1"),
+    ({"detour_chance": math.nan}, "detour_chance must be a finite number, got nan"),
+    ({"progress_scale": math.inf}, "progress_scale must be a finite number, got inf"),
+    ({"collision_distance": 0.1}, "collision_distance must be .*0.18, got 0.1"),
+    ({"collision_distance": True}, "collision_distance must be .*got True"),
+    ({"collision_distance": [1]}, r"collision_distance must be .*got \[1\]"),
+    ({"collision_distance": "touch"}, "collision_distance must be .*got 'touch'"),
+    ({"reward": 3}, "reward must be callable or None, got 3"),
+    ({"memory": "lstm"}, r"memory must be one of \('none', 'map'\), got 'lstm'"),
+    ({"history": -1}, "history must be an integer of at least 0, got -1"),
+    ({"history": 1.5}, "history must be an integer of at least 0, got 1.5"),
+    ({"history": "two"}, "history must be an integer of at least 0, got 'two'"),
+    ({"lidar": {"sectors": 0}}, "sectors must be a positive integer, got 0"),
+    ({"lidar": {"reduction": "mean"}}, "reduction must be one of .*got 'mean'"),
+    ({"lidar": {"max_range": -1.0}}, r"max_range must be positive, got -1\.0"),
+    ({"lidar": {"noise": -1.0}}, r"noise must not be negative, got -1\.0"),
+    ({"lidar": {"sector": 3}}, "lidar must hold arguments of Lidar, got {'sector': 3}"),
+    ({"lidar": 18}, "lidar must hold arguments of Lidar, got 18"),
+    (
+        {"lidar": {"noise": 0.1}, "noise": {"range_noise": 0.1}},
+        "lidar must not hold 'noise' beside noise=",
+    ),
+    ({"noise": {"latecy": 1}}, "noise must be a RobotNoise or hold arguments of it"),
+    ({"noise": {"slip": 0.6}}, r"slip must be in \[0, 0.45\], got 0.6"),
+    ({"noise": 3}, "noise must be a RobotNoise or hold arguments of it, got 3"),
+]
+ONE: Rows = [
+    ({"world": "tets"}, "world must be .*got 'tets' .did you mean 'test'"),
+    ({"render_mode": "ansi"}, "render_mode must be None or 'human' or 'rgb_array', got 'ansi'"),
+    ({"noise": {"slip": 0.6}}, r"slip must be in \[0, 0.45\], got 0.6"),
+]
+MANY: Rows = [
+    ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
+    ({"num_envs": 2.5}, "num_envs must be a positive integer, got 2.5"),
+    ({"world": []}, "world must hold at least one world, got an empty sequence"),
+    ({"world": ["A", "tets"]}, "world must be .*got 'tets' .did you mean 'test'"),
+    ({"world": "barz"}, "world must be .*got 'barz' .did you mean 'bars'"),
+    ({"difficulty": 0.5}, "difficulty must be None unless world is the name of a generator"),
+    ({"world": "rooms", "difficulty": 1.5}, r"difficulty must be in \[0, 1\], got 1.5"),
+    ({"episodes_per_world": 0}, "episodes_per_world must be a positive integer, got 0"),
+    ({"split": "test"}, "split must be 'train' or 'validation', got 'test'"),
+    ({"max_goal_distance": 1.0}, "max_goal_distance must be above min_goal_distance = 2.0"),
+    ({"autoreset_mode": "Never"}, "autoreset_mode must be .*got 'Never'"),
+    ({"min_goal_distance": 40.0}, "world 'A' has no start and goal at least"),
+    ({"world": World(name="box", size=(0.9, 0.9))}, "world 'box' has no free goal"),
+    ({"world": "bars", "min_goal_distance": 90.0}, "world = 'bars' cannot be driven: 50 of"),
+    ({"progress": "path"}, "progress must be one of .*got 'path'"),
+]
+TORCHRL: Rows = [
+    ({"num_envs": 0}, "num_envs must be a positive integer, got 0"),
+    ({"num_envs": 0, "parallel": True}, "num_envs must be a positive integer, got 0"),
+    ({"parallel": True}, "num_envs must be a positive integer with parallel=True, got None"),
+    ({"parallel": True, "num_envs": 2, "world": ["A", "B"]}, "world must be one, .*, got"),
+    ({"info_keys": ("succes",)}, "info_keys must be among .*got 'succes'"),
+    ({"max_steps": -1}, "max_steps must be a positive integer, got -1"),
+]
+ROBOT: Rows = [
+    ({"radius": 0.0}, "radius must be positive, got 0.0"),
+    ({"mass": math.inf}, "mass must be a finite number, got inf"),
+    ({"mass": "heavy"}, "mass must be a finite number, got 'heavy'"),
+    ({"mass": True}, "mass must be a finite number, got True"),
+    ({"name": ""}, "name must be a non-empty string, got ''"),
+    ({"wheel_base": 1.0}, "wheel_base must be at most the diameter 0.36, got 1.0"),
+    ({"wheel_radius": 0.3}, "wheel_radius must be at most half the height"),
+    ({"min_wheel_speed": 0.5}, "min_wheel_speed must be below max_wheel_speed = 0.5, got 0.5"),
+]
+NOISE: Rows = [
+    ({"range_noise": -0.1}, "range_noise must not be negative, got -0.1"),
+    ({"drift": math.nan}, "drift must be a finite number, got nan"),
+    ({"dropout": 1.5}, r"dropout must be in \[0, 1\], got 1.5"),
+    ({"latency": 0.5}, "latency must be an integer of at least 0, got 0.5"),
+]
+LIDAR: Rows = [
+    ({"field_of_view": 0.0}, "field_of_view must be positive, got 0.0"),
+    ({"field_of_view": -90.0}, "field_of_view must be positive, got -90.0"),
+    ({"field_of_view": 361.0}, "field_of_view must be at most 360 degrees, got 361.0"),
+    ({"field_of_view": math.nan}, "field_of_view must be a finite number, got nan"),
+]
+PAIRS: Rows = [
+    ({"pairs": [(1.0, 1.0)]}, r"pairs must be two or more pairs of numbers, got \[\(1.0, 1.0\)\]"),
+    ({"pairs": [(1.0, 1.0), (2.0, 1.0)]}, r"pairs must be in \[-1, 1\]"),
+    ({"pairs": [(1.0, math.nan), (0.0, 1.0)]}, r"pairs must be in \[-1, 1\]"),
+    ({"pairs": [(1.0, 1.0), (1.0, 1.0)]}, "pairs must be different"),
+    ({"pairs": [1.0, 0.5]}, "pairs must be two or more pairs"),
+]
+MIRROR: Rows = [
+    ({"sectors": -1}, "sectors must be a positive integer, got -1"),
+    ({"history": -1}, "history must be an integer of at least 0, got -1"),
+    ({"pairs": [(1.0, 1.0), (0.0, 1.0)]}, "pairs must hold the mirror image of each, got none of"),
+]
+CHANCE: Rows = [
+    ({"chance": -0.1}, r"chance must be in \[0, 1\], got -0.1"),
+    ({"chance": 1.5}, r"chance must be in \[0, 1\], got 1.5"),
+    ({"chance": math.nan}, "chance must be a finite number, got nan"),
+]
+BINS: Rows = [
+    ({"groups": 0}, "groups must be a positive integer, got 0"),
+    ({"groups": 19}, "groups must be at most 18 sectors, got 19"),
+    ({"closeness": (0.5, 0.5)}, r"closeness must be finite and rise, got \(0.5, 0.5\)"),
+    ({"distances": (math.nan,)}, r"distances must be finite and rise, got \(nan,\)"),
+    ({"directions": 2.5}, "directions must be a positive integer, got 2.5"),
+    ({"observation_size": 23}, "observation_size must be 24 or more: 23"),
+]
+PILOT: Rows = [
+    ({"robot": "waffle"}, "learned with a robot of radius 0.18 m, waffle has 0.22 m"),
+    ({"robot": "burger", "pace": 0.5}, "pace must be above 0 and at most 0.44, as burger"),
+    ({"pace": 0.0}, "pace must be above 0"),
+    ({"silent": "near"}, "silent must be one of"),
+    ({"mount": (0.0, 1.0)}, "mount must be 3 numbers, got 2"),
+    ({"unseen": -1.0}, "unseen must be positive, got -1.0"),
+    ({"map_size": math.inf}, "map_size must be a finite number, got inf"),
+]
+CONTROLLER: Rows = [
+    ({"stop_distance": -0.1}, "stop_distance must not be negative, got -0.1"),
+    ({"stop_distance": math.nan}, "stop_distance must be a finite number, got nan"),
+    ({"scan_timeout": 0.0}, "scan_timeout must be positive, got 0.0"),
+    ({"odometry_timeout": math.inf}, "odometry_timeout must be a finite number, got inf"),
+    ({"check_period": 0.0}, "check_period must be positive, got 0.0"),
+]
+SIMULATED: Rows = [
+    ({"physics": "none"}, "physics must be one of .*got 'none'"),
+    ({"rays": 1}, "rays must be an integer of at least 2, got 1"),
+    ({"field": (1.0, 1.0)}, r"field must rise, got \(1.0, 1.0\)"),
+    ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
+    ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+]
+PARTS: list[tuple[Callable[..., object], Rows]] = [
+    (TaskConfig, TASK),
+    (one, ONE),
+    (many, MANY),
+    (torchrl, TORCHRL),
+    (partial(replace, ROBOTS["turtlebot2"]), ROBOT),
+    (RobotNoise, NOISE),
+    (partial(Lidar, WORLDS["A"]), LIDAR),
+    (DiscreteWheels, PAIRS),
+    (Mirror, MIRROR),
+    (RandomMirror, CHANCE),
+    (Binning, BINS),
+    (pilot, PILOT),
+    (controller, CONTROLLER),
+    (partial(SimulatedRobot, "A", **{"physics": "kinematic"}), SIMULATED),
+]
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "message"),
+    [(make, *row) for make, rows in PARTS for row in rows],
+)
+def test_a_bad_argument_is_named_with_its_value(
+    make: Callable[..., object], arguments: Mapping[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**arguments)
