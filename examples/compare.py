@@ -27,9 +27,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import training.extra  # noqa: F401
@@ -38,18 +36,11 @@ import training.extra  # noqa: F401
 from torchrl_mpfa.spelling import unknown
 from training import files
 from training.comparison.arms import check_free, parse_arms
-from training.comparison.execution import Runs, Start
-from training.comparison.jobs import TESTED, Evaluation, Study, collect, other_than_asked
-from training.comparison.processes import Child
+from training.comparison.execution import JOBS, make_runs
+from training.comparison.jobs import TESTED, Evaluation, Study
 from training.environments import check_physics
 from training.settings.train import GROUPS, register
-from training.stopping import Stop
 from training.worlds import parse_worlds
-
-_PAUSE = 0.3
-"""Between two looks at the runs [s]."""
-_JOBS = 2
-"""Runs at a time on one machine."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -70,7 +61,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--folder", type=Path, default=Path("runs/compare"), help="(default: runs/compare)"
     )
     parser.add_argument(
-        "--jobs", type=int, help=f"runs at a time (default: {_JOBS}; with --ray as many as fit)"
+        "--jobs", type=int, help=f"runs at a time (default: {JOBS}; with --ray as many as fit)"
     )
     parser.add_argument(
         "--ray",
@@ -119,52 +110,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-@contextmanager
-def executor(address: str | None) -> Iterator[Start]:
-    """Where commands are run.
-
-    Args:
-        address: Of a Ray cluster, empty for the one that there is; None: on this machine.
-
-    Yields:
-        What starts one.
-
-    Raises:
-        ValueError: If Ray is not installed, or there is no such cluster.
-    """
-    if address is None:
-        yield Child
-        return
-    try:
-        from training.comparison.clusters import RemoteChild, connected
-    except ImportError as error:
-        raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
-    try:
-        with connected(address or None):
-            yield RemoteChild
-    except ConnectionError as error:
-        raise ValueError(f"--ray {address}: {error}") from error
-
-
-def run_all(runs: Runs) -> Stop:
-    """Train and evaluate, some at a time.
-
-    Args:
-        runs: What there is to do.
-
-    Returns:
-        Whether all was stopped.
-    """
-    stop = Stop("saving the runs; the same command continues them")
-    with stop.listening():
-        while runs and not stop:
-            runs.begin()
-            time.sleep(_PAUSE)
-            runs.look()
-        runs.stop()
-    return stop
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train what is not trained, evaluate it, collect the rows.
 
@@ -189,32 +134,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tuple(options.arms),
         Evaluation(tuple(options.worlds), options.episodes, options.physics),
     )
-    jobs, wanted = study.jobs, study.evaluation
     try:
-        with files.lock(options.folder):
-            others = other_than_asked(jobs, options.overrides)
-            if others and not options.anew:
-                job, found = next(iter(others.items()))
-                raise ValueError(
-                    f"{job.path} was trained with {'; '.join(found)}: name another --folder, or "
-                    "train it again with --anew"
-                )
-            waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
-            print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {options.folder}")
-            with executor(options.ray if waiting else None) as start:
-                most = options.jobs or (_JOBS if options.ray is None else len(waiting))
-                runs = Runs(
-                    waiting, options.overrides, wanted, anew=set(others), start=start, most=most
-                )
-                stop = run_all(runs)
-            if stop:
-                return stop.exit_status
-            collect(jobs, wanted, options.folder)
+        status = make_runs(study, most=options.jobs, ray=options.ray, anew=options.anew)
     except (ValueError, files.FolderInUse) as error:
         print(f"compare.py: {error}", file=sys.stderr)
         return 2
-    print(f"written: {options.folder / files.EPISODES}; now: report.py {options.folder}")
-    return 1 if runs.failed else 0
+    if status < 128:
+        print(f"written: {options.folder / files.EPISODES}; now: report.py {options.folder}")
+    return status
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ COMMANDS = {
     "run": ("run", "train and evaluate the runs of tables A to E"),
     "gym": ("gym.script", "train the runs of table F, on Gymnasium tasks"),
     "report": ("report", "make the pages and figures of the tables"),
+    "statistics": ("statistics", "make every statistic of comparisons by compare.py"),
     "paper": ("paper_report", "make the paper's figures and tables"),
     "strength": ("strength", "measure how strongly methods prioritize"),
     "cliffwalk": ("cliffwalk", "count updates to convergence on the blind cliffwalk"),

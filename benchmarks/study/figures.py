@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.study.protocol import HEIGHT, KEY, OF_VOLUMES, VOLUMES, Table, short_names
-from benchmarks.study.rows import Rows, by_run, scores_of
-from benchmarks.study.tables import FEWEST, MEASURES
-from mpfa_envs.render.charts import finish, look, new_figure
-from torchrl_mpfa.methods import METHODS
-from training.report.intervals import (
+from benchmarks.study.intervals import (
     Array,
     mean_interval,
     performance_profile,
     resampled_means,
     widened_ends,
 )
+from benchmarks.study.protocol import HEIGHT, KEY, OF_VOLUMES, VOLUMES, Table, short_names
+from benchmarks.study.rows import Rows, by_run, scores_of
+from benchmarks.study.tables import FEWEST, MEASURES
+from mpfa_envs.render.charts import finish, look, new_figure
+from torchrl_mpfa.methods import METHODS
 
 _LEVELS = np.linspace(0.0, 1.0, 201)
 _SIZE = (3.6, 2.8)

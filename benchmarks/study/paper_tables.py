@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 import pandas as pd
 
 from benchmarks.study.paper import NAMES, TABLE_2, TABLE_3, TABLE_4, TESTS, Tested
+from training.comparison.report import table
 from training.figures import Runs
-from training.report.tables import table
 
 
 def unseen_table(tested: Runs, paper: Mapping[str, Tested]) -> str:

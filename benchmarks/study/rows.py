@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from benchmarks.study.protocol import Table, label_of
@@ -15,7 +16,6 @@ from benchmarks.study.remaining import parts_left
 from training import files
 from training.comparison.jobs import Evaluation, Job, Study
 from training.records import read_table
-from training.report.tables import area_under
 from training.worlds import family
 
 GOAL = 0.9
@@ -83,6 +83,12 @@ def scores_of(rows: Rows, table: Table) -> dict[str, pd.DataFrame]:
             "success": success.get(arm, {}).get(seed, math.nan),
         }
     return {arm: pd.DataFrame.from_dict(runs, "index") for arm, runs in found.items()}
+
+
+def area_under(steps: pd.Series, values: pd.Series) -> float:
+    """Mean height of a curve that starts at zero, over its steps."""
+    x, y = np.concatenate(([0.0], steps)), np.concatenate(([0.0], values))
+    return float(np.trapezoid(y, x) / x[-1])
 
 
 def by_run(table: pd.DataFrame) -> Iterator[tuple[str, int, pd.DataFrame]]:

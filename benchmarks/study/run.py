@@ -7,7 +7,7 @@
     python -m benchmarks.study run --keep docs/results/study    add the rows of finished runs to it
     python -m benchmarks.study run --kept docs/results/study    make only runs that it lacks
 
-Every run is made by ``compare.py``, with the commands that ``--list`` shows. What is trained and
+Every run is made as by ``compare.py`` with the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is in progress, and the same command continues it. Tables
 A to E are in ``benchmarks/study/protocol.py``, with one folder per task in ``--folder``; table F,
 which is not about navigation, is made by ``python -m benchmarks.study gym``. The checkpoint of a
@@ -17,16 +17,19 @@ finished run is removed: thousands of them take tens of gigabytes.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import compare
 from benchmarks.study.kept_rows import is_kept, joined, keep, of_arms, read_all_kept
 from benchmarks.study.protocol import ROOT, Table, label_of, tables
 from benchmarks.study.remaining import counts, free_checkpoints, hours_left, parts_left
 from benchmarks.study.rows import Rows, read_runs, without_rows
 from training import files
+from training.comparison.execution import make_runs
+from training.comparison.jobs import Study
+from training.settings.train import register
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -127,8 +130,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line.
 
     Returns:
-        Exit status: 0, the highest of ``compare.py``, or 128 and the number of the signal that
-        stopped it.
+        Exit status: 0, the highest of :func:`make_runs`, or 128 and the number of the signal that
+        stopped it; 2 for a table whose runs cannot be made.
     """
     options = parse(arguments)
     if options.list or options.keep:
@@ -137,6 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.keep:
             print(kept(options.tables, options.folder, options.keep))
         return 0
+    register()
     worst = 0
     for table in options.tables:
         for study in table.studies:
@@ -145,8 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(
                     f"{summary(options.tables, jobs=options.jobs)}\n{table.name}: {study.command}"
                 )
-                status = compare.main([*study.arguments[:2], *_jobs(options), *study.arguments[2:]])
-                worst = max(worst, status)
+                worst = max(worst, _make(study, options.jobs))
             free_checkpoints(study)
             if worst >= 128:
                 return worst
@@ -154,5 +157,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return worst
 
 
-def _jobs(options: argparse.Namespace) -> list[str]:
-    return ["--jobs", str(options.jobs)]
+def _make(study: Study, jobs: int) -> int:
+    """Make the runs of a study; 2 if they cannot be, as of ``compare.py``."""
+    try:
+        return make_runs(study, most=jobs)
+    except (ValueError, files.FolderInUse) as error:
+        print(f"run: {error}", file=sys.stderr)
+        return 2

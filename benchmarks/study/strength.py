@@ -29,7 +29,7 @@ from tensordict import TensorDict
 from benchmarks.study.protocol import SPARSE
 from mpfa_envs import RandomMirror
 from torchrl_mpfa import EntropyFusion, SignalSampler, TD3Learner
-from training.report.tables import table
+from training.comparison.report import table
 from training.run.loop import TrainingRun
 from training.settings.command_line import composed
 from training.settings.train import register

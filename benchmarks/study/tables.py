@@ -11,10 +11,7 @@ from textwrap import fill
 import numpy as np
 import pandas as pd
 
-from benchmarks.study.protocol import Pair, Table, short_names
-from benchmarks.study.rows import GOAL, Rows, kinds_of, scores_of, worlds_of
-from mpfa_envs.evaluation.results import Interval
-from training.report.intervals import (
+from benchmarks.study.intervals import (
     Array,
     difference_interval,
     improvement_interval,
@@ -22,10 +19,13 @@ from training.report.intervals import (
     mean_interval,
     mean_over_worlds,
 )
-from training.report.permutation import deal_p, flip_p, holm, rank_flip_p, rank_p
-from training.report.power import difference_found, paired_difference_found
-from training.report.tables import median_of
-from training.report.tables import table as markdown
+from benchmarks.study.permutation import deal_p, flip_p, holm, rank_flip_p, rank_p
+from benchmarks.study.power import difference_found, paired_difference_found
+from benchmarks.study.protocol import Pair, Table, short_names
+from benchmarks.study.rows import GOAL, Rows, kinds_of, scores_of, worlds_of
+from mpfa_envs.evaluation.results import Interval
+from training.comparison.report import median_of
+from training.comparison.report import table as markdown
 from training.worlds import family
 
 NOTES = """\

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
+import pandas as pd
 import pytest
 from hydra.core.config_store import ConfigStore
+
+from training.records import write_table
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -20,4 +24,32 @@ def one_store() -> Iterator[None]:
 @pytest.fixture
 def tables_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the report of a study make no figure, which takes longer than all of its tables."""
-    monkeypatch.setattr("report.plot_evaluations", lambda *_: None)
+    monkeypatch.setattr("training.comparison.report.plot_evaluations", lambda *_: None)
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Two methods, two seeds, four pairs: the first method fails once, the other always."""
+    evaluation = []
+    for method, failures in (("mpfa_per", {(1, 3)}), ("per", None)):
+        for seed in (0, 1):
+            for episode in range(4):
+                good = failures is not None and (seed, episode) not in failures
+                evaluation.append(
+                    {
+                        **{"learner": "ddpg", "method": method, "seed": seed, "world": "test"},
+                        **{"episode": episode, "success": good, "collision": not good},
+                        **{"timeout": False, "time_s": 20.0 + seed, "spl": 0.8 * good},
+                    }
+                )
+            folder = tmp_path / f"ddpg-{method}-{seed}"
+            folder.mkdir()
+            training = [
+                {"total_steps": 10 * (n + 1), "success": n > 1, "average_reward": 0.1 * n}
+                for n in range(5)
+            ]
+            write_table(pd.DataFrame(training), folder / "episodes.csv")
+            found = [{"total_steps": 5000, "success": 0.5}, {"total_steps": 9000, "success": 1}]
+            write_table(pd.DataFrame(found), folder / "evaluations.csv")
+    write_table(pd.DataFrame(evaluation), tmp_path / "episodes.csv")
+    return tmp_path

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tqdm import tqdm
 
-from training.comparison.jobs import Evaluation, Job, other_than_asked
-from training.comparison.processes import Lost, Started
+from training import files
+from training.comparison.jobs import Evaluation, Job, Study, collect, other_than_asked
+from training.comparison.processes import Child, Lost, Started
+from training.stopping import Stop
 
 Start = Callable[[Sequence[str], Path], Started]
 """Starts a command, whose output goes to a file."""
+JOBS = 2
+"""Runs at a time on one machine."""
+_PAUSE = 0.3
+"""Between two looks at the runs [s]."""
 _MOST_LOSSES = 10
 """Machines that may be lost under a run, which may be what takes them down."""
 
@@ -160,3 +167,75 @@ class Runs:
             each.stop()
         for each in self.running:
             each.wait()
+
+
+def make_runs(
+    study: Study, *, most: int | None = None, ray: str | None = None, anew: bool = False
+) -> int:
+    """Train what is not trained, evaluate it, collect the rows.
+
+    Args:
+        study: The runs.
+        most: How many at a time; None: :data:`JOBS`, or on a cluster as many as there are.
+        ray: Address of a Ray cluster, empty for the one that there is; None: on this machine.
+        anew: Whether runs with other settings are trained again.
+
+    Returns:
+        Exit status: 1 if a run failed, 128 and the number of the signal that stopped it.
+
+    Raises:
+        ValueError: If a run was trained with other settings, or Ray cannot be used.
+        FolderInUse: If another process makes runs there.
+    """
+    jobs, wanted = study.jobs, study.evaluation
+    with files.lock(study.folder):
+        others = other_than_asked(jobs, study.settings)
+        if others and not anew:
+            job, found = next(iter(others.items()))
+            raise ValueError(
+                f"{job.path} was trained with {'; '.join(found)}: name another --folder, or "
+                "train it again with --anew"
+            )
+        waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
+        print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {study.folder}")
+        with _starting(ray if waiting else None) as start:
+            most = most or (JOBS if ray is None else len(waiting))
+            runs = Runs(waiting, study.settings, wanted, anew=set(others), start=start, most=most)
+            stop = _run_all(runs)
+        if stop:
+            return stop.exit_status
+        collect(jobs, wanted, study.folder)
+    return 1 if runs.failed else 0
+
+
+@contextmanager
+def _starting(address: str | None) -> Iterator[Start]:
+    """Whatever starts a command: on this machine, or on a cluster.
+
+    Raises:
+        ValueError: If Ray is not installed, or there is no such cluster.
+    """
+    if address is None:
+        yield Child
+        return
+    try:
+        from training.comparison.clusters import RemoteChild, connected
+    except ImportError as error:
+        raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
+    try:
+        with connected(address or None):
+            yield RemoteChild
+    except ConnectionError as error:
+        raise ValueError(f"--ray {address}: {error}") from error
+
+
+def _run_all(runs: Runs) -> Stop:
+    """Train and evaluate, some at a time; whether all was stopped."""
+    stop = Stop("saving the runs; the same command continues them")
+    with stop.listening():
+        while runs and not stop:
+            runs.begin()
+            time.sleep(_PAUSE)
+            runs.look()
+        runs.stop()
+    return stop

@@ -22,7 +22,7 @@ from benchmarks.study.rows import (
     Rows,
 )
 from tests.benchmarks.study.test_pages import PAIRS, small_table
-from tests.integration.report.test_figures import GRAY, ORANGE, colored
+from tests.integration.test_figures import GRAY, ORANGE, colored
 
 
 def test_a_mean_curve_begins_at_zero_and_ends_where_the_shortest_run_does() -> None:

@@ -20,6 +20,7 @@ from benchmarks.study.figures import (
 )
 from benchmarks.study.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
 from benchmarks.study.paper import NAMES, PHIS
+from benchmarks.study.permutation import deal_p
 from benchmarks.study.protocol import Table, paper_studies, tables
 from benchmarks.study.rows import (
     Rows,
@@ -33,7 +34,6 @@ from training import files
 from training.comparison.arms import Arm
 from training.comparison.jobs import Evaluation, Job, Study
 from training.records import write_table
-from training.report.permutation import deal_p
 
 TEST = Evaluation(("bars:test", "halls:test"), 4, "wheels")
 PAIRS = (("s/td3/per", "s/td3/uniform"), ("s/td3/uniform/wide", "s/td3/uniform"))

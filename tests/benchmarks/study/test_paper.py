@@ -25,7 +25,7 @@ from benchmarks.study.paper import (
 )
 from benchmarks.study.paper_figures import plot_claims, reward_of_blocks
 from benchmarks.study.paper_tables import trained_table, unseen_table
-from tests.integration.report.test_figures import colored, heights
+from tests.integration.test_figures import colored, heights
 from tests.integration.tiny_runs import tiny, train
 from training import files
 from training.comparison.jobs import Job

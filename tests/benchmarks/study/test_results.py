@@ -7,10 +7,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-import report
 from benchmarks.study import pages as study_pages
-from benchmarks.study import report as study_report
-from benchmarks.study import strength
+from benchmarks.study import report, statistics, strength
+from training.comparison.report import read_comparisons
 
 pytestmark = pytest.mark.usefixtures("tables_alone")
 DOCS = Path(__file__).parents[3] / "docs"
@@ -21,7 +20,7 @@ PAGES = {
 
 
 def tables(folder: Path, *studies: str) -> str:
-    report.main([*(str(DOCS / study) for study in studies), "--output", str(folder)])
+    statistics.main([*(str(DOCS / study) for study in studies), "--output", str(folder)])
     return (folder / "tables.md").read_text(encoding="utf-8")
 
 
@@ -62,7 +61,7 @@ def test_the_pages_of_the_study_are_made_of_its_rows(
     pages = sorted((DOCS / "results/study").glob("*.md"))
     figures = {page.stem: sorted(page.parent.glob(f"{page.stem}_*.png")) for page in pages}
     monkeypatch.setattr(study_pages, "plot_study", lambda table, *_: figures[table.name])
-    study_report.main([str(DOCS / "results/study"), "--output", str(tmp_path)])
+    report.main([str(DOCS / "results/study"), "--output", str(tmp_path)])
     assert [page.name for page in pages] == sorted(path.name for path in tmp_path.glob("*.md"))
     assert pages
     for page in pages:
@@ -84,7 +83,7 @@ def test_the_numbers_of_the_study_in_the_results_are_those_of_its_pages() -> Non
 
 @pytest.mark.parametrize("study", PAGES)
 def test_every_run_of_a_study_was_tested_on_the_same_two_hundred_pairs(study: str) -> None:
-    rows = report.read_studies([DOCS / study]).query("world == 'test'")
+    rows = read_comparisons([DOCS / study]).query("world == 'test'")
     assert rows["arm"].nunique() >= 4
     assert (rows.groupby("arm")["run"].nunique() == 3).all()
     assert (rows.groupby(["arm", "run"]).size() == 200).all()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.assembly import unused_settings
 from torchrl_mpfa.methods.catalogue import check_ranges
 from training import files
+from training.comparison import execution
 from training.comparison.arms import Arm, with_defaults
 from training.comparison.jobs import Evaluation, Study
 from training.run import running
@@ -227,7 +227,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     settings += ("evaluation.every=10", "evaluation.episodes=1", "evaluation.world=A")
 
     def two(root: Path, *, most: int | None = None) -> dict[str, Table]:
-        worlds = compare.Evaluation(("B",), 2)
+        worlds = Evaluation(("B",), 2)
         seeds = range(100, 102)[:most]
         of = {
             "C": Study(root / "s", ("per", "uniform"), settings, seeds, evaluation=worlds),
@@ -236,8 +236,8 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return {name: Table(name, "Why?", (each,), (), (), {}) for name, each in of.items()}
 
     monkeypatch.setattr(study, "tables", two)
-    monkeypatch.setattr(compare, "Child", InThisProcess)
-    monkeypatch.setattr(compare, "_PAUSE", 0.0)
+    monkeypatch.setattr(execution, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "_PAUSE", 0.0)
     monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
     return tmp_path
 
@@ -313,21 +313,20 @@ def test_a_study_stops_where_a_signal_stopped_its_runs(
 ) -> None:
     asked = []
 
-    def stopped(arguments: Sequence[str]) -> int:
-        asked.append(arguments)
+    def stopped(wanted: Study, *, most: int) -> int:
+        asked.append(most)
         return 130
 
-    monkeypatch.setattr(compare, "main", stopped)
+    monkeypatch.setattr(study, "make_runs", stopped)
     assert study.main(["--folder", str(small), "--jobs", "3"]) == 130
-    (arguments,) = asked
-    assert compare.parse(arguments).jobs == 3
+    assert asked == [3]
 
 
 def test_a_failed_run_does_not_keep_the_other_tables_from_theirs(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     statuses = iter([1, 0])
-    monkeypatch.setattr(compare, "main", lambda arguments: next(statuses))
+    monkeypatch.setattr(study, "make_runs", lambda *_, **__: next(statuses))
     assert study.main(["--folder", str(small)]) == 1
     assert next(statuses, None) is None
 

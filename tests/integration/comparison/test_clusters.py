@@ -15,6 +15,7 @@ import torch
 import compare
 from tests.integration.comparison.test_compare import InThisProcess, assert_same_rows, study
 from training import files
+from training.comparison import execution
 
 ray = pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
 pytestmark = pytest.mark.slow
@@ -61,7 +62,7 @@ def test_a_study_loses_a_machine_and_gives_the_rows_of_one_machine(
     arguments[1] = str(tmp_path / "serial")
     arguments.remove("--ray")
     arguments.remove(cluster.address)
-    monkeypatch.setattr(compare, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "Child", InThisProcess)
     assert compare.main(arguments) == 0
     torch.set_flush_denormal(False)
     assert_same_rows(tmp_path / "ray", tmp_path / "serial")

@@ -66,8 +66,8 @@ class InThisProcess:
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(compare, "Child", InThisProcess)
-    monkeypatch.setattr(compare, "_PAUSE", 0.0)
+    monkeypatch.setattr(execution, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "_PAUSE", 0.0)
     # A picture of a run takes longer than the two episodes of one.
     monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
     yield
@@ -279,19 +279,19 @@ def test_a_run_whose_machine_is_gone_goes_on_at_its_last_checkpoint(
                 raise Lost("machine 7 is gone")
             return super().ended()
 
-    monkeypatch.setattr(compare, "Child", OnMachinesThatFail)
+    monkeypatch.setattr(execution, "Child", OnMachinesThatFail)
     assert compare.main(study(tmp_path / "lost", methods=("per",))) == 0
     assert commands == ["train.py", *["evaluate.py"] * 3]
     assert capsys.readouterr().out.count("its machine is gone") == 3
     assert not (tmp_path / "lost" / "ddpg-per-0" / files.PREVIOUS).exists()
-    monkeypatch.setattr(compare, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "Child", InThisProcess)
     assert compare.main(study(tmp_path / "whole", methods=("per",))) == 0
     assert_same_rows(tmp_path / "lost", tmp_path / "whole")
 
     # A run that takes down whatever it runs on is given up.
     commands.clear()
     monkeypatch.setattr(execution, "_MOST_LOSSES", 2)
-    monkeypatch.setattr(compare, "Child", OnMachinesThatFail)
+    monkeypatch.setattr(execution, "Child", OnMachinesThatFail)
     assert compare.main(study(tmp_path / "never", methods=("per",))) == 1
     assert "ddpg-per-0: failed, lost 2 machines" in capsys.readouterr().out
 
@@ -316,7 +316,7 @@ def test_training_again_that_is_lost_goes_on_with_the_new_settings(
                 raise Lost("machine 7 is gone")
             return super().ended()
 
-    monkeypatch.setattr(compare, "Child", Gone)
+    monkeypatch.setattr(execution, "Child", Gone)
     assert compare.main(arguments) == 0
     kept = json.loads((tmp_path / "ddpg-per-0" / files.SETTINGS).read_text())
     assert kept["method"]["alpha"] == 0.9

@@ -3,38 +3,48 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
-from training.report.intervals import (
+from benchmarks.study import statistics
+from benchmarks.study.intervals import (
     Array,
+    bootstrap_runs,
+    bootstrap_runs_and_pairs,
     difference_interval,
     improvement_interval,
     interquartile_interval,
+    interquartile_mean,
+    mean,
     mean_interval,
     mean_over_worlds,
     performance_profile,
+    probability_of_improvement,
     resampled_means,
+    t_interval,
     widened_ends,
 )
-from training.report.permutation import (
+from benchmarks.study.permutation import (
     deal_p,
     flip_p,
     flips,
     holm,
     least_flip_p,
-    permutation_p,
+    least_p,
     rank_flip_p,
     rank_p,
 )
-from training.report.power import (
+from benchmarks.study.power import (
     MOST,
     difference_found,
     paired_difference_found,
     runs_needed,
 )
+from training.records import write_table
 
 
 def plain_p(ours: Array, theirs: Array) -> float:
@@ -65,7 +75,6 @@ def test_many_sets_of_data_at_once_have_the_values_of_each() -> None:
     found = deal_p(a, b)
     assert found.shape == (2, 3)
     assert found[1, 2] == deal_p(a[1, 2], b[1, 2])
-    assert permutation_p(a[0], b[0]) == deal_p(a[0].mean(axis=1), b[0].mean(axis=1))
 
 
 def test_a_sample_of_the_deals_comes_near_to_all_of_them() -> None:
@@ -370,3 +379,87 @@ def test_the_signs_are_all_that_there_are_or_a_sample_that_begins_with_the_data(
     for signs in (every, sample):
         assert (signs[0] == 1.0).all()
         assert set(np.unique(signs)) == {-1.0, 1.0}
+
+
+def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end() -> None:
+    scores = np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])
+    assert interquartile_mean(scores) == pytest.approx((2 + 3 + 4 + 5) / 4)
+
+
+def test_ties_count_half_in_the_probability_of_improvement() -> None:
+    ours, theirs = np.array([[1.0, 5.0]]), np.array([[1.0, 4.0], [2.0, 4.0]])
+    # First task: a tie and a loss; second task: two wins.
+    assert probability_of_improvement(ours, theirs) == pytest.approx((0.25 + 1.0) / 2)
+
+
+def test_many_episodes_of_one_policy_do_not_narrow_the_interval_over_runs() -> None:
+    # Each run has a level of its own, and all of its pairs have that.
+    few = np.random.default_rng(0).normal(0.5, 0.1, (6, 1)) * np.ones((6, 4))
+    many = np.repeat(few, 100, axis=1)
+    for interval in (t_interval, lambda x: bootstrap_runs(mean, x, rng=np.random.default_rng(1))):
+        a, b = interval(few), interval(many)
+        assert (b.low, b.high) == pytest.approx((a.low, a.high))
+        assert b.high - b.low > 0.05
+
+
+@pytest.mark.parametrize("runs", [4, 12])
+def test_the_t_interval_covers_the_mean_as_often_as_it_says(runs: int) -> None:
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(400):
+        scores = rng.normal(0.3, 1.0, (runs, 1)) + rng.normal(0.0, 1.0, (runs, 5))
+        interval = t_interval(scores)
+        covered += interval.low <= 0.3 <= interval.high
+    assert 0.92 <= covered / 400 <= 0.98
+
+
+def test_resampling_pairs_as_well_widens_the_interval_where_pairs_differ() -> None:
+    # All runs agree: other runs would say the same, other pairs would not.
+    scores = np.tile(np.arange(10.0), (5, 1))
+    rng = np.random.default_rng(0)
+    runs = bootstrap_runs(mean, scores, rng=rng)
+    both = bootstrap_runs_and_pairs(mean, scores, rng=rng)
+    assert (runs.low, runs.high) == (4.5, 4.5)
+    assert both.high - both.low > 2.0
+
+
+def test_the_runs_that_it_takes_find_the_difference_as_often_as_promised() -> None:
+    rng = np.random.default_rng(0)
+    runs = runs_needed(1.95, 2.0)
+    assert runs == 16
+    found = [
+        stats.ttest_ind(rng.normal(0, 1.95, runs), rng.normal(2, 1.95, runs)).pvalue < 0.05
+        for _ in range(400)
+    ]
+    assert 0.75 <= np.mean(found) <= 0.86
+
+
+def test_the_least_p_is_that_of_the_most_extreme_deal() -> None:
+    assert least_p(3, 3) == pytest.approx(0.1)
+    assert least_p(9, 3) == pytest.approx(1 / 220)
+
+
+@pytest.mark.usefixtures("tables_alone")
+def test_every_statistic_of_a_comparison_is_in_its_tables(study: Path) -> None:
+    assert statistics.main([str(study)]) == 0
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    no = "none, no spread"
+    assert "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |" in text
+    assert f"| ddpg/per | 2 | success | 0.000 | {no} | {no} | {no} |  |" in text
+    assert f"| ddpg/per | 2 | SPL | 0.000 | {no} | {no} | {no} | 0.000 {no} |" in text
+    # From zero to 0.5 in 5,000 steps, then to 1 in 4,000: (1250 + 3000) / 9000.
+    assert "| ddpg | mpfa_per | 9,000; 9,000 | 0.472 | 0.472, 0.472 |" in text
+    assert "| ddpg/mpfa_per − ddpg/per | +0.875, p = 0.333 | +0.700, p = 0.333 | 0.333 |" in text
+    assert "Success of ddpg varies from run to run by 12.50 points" in text
+
+
+@pytest.mark.usefixtures("tables_alone")
+def test_runs_that_differ_much_have_their_tables(study: Path) -> None:
+    rows = pd.read_csv(study / "episodes.csv")
+    good = rows["seed"] == 1
+    rows = rows.assign(success=good, collision=~good)
+    write_table(rows, study / "episodes.csv")
+    assert statistics.main([str(study)]) == 0
+    text = (study / "tables.md").read_text(encoding="utf-8")
+    assert "from run to run by 70.71 points" in text
+    assert "80 % power: more than 10,000 for 2 points, 3141 for 5 points." in text

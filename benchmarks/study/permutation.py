@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy import stats
 
-from training.report.intervals import Array
+from benchmarks.study.intervals import Array
 
 MOST_DEALS = 200_000
 """Deals that are tried: all of them up to ten runs against ten, a sample of more."""
@@ -22,19 +22,6 @@ MOST_FLIPS = 100_000
 _ALL_FLIPS = 20
 _AT_ONCE = 4_000_000
 """Differences that are in memory at once."""
-
-
-def permutation_p(ours: Array, theirs: Array) -> float:
-    """Two-sided permutation test of the difference between the means of runs.
-
-    Args:
-        ours: Shape ``[runs, pairs]``.
-        theirs: Shape ``[other runs, pairs]``.
-
-    Returns:
-        Share of the ways to deal the runs to the two sides that differ at least as much.
-    """
-    return float(deal_p(ours.mean(axis=1), theirs.mean(axis=1)))
 
 
 def deal_p(ours: Array, theirs: Array, *, most: int = MOST_DEALS) -> Array:
@@ -178,7 +165,7 @@ def least_flip_p(seeds: int) -> float:
 
 
 def least_p(ours: int, theirs: int) -> float:
-    """Least value that :func:`permutation_p` can have for these numbers of runs."""
+    """Least value that :func:`deal_p` can have for these numbers of runs."""
     sides = 2 if ours == theirs else 1
     return min(1.0, sides / math.comb(ours + theirs, ours))
 

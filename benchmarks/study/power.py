@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 from scipy import stats
 
-from training.report.intervals import Array
-from training.report.permutation import deals, flips, least_flip_p, least_p
+from benchmarks.study.intervals import Array
+from benchmarks.study.permutation import deals, flips, least_flip_p, least_p
 
 MOST = 10_000
 """Runs that anyone is told to make."""

@@ -1,0 +1,332 @@
+"""Tables of comparisons in Markdown, from the rows of their episodes and evaluations.
+
+The unit is the run: the episodes of one policy are not independent, as whether it found the way
+around a bar decides many of them. Intervals and tests are of the means of runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import stats
+
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.comparison.jobs import run_name
+from training.figures import Runs, plot_evaluations
+from training.records import read_table
+from training.worlds import family
+
+RATES = (0.9, 0.95)
+"""Rates of greedy success in validation that the time to is told of."""
+ARM = ("learner", "method", "arm")
+_DEALS = 50_000
+"""Ways to deal the runs to two sides: all of them up to nine runs against nine, else a sample."""
+Array = NDArray[np.float64]
+
+
+def write_report(
+    parser: argparse.ArgumentParser,
+    arguments: Sequence[str] | None,
+    tables: Callable[[pd.DataFrame], list[str]],
+    *speeds: Callable[[Runs], str],
+) -> int:
+    """Read the rows of the folders on a command line, write ``tables.md`` and a figure.
+
+    Args:
+        parser: Gets the arguments of both.
+        arguments: The command line.
+        tables: From the episodes of one family of worlds to its tables.
+        *speeds: From evaluations during training to a table each.
+
+    Returns:
+        Exit status.
+    """
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
+    parser.add_argument("--output", type=Path, help="folder (default: the first study's)")
+    options = parser.parse_args(arguments)
+    output = options.output or options.folders[0]
+    there = [folder.resolve() for folder in options.folders]
+    for folder, path in zip(options.folders, there, strict=True):
+        if there.count(path) > 1:
+            parser.error(f"{folder} is named twice: its runs count once")
+    try:
+        files.check_folder(output)
+        rows = read_comparisons(options.folders)
+        evaluations = tables_of_runs(rows, files.EVALUATIONS)
+        parts = sections(rows, tables)
+    except ValueError as error:
+        parser.error(" ".join(str(error).split()))
+    output.mkdir(parents=True, exist_ok=True)
+    if evaluations:
+        parts += ["## Evaluations during training", *(speed(evaluations) for speed in speeds)]
+        plot_evaluations(evaluations, output / "evaluations.png")
+    text = "\n\n".join(part for part in parts if part)
+    write_text_atomically(text + "\n", output / "tables.md")
+    print(text)
+    return 0
+
+
+def read_comparisons(folders: Sequence[Path]) -> pd.DataFrame:
+    """The evaluation episodes of comparisons.
+
+    Args:
+        folders: Their folders; seeds in two of them are two runs.
+
+    Returns:
+        The rows of ``compare.py``; with ``arm`` (learner, method and the arm of the comparison, if
+        it has any), ``run`` (its name, unique in its arm), ``path`` (its folder) and ``family``:
+        the split of a generator that its world is of, BARN, or the world; comparisons that are
+        older than ``physics`` have an empty one.
+
+    Raises:
+        ValueError: If there are no rows, or a file lacks columns.
+    """
+    names = [folder.name for folder in folders]
+    tables = []
+    for folder in folders:
+        found = read_table(folder / files.EPISODES)
+        if not len(found):
+            continue
+        missing = [name for name in ("learner", "method", "seed", "world") if name not in found]
+        if missing:
+            raise ValueError(
+                f"{folder / files.EPISODES} has no column {missing[0]}: name the folder of a "
+                "study, which compare.py made, not that of a run"
+            )
+        for column in ("arm", "physics"):
+            found[column] = found[column].fillna("") if column in found else ""
+        words = found[["learner", "method", "arm", "seed"]]
+        found["path"] = [str(folder / run_name(*each)) for each in words.itertuples(index=False)]
+        found["arm"] = words[["learner", "method", "arm"]].agg("/".join, axis=1).str.rstrip("/")
+        seed = found["seed"].astype(str)
+        name = str(folder) if names.count(folder.name) > 1 else folder.name
+        found["run"] = seed if len(folders) == 1 else f"{name}/" + seed
+        found["family"] = found["world"].map(family)
+        tables.append(found)
+    if not tables:
+        names = [str(folder) for folder in folders]
+        raise ValueError(
+            f"{', '.join(names)}: no {files.EPISODES} with rows, which compare.py writes"
+        )
+    return pd.concat(tables, ignore_index=True)
+
+
+def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
+    """A table of each run's own folder, by arm and run; runs without it are left out."""
+    found: dict[str, dict[str, pd.DataFrame]] = {}
+    for (arm, run, path), _ in rows.groupby(["arm", "run", "path"], sort=False):
+        table = read_table(Path(str(path)) / name)
+        if len(table):
+            found.setdefault(str(arm), {})[str(run)] = table
+    return found
+
+
+def sections(rows: pd.DataFrame, tables: Callable[[pd.DataFrame], list[str]]) -> list[str]:
+    """Headed tables of each physics and family of worlds, and success in all worlds together.
+
+    Args:
+        rows: Of :func:`read_comparisons`.
+        tables: From the rows of one family to its tables.
+
+    Returns:
+        The parts of a page.
+    """
+    parts = []
+    for physics, driven in rows.groupby("physics", sort=False):
+        how = f", {physics!s}" if physics else ""
+        for where, found in driven.groupby("family", sort=False):
+            parts += [f"## {where}{how}", *tables(found)]
+        if driven["family"].nunique() > 1:
+            parts += [f"## Success in all worlds{how}", success_table(driven)]
+    return parts
+
+
+def table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    head = list(head)
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def scores(rows: pd.DataFrame, column: str) -> Array:
+    """Values of a column, shape ``[runs, pairs]``; flags are 0 and 1.
+
+    Args:
+        rows: Evaluation episodes of one arm, each of its runs on the same pairs.
+        column: Its name.
+
+    Returns:
+        The values, runs in the order in which they come first.
+
+    Raises:
+        ValueError: If a run lacks pairs that another one has.
+    """
+    matrix = rows.pivot(index="run", columns=["world", "episode"], values=column)
+    matrix = matrix.loc[rows["run"].unique()].astype(float)
+    if matrix.isna().to_numpy().any():
+        raise ValueError(f"the runs {', '.join(matrix.index)} were not tested on the same pairs")
+    return matrix.to_numpy()
+
+
+def outcomes(rows: pd.DataFrame, *, interval: bool = True) -> str:
+    """A table of the success of each arm and of each run, and means over the runs.
+
+    Args:
+        rows: Evaluation episodes.
+        interval: Whether success has Student's 95 % interval over the runs.
+    """
+    lines = []
+    width = columns_of(rows["arm"])
+    for arm, found in rows.groupby("arm", sort=False):
+        success, time = scores(found, "success"), scores(found, "time_s")
+        reached = time[success == 1.0]
+        rates = [f"{scores(found, name).mean():.1%}" for name in ("collision", "timeout")]
+        lines.append(
+            [
+                *cells(str(arm), width),
+                f"{success.mean():.1%}",
+                *([_interval(success.mean(axis=1))] if interval else []),
+                ", ".join(f"{value:.1%}" for value in success.mean(axis=1)),
+                *rates,
+                f"{scores(found, 'spl').mean():.3f}",
+                f"{reached.mean():.1f}" if reached.size else "",
+            ]
+        )
+    head = [*ARM[:width], "success", *["95 %"] * interval, "of each run", "collision", "timeout"]
+    return table([*head, "SPL", "time [s]"], lines)
+
+
+def success_table(rows: pd.DataFrame) -> str:
+    """Success of each arm in each world or generator, and in brackets that of its worst run."""
+    arms = list(rows["arm"].unique())
+    families = {str(name): found for name, found in rows.groupby("family", sort=False)}
+    lines = []
+    for name, found in (families | {"all": rows}).items():
+        driven = {str(arm): each for arm, each in found.groupby("arm")}
+        if name == "all":
+            # An arm whose runs were not driven in all of them has no mean of all.
+            driven = {
+                arm: each
+                for arm, each in driven.items()
+                if (each.groupby("run")["family"].nunique() == len(families)).all()
+            }
+        lines.append([name, *(_worst(driven[arm]) if arm in driven else "" for arm in arms)])
+    return table(["mean of the runs (the worst one)", *arms], lines)
+
+
+def differences(rows: pd.DataFrame) -> str:
+    """A table of the differences between arms, tested over runs; empty for one arm."""
+    arms = {str(arm): found for arm, found in rows.groupby("arm", sort=False)}
+    lines = []
+    for a, b in combinations(arms, 2):
+        line = [f"{a} − {b}"]
+        for column in ("success", "spl"):
+            ours, theirs = (scores(arms[name], column).mean(axis=1) for name in (a, b))
+            gap = f"{ours.mean() - theirs.mean():+.3f}"
+            line += [gap, _interval(ours, theirs), f"{permutation_p(ours, theirs):.3f}"]
+        lines.append(line)
+    head = ["", "success", "95 %", "p", "SPL", "95 %", "p"]
+    return table(head, lines) if lines else ""
+
+
+def permutation_p(ours: Array, theirs: Array) -> float:
+    """P of the two-sided permutation test of the difference between means, a number for each run.
+
+    Examples:
+        >>> permutation_p(np.array([3.0, 4.0, 5.0]), np.array([0.0, 1.0, 2.0]))
+        0.1
+    """
+
+    def gap(x: Array, y: Array, axis: int) -> Array:
+        # What is equal but for rounding counts as equal.
+        return np.asarray(abs(x.mean(axis=axis) - y.mean(axis=axis)).round(12))
+
+    how: dict[str, Any] = {"alternative": "greater", "vectorized": True, "rng": 0}
+    found = stats.permutation_test((ours, theirs), gap, n_resamples=_DEALS, **how)
+    return float(found.pvalue)
+
+
+def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
+    """Actions and time of training after which validation first had a rate of success."""
+    lines = []
+    width = columns_of(curves)
+    for arm, runs in curves.items():
+        for rate in RATES:
+            steps = [_first(found, rate, "total_steps") for found in runs.values()]
+            seconds = [_first(found, rate, "trained_for") for found in runs.values()]
+            never = sum(math.isinf(each) for each in steps)
+            medians = [median_of(each) for each in (steps, seconds)]
+            lines.append([*cells(arm, width), f"{rate:.0%}", *medians, f"{never} of {len(runs)}"])
+    head = [*ARM[:width], "success", "actions, median of the runs", "seconds of training, median"]
+    return table([*head, "never"], lines)
+
+
+def median_of(values: Iterable[float]) -> str:
+    """The median of what runs took, of an even number the lower of the two in the middle.
+
+    Args:
+        values: Of each run; infinite where it never came so far.
+
+    Returns:
+        The median: "never" if more than half of the runs never came so far, empty for NaN.
+
+    Examples:
+        >>> median_of([4000.0, 2000.0, math.inf, math.inf]), median_of([2000.0, math.inf, math.inf])
+        ('4,000', 'never')
+    """
+    middle = float(np.quantile(np.array(list(values)), 0.5, method="inverted_cdf"))
+    if math.isnan(middle):
+        return ""
+    return "never" if math.isinf(middle) else f"{middle:,.0f}"
+
+
+def columns_of(arms: Iterable[str]) -> int:
+    """Columns that the names of arms take: two, or three where a comparison has arms."""
+    return max(arm.count("/") for arm in arms) + 1
+
+
+def cells(arm: str, width: int) -> list[str]:
+    """The name of an arm in so many columns."""
+    return [*arm.split("/"), *[""] * width][:width]
+
+
+def _interval(ours: Array, theirs: Array | None = None) -> str:
+    """Student's 95 % interval of a mean of runs, or Welch's of a difference of two."""
+    sides = [ours] if theirs is None else [ours, theirs]
+    if min(map(len, sides)) < 2:
+        return "one run"
+    # Runs that all end alike, at 0 % or 100 % as a rule, do not tell how much others differ.
+    if not any(np.ptp(each) for each in sides):
+        return "none, no spread"
+    if theirs is None:
+        low, high = stats.ttest_1samp(ours, 0.0).confidence_interval(0.95)
+        # A share lies in no other part of it.
+        return f"[{max(low, 0.0):.1%}, {min(high, 1.0):.1%}]"
+    low, high = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+    return f"[{low:+.3f}, {high:+.3f}]"
+
+
+def _first(found: pd.DataFrame, rate: float, column: str) -> float:
+    """Value of a column where a rate of success is first reached; infinite if it never is."""
+    reached = found[found["success"] >= rate]
+    if not len(reached):
+        return math.inf
+    return float(reached[column].iloc[0]) if column in found else math.nan
+
+
+def _worst(rows: pd.DataFrame) -> str:
+    """Mean success of the runs of an arm, and in brackets the run with the lowest."""
+    of_runs = scores(rows, "success").mean(axis=1)
+    if len(of_runs) == 1:
+        return f"{of_runs[0]:.1%}"
+    name = rows["run"].unique()[of_runs.argmin()]
+    return f"{of_runs.mean():.1%} ({name}: {of_runs.min():.1%})"

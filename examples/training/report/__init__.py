@@ -1,1 +1,0 @@
-"""What is said of many runs: statistics, tables and figures."""

@@ -1,1 +1,0 @@
-"""Tests of statistics, tables and figures of many runs."""
