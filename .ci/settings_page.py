@@ -20,7 +20,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_module
 
-from training.settings.checks import settings_by_name
+from training.settings.rules import settings_by_name
 from training.settings.train import GROUPS, Stage, TrainSettings, as_settings, register
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "settings.md"

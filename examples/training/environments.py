@@ -67,6 +67,18 @@ def collision_distance(settings: EnvironmentSettings) -> float:
     return resolve_robot(settings.robot).radius + settings.clearance
 
 
+def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
+    """The task to learn: what a policy must find again, and what pays and ends an episode."""
+    return {
+        "collision_distance": collision_distance(settings),
+        "progress": settings.progress,
+        "progress_scale": settings.progress_scale,
+        "detour_chance": settings.detour_chance,
+        "noise": asdict(settings.noise),
+        **env_arguments(settings),
+    }
+
+
 def make_training_env(
     world: str, settings: EnvironmentSettings, *, robots: int = 1, discrete: bool = False
 ) -> EnvBase:
@@ -85,14 +97,9 @@ def make_training_env(
         world=world,
         num_envs=robots,
         info_keys=INFO,
-        collision_distance=collision_distance(settings),
-        progress=settings.progress,
-        progress_scale=settings.progress_scale,
-        detour_chance=settings.detour_chance,
         max_goal_distance=settings.max_goal_distance or math.inf,
         episodes_per_world=settings.episodes_per_world,
-        noise=asdict(settings.noise),
-        **env_arguments(settings),
+        **task_arguments(settings),
     )
     return TransformedEnv(env, DiscreteWheels()) if discrete else env
 

@@ -63,7 +63,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (train.main, "run_dir=file", A_FILE),
         (train.main, "run_dir=file/run", r"file/run cannot be a folder, as .*file is a file"),
         (train.main, "run_dir=", "run_dir must not be empty, got ''"),
-        (train.main, f"seed={2**62}", f"seed must be at most 4294967295, got {2**62}"),
+        (train.main, f"seed={2**62}", f"seed must be from 0 to 4294967295, got {2**62}"),
         (train.main, "tracking.project=", "tracking.project must not be empty, got ''"),
         (train.main, "tracking.group=", "tracking.group must be a word of at most 128 letters"),
         (train.main, "threads=1000000", "threads must be from 1 to 1024, got 1000000"),

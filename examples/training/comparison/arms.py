@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from training.settings.checks import NAME
 from training.settings.command_line import parse_overrides
+from training.settings.rules import NAME
 
 DEFAULTS = ("tracking=off", "evaluation.every=5000")
 """What a study has unless its command line says otherwise."""

@@ -17,10 +17,10 @@ from training.comparison.arms import PLAIN, Arm, with_defaults
 from training.evaluating import evaluation_folder
 from training.finished import is_finished, read_json
 from training.records import read_table, write_table
-from training.settings.checks import settings_by_name
 from training.settings.command_line import composed
 from training.settings.environment import EnvironmentSettings
 from training.settings.resuming import LAWFUL, OF_THE_CALL
+from training.settings.rules import settings_by_name
 from training.settings.train import TrainSettings, as_settings
 
 SCRIPTS = Path(__file__).resolve().parents[2]

@@ -3,164 +3,47 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, fields, is_dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
 import torch
 
-from mpfa_envs import world_tasks
+from mpfa_envs import RobotNoise, TaskConfig, world_tasks
 from mpfa_envs.robots.model import resolve_robot
-from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule
+from torchrl_mpfa.checks import Rule
 from torchrl_mpfa.methods import Method, can_be_remote
 from torchrl_mpfa.methods.assembly import WORDS, unused_settings
 from torchrl_mpfa.methods.catalogue import RANGES
-from training.environments import check_physics, make_training_env
+from training.environments import check_physics, make_training_env, task_arguments
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
+from training.settings.rules import NAME, check_rules, choice, rules_of, up_to
 from training.settings.train import TrainSettings
 from training.worlds import is_of_a_test
-
-
-def at_least(least: float) -> Rule:
-    """Finite, and not below a bound."""
-    return lambda value: least <= value < math.inf, f"at least {least:g}"
-
-
-def up_to(most: int) -> Rule:
-    """A count that this machine may have room for."""
-    return lambda value: 1 <= value <= most, f"from 1 to {most}"
-
-
-def choice(*names: str) -> Rule:
-    """One of some words."""
-    return lambda value: value in names, f"one of {', '.join(names)}"
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
 
 LEVEL: Rule = (
     lambda value: value == "mean" or (_is_number(value) and math.isfinite(value)),
     "a finite number or mean",
 )
-NAME: Rule = (
-    lambda value: re.fullmatch(r"[\w.+-]+", value) is not None,
-    "letters, digits and any of . _ + -, as it names a folder",
-)
-
+OF_A_METHOD: dict[str, Rule] = {
+    "name": NAME,
+    **{name: choice(*sorted(words)) for name, words in WORDS.items()},
+    **RANGES,
+    "positive_above": LEVEL,
+    "capacity": up_to(10**9),
+}
+"""Those of the package, and what this machine has room for."""
 SIGNALS = (
     *("reward", "td_error", "action_gradient", "value"),
     *("relative_value", "relative_td_error"),
 )
 """What the losses of ``train.py`` write; a script of your own may have others."""
-MOST_ROBOTS = 4096
-"""On wheels these take 6.4 GB."""
-
-WORD: Rule = (lambda value: bool(value.strip()), "not be empty")
-
-LAST_SEED = 2**32 - 1
-"""Each stage has a seed of its own, a million times as large, which is to fit in 64 bits."""
-RULES: dict[str, Rule] = {
-    "run_dir": WORD,
-    "tracking.project": WORD,
-    "seed": at_least(0),
-    "threads": up_to(1024),
-    "checkpoint_every": at_least(1),
-    "robots": (
-        lambda value: 1 <= value <= MOST_ROBOTS,
-        f"from 1 to {MOST_ROBOTS}, as a robot takes up to 1.6 MB of memory",
-    ),
-    "updates": at_least(1),
-    "method.name": NAME,
-    **{f"method.{name}": choice(*sorted(words)) for name, words in WORDS.items()},
-    **{f"method.{name}": rule for name, rule in RANGES.items()},
-    "method.positive_above": LEVEL,
-    "method.capacity": up_to(10**9),
-    "learner.name": NAME,
-    "learner.algorithm": choice("ddpg", "td3", "sac", "dqn", "q_learning"),
-    "learner.actor_lr": POSITIVE,
-    "learner.critic_lr": POSITIVE,
-    "learner.lr_end_factor": SHARE,
-    "learner.lr_power": POSITIVE,
-    "learner.gamma": SHARE,
-    "learner.tau": ABOVE_ZERO,
-    "learner.width": up_to(2**16),
-    "learner.layers": up_to(100),
-    "learner.final_init": POSITIVE,
-    "learner.critic_weight_decay": NOT_NEGATIVE,
-    "learner.reward_scale": POSITIVE,
-    "learner.saturation_penalty": NOT_NEGATIVE,
-    "learner.saturation_limit": NOT_NEGATIVE,
-    "learner.policy_delay": at_least(1),
-    "learner.policy_noise": NOT_NEGATIVE,
-    "learner.noise_clip": NOT_NEGATIVE,
-    "learner.alpha_init": POSITIVE,
-    "learner.alpha_lr": POSITIVE,
-    "learner.table_lr": ABOVE_ZERO,
-    "curriculum.name": NAME,
-    "exploration.random_steps": at_least(0),
-    "exploration.sigma": NOT_NEGATIVE,
-    "exploration.sigma_end": NOT_NEGATIVE,
-    "exploration.epsilon": SHARE,
-    "exploration.epsilon_end": SHARE,
-    "exploration.annealing_steps": at_least(1),
-    "environment.physics": choice("wheels", "kinematic"),
-    "environment.max_steps": at_least(1),
-    "environment.action_repeat": at_least(1),
-    "environment.progress_scale": NOT_NEGATIVE,
-    "environment.clearance": NOT_NEGATIVE,
-    "environment.detour_chance": SHARE,
-    "environment.progress": choice("straight_line", "shortest_path", "none"),
-    "environment.memory": choice("none", "map"),
-    "environment.history": at_least(0),
-    "environment.field_of_view": (lambda value: 10.0 <= value <= 360.0, "from 10 to 360 [deg]"),
-    "environment.noise.range_noise": NOT_NEGATIVE,
-    "environment.noise.dropout": SHARE,
-    "environment.noise.slip": (lambda value: 0.0 <= value <= 0.45, "in [0, 0.45]"),
-    "environment.noise.latency": at_least(0),
-    "environment.noise.drift": NOT_NEGATIVE,
-    "environment.max_goal_distance": POSITIVE,
-    "environment.episodes_per_world": at_least(1),
-    "evaluation.every": at_least(0),
-    "evaluation.episodes": at_least(1),
-    "assessment.episodes": at_least(0),
-    "assessment.early_episodes": at_least(1),
-    "assessment.early_share": SHARE,
-    "assessment.best_factor": SHARE,
-    "assessment.by": choice("outcome", "return"),
-    "ray.address": WORD,
-    "ray.workers": at_least(0),
-    "ray.steps": at_least(1),
-    "tracking.mode": choice("offline", "online", "off"),
-    "tracking.group": (lambda value: 0 < len(value) <= 128, "a word of at most 128 letters"),
-    "tracking.log_every": at_least(1),
-    "tracking.pictures_every": at_least(0),
-}
-"""By dotted name; a setting that is null is not looked at."""
 
 
-def settings_by_name(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting with its dotted name.
-
-    Args:
-        settings: The settings.
-        prefix: What is before their names.
-
-    Yields:
-        Name and value; the settings of a group are single ones, stages are one value.
-    """
-    for entry in fields(settings):
-        if not prefix and entry.name in ("hydra", "defaults"):
-            continue
-        value, name = getattr(settings, entry.name), prefix + entry.name
-        if is_dataclass(value):
-            yield from settings_by_name(value, f"{name}.")
-        else:
-            yield name, value
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def check_settings(settings: TrainSettings) -> None:
@@ -174,12 +57,14 @@ def check_settings(settings: TrainSettings) -> None:
     """
     if not settings.curriculum.stages:
         raise ValueError("curriculum.stages must name at least one world, got []")
-    for name, value in settings_by_name(settings):
-        if value is not None:
-            _check_value(name, value)
-    if settings.seed > LAST_SEED:
-        raise ValueError(f"seed must be at most {LAST_SEED}, got {settings.seed}")
+    check_rules(settings, rules_of(settings), "")
+    check_rules(settings.method, OF_A_METHOD, "method.")
+    for entry in fields(settings):
+        group = getattr(settings, entry.name)
+        if is_dataclass(group):
+            check_rules(group, rules_of(group), f"{entry.name}.")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
+    _check_environment(settings.environment)
     _check_stages(settings)
     _resolve(
         "evaluation.world",
@@ -214,11 +99,16 @@ def check_settings(settings: TrainSettings) -> None:
         )
 
 
-def _check_value(name: str, value: Any) -> None:
-    allowed, wanted = rule = RULES.get(name, (lambda _: True, ""))
-    if not allowed(value):
-        must = wanted if rule is WORD else f"be {wanted}"
-        raise ValueError(f"{name} must {must}, got {value!r}")
+def _check_environment(environment: EnvironmentSettings) -> None:
+    """Have the parts of the task reject what they cannot be."""
+    for prefix, make in (
+        ("environment.noise.", lambda: RobotNoise(**asdict(environment.noise))),
+        ("environment.", lambda: TaskConfig(**task_arguments(environment))),
+    ):
+        try:
+            make()
+        except ValueError as error:
+            raise ValueError(f"{prefix}{error}") from error
 
 
 def _check_method(method: Method) -> None:

@@ -1,8 +1,11 @@
-"""The settings of the navigation task."""
+"""The settings of the navigation task; its parts check those that have no rule here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+
+from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE
+from training.settings.rules import at_least, between, setting
 
 
 @dataclass
@@ -34,10 +37,10 @@ class EnvironmentSettings:
     action_repeat: int = 2
     """Time steps of 0.1 s for which an action is held. With one, rewards are twice as many actions
     away, and DDPG is less reliable (``docs/tuning.md``)."""
-    progress_scale: float = 5.0
+    progress_scale: float = setting(5.0, NOT_NEGATIVE)
     """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
     far away, and a critic that is a little too smooth would rather circle than arrive."""
-    clearance: float = 0.07
+    clearance: float = setting(0.07, NOT_NEGATIVE)
     """Clearance below which training counts a collision [m]. With 0.17 m, 0.35 m from the robot's
     center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
     detour_chance: float = 0.8
@@ -46,17 +49,17 @@ class EnvironmentSettings:
     progress: str = "straight_line"
     """What Eq. 25 measures approach by: ``straight_line`` (the paper), ``shortest_path``, or
     ``none``, the goal and the collision alone."""
-    max_goal_distance: float | None = None
+    max_goal_distance: float | None = setting(None, POSITIVE)
     """Longest way of a sampled task [m]; null: as it comes."""
-    episodes_per_world: int = 1
+    episodes_per_world: int = setting(1, at_least(1))
     """Episodes of a robot in a world of a generator before it gets another one."""
     memory: str = "none"
     """``map``: the robot makes a map of what its lidar met and senses the way to the goal that is
     open on it; ``none``: it senses what is before it alone."""
-    history: int = 0
+    history: int = setting(0, at_least(0))
     """Earlier scans of the lidar that it senses beside the last one, by which it may tell what
     moves."""
-    field_of_view: float = 180.0
+    field_of_view: float = setting(180.0, between(10.0, 360.0, "from 10 to 360 [deg]"))
     """Angle that the lidar sees [deg], in sectors of 10 degrees. A robot that must keep moving is
     run into from behind by people unless it sees all 360."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)

@@ -4,64 +4,67 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE
+from training.settings.rules import NAME, at_least, choice, setting, up_to
+
 
 @dataclass
 class LearnerSettings:
     """DDPG of Table 1, with what keeps it from collapsing (see ``docs/design.md``)."""
 
-    name: str = "ddpg"
+    name: str = setting("ddpg", NAME)
     """Part of the run's folder and of its group in wandb."""
-    algorithm: str = "ddpg"
+    algorithm: str = setting("ddpg", choice("ddpg", "td3", "sac", "dqn", "q_learning"))
     """``ddpg``, ``td3``, ``sac``, ``dqn`` or ``q_learning``; ``learner=td3`` chooses it with what
     goes with it. The last two choose among seven pairs of wheel speeds."""
-    actor_lr: float = 1e-4
+    actor_lr: float = setting(1e-4, POSITIVE)
     """Learning rate of the actor at the start; 1e-4 is the paper's (Table 1)."""
-    critic_lr: float = 1e-4
+    critic_lr: float = setting(1e-4, POSITIVE)
     """Learning rate of the critics at the start; 1e-4 is the paper's (Table 1)."""
-    lr_end_factor: float = 0.0
+    lr_end_factor: float = setting(0.0, SHARE)
     """Learning rates fall with the episodes to this fraction of the first; 1: constant. At a
     constant rate DDPG forgets and relearns, and the last policy is a matter of luck."""
-    lr_power: float | None = None
+    lr_power: float | None = setting(None, POSITIVE)
     """Shape of the fall: 1 is linear, right for a thousand episodes; 3 has halved the rates after a
     fifth of them, right for a hundred. Null: 1 from 500 episodes on, 3 below."""
-    gamma: float = 0.99
+    gamma: float = setting(0.99, SHARE)
     """Discount of the next action's value (Table 1)."""
-    tau: float = 0.01
+    tau: float = setting(0.01, ABOVE_ZERO)
     """Share of a network by which its target moves in an update; 0.01 is the paper's (Table 1)."""
-    width: int = 64
+    width: int = setting(64, up_to(2**16))
     """Units of a hidden layer."""
-    layers: int = 2
+    layers: int = setting(2, up_to(100))
     """Hidden layers."""
     layer_norm: bool = True
     """Normalize hidden layers: features cannot grow without bound."""
     late_action: bool = True
     """The action joins the critic at its second layer, as in the original DDPG."""
-    final_init: float | None = 3e-3
+    final_init: float | None = setting(3e-3, POSITIVE)
     """Last layers start within this, near the middle of the tanh; null: PyTorch's start."""
-    critic_weight_decay: float = 1e-4
+    critic_weight_decay: float = setting(1e-4, NOT_NEGATIVE)
     """L2 decay of the critic. The original DDPG's 1e-2 holds Q well below the returns here."""
-    reward_scale: float = 0.1
+    reward_scale: float = setting(0.1, POSITIVE)
     """Factor of rewards in the loss, so that Q is of order one."""
-    saturation_penalty: float = 1.0
+    saturation_penalty: float = setting(1.0, NOT_NEGATIVE)
     """Factor of the penalty on actions deep in the tanh's flat ends, where no gradient is."""
-    saturation_limit: float = 1.5
+    saturation_limit: float = setting(1.5, NOT_NEGATIVE)
     """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
     compile: bool = False
     """Make one program of an update with ``torch.compile``, which halves the time of a run. Needs a
     C++ compiler, and half a minute at the start, a few seconds the next time."""
-    policy_delay: int = 1
+    policy_delay: int = setting(1, at_least(1))
     """DDPG and TD3: updates of the critics for one of the actor and the targets."""
-    policy_noise: float = 0.0
+    policy_noise: float = setting(0.0, NOT_NEGATIVE)
     """DDPG and TD3: standard deviation of the noise that smooths the target."""
-    noise_clip: float = 0.5
+    noise_clip: float = setting(0.5, NOT_NEGATIVE)
     """DDPG and TD3: bound of that noise."""
-    alpha_init: float = 0.01
+    alpha_init: float = setting(0.01, POSITIVE)
     """SAC: temperature of the entropy at the start, of rewards that are scaled."""
-    alpha_lr: float = 3e-4
+    alpha_lr: float = setting(3e-4, POSITIVE)
     """SAC: learning rate of the temperature's logarithm."""
     double: bool = True
     """DQN: whether the next action is that of the network, and not of the target network."""
-    table_lr: float = 0.2
+    table_lr: float = setting(0.2, ABOVE_ZERO)
     """Q learning: learning rate of the table, falling as the others do."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from training.settings.checks import settings_by_name
+from training.settings.rules import settings_by_name
 from training.settings.train import (
     GROUPS,
     REGIMES,

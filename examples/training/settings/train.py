@@ -1,8 +1,8 @@
 """Settings of a training run: typed, in one place, each with its default and its reason.
 
 Hydra builds its command line from these: ``train.py method=per learner.width=128 seed=3``. The
-settings of a method are those of :class:`torchrl_mpfa.methods.Method`; what values are allowed is
-in ``checks.py``.
+settings of a method are those of :class:`torchrl_mpfa.methods.Method`; ``checks.py`` has what
+settings may not be together.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from mpfa_envs import GENERATORS
+from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, Rule
 from torchrl_mpfa.methods import METHODS, Method
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import (
@@ -29,23 +30,30 @@ from training.settings.learners import (
     SACSettings,
     TD3Settings,
 )
+from training.settings.rules import NAME, WORD, at_least, between, choice, setting, up_to
+
+MOST_ROBOTS = 4096
+"""On wheels these take 6.4 GB."""
+LAST_SEED = 2**32 - 1
+"""Each stage has a seed of its own, a million times as large, which is to fit in 64 bits."""
+_GROUP: Rule = (lambda value: 0 < len(value) <= 128, "a word of at most 128 letters")
 
 
 @dataclass
 class ExplorationSettings:
     """Uniform actions at first, then Gaussian noise on the policy's, or some at random."""
 
-    random_steps: int = 1_000
+    random_steps: int = setting(1_000, at_least(0))
     """Steps of uniformly random actions."""
-    sigma: float = 1.0
+    sigma: float = setting(1.0, NOT_NEGATIVE)
     """Standard deviation of the noise at the start."""
-    sigma_end: float = 0.2
+    sigma_end: float = setting(0.2, NOT_NEGATIVE)
     """Standard deviation at the end; it does not vanish, as narrow data makes DDPG forget."""
-    epsilon: float = 1.0
+    epsilon: float = setting(1.0, SHARE)
     """DQN and Q learning: chance of a random action at the start."""
-    epsilon_end: float = 0.1
+    epsilon_end: float = setting(0.1, SHARE)
     """DQN and Q learning: chance at the end."""
-    annealing_steps: int = 5_000
+    annealing_steps: int = setting(5_000, at_least(1))
     """Steps in which the noise, or the chance, goes from its start to its end."""
     varied: bool = True
     """Whether each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
@@ -74,7 +82,7 @@ class Stage:
 class CurriculumSettings:
     """Worlds one after the other."""
 
-    name: str | None = None
+    name: str | None = setting(None, NAME)
     """Part of the run's folder and of its group in wandb; null: named after the stages."""
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
     """The worlds in their order; all of them count episodes, or all of them count actions."""
@@ -123,12 +131,12 @@ def curriculum_name(stages: Sequence[Stage]) -> str:
 class EvaluationSettings:
     """Greedy episodes during training, which show how fast it learns and change nothing in it."""
 
-    every: int = 0
+    every: int = setting(0, at_least(0))
     """Actions between two evaluations; 0: none."""
     world: str = "validation"
     """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
     which nothing may be chosen, are refused with ``choose``. ``same``: where the last stage is."""
-    episodes: int = 20
+    episodes: int = setting(20, at_least(1))
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
     choose: bool = False
     """Whether the policy of the run is the one that did best there, not the last one."""
@@ -138,19 +146,19 @@ class EvaluationSettings:
 class TrackingSettings:
     """Where the run is logged; ``tracking=[wandb,csv]`` names several places."""
 
-    mode: str = "off"
+    mode: str = setting("off", choice("offline", "online", "off"))
     """wandb: ``offline`` (no account), ``online`` or ``off``."""
     csv: bool = False
     """Whether TorchRL's CSVLogger writes a file for each number, to ``csv/`` of the folder."""
     tensorboard: bool = False
     """Whether TorchRL's TensorboardLogger writes to ``tensorboard/`` of the folder."""
-    project: str = "torchrl-mpfa"
+    project: str = setting("torchrl-mpfa", WORD)
     """wandb: the project."""
-    group: str | None = None
+    group: str | None = setting(None, _GROUP)
     """wandb: what the runs of a kind have in common; null: CURRICULUM-METHOD-LEARNER."""
-    log_every: int = 200
+    log_every: int = setting(200, at_least(1))
     """Actions between two entries of losses, weights and priorities."""
-    pictures_every: int | None = 0
+    pictures_every: int | None = setting(0, at_least(0))
     """Actions between two sets of pictures of the policy in the worlds of ``evaluation.world``,
     for wandb and TensorBoard; 0: at the end alone, null: none."""
 
@@ -159,15 +167,15 @@ class TrackingSettings:
 class AssessmentSettings:
     """Whether policies are held fixed and assessed, and the best of them kept."""
 
-    episodes: int = 0
+    episodes: int = setting(0, at_least(0))
     """Whole episodes that assess a policy before the next updates, 20 in TD7; 0: none do."""
-    early_episodes: int = 1
+    early_episodes: int = setting(1, at_least(1))
     """Episodes that do so in the early part of a run, which fewer of them speed up."""
-    early_share: float = 0.15
+    early_share: float = setting(0.15, SHARE)
     """How much of the run that part is, TD7's 750,000 of 5 million steps."""
-    best_factor: float = 0.9
+    best_factor: float = setting(0.9, SHARE)
     """What is left of the best score at its end, as the worst of more episodes is worse."""
-    by: str = "outcome"
+    by: str = setting("outcome", choice("outcome", "return"))
     """Score of an episode: ``outcome``, what Eq. (25) pays at its end, or ``return``, all of its
     rewards, as in TD7. Returns grow with path length."""
 
@@ -176,12 +184,12 @@ class AssessmentSettings:
 class RaySettings:
     """Where the robots drive; ``docs/scaling.md`` has what it needs and what it brings."""
 
-    workers: int = 0
+    workers: int = setting(0, at_least(0))
     """Processes that drive the robots, each an equal part of them; 0: the run drives them."""
-    address: str | None = None
+    address: str | None = setting(None, WORD)
     """Address of a cluster's head; null: that of ``RAY_ADDRESS``, one that was started on this
     machine, or else the cores of this machine."""
-    steps: int = 16
+    steps: int = setting(16, at_least(1))
     """Actions of each robot of a worker before it writes them and gets new weights."""
     sync: bool = False
     """Whether the workers wait for each other and for the updates. If not, they drive on while the
@@ -216,18 +224,19 @@ class TrainSettings:
             "output_subdir": None,
         }
     )
-    run_dir: str = (
+    run_dir: str = setting(
         "runs/${curriculum_name:${curriculum.name},${curriculum.stages}}"
-        "-${method.name}-${learner.name}-${seed}"
+        "-${method.name}-${learner.name}-${seed}",
+        WORD,
     )
     """Folder of checkpoints, logs and pictures."""
     regime: str = "paper"
     """``regime=rooms``: many robots in new worlds; ``regime=paper``: Table 1, one robot, A to D."""
-    seed: int = 0
+    seed: int = setting(0, between(0, LAST_SEED, f"from 0 to {LAST_SEED}"))
     """Seed of the networks, the exploration, the replay and the generated worlds."""
     device: str = "cpu"
     """Where the networks are; the buffer stays in main memory."""
-    threads: int = 1
+    threads: int = setting(1, up_to(1024))
     """Threads of PyTorch, by which the last bits of a network depend; with networks this small a
     second one gains nothing."""
     overwrite: bool = False
@@ -235,12 +244,12 @@ class TrainSettings:
     resume: str | None = None
     """Folder of a run to continue, with its own settings. More episodes, tracking and how
     often to evaluate and to save may be changed; anything else is rejected."""
-    checkpoint_every: int = 10_000
+    checkpoint_every: int = setting(10_000, at_least(1))
     """Actions between two checkpoints."""
-    robots: int = 1
+    robots: int = setting(1, up_to(MOST_ROBOTS, why=", as a robot takes up to 1.6 MB of memory"))
     """Robots that drive at once, each in a world of its own; those that are under way at the end of
     a stage give up their episodes."""
-    updates: int = 1
+    updates: int = setting(1, at_least(1))
     """Updates for one action of each robot."""
     method: Method = field(default_factory=Method)
     """One of the methods by name; its settings can be changed one by one."""

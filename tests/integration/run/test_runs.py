@@ -27,10 +27,9 @@ from training.run import loop, tracking
 from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.run.running import Refused, resume, start
-from training.settings.checks import LAST_SEED
 from training.settings.command_line import composed, parse_overrides
 from training.settings.resuming import changed
-from training.settings.train import register
+from training.settings.train import LAST_SEED, register
 
 STAGES = "curriculum.stages=[{{world: A, episodes: {}}}]"
 

@@ -1,0 +1,90 @@
+"""Settings with the rule of their values beside their default."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import field, fields, is_dataclass
+from typing import Any
+
+from torchrl_mpfa.checks import Rule
+
+
+def setting(default: Any, rule: Rule) -> Any:
+    """A field of settings, and what its values may be; null is always allowed."""
+    return field(default=default, metadata={"rule": rule})
+
+
+def at_least(least: float) -> Rule:
+    """Finite, and not below a bound."""
+    return lambda value: least <= value < math.inf, f"at least {least:g}"
+
+
+def up_to(most: int, *, why: str = "") -> Rule:
+    """A count that this machine may have room for."""
+    return lambda value: 1 <= value <= most, f"from 1 to {most}{why}"
+
+
+def between(low: float, high: float, words: str) -> Rule:
+    """In a closed interval."""
+    return lambda value: low <= value <= high, words
+
+
+def choice(*names: str) -> Rule:
+    """One of some words."""
+    return lambda value: value in names, f"one of {', '.join(names)}"
+
+
+NAME: Rule = (
+    lambda value: re.fullmatch(r"[\w.+-]+", value) is not None,
+    "letters, digits and any of . _ + -, as it names a folder",
+)
+WORD: Rule = (lambda value: bool(value.strip()), "not be empty")
+
+
+def settings_by_name(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every setting with its dotted name.
+
+    Args:
+        settings: The settings.
+        prefix: Start of their names.
+
+    Yields:
+        Name and value; the settings of a group are single ones, stages are one value.
+    """
+    for entry in fields(settings):
+        if not prefix and entry.name in ("hydra", "defaults"):
+            continue
+        value, name = getattr(settings, entry.name), prefix + entry.name
+        if is_dataclass(value):
+            yield from settings_by_name(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def rules_of(settings: Any) -> dict[str, Rule]:
+    """The rules of a group of settings, of those too whose default a subclass changes."""
+    found: dict[str, Rule] = {}
+    for kind in reversed(type(settings).__mro__):
+        for name, entry in getattr(kind, "__dataclass_fields__", {}).items():
+            found |= {name: entry.metadata["rule"]} if "rule" in entry.metadata else {}
+    return found
+
+
+def check_rules(settings: Any, rules: Mapping[str, Rule], prefix: str) -> None:
+    """Reject a value that its rule does not allow.
+
+    Args:
+        settings: A group of settings.
+        rules: By the names of its fields.
+        prefix: Start of their names on the command line.
+
+    Raises:
+        ValueError: With the setting's name and its value.
+    """
+    for name, rule in rules.items():
+        value, (allowed, wanted) = getattr(settings, name), rule
+        if value is not None and not allowed(value):
+            must = wanted if rule is WORD else f"be {wanted}"
+            raise ValueError(f"{prefix}{name} must {must}, got {value!r}")
