@@ -62,7 +62,8 @@ def arrows(package):
 
     Imports for the sake of types do not, nor does the package's own face, which imports all.
     """
-    folder = {"torchrl_mpfa": ROOT / "torchrl_mpfa", "mpfa_envs": ROOT / "envs/mpfa_envs"}[package]
+    root = {"mpfa_envs": ROOT / "envs", "training": ROOT / "examples"}.get(package, ROOT)
+    folder = root / package
     files = {
         ".".join(path.relative_to(folder.parent).with_suffix("").parts).removesuffix(
             ".__init__"
@@ -91,7 +92,7 @@ def arrows(package):
     return found
 
 
-@pytest.mark.parametrize("package", ["torchrl_mpfa", "mpfa_envs"])
+@pytest.mark.parametrize("package", ["torchrl_mpfa", "mpfa_envs", "training", "benchmarks"])
 def test_no_files_import_each_other_in_a_circle(package):
     left = {module: set(names) for module, names in arrows(package).items()}
     while ends := [module for module, names in left.items() if not names & set(left)]:

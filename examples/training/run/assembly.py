@@ -1,4 +1,4 @@
-"""Networks, loss and optimizers of a training run, put together from its settings."""
+"""Networks, loss, optimizers and robots of a training run, put together from its settings."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from torchrl_mpfa.methods import Method, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table
 from torchrl_mpfa.networks.values import ValueNetwork, ValueTable
+from training.run.driving import Robots
 from training.settings.learners import LearnerSettings, is_discrete
 from training.settings.train import TrainSettings
 
@@ -218,3 +219,12 @@ def make_curiosity(
         return None
     made = Curiosity(observation_size, action_size, scale=method.curiosity_scale)
     return made.to(device)
+
+
+def make_robots(settings: TrainSettings) -> Robots:
+    """The robots of a run, in this process or on a Ray cluster."""
+    if not settings.ray.workers:
+        return Robots(settings)
+    from training.run.fleet import Fleet
+
+    return Fleet(settings)

@@ -254,12 +254,3 @@ class Robots:
         if self._env is not None:
             self._env.close()
             self._env = None
-
-
-def make_robots(settings: TrainSettings) -> Robots:
-    """The robots of a run, in this process or on a Ray cluster."""
-    if not settings.ray.workers:
-        return Robots(settings)
-    from training.run.fleet import Fleet
-
-    return Fleet(settings)

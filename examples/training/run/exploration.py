@@ -123,7 +123,7 @@ class NoisyPolicy:
             self.shares.copy_(state_dict["shares"])
 
 
-class OftenGreedy:
+class EpsilonGreedy:
     """The best action, or with some chance, falling linearly, any of them.
 
     With ``varied`` each episode has a share of that chance, as :class:`NoisyPolicy` of its noise.
@@ -238,5 +238,5 @@ def make_explorer(
     if isinstance(policy, StochasticActor):
         return RandomPolicy(policy, settings)
     if "action_value" in policy.out_keys:
-        return OftenGreedy(policy, settings, action_spec.shape[0])
+        return EpsilonGreedy(policy, settings, action_spec.shape[0])
     return NoisyPolicy(policy, settings, action_spec)

@@ -30,10 +30,9 @@ from training.records import (
     last_best,
     write_table,
 )
-from training.run.assembly import make_curiosity, make_learner, method_of
+from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
 from training.run.assessment import Assessment
 from training.run.checkpoints import FORMAT, random_state, set_random_state
-from training.run.driving import make_robots
 from training.run.evaluations import evaluate_policy, exported_policy
 from training.run.exploration import make_explorer
 from training.run.schedule import Schedule

@@ -7,7 +7,7 @@ import torch
 from torchrl.data import Bounded
 
 from torchrl_mpfa import make_actor, make_stochastic_actor, make_value_network
-from training.run.exploration import NoisyPolicy, OftenGreedy, RandomPolicy, make_explorer
+from training.run.exploration import EpsilonGreedy, NoisyPolicy, RandomPolicy, make_explorer
 from training.settings.train import ExplorationSettings
 
 SPEC = Bounded(low=-1.0, high=1.0, shape=(3, 2))
@@ -75,7 +75,7 @@ def test_a_deterministic_policy_gets_noise() -> None:
 def test_a_choice_at_random_becomes_as_rare_as_it_is_told_and_each_robot_has_its_share() -> None:
     torch.manual_seed(0)
     settings = ExplorationSettings(epsilon=0.8, epsilon_end=0.2, annealing_steps=600, varied=False)
-    explorer = OftenGreedy(make_value_network(5, 4, width=8), settings, 3)
+    explorer = EpsilonGreedy(make_value_network(5, 4, width=8), settings, 3)
     best = explorer.policy.outputs({"observation": OBSERVATION})["action"]
     for expected in (0.8, 0.5, 0.2, 0.2):
         assert explorer.epsilon == pytest.approx(expected)
