@@ -59,6 +59,7 @@ class TreeSampler(SavedTrees):
         1.0
     """
 
+    _alpha: float
     _rng: torch.Generator | None
 
     def __init__(
