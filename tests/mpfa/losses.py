@@ -2,24 +2,72 @@
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
+from torchrl_mpfa import (
+    make_actor,
+    make_critic,
+    make_ddpg_loss,
+    make_sac_loss,
+    make_stochastic_actor,
+    make_td3_loss,
+)
 from torchrl_mpfa.learners.gradients import Gradients
+from torchrl_mpfa.networks import StochasticActor
 
 GAMMA = 0.9
 BOUNDS = (-1.0, 1.0)
+KINDS = ["ddpg", "td3", "sac"]
+CRITICS_LOSS = {"ddpg": "loss_value", "td3": "loss_qvalue", "sac": "loss_qvalue"}
+"""TorchRL's name of the critics' loss."""
 
 
-def make_networks(seed=0, **kwargs):
+def make_networks(seed=0, *, stochastic=False, **kwargs):
     """An actor and a critic that start far from zero, so that gradients are not tiny."""
     torch.manual_seed(seed)
     arguments = {"width": 16, "final_init": 0.5, **kwargs}
-    return make_actor(5, 2, **arguments), make_critic(5, 2, **arguments)
+    make = make_stochastic_actor if stochastic else make_actor
+    return make(5, 2, **arguments), make_critic(5, 2, **arguments)
 
 
 def make_loss(seed=0, **kwargs):
     return make_ddpg_loss(*make_networks(seed), gamma=GAMMA, **kwargs)
+
+
+def without_shortcut(actor, critic):
+    """The same networks as modules that must be called with tensordicts."""
+    critic = TensorDictModule(critic.module, critic.in_keys, critic.out_keys)
+    if not isinstance(actor, StochasticActor):
+        return TensorDictModule(actor.module, actor.in_keys, actor.out_keys), critic
+    inner = actor.module[0]
+    inner = TensorDictModule(inner.module, inner.in_keys, inner.out_keys)
+    keys, spec = {"loc": "preactivation", "scale": "scale"}, actor.spec["action"]
+    return ProbabilisticActor(inner, keys, spec=spec, distribution_class=TanhNormal), critic
+
+
+def make_of(kind, *, networks=None, **options):
+    """A loss of any kind whose targets differ from its networks, lest a mix-up goes unseen."""
+    if networks is None:
+        networks = make_networks(stochastic=kind == "sac")
+    make, more = {
+        "ddpg": (make_ddpg_loss, {}),
+        "td3": (make_td3_loss, {"bounds": BOUNDS}),
+        "sac": (make_sac_loss, {"alpha_init": 0.3}),
+    }[kind]
+    loss = make(*networks, **{"gamma": GAMMA, **more, **options})
+    with torch.no_grad():
+        for name, value in loss.named_buffers():
+            if name.startswith("target_"):
+                value.mul_(0.7)
+    return loss
+
+
+def evaluate(loss, batch, seed=1):
+    """All losses by the same random numbers, of smoothed targets or random actions."""
+    torch.manual_seed(seed)
+    return loss(batch)
 
 
 def make_batch(count=6, *, seed=0, weighted=False):

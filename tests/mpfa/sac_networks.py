@@ -3,8 +3,6 @@
 from copy import deepcopy
 
 import torch
-from tensordict.nn import TensorDictModule
-from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from tests.mpfa.losses import GAMMA
 from torchrl_mpfa import SACLearner, make_critic, make_sac_loss, make_stochastic_actor
@@ -14,16 +12,6 @@ def make_networks(seed=0, size=5, **kwargs):
     torch.manual_seed(seed)
     arguments = {"width": 16, "final_init": 0.5, **kwargs}
     return make_stochastic_actor(size, 2, **arguments), make_critic(size, 2, **arguments)
-
-
-def without_shortcut(actor, critic):
-    """The same networks as modules that must be called with tensordicts."""
-    inner = actor.module[0]
-    inner = TensorDictModule(inner.module, inner.in_keys, inner.out_keys)
-    keys = {"loc": "preactivation", "scale": "scale"}
-    spec = actor.spec["action"]
-    wrapped = ProbabilisticActor(inner, keys, spec=spec, distribution_class=TanhNormal)
-    return wrapped, TensorDictModule(critic.module, critic.in_keys, critic.out_keys)
 
 
 def make_loss(seed=0, **kwargs):

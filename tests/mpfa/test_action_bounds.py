@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Composite
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, TD3Loss, ValueEstimators
@@ -207,40 +207,3 @@ def test_a_spec_may_be_that_of_a_batch_of_environments_or_have_a_key():
     for spec in (SPEC, batched, Composite(action=SPEC), Composite(action=batched, shape=(3,))):
         low, high = action_bounds(spec, 2)
         assert (low.tolist(), high.tolist()) == (LOW, HIGH)
-
-
-@pytest.mark.parametrize(
-    ("spec", "words"),
-    [
-        (Unbounded((2,)), "action_spec must be Bounded, got Unbounded"),
-        (Categorical(3), "action_spec must be Bounded, got Categorical"),
-        (Bounded(low=0, high=3, shape=(2,), dtype=torch.int64), "real numbers, got torch.int64"),
-        (Bounded(low=-1.0, high=1.0, shape=(3,)), "must have action_size = 2 entries"),
-        (Bounded(low=-1.0, high=math.inf, shape=(2,)), "finite bounds, low < high"),
-        (Bounded(low=1.0, high=1.0, shape=(2,)), "finite bounds, low < high"),
-        (Composite(a=SPEC, b=SPEC), "action_spec must have one entry, got 2"),
-        (
-            Bounded(low=torch.tensor([LOW, [0.0, 0.0]]), high=torch.tensor([HIGH, HIGH])),
-            "the same bounds for all environments",
-        ),
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("maker", MAKERS)
-def test_a_spec_that_bounds_no_action_of_this_size_is_refused(maker, spec, words):
-    with pytest.raises(ValueError, match=words):
-        make(maker, spec)
-
-
-def test_td3_assumes_no_bounds():
-    actor, critic = networks(make_actor)
-    with pytest.raises(ValueError, match="one of action_spec and bounds must be given"):
-        make_td3_loss(actor, critic)
-    with pytest.raises(ValueError, match="one of action_spec and bounds must be given"):
-        make_td3_loss(actor, critic, bounds=(-1.0, 1.0), action_spec=SPEC)
-    with pytest.raises(ValueError, match=r"bounds must be finite, low < high, got \(1.0, -1.0\)"):
-        make_td3_loss(actor, critic, bounds=(1.0, -1.0))
-    with pytest.raises(ValueError, match="action_spec must be Bounded, got Unbounded"):
-        make_td3_loss(actor, critic, action_spec=Unbounded((2,)))
-    loss = make_td3_loss(actor, critic, bounds=(torch.tensor(LOW), torch.tensor(HIGH)))
-    assert loss.max_action.tolist() == HIGH

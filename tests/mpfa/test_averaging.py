@@ -4,7 +4,6 @@ import copy
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 
 from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks
 from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
@@ -109,12 +108,3 @@ def test_a_traced_learner_averages_as_well():
             learner.update(batch)
             learner.end_episode()
         torch.testing.assert_close(other["signals"].to_dict(), one["signals"].to_dict())
-
-
-def test_what_cannot_be_averaged_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"target_average must be an integer from 1 to .*, got 0"):
-        make_learner("ddpg", 0)
-    actor, critic = make_networks()
-    wrapped = TensorDictModule(critic.module, critic.in_keys, critic.out_keys)
-    with pytest.raises(ValueError, match="needs a DirectModule as critic, got TensorDictModule"):
-        make_ddpg_loss(actor, wrapped, target_average=2)

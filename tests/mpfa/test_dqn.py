@@ -262,22 +262,6 @@ def test_a_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
     assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))
 
 
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [
-        ({"signals": ["action_gradient"]}, "no slope"),
-        ({"signals": ["value"]}, "signals"),
-        ({"importance": "all"}, "importance"),
-        ({"reward_scale": 0.0}, "reward_scale"),
-        ({"loss_function": "pal"}, "loss_function"),
-        ({"gamma": 1.5}, "gamma"),
-    ],
-)
-def test_the_loss_refuses_options_that_cannot_be(options, word):
-    with pytest.raises(ValueError, match=word):
-        SignalDQNLoss(network(), **options)
-
-
 def test_learners_refuse_what_is_anothers():
     with pytest.raises(TypeError, match="SignalDQNLoss"):
         DQNLearner(network())

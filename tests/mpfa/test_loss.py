@@ -1,5 +1,8 @@
-"""SignalDDPGLoss: equal to TorchRL's loss where it should be, and to Eqs. (5) and (11) by hand."""
+"""The losses: equal to TorchRL's where they should be, and to Eqs. (5) and (11) by hand."""
 
+import inspect
+import itertools
+import pickle
 from copy import deepcopy
 
 import pytest
@@ -7,10 +10,25 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.objectives import DDPGLoss, ValueEstimators
+from torchrl.data import Bounded
+from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss, ValueEstimators
 
-from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks, parameter_gradients
-from torchrl_mpfa import SignalDDPGLoss, make_ddpg_loss
+from tests.mpfa.losses import (
+    BOUNDS,
+    CRITICS_LOSS,
+    GAMMA,
+    KINDS,
+    evaluate,
+    make_batch,
+    make_loss,
+    make_networks,
+    make_of,
+    parameter_gradients,
+    without_shortcut,
+)
+from torchrl_mpfa import SignalDDPGLoss, SignalSACLoss, SignalTD3Loss, make_ddpg_loss
+from torchrl_mpfa.losses import SignalLoss
+from torchrl_mpfa.losses.functional import pal_distance
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -77,57 +95,65 @@ def test_a_network_of_two_lines_gives_the_numbers_of_a_hand_calculation():
     assert float(loss.actor_network_params["module", "action"].grad) == pytest.approx(-3.0)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("delay_actor", [False, True])
+@pytest.mark.parametrize("estimator", [ValueEstimators.TD0, ValueEstimators.TDLambda], ids=str)
 @pytest.mark.parametrize("loss_function", ["l2", "smooth_l1"])
-def test_losses_and_gradients_equal_torchrls(weighted, delay_actor, loss_function):
-    actor, critic = make_networks()
-    arguments = {"loss_function": loss_function, "delay_actor": delay_actor}
-    theirs = DDPGLoss(deepcopy(actor), deepcopy(critic), **arguments)
-    theirs.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-    ours = make_ddpg_loss(actor, critic, gamma=GAMMA, importance="torchrl", **arguments)
-    shift_targets(theirs), shift_targets(ours)
-    batch = make_batch(weighted=weighted)
-    expected_batch = batch.clone()
-    found, expected = ours(batch), theirs(expected_batch)
-    for key in ("loss_value", "loss_actor", "td_error", "pred_value", "target_value"):
-        torch.testing.assert_close(found[key], expected[key], msg=key)
-    torch.testing.assert_close(batch["td_error"], expected_batch["td_error"])
-    for losses in (found, expected):
-        (losses["loss_value"] + losses["loss_actor"]).backward()
-    theirs_by_name = parameter_gradients(theirs)
-    assert theirs_by_name
-    for name, gradient in parameter_gradients(ours).items():
-        torch.testing.assert_close(gradient, theirs_by_name[name], msg=name)
+@pytest.mark.parametrize("weights", ["none", "torchrl", "not in the batch"])
+@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("kind", [*KINDS, "ddpg without a target actor"])
+def test_losses_and_gradients_equal_torchrls(kind, direct, weights, loss_function, estimator):
+    name, options = kind.split()[0], {"loss_function": loss_function}
+    if kind.endswith("actor"):
+        options["delay_actor"] = False
+    networks = make_networks(stochastic=name == "sac")
+    if not direct:
+        networks = without_shortcut(*networks)
+    importance = "none" if weights == "none" else "torchrl"
+    ours = make_of(name, networks=deepcopy(networks), importance=importance, **options)
+    if weights == "none":
+        options["use_prioritized_weights"] = False
+    theirs = {
+        "ddpg": lambda: DDPGLoss(*networks, **{"delay_actor": True, **options}),
+        "td3": lambda: TD3Loss(*networks, bounds=BOUNDS, **options),
+        "sac": lambda: SACLoss(*networks, alpha_init=0.3, **options),
+    }[name]()
+    for loss in (ours, theirs):
+        loss.make_value_estimator(estimator, gamma=GAMMA)
+    theirs.load_state_dict(ours.state_dict())
+    found = []
+    for loss in (ours, theirs):
+        batch = make_batch(weighted=weights != "not in the batch")
+        if estimator is ValueEstimators.TDLambda:
+            batch = batch.reshape(1, 6)
+        losses = evaluate(loss, batch)
+        sum(value for key, value in losses.items() if key.startswith("loss")).backward()
+        found.append((losses, batch["td_error"], parameter_gradients(loss)))
+    (mine, error, gradients), (expected, expected_error, expected_gradients) = found
+    assert set(expected.keys()) <= set(mine.keys())
+    if name == "td3":  # Of which both critics are in TorchRL's value, and the first in ours.
+        expected = expected.exclude("state_action_value_actor")
+    for key in expected.keys():  # noqa: SIM118
+        torch.testing.assert_close(mine[key], expected[key], msg=key)
+    torch.testing.assert_close(error, expected_error)
+    assert gradients.keys() == expected_gradients.keys()
+    for key, gradient in gradients.items():
+        torch.testing.assert_close(gradient, expected_gradients[key], msg=key)
 
 
-def shift_targets(loss):
-    """Target networks of their own, so that a mix-up with the current ones shows."""
-    for params in (loss.target_value_network_params, loss.target_actor_network_params):
-        if params.requires_grad or params is None:
-            continue
-        for tensor in params.flatten_keys().values():
-            with torch.no_grad():
-                tensor.mul_(0.7)
-
-
-def test_importance_weighs_the_critic_alone_and_divides_by_the_batch_size():
-    loss, batch = make_loss(loss_function="l2"), make_batch(weighted=True)
-    losses = loss(batch)
-    delta = losses["target_value"] - losses["pred_value"]
-    total = 0.0
-    for weight, error in zip(batch["priority_weight"].tolist(), delta.tolist(), strict=True):
-        total += weight * error**2
-    assert losses["loss_value"].item() == pytest.approx(total / len(delta), rel=1e-5)
-    plain = loss(make_batch(weighted=False))
-    assert losses["loss_actor"].equal(plain["loss_actor"])
-    assert not losses["loss_value"].equal(plain["loss_value"])
-
-
-def test_without_importance_the_weights_are_not_read():
-    loss = make_loss(importance="none")
-    for key in ("loss_value", "loss_actor"):
-        assert loss(make_batch(weighted=True))[key].equal(loss(make_batch(weighted=False))[key])
+@pytest.mark.parametrize("kind", KINDS)
+def test_importance_weighs_the_critics_alone_and_divides_by_the_batch_size(kind):
+    weighted, name = make_batch(weighted=True), CRITICS_LOSS[kind]
+    losses, plain = (evaluate(make_of(kind), b) for b in (weighted, make_batch()))
+    loss = make_of(kind)
+    torch.manual_seed(1)
+    _, log = loss.losses(make_batch(), trains="critic")
+    squares = (log["target_value"] - log["pred_value"]).square().reshape(-1, 6).sum(0)
+    total = sum(w * s for w, s in zip(weighted["priority_weight"], squares, strict=True))
+    torch.testing.assert_close(losses[name].detach(), total / 6)
+    assert not losses[name].equal(plain[name])
+    for key in {"loss_actor", "loss_alpha"} & set(plain.keys()):
+        assert losses[key].equal(plain[key])
+    unread = evaluate(make_of(kind, importance="none"), make_batch(weighted=True))
+    assert unread[name].equal(plain[name])
 
 
 def test_weights_may_be_a_column():
@@ -135,15 +161,6 @@ def test_weights_may_be_a_column():
     expected = loss(batch)["loss_value"]
     batch["priority_weight"] = batch["priority_weight"].unsqueeze(1)
     assert loss(batch)["loss_value"].equal(expected)
-
-
-def test_the_td_error_signal_is_absolute_and_not_squared():
-    loss, batch = make_loss(), make_batch()
-    losses = loss(batch)
-    delta = (losses["target_value"] - losses["pred_value"]).abs()
-    torch.testing.assert_close(batch["signals", "td_error"], delta)
-    torch.testing.assert_close(batch["td_error"], delta.square())
-    assert (batch["signals", "td_error"] >= 0).all()
 
 
 def test_an_end_is_not_bootstrapped_and_a_time_limit_is():
@@ -164,60 +181,180 @@ def test_an_end_is_not_bootstrapped_and_a_time_limit_is():
     assert not loss(limited)["target_value"].equal(reward)
 
 
-def test_nothing_of_the_output_but_the_losses_is_attached_to_the_graph():
-    losses = make_loss(saturation_penalty=0.1)(make_batch())
-    attached = {key for key, value in losses.items() if value.requires_grad}
-    assert attached == {"loss_value", "loss_actor"}
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_loss_moves_its_own_parameters_alone(kind):
+    own = {"loss_actor": "actor", CRITICS_LOSS[kind]: ("value", "qvalue")}
+    if kind == "sac":
+        own["loss_alpha"] = "log_alpha"
+    losses = evaluate(make_of(kind, saturation_penalty=0.1), make_batch())
+    assert {key for key, value in losses.items() if value.requires_grad} == set(own)
+    for key, prefix in own.items():
+        loss = make_of(kind)
+        evaluate(loss, make_batch())[key].backward()
+        names = parameter_gradients(loss)
+        assert names
+        assert all(name.startswith(prefix) for name in names)
 
 
-def test_the_critic_gets_no_gradient_from_the_actors_loss_nor_the_actor_from_the_critics():
-    for key, without in (("loss_actor", "value"), ("loss_value", "actor")):
-        loss = make_loss()
-        loss(make_batch())[key].backward()
-        gradients = parameter_gradients(loss)
-        assert gradients
-        assert not any(without in name for name in gradients)
-
-
-def test_no_gradient_reaches_the_targets_or_the_batch():
-    loss, batch = make_loss(), make_batch()
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_gradient_reaches_the_batch_and_only_signals_are_added(kind):
+    loss, batch = make_of(kind), make_batch()
     before = batch.clone()
     losses = loss(batch)
-    (losses["loss_value"] + losses["loss_actor"]).backward()
-    assert not any("target" in name for name in parameter_gradients(loss))
+    (losses[CRITICS_LOSS[kind]] + losses["loss_actor"]).backward()
     assert not any(entry.requires_grad for entry in batch.values(True, True))
     for key in ("observation", "action", ("next", "reward")):
         assert batch[key].equal(before[key])
-    added = {"signals", "td_error"}
-    assert set(batch.keys()) - set(before.keys()) == added
+    assert set(batch.keys()) - set(before.keys()) == {"signals", "td_error"}
 
 
-def test_the_loss_can_be_looked_at_without_gradients():
-    loss, batch = make_loss(), make_batch()
-    expected = make_batch()
-    with_grad = loss(expected)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_loss_can_be_looked_at_without_gradients(kind):
+    batch, expected, name = make_batch(), make_batch(), CRITICS_LOSS[kind]
+    with_grad = evaluate(make_of(kind), expected)
     with torch.no_grad():
-        losses = loss(batch)
-    assert not losses["loss_value"].requires_grad
-    torch.testing.assert_close(losses["loss_value"], with_grad["loss_value"].detach())
+        losses = evaluate(make_of(kind), batch)
+    assert not losses[name].requires_grad
+    torch.testing.assert_close(losses[name], with_grad[name].detach())
     for key in ("td_error", "action_gradient"):
         torch.testing.assert_close(batch["signals", key], expected["signals", key])
 
 
 def test_the_value_estimator_is_one_step_if_none_is_made():
-    actor, critic = make_networks()
-    loss = SignalDDPGLoss(actor, critic)
-    losses = loss(make_batch())
-    assert losses["loss_value"].isfinite()
+    assert SignalDDPGLoss(*make_networks())(make_batch())["loss_value"].isfinite()
 
 
-def test_networks_that_need_tensordicts_give_the_same_as_those_that_do_not():
-    direct = make_networks()
-    indirect = [TensorDictModule(n.module, n.in_keys, n.out_keys) for n in direct]
+def test_networks_that_need_tensordicts_give_the_same_bits():
     found = []
-    for networks in (direct, indirect):
+    for networks in (make_networks(), without_shortcut(*make_networks())):
         batch = make_batch(weighted=True)
         losses = make_ddpg_loss(*networks, gamma=GAMMA)(batch)
         found.append([losses["loss_value"], losses["loss_actor"], *batch["signals"].values()])
     for one, other in zip(*found, strict=True):
         assert one.equal(other)
+
+
+def test_an_actor_may_observe_what_the_critic_does_not():
+    actor = TensorDictModule(nn.Linear(5, 2), ["image"], ["action"])
+    loss = make_ddpg_loss(actor, make_networks()[1], gamma=GAMMA)
+    batch = make_batch()
+    batch["image"], batch["next", "image"] = torch.randn(2, 6, 5)
+    losses = loss(batch)
+    assert losses["loss_value"].isfinite()
+    assert batch["signals", "action_gradient"].shape == (6,)
+
+
+def test_every_key_may_be_nested_and_renamed():
+    actor, critic = make_networks()
+    agent_actor = TensorDictModule(
+        actor.module, [("agent", "obs")], [("agent", "u"), ("agent", "act")]
+    )
+    agent_critic = TensorDictModule(
+        critic.module, [("agent", "obs"), ("agent", "act")], [("agent", "q")]
+    )
+    loss = SignalDDPGLoss(agent_actor, agent_critic)
+    loss.set_keys(
+        action=("agent", "act"),
+        state_action_value=("agent", "q"),
+        preactivation=("agent", "u"),
+        reward=("agent", "r"),
+        terminated=("agent", "end"),
+        done=("agent", "done"),
+        priority=("agent", "squared"),
+        td_error_signal=("agent", "signals", "td"),
+        action_gradient_signal=("agent", "signals", "slope"),
+    )
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    plain = make_batch()
+    expected = make_loss()(plain)
+    batch = make_batch()
+    after = batch["next"]
+    nested = batch.empty()
+    nested["agent", "obs"], nested["agent", "act"] = batch["observation"], batch["action"]
+    nested["next", "agent", "obs"], nested["next", "agent", "r"] = (
+        after["observation"],
+        after["reward"],
+    )
+    nested["next", "agent", "end"], nested["next", "agent", "done"] = (
+        after["terminated"],
+        after["done"],
+    )
+    found = loss(nested)
+    for key in ("loss_value", "loss_actor"):
+        torch.testing.assert_close(found[key], expected[key])
+    torch.testing.assert_close(nested["agent", "signals", "td"], plain["signals", "td_error"])
+    torch.testing.assert_close(
+        nested["agent", "signals", "slope"], plain["signals", "action_gradient"]
+    )
+    assert nested["agent", "squared"].shape == (6,)
+
+
+@pytest.mark.parametrize(
+    ("kind", "path"),
+    # What TorchRL makes of several critics cannot be pickled.
+    [("ddpg", "pickle"), *itertools.product(KINDS, ["deepcopy", "double"])],
+)
+def test_a_copied_or_converted_loss_uses_its_own_parameters(kind, path):
+    loss, name = make_of(kind), CRITICS_LOSS[kind]
+    before = evaluate(loss, make_batch())
+    if path == "double":
+        batch = make_batch()
+        batch.update(batch.select("observation", "action", ("next", "observation")).double())
+        batch["next", "reward"] = batch["next", "reward"].double()
+        losses = evaluate(loss.double(), batch)
+        assert losses[name].dtype == losses["loss_actor"].dtype == torch.double
+        return
+    copied = deepcopy(loss) if path == "deepcopy" else pickle.loads(pickle.dumps(loss))
+    found = evaluate(copied, make_batch())
+    assert found[name].equal(before[name])
+    assert found["loss_actor"].equal(before["loss_actor"])
+    with torch.no_grad():
+        for parameter in copied.parameters():
+            parameter.mul_(2)
+    assert not evaluate(copied, make_batch())[name].equal(before[name])
+    assert evaluate(loss, make_batch())[name].equal(before[name])
+
+
+@pytest.mark.parametrize(
+    "key", ["observation", "action", "next", ("next", "reward"), ("next", "terminated")], ids=str
+)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missing_input_is_named(kind, key):
+    with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
+        make_of(kind)(make_batch().exclude(key))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.7])
+def test_the_exponent_of_pal_reaches_the_loss(alpha):
+    loss, batch = make_loss(loss_function="pal", pal_alpha=alpha), make_batch()
+    batch["next", "reward"] *= 5.0
+    found = loss(batch)
+    error = found["target_value"] - found["pred_value"]
+    assert float(error.abs().max()) > 1
+    torch.testing.assert_close(found["loss_value"], pal_distance(error, alpha=alpha).mean())
+
+
+def test_an_action_spec_takes_the_place_of_bounds():
+    spec = Bounded(low=-0.5, high=0.5, shape=(2,))
+    loss = SignalTD3Loss(*make_networks(), action_spec=spec)
+    assert loss.max_action.tolist() == [0.5, 0.5]
+    low, high = torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 10.0])
+    assert SignalTD3Loss(*make_networks(), bounds=(low, high)).max_action.tolist() == [2.0, 10.0]
+
+
+def test_the_critics_of_td3_start_apart():
+    params = make_of("td3").qvalue_network_params.flatten_keys()
+    weights = [value for name, value in params.items() if name.endswith("weight")]
+    assert any(not value[0].equal(value[1]) for value in weights)
+
+
+@pytest.mark.parametrize("kind", [SignalDDPGLoss, SignalTD3Loss, SignalSACLoss])
+def test_each_loss_says_where_its_options_are_and_takes_each_of_them(kind):
+    options = set(inspect.signature(SignalLoss.__init__).parameters)
+    options -= {"self", "actor_network", "critic_network", "kwargs"}
+    assert len(options) == 8
+    assert "Options: see :class:`~torchrl_mpfa.losses.SignalLoss`" in kind.__doc__
+    for name in options:
+        assert f"``{name}``" in kind.__doc__
+        assert f"        {name}: " in SignalLoss.__doc__
+        assert name not in inspect.signature(kind.__init__).parameters

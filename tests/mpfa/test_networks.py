@@ -1,12 +1,16 @@
-"""Actor and critic: shapes, options, and the start near the middle of the tanh."""
+"""Actor and critic: shapes, options, the start near the middle of the tanh, and refusals."""
+
+import math
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import make_actor, make_critic
+from torchrl_mpfa import make_actor, make_critic, make_stochastic_actor, make_value_network
+from torchrl_mpfa.networks import make_value_table
 
 
 def count(module, kind):
@@ -81,16 +85,52 @@ def test_the_value_depends_on_observation_and_action(late_action):
     assert not critic(observation + 1, action).equal(value)
 
 
-@pytest.mark.parametrize("argument", ["observation_size", "action_size", "width", "layers"])
-def test_sizes_below_one_are_refused(argument):
-    sizes = {"observation_size": 3, "action_size": 2, argument: 0}
-    for make in (make_actor, make_critic):
-        with pytest.raises(
-            ValueError, match=f"{argument} must be an integer from 1 to 2147483647, got 0"
-        ):
-            make(**sizes)
+_SPEC = Bounded(low=-1.0, high=1.0, shape=(2,))
+SPECS = [
+    (Unbounded((2,)), "action_spec must be Bounded, got Unbounded"),
+    (Categorical(3), "action_spec must be Bounded, got Categorical"),
+    (Bounded(low=0, high=3, shape=(2,), dtype=torch.int64), "real numbers, got torch.int64"),
+    (Bounded(low=-1.0, high=1.0, shape=(3,)), "must have action_size = 2 entries"),
+    (Bounded(low=-1.0, high=math.inf, shape=(2,)), "finite bounds, low < high"),
+    (Bounded(low=1.0, high=1.0, shape=(2,)), "finite bounds, low < high"),
+    (Composite(a=_SPEC, b=_SPEC), "action_spec must have one entry, got 2"),
+    (
+        Bounded(
+            low=torch.tensor([[-2.0, 0.0], [0.0, 0.0]]),
+            high=torch.tensor([[2.0, 10.0], [2.0, 10.0]]),
+        ),
+        "the same bounds for all environments",
+    ),
+]
+SIZES = {
+    make_actor: {"observation_size": 3, "action_size": 2, "width": 8, "layers": 2},
+    make_critic: {"observation_size": 3, "action_size": 2, "width": 8, "layers": 2},
+    make_stochastic_actor: {"observation_size": 3, "action_size": 2, "width": 8, "layers": 2},
+    make_value_network: {"observation_size": 3, "actions": 2, "width": 8, "layers": 2},
+    make_value_table: {"cell_of": len, "cells": 3, "actions": 2},
+}
+REFUSALS = [
+    *[
+        (make, {name: 0}, f"{name} must be an integer from 1 to 2147483647, got 0")
+        for make, sizes in SIZES.items()
+        for name in sizes
+        if name != "cell_of"
+    ],
+    *[
+        (make, {"final_init": -1.0}, "final_init must be finite and not negative, got -1.0")
+        for make in list(SIZES)[:4]
+    ],
+    *[
+        (make, {"action_spec": spec}, words)
+        for make in (make_actor, make_stochastic_actor)
+        for spec, words in SPECS
+    ],
+    (make_critic, {"layers": 1}, "layers must be at least 2 with late_action, got 1"),
+]
 
 
-def test_a_late_action_needs_a_second_layer():
-    with pytest.raises(ValueError, match="layers must be at least 2 with late_action, got 1"):
-        make_critic(3, 2, layers=1)
+@pytest.mark.parametrize(("make", "options", "words"), REFUSALS, ids=lambda value: str(value)[:40])
+def test_an_argument_that_no_network_can_have_is_rejected_by_name(make, options, words):
+    make(**SIZES[make])
+    with pytest.raises(ValueError, match=words):
+        make(**{**SIZES[make], **options})

@@ -83,15 +83,6 @@ def test_without_noise_ddpg_draws_no_random_number_and_has_the_same_state():
     assert loss.state_dict().keys() == noisy.state_dict().keys()
 
 
-def test_noise_without_bounds_is_refused():
-    with pytest.raises(ValueError, match="one of action_spec and bounds must be given"):
-        make_loss(policy_noise=0.1)
-    with pytest.raises(ValueError, match="policy_noise must be finite and not negative"):
-        make_loss(policy_noise=-0.1, bounds=BOUNDS)
-    with pytest.raises(ValueError, match="low < high"):
-        make_loss(policy_noise=0.1, bounds=(1.0, -1.0))
-
-
 @pytest.mark.parametrize("compile", [False, UNTRACED])
 def test_a_delayed_actor_of_ddpg_moves_with_the_targets_at_every_third_update(compile):
     learner = make_learner(make_loss(), policy_delay=3, compile=compile)

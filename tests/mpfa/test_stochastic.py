@@ -7,7 +7,6 @@ from torchrl.modules import TanhNormal
 
 from tests.mpfa.losses import make_batch
 from tests.mpfa.sac_networks import make_networks
-from torchrl_mpfa import make_stochastic_actor
 from torchrl_mpfa.networks import sample_tanh_normal
 
 
@@ -44,8 +43,3 @@ def test_sampled_actions_and_densities_are_torchrls(loc):
     torch.testing.assert_close(action, expected[0])
     torch.testing.assert_close(log_density, expected[1])
     assert action.abs().max() <= 1.0
-
-
-def test_a_policy_without_units_is_refused():
-    with pytest.raises(ValueError, match="width must be an integer from 1 to 2147483647, got 0"):
-        make_stochastic_actor(5, 2, width=0)

@@ -7,10 +7,10 @@ import torch
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.transforms import MultiStepTransform
 from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss, ValueEstimators
-from torchrl.objectives.value import GAE, TD0Estimator, TDLambdaEstimator
+from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
 
 from tests.mpfa import sac_networks
-from tests.mpfa.losses import BOUNDS, differentiate_at_once, make_batch, make_networks
+from tests.mpfa.losses import BOUNDS, differentiate_at_once, make_batch, make_networks, make_of
 from torchrl_mpfa import DDPGLearner, SignalDDPGLoss, SignalSACLoss, SignalTD3Loss, TD3Learner
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
@@ -99,6 +99,35 @@ def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
         assert float(found[row]) == pytest.approx(expected, abs=1e-6)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_the_target_of_sac_is_soft_row_by_row(scale):
+    loss = make_of("sac", reward_scale=scale, signals=["td_error", "value"], gamma=0.9)
+    batch = make_batch()
+    torch.manual_seed(1)
+    log = loss.value_loss(batch)[1]
+    torch.manual_seed(1)
+    noise = torch.randn(6, 2)
+    current = sac_networks.critics_of(loss, loss.qvalue_network_params)
+    later = sac_networks.critics_of(loss, loss.target_qvalue_network_params)
+    for row in range(6):
+        after = batch["next", "observation"][row]
+        loc, deviation = loss.actor_network.module[0].module(after)
+        normal = torch.distributions.Normal(loc, deviation)
+        before = loc + deviation * noise[row]
+        action = before.tanh()
+        log_density = sum(normal.log_prob(before) - (1 - action.square()).log())
+        value = min(float(q(after, action)) for q in later) - 0.3 * float(log_density)
+        target = scale * float(batch["next", "reward"][row])
+        if row != 1:  # The second transition is an end, the third a time limit.
+            target += 0.9 * value
+        assert float(log["target_value"][row]) == pytest.approx(target, rel=1e-4)
+        values = [float(q(batch["observation"][row], batch["action"][row])) for q in current]
+        error = max(abs(target - value) for value in values) / scale
+        assert float(batch["signals", "td_error"][row]) == pytest.approx(error, rel=1e-4)
+        assert float(batch["signals", "value"][row]) == pytest.approx(values[0] / scale, rel=1e-4)
+
+
 @pytest.mark.parametrize("column", [False, True], ids=["[B]", "[B, 1]"])
 @pytest.mark.parametrize("name", ["ddpg", "td3"])
 def test_a_compiled_update_has_the_targets_of_several_steps_too(name, column):
@@ -133,6 +162,16 @@ def test_other_value_estimators_are_honored_as_by_torchrl(name, estimator, optio
     assert not torch.allclose(targets_of(ours, batch.clone()), expected)
 
 
+@pytest.mark.parametrize("name", KINDS)
+def test_rewards_are_scaled_for_longer_targets_too(name):
+    loss, batch = make_of(name, reward_scale=3.0), make_batch().reshape(1, 6)
+    loss.make_value_estimator(ValueEstimators.TDLambda, gamma=0.5, lmbda=0.5)
+    for key in ("terminated", "done"):
+        batch["next", key] = torch.ones(1, 6, 1, dtype=torch.bool)
+    _, log = loss.losses(batch, trains="critic")
+    torch.testing.assert_close(log["target_value"], batch["next", "reward"].squeeze(-1) * 3.0)
+
+
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32], ids=str)
 @pytest.mark.parametrize("estimator", [ValueEstimators.TD0, ValueEstimators.TD1], ids=str)
 @pytest.mark.parametrize("name", KINDS)
@@ -155,18 +194,6 @@ def test_an_estimator_may_be_given_as_it_is(name):
     batch = make_batch(12).reshape(2, 6)
     found, expected = (targets_of(loss, batch.clone()) for loss in (given, by_name))
     torch.testing.assert_close(found, expected)
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_an_estimator_that_makes_no_targets_for_a_critic_of_actions_is_refused(name):
-    _, loss = make_pair(name)
-    kept = loss.value_estimator
-    with pytest.raises(ValueError, match=r"value_type .*GAE"):
-        loss.make_value_estimator(ValueEstimators.GAE, gamma=GAMMA, lmbda=0.9)
-    with pytest.raises(ValueError, match=r"value_type must make one of TD0Estimator.*, got GAE"):
-        loss.make_value_estimator(GAE(gamma=GAMMA, lmbda=0.9, value_network=None))
-    assert loss.value_estimator is kept
-    assert loss.value_type is ValueEstimators.TD0
 
 
 @pytest.mark.parametrize(
