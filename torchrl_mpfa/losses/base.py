@@ -171,6 +171,7 @@ class SignalLoss:
         *,
         trains: Trains = "both",
         loss_function: str | None = None,
+        defer_gradient: bool = True,
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The losses of an update, with the signal of Eq. (14) deferred.
 
@@ -178,6 +179,7 @@ class SignalLoss:
             batch: What is learned from, batch size ``[B]``; the critics' loss writes its signals.
             trains: Whose losses are wanted: the ``"critic"``'s, the ``"actor"``'s, or ``"both"``.
             loss_function: Distance of the critics' loss; None: the loss's own.
+            defer_gradient: False writes the signal of Eq. (14) at once.
 
         Returns:
             Losses by name, to be summed and differentiated before :meth:`write_action_gradient`;
@@ -187,7 +189,7 @@ class SignalLoss:
         log: dict[str, Tensor] = {}
         self._deferred = None  # Of an update that failed halfway.
         if trains != "actor":
-            options = {"defer_gradient": True, "loss_function": loss_function}
+            options = {"defer_gradient": defer_gradient, "loss_function": loss_function}
             losses["loss_value"], log = self._critics_part(batch, **options)
         if trains != "critic":
             of_actor, more = self._actors_part(batch)
