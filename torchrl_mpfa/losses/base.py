@@ -1,4 +1,4 @@
-"""What the losses share: options, networks, signals (Eqs. 13-14), and means over the batch."""
+"""Options, networks, signals (Eqs. 13-14) and means over the batch, which all losses share."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ class SignalLoss:
         self.pal_alpha = pal_alpha
         self._bound: Networks | None = None
         self._deferred: tuple[Tensor, Tensor] | None = None
-        """Actions and values whose gradients the backward pass of the loss will find."""
+        """Actions and values, whose gradients the backward pass of the loss will find."""
         # A list of modules, so that the past is saved, loaded and moved with the loss.
         self.past_critics = nn.ModuleList()
         if target_average > 1:
@@ -163,7 +163,7 @@ class SignalLoss:
             for network in self._held_critics(""):
                 self.past_critics.append(PastCritics(network.module, target_average - 1))
 
-    # What a learner asks for.
+    # Asked for by a learner.
 
     def losses(
         self,
@@ -176,7 +176,7 @@ class SignalLoss:
         """The losses of an update, with the signal of Eq. (14) deferred.
 
         Args:
-            batch: What is learned from, batch size ``[B]``; the critics' loss writes its signals.
+            batch: Transitions, batch size ``[B]``; the critics' loss writes their signals.
             trains: Whose losses are wanted: the ``"critic"``'s, the ``"actor"``'s, or ``"both"``.
             loss_function: Distance of the critics' loss; None: the loss's own.
             defer_gradient: False writes the signal of Eq. (14) at once.
@@ -247,11 +247,11 @@ class SignalLoss:
         return self._held_critics("")
 
     def actor_parameters(self) -> list[nn.Parameter]:
-        """What the actor's loss moves."""
+        """Parameters that the actor's loss moves."""
         return self._parameters_of("actor_network")
 
     def critic_parameters(self) -> list[nn.Parameter]:
-        """What the critics' loss moves."""
+        """Parameters that the critics' loss moves."""
         return self._parameters_of(self._critic_name)
 
     def _parameters_of(self, name: str) -> list[nn.Parameter]:
@@ -445,6 +445,6 @@ class SignalLoss:
 
 
 def check_importance(importance: str) -> None:
-    """Raise if this is no use of importance weights."""
+    """Reject a use of importance weights that there is not."""
     if importance not in ("critic", "torchrl", "none"):
         raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")

@@ -54,7 +54,7 @@ def bind_frozen(network: TensorDictModule, params: TensorDictBase) -> list[Tenso
 def read_inputs(
     network: TensorDictModule, source: TensorDictBase, chosen: Tensors | None = None
 ) -> dict[NestedKey, Tensor]:
-    """What a network reads: what was chosen, and the rest out of ``source``, detached."""
+    """Inputs of a network: those that were chosen, and the rest of ``source``, detached."""
     chosen = chosen or {}
     return {key: chosen[key] if key in chosen else source[key].detach() for key in network.in_keys}
 
@@ -62,7 +62,7 @@ def read_inputs(
 def call(
     network: TensorDictModule, source: TensorDictBase, chosen: Tensors | None = None
 ) -> dict[NestedKey, Tensor]:
-    """What a network gives for the inputs of :func:`read_inputs`."""
+    """Outputs of a network for the inputs of :func:`read_inputs`."""
     inputs = read_inputs(network, source, chosen)
     if isinstance(network, DirectModule):
         return network.outputs(inputs)
@@ -82,7 +82,7 @@ class StackedNetworks:
         self._params = bare(params) if isinstance(network, DirectModule) else _by_name(params)
 
     def call(self, source: TensorDictBase, chosen: Sequence[Tensors]) -> list[Tensors]:
-        """What each network gives for what was chosen for it, as :func:`call` does for one."""
+        """Outputs of each network for what was chosen for it, see :func:`call`."""
         split = {name: value.unbind(0) for name, value in self._params.items()}
         found: list[Tensors] = []
         for place, instead in enumerate(chosen):
@@ -109,7 +109,7 @@ def _by_name(params: TensorDictBase) -> dict[str, Tensor]:
 
 
 def check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
-    """Raise at what are no networks, and at those in the wrong order."""
+    """Reject what are no networks, and networks in the wrong order."""
     first = critic[0] if isinstance(critic, list) and critic else critic
     for name, network in (("actor_network", actor), (critic_name, first)):
         if not hasattr(network, "in_keys") or not hasattr(network, "out_keys"):

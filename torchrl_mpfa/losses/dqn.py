@@ -62,7 +62,7 @@ class SignalDQNLoss(DQNLoss):
         double: bool = True,
         gamma: float = 0.99,
     ) -> None:
-        check_signals(signals)
+        _check_signals(signals)
         check_importance(importance)
         if loss_function not in _DISTANCES:
             raise ValueError(f"loss_function must be one of {_DISTANCES}, got {loss_function!r}")
@@ -123,12 +123,8 @@ class SignalDQNLoss(DQNLoss):
         return TensorDict({"loss": self.losses(tensordict)[0]})
 
 
-def check_signals(signals: Sequence[str]) -> None:
-    """Refuse signals that a value for each action does not have.
-
-    Raises:
-        ValueError: If there is one.
-    """
+def _check_signals(signals: Sequence[str]) -> None:
+    """Reject signals that a value for each action does not have."""
     for name in signals:
         if name == ACTION_GRADIENT.name:
             raise ValueError(

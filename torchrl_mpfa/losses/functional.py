@@ -141,7 +141,7 @@ def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
 
 
 def saturation(preactivation: Tensor, *, limit: float) -> Tensor:
-    r"""How deep actions lie in the flat ends of the tanh: mean of :math:`\max(0, |u| - l)^2`."""
+    r"""Depth of actions in the flat ends of the tanh, the mean of :math:`\max(0, |u| - l)^2`."""
     return (preactivation.abs() - limit).clamp_min(0).square().mean()
 
 
