@@ -119,12 +119,12 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        value = self._stored_values(tensordict, defer_gradient=defer_gradient)
+        value = self._stored_values(tensordict, defer_gradient=defer_gradient)  # And Eq. (14).
         with torch.no_grad():
-            target = self._target(tensordict, self._next_value(tensordict["next"]))
+            target = self._target(tensordict, self._next_value(tensordict["next"]))  # Eq. (5)
         td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, value)
-        loss = self._critic_mean(tensordict, value, target, loss_function)
+        self._write_signals(tensordict, td_error, value)  # Eq. (13)
+        loss = self._critic_mean(tensordict, value, target, loss_function)  # Eqs. (4), (11)
 
         squared, value = td_error[0].square(), value[0].detach()
         tensordict.set(self.tensor_keys.priority, squared, inplace=True)

@@ -93,13 +93,13 @@ class SignalSACLoss(SignalLoss, SACLoss):
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
-        value = self._stored_values(tensordict, defer_gradient=defer_gradient)
+        value = self._stored_values(tensordict, defer_gradient=defer_gradient)  # And Eq. (14).
         with torch.no_grad():
             next_value = self._next_value(tensordict["next"])
-            target = self._target(tensordict, next_value)
+            target = self._target(tensordict, next_value)  # Eq. (5)
         td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, value)
-        loss = self._critic_mean(tensordict, value, target, loss_function)
+        self._write_signals(tensordict, td_error, value)  # Eq. (13)
+        loss = self._critic_mean(tensordict, value, target, loss_function)  # Eqs. (4), (11)
         metadata = {
             "td_error": td_error.square(),
             "next_state_value": next_value,
