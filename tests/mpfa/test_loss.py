@@ -95,10 +95,20 @@ def test_a_network_of_two_lines_gives_the_numbers_of_a_hand_calculation():
     assert float(loss.actor_network_params["module", "action"].grad) == pytest.approx(-3.0)
 
 
-@pytest.mark.parametrize("estimator", [ValueEstimators.TD0, ValueEstimators.TDLambda], ids=str)
-@pytest.mark.parametrize("loss_function", ["l2", "smooth_l1"])
-@pytest.mark.parametrize("weights", ["none", "torchrl", "not in the batch"])
-@pytest.mark.parametrize("direct", [True, False])
+# Each pair of values of two options once.
+@pytest.mark.parametrize(
+    ("weights", "loss_function", "direct", "estimator"),
+    [
+        ("none", "l2", True, ValueEstimators.TD0),
+        ("none", "smooth_l1", False, ValueEstimators.TDLambda),
+        ("torchrl", "l2", False, ValueEstimators.TDLambda),
+        ("torchrl", "l2", True, ValueEstimators.TDLambda),
+        ("torchrl", "smooth_l1", True, ValueEstimators.TD0),
+        ("torchrl", "smooth_l1", False, ValueEstimators.TD0),
+        ("not in the batch", "l2", False, ValueEstimators.TD0),
+        ("not in the batch", "smooth_l1", True, ValueEstimators.TDLambda),
+    ],
+)
 @pytest.mark.parametrize("kind", [*KINDS, "ddpg without a target actor"])
 def test_losses_and_gradients_equal_torchrls(kind, direct, weights, loss_function, estimator):
     name, options = kind.split()[0], {"loss_function": loss_function}
