@@ -24,48 +24,20 @@ def check_level(positive_above: Level) -> None:
 
 
 def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor:
-    """Whether transitions are positive, :math:`r_i > 0` in the paper (Eqs. 17, 22-24).
-
-    Args:
-        reward: Signed rewards, shape ``[B]``.
-        positive_above: The level. Where all rewards have one sign, 0 tells nothing apart;
-            ``"mean"`` does.
-        mean: Mean reward of the buffer.
-
-    Returns:
-        Truth values, shape ``[B]``.
-
-    Examples:
-        >>> import torch
-        >>> is_positive(torch.tensor([-3.0, -1.0]), "mean", mean=-2.0).tolist()
-        [False, True]
-    """
+    """Whether transitions are positive, :math:`r_i > 0` in the paper (Eqs. 17, 22-24), ``[B]``."""
     return reward > (mean if positive_above == "mean" else positive_above)
 
 
 def level_of(parts: Iterable[object]) -> Level:
-    """The level of the first of these parts that has one; 0 without any.
-
-    Examples:
-        >>> from torchrl_mpfa import FixedFusion, PositiveBoost
-        >>> level_of([FixedFusion(), PositiveBoost(positive_above=1.0)])
-        1.0
-    """
+    """The level of the first of these parts that has one; 0 without any."""
     levels = (getattr(getattr(part, "fusion", part), "positive_above", None) for part in parts)
     return next((level for level in levels if level is not None), 0.0)
 
 
 def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
-    """A warning if all rewards of a buffer are on one side of a level that parts ask for.
+    """A warning if all rewards of a buffer are on one side of a level that parts ask for, or None.
 
-    Args:
-        rewards: Signed rewards of the buffer, shape ``[N]``.
-        parts: Fusion and adjustments; those that tell positive transitions from others have an
-            attribute ``positive_above``.
-
-    Returns:
-        The warning; None where both sides are there, where all rewards are equal, which no level
-        tells apart, or too few rewards to tell.
+    No level tells rewards apart that are all equal, and few rewards may yet turn out on both sides.
     """
     if len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
         return None

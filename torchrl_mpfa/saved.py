@@ -44,6 +44,11 @@ def number(name: str, *, high: float = math.inf, optional: bool = False) -> Entr
     return Entry(name, holds, words)
 
 
+def finite(name: str) -> Entry:
+    """An entry that must be a finite number."""
+    return Entry(name, lambda v: isinstance(v, int | float) and math.isfinite(v), "a finite number")
+
+
 def count(name: str, *, high: int | None = None) -> Entry:
     """An entry that must be an integer from 0 to ``high``."""
     words = "an integer of at least 0" if high is None else f"in [0, {high}]"

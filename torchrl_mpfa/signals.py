@@ -69,19 +69,9 @@ MPFA_SIGNALS: tuple[Signal, ...] = (REWARD, TD_ERROR, ACTION_GRADIENT)
 def as_signals(signals: Sequence[Signal | str]) -> tuple[Signal, ...]:
     """Signals from signals or names; the paper's are known by name, any other name is learned.
 
-    Args:
-        signals: Signals, or their names.
-
-    Returns:
-        The signals, in the order given.
-
     Raises:
         TypeError: If they are a text, or anything but signals and names.
         ValueError: If there is none, or a name appears twice.
-
-    Examples:
-        >>> [signal.name for signal in as_signals(["td_error", "novelty"])]
-        ['td_error', 'novelty']
     """
     if isinstance(signals, str) or not all(isinstance(s, str | Signal) for s in signals):
         raise TypeError(f"signals must be a list of signals or their names, got {signals!r}")

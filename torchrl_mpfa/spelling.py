@@ -7,15 +7,7 @@ from difflib import get_close_matches
 
 
 def unknown(word: str, name: object, known: Iterable[str]) -> str:
-    """The sentence of an error about a name that is not known.
-
-    Args:
-        word: What the name is one of.
-        name: What was given.
-        known: The names there are.
-
-    Returns:
-        A sentence that names the nearest one, or all of them where none is near.
+    """The error of an unknown name, with the nearest known one, or all of them if none is near.
 
     Examples:
         >>> unknown("method", "mpfa-per", ["mpfa_per", "per"])

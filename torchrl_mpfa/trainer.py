@@ -83,12 +83,7 @@ class PriorityStepper(OptimizationStepper):
         return metrics.detach()
 
     def register(self, trainer: Trainer, name: str = "optimization_stepper") -> None:
-        """Make it the optimization stepper of a trainer, for steps and checkpoints.
-
-        Args:
-            trainer: The trainer.
-            name: Name of the inner stepper's state in checkpoints.
-        """
+        """Make it the optimization stepper of a trainer; ``name`` is that of the inner state."""
         self.stepper.register(trainer, name)
         self._trainer = trainer
         trainer.optimization_stepper = self
@@ -124,15 +119,7 @@ class PriorityGuard(TrainerHookBase):
         self._trainer: Trainer | None = None
 
     def register(self, trainer: Trainer, name: str = "priority_guard") -> None:
-        """Watch a trainer.
-
-        Args:
-            trainer: The trainer.
-            name: As in TorchRL; there is no state to save under it.
-
-        Raises:
-            ValueError: If neither the guard nor the trainer has a replay buffer.
-        """
+        """Watch a trainer; there is no state to save under the name."""
         if _updates_remotely(trainer):
             return
         if self.replay_buffer is None:
@@ -197,17 +184,7 @@ def check_priority_updates(trainer: Trainer, *, replay_buffer: Any | None = None
 
 
 def buffer_of(trainer: Trainer) -> Any:
-    """The replay buffer of a trainer.
-
-    Args:
-        trainer: The trainer.
-
-    Returns:
-        The buffer.
-
-    Raises:
-        ValueError: If it has none.
-    """
+    """The replay buffer of a trainer, which must have one."""
     replay_buffer = getattr(trainer, "replay_buffer", None)
     if replay_buffer is None:
         raise ValueError(f"replay_buffer of the trainer must not be None, got {_name(trainer)}")

@@ -23,19 +23,10 @@ def config_of(
     leave_out: Collection[str] = (),
     **defaults: Any,
 ) -> type[Any]:
-    """A configuration of a class or a function.
+    """A configuration of a class, with the arguments that it passes on, or of a function.
 
-    Args:
-        made: The class, with the arguments of those that it inherits from, or the function.
-        base: A configuration of TorchRL, whose fields stay as they are.
-        target: Path of what Hydra is to call.
-        name: Name of the class; by default that of ``made``, with ``Config`` behind it.
-        required: Default of arguments that have none; ``"???"``: must be given.
-        leave_out: Arguments that are no fields.
-        **defaults: Other defaults.
-
-    Returns:
-        A dataclass.
+    The fields of ``base``, a configuration of TorchRL, stay as they are. Hydra calls ``target``;
+    ``required`` is the default of arguments that have none.
     """
     known = {each.name for each in fields(base)} | set(leave_out)
     entries: dict[str, tuple[str, Any, Any]] = {}

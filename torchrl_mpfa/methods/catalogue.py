@@ -122,21 +122,7 @@ RANGES: dict[str, Rule] = {
 
 
 def check_ranges(method: Method) -> None:
-    """Reject a number or a switch of a method that is out of its range.
-
-    Args:
-        method: The settings.
-
-    Raises:
-        TypeError: If a setting is not a number, with its name and value.
-        ValueError: If it is out of its range, likewise.
-
-    Examples:
-        >>> check_ranges(Method(priority_floor=-1.0))
-        Traceback (most recent call last):
-        ...
-        ValueError: priority_floor must be finite and not negative, got -1.0
-    """
+    """Reject a number or a switch of a method that is out of its range, by name and value."""
     for name, rule in RANGES.items():
         check(rule, **{name: getattr(method, name)})
 

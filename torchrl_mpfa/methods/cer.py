@@ -28,19 +28,7 @@ class CERSampler(NewestSampler):
     """
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Any]]:
-        """Sample slots.
-
-        Args:
-            storage: The storage to sample from.
-            batch_size: ``B``.
-
-        Returns:
-            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
-            each; and no information.
-
-        Raises:
-            RuntimeError: If the storage is empty.
-        """
+        """Sample slots as TorchRL's ``RandomSampler`` does, the newest first."""
         index, info = super().sample(storage, batch_size)
         if self.newest is not None:
             along = index if isinstance(index, tuple) else (index,)

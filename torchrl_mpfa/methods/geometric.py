@@ -93,19 +93,7 @@ class GeometricSampler(NewestSampler):
         return True
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Any]]:
-        """Sample slots.
-
-        Args:
-            storage: The storage to sample from.
-            batch_size: ``B``.
-
-        Returns:
-            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
-            each; and no information.
-
-        Raises:
-            RuntimeError: If the storage is empty.
-        """
+        """Sample slots, in the form of TorchRL's ``RandomSampler``."""
         index, info = super().sample(storage, batch_size)
         if self.newest is None:
             return index, info

@@ -27,20 +27,7 @@ _LEAST = 1e-6
 
 
 def running_bend(priority: Tensor, *, quantile: float, otherwise: float) -> Tensor:
-    """The priority below which a share of the known ones lies.
-
-    Args:
-        priority: Priorities, shape ``[N]``; NaN where none is known yet.
-        quantile: The share, in (0, 1].
-        otherwise: What to give where none is known.
-
-    Returns:
-        The least of them that is not exceeded by that share, a positive number, shape ``[]``.
-
-    Examples:
-        >>> float(running_bend(torch.tensor([4.0, 1.0, torch.nan]), quantile=0.5, otherwise=9.0))
-        1.0
-    """
+    """The least known priority, shape ``[]``, that a share of the known ones does not exceed."""
     known = priority[~priority.isnan()]
     if len(known) == 0:
         return priority.new_tensor(otherwise)

@@ -65,21 +65,8 @@ def importance_ratio(action: Tensor, now: Tensor, then: Tensor, sigma: Tensor) -
 def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> float:
     r"""Weight :math:`\beta` of the policy's gradient after a batch of which a share is far.
 
-    Args:
-        weight: :math:`\beta` before, in [0, 1].
-        far: Share of the transitions that are far.
-        allowed: Share :math:`D` that may be.
-        rate: :math:`\eta`, how fast it moves.
-
-    Returns:
-        :math:`(1 - \eta') \beta` where too many are far, with :math:`\eta' = \min(\eta, \beta)`;
-        else :math:`(1 - \eta') \beta + \min(\eta, 1 - \beta)`.
-
-    Examples:
-        >>> next_weight(0.5, far=0.3, allowed=0.1, rate=0.1)
-        0.45
-        >>> next_weight(0.5, far=0.0, allowed=0.1, rate=0.1)
-        0.55
+    With :math:`\eta' = \min(\eta, \beta)` it is :math:`(1 - \eta') \beta` where more are far than
+    allowed, else :math:`(1 - \eta') \beta + \min(\eta, 1 - \beta)`.
     """
     kept = (1.0 - min(rate, weight)) * weight
     return kept if far > allowed else kept + min(rate, 1.0 - weight)

@@ -24,18 +24,7 @@ _NEWEST = Entry(
 
 
 class NewestSampler(SavedValues):
-    """Uniform sampling that keeps and saves the newest slot.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-        >>> buffer = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(100), sampler=NewestSampler(), batch_size=4
-        ... )
-        >>> index = buffer.extend(TensorDict({"reward": torch.rand(10)}, [10]))
-        >>> buffer.sampler.newest
-        [9]
-    """
+    """Uniform sampling that keeps and saves the newest slot."""
 
     FILE = "newest.json"
     ENTRIES = (_NEWEST,)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,30 +23,28 @@ from torchrl_mpfa.samplers.tree import (
     in_dimensions_of,
     last_of_each,
 )
-from torchrl_mpfa.saved import Entry, count, exactly, number
+from torchrl_mpfa.saved import Entry, count, exactly, finite, number
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.storages.table import SignalTable, signal_table_of
 
-_ENTROPY_REFRESH = 1 / 256
+_USE = "Use SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
 # capacity.
 _COUNT_REFRESH = 1 / 16
+_NO_WEIGHTS = torch.empty(0)
 
 
 @dataclass(frozen=True)
 class Weighing:
     """Results of the last passes over the buffer, and the state of the buffer at each of them."""
 
-    weights: Tensor  # One per fused signal, in the order of their columns, [K].
-    mean_reward: float
-    writes: int  # Transitions that had been written when the weights were computed.
+    weights: Tensor = _NO_WEIGHTS  # One per fused signal, in the order of their columns, [K].
+    mean_reward: float = 0.0
+    writes: int = 0  # Transitions that had been written when the weights were computed.
     counted: tuple[Tensor | None, ...] = ()  # One result per adjustment, None if it has none.
     counted_writes: int = 0  # Transitions that had been written when the adjustments counted.
     learned_since: int = 0  # Transitions that were learned from since then.
-
-
-_NOTHING = Weighing(torch.empty(0), 0.0, 0)
 
 
 class SignalSampler(TreeSampler):
@@ -111,7 +108,7 @@ class SignalSampler(TreeSampler):
         signals: Sequence[Signal | str] = ("td_error",),
         fusion: Fusion | None = None,
         adjustments: Sequence[Adjustment] = (),
-        entropy_refresh: float = _ENTROPY_REFRESH,
+        entropy_refresh: float = 1 / 256,
         stratified: bool = False,
         combination: str = "sum",
     ) -> None:
@@ -175,7 +172,7 @@ class SignalSampler(TreeSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
         """Sample slots by Eq. (8), and count a replay for each.
 
-        As :meth:`TreeSampler.sample`; an overwritten slot is known by ``"written_at"``, ``[B]``.
+        As :meth:`TreeSampler.sample`; ``"written_at"``, shape ``[B]``, tells overwritten slots.
         """
         slots, weight = self._sampled(storage, batch_size)
         info = {"priority_weight": weight}
@@ -190,8 +187,7 @@ class SignalSampler(TreeSampler):
         else:
             self._warn_once(
                 f"{type(self).__name__} samples from a {type(storage).__name__}, which keeps no "
-                "signals: nothing can be fused. Use SignalTensorStorage or SignalMemmapStorage, in "
-                "a SignalReplayBuffer"
+                f"signals: nothing can be fused. {_USE}"
             )
         return in_dimensions_of(storage, slots), info
 
@@ -203,8 +199,7 @@ class SignalSampler(TreeSampler):
         if self._table is None and self._highest is not None:
             self._warn_once(
                 f"{type(self).__name__} was given one number as the priority: it is neither fused "
-                "nor adjusted. TorchRL's own buffers do so in update_tensordict_priority; use "
-                "SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
+                f"nor adjusted. TorchRL's own buffers do so in update_tensordict_priority. {_USE}"
             )
         super().update_priority(index, priority, storage=storage)
 
@@ -317,7 +312,7 @@ class SignalSampler(TreeSampler):
             weights = checked_weights(self.fusion, self._names, table, index)
             if (text := one_sided(table.rewards, (self.fusion, *self.adjustments))) is not None:
                 self._warn_once(text)
-            mean, before = float(table.rewards.mean()), last or _NOTHING
+            mean, before = float(table.rewards.mean()), last or Weighing()
             made = replace(before, weights=weights, mean_reward=mean, writes=table.writes)
         elif getattr(self.fusion, "every_batch", False):
             made = replace(last, weights=checked_weights(self.fusion, self._names, table, index))
@@ -343,12 +338,7 @@ class SignalSampler(TreeSampler):
         )
 
     def bind(self, storage: Storage) -> SignalTable:
-        """Take the signals of a storage as those to fuse, and return them.
-
-        Raises:
-            TypeError: If the storage keeps no signals.
-            ValueError: If its capacity or its signals are not those of the sampler.
-        """
+        """Take the signals of a storage, which must be those of the sampler, as those to fuse."""
         table = signal_table_of(storage, self.signals, self._max_capacity)
         if table is not self._table:
             weights, before = self.weights, self._weighing
@@ -363,7 +353,7 @@ class SignalSampler(TreeSampler):
         return table
 
     def stats(self, storage: Storage) -> dict[str, float]:
-        """Composition of buffer and last batch by name; see ``docs/metrics.md`` for each entry."""
+        """Composition of buffer and last batch by name, see ``docs/metrics.md``."""
         table, weights = self.bind(storage), self.weights
         found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
         for place, adjust in enumerate(self.adjustments):
@@ -405,7 +395,7 @@ class SignalSampler(TreeSampler):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only."""
-        last = self._weighing or _NOTHING
+        last = self._weighing or Weighing()
         state = {
             **super().state_dict(),
             "_signals": sorted(self._names),
@@ -430,15 +420,12 @@ class SignalSampler(TreeSampler):
             fit = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
             return isinstance(counted, list) and (not counted or fit == self._counting)
 
-        def finite(mean: Any) -> bool:
-            return isinstance(mean, int | float) and math.isfinite(mean)
-
         entries = [
             *super()._entries(),
             exactly("_signals", names),
             Entry("_weights", fit_signals, f"empty, or one number for each of {names}"),
             count("_weighed_at"),
-            Entry("_mean_reward", finite, "a finite number"),
+            finite("_mean_reward"),
         ]
         if any(self._counting):
             words = f"empty, or finite numbers for {sum(self._counting)} adjustments"

@@ -110,9 +110,7 @@ class TreeSampler(SavedTrees):
 
     @property
     def alpha(self) -> float:
-        r"""Priority exponent :math:`\alpha` of Eq. (8).
-
-        Setting it follows in all leaves.
+        r"""Priority exponent :math:`\alpha` of Eq. (8); setting it follows in all leaves.
 
         Raises:
             TypeError: If it is set to anything but a number.
@@ -442,11 +440,9 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
 
 
 def last_of_each(slots: Tensor) -> Tensor | None:
-    """Last position of each slot, shape ``[U]``; None if every slot appears once.
-
-    Of a slot that is written twice in one call the last must win, which writing by index leaves
-    open for large batches.
-    """
+    """Last position of each slot, shape ``[U]``; None if every slot appears once."""
+    # Of a slot that is written twice in one call the last must win, which writing by index leaves
+    # open for large batches.
     unique, inverse = slots.unique(return_inverse=True)
     if len(unique) == len(slots):
         return None

@@ -313,7 +313,13 @@ class SignalStorageMixin:
         seal_dump(path, path)
 
     def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read the saved signals, and reject the folder as :meth:`check_state` does a state."""
+        """Read the saved signals, and reject the folder as :meth:`check_state` does a state.
+
+        Raises:
+            KeyError: See :meth:`check_state`.
+            ValueError: See :meth:`check_state`; or if a file is damaged, missing, or one that
+                could execute something.
+        """
         path = open_dump(path)
         if not (path / _FILE).exists():
             raise KeyError(f"'_signals' is missing in the saved storage: no {path / _FILE}")
@@ -326,13 +332,7 @@ class SignalStorageMixin:
         return state
 
     def loads(self, path: str | Path) -> None:
-        """Restore data and signals from a folder.
-
-        Raises:
-            KeyError: See :meth:`check_state`.
-            ValueError: See :meth:`check_state`; or if a file is damaged, missing, or one that
-                could execute something.
-        """
+        """Restore data and signals from a folder, or raise as :meth:`check_dump` does."""
         state = self.check_dump(path)
         self.signal_table.stop_clock()
         super().loads(path)  # type: ignore[misc]

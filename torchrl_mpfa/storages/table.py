@@ -116,19 +116,7 @@ class SignalTable:
         return self._blank.expand(count, -1).clone()
 
     def read(self, data: Any, count: int) -> Tensor:
-        """Rows for new transitions, checked and not yet written.
-
-        Args:
-            data: The transitions, batch size ``[count]``, or ``[]`` for one.
-            count: Their number.
-
-        Returns:
-            One row each; an entry that ``data`` does not have is NaN.
-
-        Raises:
-            ValueError: If a reward or a signal is not finite, a signal is negative, or either
-                has not one number per transition.
-        """
+        """Rows for new transitions, checked and not yet written; NaN for entries that they lack."""
         rows = self.blank(count)
         reward = _column(data, self.reward_key, "reward", count)
         if reward is not None:
