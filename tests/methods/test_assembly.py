@@ -145,7 +145,7 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"method": "klper", "sigma": 0.1}, "method 'klper' needs policy:"),
     ],
 )
-def test_a_mistake_is_refused_in_one_sentence(arguments, message):
+def test_a_mistake_is_rejected_in_one_sentence(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_replay(**arguments)
 
@@ -163,7 +163,7 @@ def test_what_is_of_another_type_is_named(arguments, message):
         make_replay(**arguments)
 
 
-def test_a_storage_that_lacks_a_signal_is_refused():
+def test_a_storage_that_lacks_a_signal_is_rejected():
     with pytest.raises(ValueError, match=r"signals .*action_gradient.* are not in the storage"):
         make_replay("mpfa_per", storage=SignalTensorStorage(10, signals=["td_error", "reward"]))
 

@@ -104,7 +104,7 @@ def test_the_models_go_on_from_a_state_that_is_loaded():
 @pytest.mark.parametrize(
     "key", ["observation", "action", ("next", "observation"), ("next", "reward")], ids=str
 )
-def test_a_batch_with_a_number_that_is_none_is_refused_before_anything_changes(key):
+def test_a_batch_with_a_number_that_is_none_is_rejected_before_anything_changes(key):
     curiosity, batch = Curiosity(6, 2), make_batch()
     curiosity(make_batch(seed=1))
     before = copy.deepcopy(curiosity.checkpoint())

@@ -48,7 +48,7 @@ def test_both_halves_are_uniform():
         assert (shares - 0.1).abs().max() < 0.01
 
 
-def test_an_odd_batch_is_parted_as_nearly_as_can_be_and_one_transition_is_refused():
+def test_an_odd_batch_is_parted_as_nearly_as_can_be_and_one_transition_is_rejected():
     buffer = make_buffer(make_replay("ddpg").buffer.sampler, 9, 5)
     assert [len(draw.batch) for draw in uniform_halves(buffer)] == [2, 3]
     alone = make_buffer(make_replay("ddpg").buffer.sampler, 9, 1)

@@ -132,7 +132,7 @@ def test_the_present_noise_is_asked_for_at_each_batch():
     assert select(both)["number"][0] == 64
 
 
-def test_of_what_a_buffer_draws_one_batch_is_left_with_its_index():
+def test_of_what_a_buffer_samples_one_batch_is_left_with_its_index():
     policy = make_actor(6, 2, width=16)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=30)
     buffer.extend(sampled(policy, [0.0, 0.5]))

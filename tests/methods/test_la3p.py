@@ -87,7 +87,7 @@ def test_both_halves_of_the_critics_batch_update_priorities():
         torch.testing.assert_close(leaves, torch.full_like(leaves, 7.0**ALPHA))
 
 
-def test_what_cannot_be_parted_is_refused():
+def test_what_cannot_be_parted_is_rejected():
     with pytest.raises(ValueError, match="batch_size must leave no part empty, got 1"):
         make_la3p(30, 4).sampler.sizes(1)
     other = make_buffer(SignalSampler(4, 0.6, 0.4, 0.1), 4, 2)

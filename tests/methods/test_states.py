@@ -1,4 +1,4 @@
-"""Saved samplers: what does not fit is refused by name, before anything changes."""
+"""Saved samplers: what does not fit is rejected by name, before anything changes."""
 
 import pytest
 import torch
@@ -120,7 +120,7 @@ def trained():
 
 
 @pytest.mark.parametrize(("method", "name", "value", "message"), CASES)
-def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(
+def test_a_state_that_does_not_fit_is_rejected_and_changes_nothing(
     trained, method, name, value, message
 ):
     first, second = (replay.buffer.sampler for replay in trained[method])
@@ -131,7 +131,7 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(
 
 
 @pytest.mark.parametrize("method", METHODS[:4])
-def test_a_state_of_another_sampler_is_refused(trained, method):
+def test_a_state_of_another_sampler_is_rejected(trained, method):
     for other in METHODS[:4]:
         if other == method:
             continue
@@ -168,7 +168,7 @@ def test_a_sampler_of_one_priority_and_one_of_signals_reject_each_others_state(
         ("cer", "'_newest' is missing in the saved sampler"),
     ],
 )
-def test_a_uniform_buffer_refuses_the_state_of_a_prioritized_one(method, message):
+def test_a_uniform_buffer_rejects_the_state_of_a_prioritized_one(method, message):
     first, second = make_trained("mpfa_per"), make_trained(method, seed=3)
     before = second.buffer.state_dict()
     with pytest.raises(ValueError, match=message):

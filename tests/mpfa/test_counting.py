@@ -109,7 +109,7 @@ def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(name, setti
 
 
 @pytest.mark.parametrize("value", [None, [], [torch.tensor(torch.nan), None], [1.0, None]])
-def test_a_saved_count_that_does_not_fit_is_refused_and_nothing_counted_is_none(value):
+def test_a_saved_count_that_does_not_fit_is_rejected_and_nothing_counted_is_none(value):
     first, second = (
         make_replay("mpfa_adaptive", capacity=9, batch_size=2).buffer.sampler for _ in range(2)
     )
@@ -122,7 +122,7 @@ def test_a_saved_count_that_does_not_fit_is_refused_and_nothing_counted_is_none(
     assert "_counted" not in make_replay("mpfa_per", capacity=9).buffer.sampler.state_dict()
 
 
-def test_a_count_that_is_not_finite_is_refused_and_changes_nothing():
+def test_a_count_that_is_not_finite_is_rejected_and_changes_nothing():
     buffer, census = make_counted()
     census.count = lambda table, priority: torch.tensor(torch.nan)
     before = buffer.sampler.priorities()

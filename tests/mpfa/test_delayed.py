@@ -88,7 +88,7 @@ def test_statistics_do_not_make_the_parts():
     assert not buffer.initialized
 
 
-def test_parts_that_do_not_fit_are_refused_at_every_use():
+def test_parts_that_do_not_fit_are_rejected_at_every_use():
     buffer = make_delayed(8)
     for _ in range(2):
         with pytest.raises(ValueError, match=r"max_capacity of the sampler is 8, max_size .* 16"):

@@ -18,17 +18,9 @@ import torch
 from torchrl.data import CompressedListStorage, LazyTensorStorage
 from torchrl.data.replay_buffers import RandomSampler
 
-from tests.mpfa.transitions import make_buffer, make_transitions, same, snapshot, train_rounds
+from tests.mpfa.transitions import Trap, make_buffer, make_transitions, same, snapshot, train_rounds
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.dumps import MANIFEST, new_dump, open_dump, seal_dump
-
-
-class Trap:
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (self.path,)
 
 
 @pytest.fixture
@@ -40,8 +32,8 @@ def dumped(tmp_path):
     return tmp_path / "buffer"
 
 
-def refused(folder, match):
-    """Whether loading is refused and changes nothing."""
+def rejected(folder, match):
+    """Whether loading is rejected and changes nothing."""
     buffer = make_buffer(16, seed=5)
     buffer.extend(make_transitions(7, seed=4))
     before = snapshot(buffer)
@@ -66,7 +58,7 @@ def pickled_entry(trap, write):
     about = {"_type": "<class 'tensordict.tensorclass.NonTensorData'>", "shape": [16]}
     about |= {"device": "cpu", "_is_memmap": True, "_is_shared": False, "_non_tensor": {}}
     write("meta.json", json.dumps(about))
-    write("other.pickle", pickle.dumps(Trap(str(trap))))
+    write("other.pickle", pickle.dumps(Trap(trap)))
 
 
 def entry_behind_a_link(storage, trap):
@@ -150,9 +142,9 @@ def replace_by_link(path):
         (MANIFEST, replace_by_link, f"it has no {MANIFEST}"),
     ],
 )
-def test_a_link_or_a_pipe_in_a_dump_is_refused(dumped, place, spoil, words):
+def test_a_link_or_a_pipe_in_a_dump_is_rejected(dumped, place, spoil, words):
     spoil(dumped / place)
-    assert refused(dumped, words)
+    assert rejected(dumped, words)
 
 
 def test_a_dump_may_be_reached_by_a_link(dumped, tmp_path):
@@ -166,21 +158,21 @@ def test_a_dump_may_be_reached_by_a_link(dumped, tmp_path):
 @pytest.mark.parametrize("sealed", [False, True])
 def test_a_file_that_would_be_unpickled_is_never_read(dumped, tmp_path, place, name, sealed):
     trap = tmp_path / "trap"
-    (dumped / place / name).write_bytes(pickle.dumps(Trap(str(trap))))
+    (dumped / place / name).write_bytes(pickle.dumps(Trap(trap)))
     if sealed and place == "dump-1":
         text = (dumped / MANIFEST).read_text(encoding="utf-8")
         (dumped / MANIFEST).write_text(text.replace('"files": {', f'"files": {{"{name}": [1, 2],'))
     if place == ".":
         make_buffer(16).loads(dumped)
     else:
-        assert refused(dumped, rf"{name} could execute anything when it is read")
+        assert rejected(dumped, rf"{name} could execute anything when it is read")
     assert not trap.exists()
 
 
-def test_what_torchrl_wrote_is_refused_and_not_unpickled(tmp_path):
+def test_what_torchrl_wrote_is_rejected_and_not_unpickled(tmp_path):
     trap = tmp_path / "trap"
     (tmp_path / "buffer").mkdir()
-    (tmp_path / "buffer/prefetch.pkl").write_bytes(pickle.dumps(Trap(str(trap))))
+    (tmp_path / "buffer/prefetch.pkl").write_bytes(pickle.dumps(Trap(trap)))
     for buffer in (make_buffer(16), SignalReplayBuffer(storage=SignalTensorStorage(4))):
         with pytest.raises(
             ValueError, match=r"buffer is not a complete dump .*: it has no manifest"
@@ -208,27 +200,27 @@ def test_every_bit_that_flips_is_noticed(dumped):
         bit = chance.randrange(len(whole) * 8)
         damaged[bit // 8] ^= 1 << bit % 8
         file.write_bytes(damaged)
-        assert refused(dumped, "is damaged|is missing|is not part|format of"), (file, bit)
+        assert rejected(dumped, "is damaged|is missing|is not part|format of"), (file, bit)
         file.write_bytes(whole)
     make_buffer(16).loads(dumped)
 
 
-def test_a_missing_short_or_unknown_file_is_refused_by_name(dumped):
+def test_a_missing_short_or_unknown_file_is_rejected_by_name(dumped):
     for file in files_of(dumped):
         whole = file.read_bytes()
         file.write_bytes(whole[:-1])
-        assert refused(dumped, f"{file.name} is damaged: its size or checksum is wrong")
+        assert rejected(dumped, f"{file.name} is damaged: its size or checksum is wrong")
         file.unlink()
-        assert refused(dumped, f"{file.name} is missing")
+        assert rejected(dumped, f"{file.name} is missing")
         file.write_bytes(whole)
     (dumped / "dump-1/storage/more.memmap").write_bytes(b"1")
-    assert refused(dumped, "more.memmap is not part of the dump")
+    assert rejected(dumped, "more.memmap is not part of the dump")
 
 
 def test_a_folder_outside_is_not_followed(dumped):
     text = (dumped / MANIFEST).read_text(encoding="utf-8")
     (dumped / MANIFEST).write_text(text.replace('"dump-1"', '"../dump-1"'), encoding="utf-8")
-    assert refused(dumped, "manifest.json is damaged: it names the folder '../dump-1'")
+    assert rejected(dumped, "manifest.json is damaged: it names the folder '../dump-1'")
     with pytest.raises(FileNotFoundError, match=r"no such folder: .*none"):
         make_buffer(16).loads(dumped / "none")
 

@@ -1,4 +1,4 @@
-"""Transitions that do not fit are refused before anything of them is written."""
+"""Transitions that do not fit are rejected before anything of them is written."""
 
 from copy import deepcopy
 
@@ -129,7 +129,7 @@ def buffer(request, tmp_path):
 
 @pytest.mark.parametrize("name", BAD)
 @pytest.mark.parametrize("way", ["extend", "add", "lazy stack"])
-def test_what_does_not_fit_is_refused_by_name_and_nothing_has_changed(buffer, name, way):
+def test_what_does_not_fit_is_rejected_by_name_and_nothing_has_changed(buffer, name, way):
     change, message = BAD[name]
     data = make_full_transitions(2, 9.0)
     change(data)
@@ -174,7 +174,7 @@ def test_of_more_transitions_than_slots_the_last_stay(count):
 
 
 @pytest.mark.parametrize("kind", [TreeSampler, MPFASampler])
-def test_a_refused_extend_is_not_remembered_by_a_writer_that_keeps_the_best(kind):
+def test_a_rejected_extend_is_not_remembered_by_a_writer_that_keeps_the_best(kind):
     buffer = SignalReplayBuffer(
         storage=SignalTensorStorage(4),
         sampler=kind(4, 0.6, 0.4),

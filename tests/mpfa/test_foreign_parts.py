@@ -86,7 +86,7 @@ def test_masks_and_floats_are_no_index(index):
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.0])
-def test_priorities_whose_sum_overflows_are_refused(alpha):
+def test_priorities_whose_sum_overflows_are_rejected(alpha):
     sampler = TreeSampler(1000, alpha, 0.4)
     sampler.mark_update(torch.arange(1000))
     before = sampler.state_dict()
@@ -97,7 +97,7 @@ def test_priorities_whose_sum_overflows_are_refused(alpha):
     assert sampler.priorities(torch.tensor([3])).item() == pytest.approx(2e38)
 
 
-def test_a_refused_update_changes_nothing_at_all():
+def test_a_rejected_update_changes_nothing_at_all():
     """Not even the weights, which were counted before an adjustment failed."""
 
     def broken(priority, batch):
@@ -143,7 +143,7 @@ def test_a_storage_of_two_dimensions_is_sampled_and_updated_as_torchrl_does():
     assert sampler.priorities()[17] == 7.0
 
 
-def test_a_place_outside_a_storage_of_two_dimensions_is_refused():
+def test_a_place_outside_a_storage_of_two_dimensions_is_rejected():
     buffer, sampler = make_two_dimensional()
     before = sampler.state_dict()
     # As a number it would be a slot: 0 * 6 + 6.

@@ -94,7 +94,7 @@ def too_many():
         (too_many, ValueError, r"'_len' of the saved storage must be in \[0, 8\], got 9"),
     ],
 )
-def test_what_cannot_be_fused_is_refused_and_nothing_changes(make_state, error, message, filled):
+def test_what_cannot_be_fused_is_rejected_and_nothing_changes(make_state, error, message, filled):
     buffer = make_buffer(8)
     if filled:
         buffer.extend(make_transitions(filled, seed=3))

@@ -1,4 +1,4 @@
-"""Entries that are written in place: rewards and signals follow, or the write is refused."""
+"""Entries that are written in place: rewards and signals follow, or the write is rejected."""
 
 import pytest
 import torch
@@ -105,7 +105,7 @@ def test_a_reward_that_was_written_in_place_makes_the_next_priority():
     sampler = SignalSampler(CAPACITY, 1.0, 0.4, 0.0, signals=["reward"])
     buffer = make_tracked_buffer(CAPACITY, sampler=sampler)
     buffer.set_(KEY, -torch.arange(1.0, 9.0).unsqueeze(1))
-    assert buffer.storage.signal_table.writes == 2 * CAPACITY  # The fusion weighs anew by it.
+    assert buffer.storage.signal_table.writes == 2 * CAPACITY  # The fusion weighs again by it.
     batch = buffer.sample()
     buffer.update_tensordict_priority(batch)
     assert buffer.stale_updates == 0
@@ -114,7 +114,7 @@ def test_a_reward_that_was_written_in_place_makes_the_next_priority():
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
-def test_a_reward_that_is_not_finite_is_refused_and_taken_back(wrong):
+def test_a_reward_that_is_not_finite_is_rejected_and_taken_back(wrong):
     buffer = make_tracked_buffer(CAPACITY)
     before = snapshot(buffer)
     for write in (
@@ -174,7 +174,7 @@ BAD_WRITES = [
 
 
 @pytest.mark.parametrize("case", range(len(BAD_WRITES)))
-def test_what_extend_would_refuse_is_refused_in_place_and_nothing_changes(case):
+def test_what_extend_would_reject_is_rejected_in_place_and_nothing_changes(case):
     write, message = BAD_WRITES[case]
     buffer = make_tracked_buffer(CAPACITY, wide=True)
     before = snapshot(buffer)

@@ -1,4 +1,4 @@
-"""States that do not fit are refused before anything is loaded."""
+"""States that do not fit are rejected before anything is loaded."""
 
 from copy import deepcopy
 
@@ -6,7 +6,15 @@ import pytest
 import torch
 from torchrl.data import ImmutableDatasetWriter
 
-from tests.mpfa.transitions import make_buffer, make_transitions, same, snapshot, train_rounds
+from tests.mpfa.transitions import (
+    MISSING,
+    make_buffer,
+    make_transitions,
+    same,
+    snapshot,
+    spoil,
+    train_rounds,
+)
 from torchrl_mpfa import SignalTensorStorage
 
 
@@ -21,17 +29,6 @@ def pair():
     return snapshot(first), second
 
 
-def spoil(state, path, value):
-    *way, last = path
-    for key in way:
-        state = state[key]
-    if value is MISSING:
-        del state[last]
-    else:
-        state[last] = value
-
-
-MISSING = object()
 NAN = float("nan")
 SPOILS = [
     (("_storage",), MISSING, "'_storage' is missing in the saved buffer"),
@@ -118,7 +115,7 @@ SPOILS = [
 
 
 @pytest.mark.parametrize(("path", "value", "message"), SPOILS)
-def test_a_state_that_does_not_fit_is_refused_and_the_next_batches_are_the_same(
+def test_a_state_that_does_not_fit_is_rejected_and_the_next_batches_are_the_same(
     pair, path, value, message
 ):
     state, buffer = pair
@@ -144,7 +141,7 @@ def test_data_that_no_one_may_write_are_restored_without_a_cursor():
 
 
 @pytest.mark.parametrize("way", ["extend", "write in place", "load another"])
-def test_a_state_whose_data_were_overwritten_since_is_refused(pair, way):
+def test_a_state_whose_data_were_overwritten_since_is_rejected(pair, way):
     other, buffer = pair
     buffer.extend(make_transitions(2))
     state, copy = buffer.state_dict(), snapshot(buffer)
@@ -185,7 +182,7 @@ def test_a_state_that_was_saved_without_a_clock_is_restored(pair):
 
 @pytest.mark.parametrize("column", range(6))
 @pytest.mark.parametrize("wrong", [torch.inf, -1.0])
-def test_signals_that_cannot_be_are_refused(pair, column, wrong):
+def test_signals_that_cannot_be_are_rejected(pair, column, wrong):
     state, buffer = pair
     if column == buffer.storage.signal_table.reward_column and wrong == -1.0:
         return

@@ -1,4 +1,4 @@
-"""Buffers against a model of plain Python, under any sequence of calls, lawful or refused."""
+"""Buffers against a model of plain Python, under any sequence of calls, lawful or rejected."""
 
 import shutil
 import tempfile
@@ -172,7 +172,7 @@ class Replay(RuleBasedStateMachine):
 
     @precondition(lambda self: self.slots)
     @rule(spoil=st.sampled_from(REFUSED), count=st.integers(1, CAPACITY + 2), one=st.booleans())
-    def refused_extend(self, spoil, count, one):
+    def rejected_extend(self, spoil, count, one):
         before = snapshot(self.buffer)
         data = spoil(make_rows([99] * count))
         with pytest.raises((KeyError, ValueError)):
@@ -185,7 +185,7 @@ class Replay(RuleBasedStateMachine):
         name=st.sampled_from(["td_error", "action_gradient"]),
         how=st.sampled_from(["value", "missing", "index", "shape"]),
     )
-    def refused_update(self, wrong, name, how):
+    def rejected_update(self, wrong, name, how):
         batch = write_signals(self.buffer.sample())
         if how == "value":
             batch["signals", name][1] = wrong
@@ -214,7 +214,7 @@ class Replay(RuleBasedStateMachine):
         ),
         value=st.sampled_from([None, "0.6", 10**18, -1, torch.full((3,), torch.nan)]),
     )
-    def refused_load(self, path, value):
+    def rejected_load(self, path, value):
         may_be = {"_rng": value is None, "_eps": type(value) is int and value > 0}
         if may_be.get(path[-1], False):
             return

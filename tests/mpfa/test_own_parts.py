@@ -115,7 +115,7 @@ def test_an_own_learned_signal_that_is_missing_is_named():
         buffer.update_tensordict_priority(batch)
 
 
-def test_transitions_without_an_own_signal_are_refused():
+def test_transitions_without_an_own_signal_are_rejected():
     with pytest.raises(KeyError, match=r"the transitions lack 'surprise': .* at 'surprise'"):
         make_own_buffer().extend(make_transitions(4))
 
@@ -135,7 +135,7 @@ def test_an_own_fusion_and_an_own_adjustment_do_their_work():
 
 
 @pytest.mark.parametrize("weights", [torch.ones(2), torch.ones(4, 1), torch.ones(())])
-def test_an_own_fusion_of_the_wrong_shape_is_refused(weights):
+def test_an_own_fusion_of_the_wrong_shape_is_rejected(weights):
     class Wrong:
         def weights(self, names, table, index):
             return weights
@@ -149,7 +149,7 @@ def test_an_own_fusion_of_the_wrong_shape_is_refused(weights):
 
 
 @pytest.mark.parametrize("wrong", [-1.0, torch.nan, torch.inf])
-def test_wrong_weights_and_wrong_adjusted_priorities_are_refused(wrong):
+def test_wrong_weights_and_wrong_adjusted_priorities_are_rejected(wrong):
     class Wrong:
         def weights(self, names, table, index):
             return torch.tensor([wrong, 1.0, 1.0, 1.0])

@@ -194,7 +194,7 @@ def test_changing_a_batch_does_not_change_the_buffer():
     assert buffer[:]["observation"].min() == 0
 
 
-def test_two_buffers_of_one_seed_draw_the_same_and_another_seed_draws_otherwise():
+def test_two_buffers_of_one_seed_draw_the_same_and_another_seed_samples_otherwise():
     sampled = []
     for seed in (1, 1, 2):
         buffer = make_buffer(64, 16, seed=seed)
@@ -365,7 +365,7 @@ def test_a_priority_is_stored_with_the_transition_where_no_signals_are_fused(mak
 
 
 @pytest.mark.parametrize("key", [("next", "reward"), "novelty", ("novelty",)])
-def test_a_priority_key_that_would_take_a_signal_away_is_refused(key):
+def test_a_priority_key_that_would_take_a_signal_away_is_rejected(key):
     signals = ["td_error", Signal("novelty", key="novelty", known_at="write")]
     with pytest.raises(ValueError, match=r"priority_key must not be where a reward .*, got "):
         SignalReplayBuffer(

@@ -56,7 +56,7 @@ def test_a_loop_of_uniform_replay_is_not_told_to_update_priorities(sampler):
         buffer.sample()
 
 
-def test_an_update_that_is_refused_does_not_count_as_one():
+def test_an_update_that_is_rejected_does_not_count_as_one():
     buffer = make_buffer()
     buffer.extend(make_transitions(10))
     with pytest.warns(UserWarning, match="100 batches in a row"):

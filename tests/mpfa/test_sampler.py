@@ -108,7 +108,7 @@ def test_options_reach_the_chain():
     assert priorities(buffer)[[0, 3]].tolist() == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_histogram_of_50000_draws_has_the_probabilities_of_eq_8_after_a_wrap():
+def test_a_histogram_of_50000_samples_has_the_probabilities_of_eq_8_after_a_wrap():
     buffer = make_buffer(24, 50, entropy_refresh=0)
     generator = seeded(3)
     for part in range(5):
@@ -230,7 +230,7 @@ class CountingFusion:
 @pytest.mark.parametrize(
     ("refresh", "expected"), [(0.0, 6), (0.25, 2), (100.0, 1)], ids=["always", "quarter", "never"]
 )
-def test_entropies_are_counted_anew_when_that_share_of_the_buffer_was_rewritten(refresh, expected):
+def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten(refresh, expected):
     fusion = CountingFusion()
     buffer = make_buffer(16, fusion=fusion, entropy_refresh=refresh)
     buffer.extend(make_transitions(16))

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from tests.mpfa.transitions import same
+from tests.mpfa.transitions import Trap, same
 from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
 
 
@@ -106,17 +106,9 @@ def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["table.md"]
 
 
-class Malicious:
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (self.path,)
-
-
-def test_a_file_with_code_in_it_is_refused_by_name_and_not_executed(tmp_path):
+def test_a_file_with_code_in_it_is_rejected_by_name_and_not_executed(tmp_path):
     trap, path = tmp_path / "trap", tmp_path / "state.pt"
-    save_atomically({"a": Malicious(str(trap))}, path)
+    save_atomically({"a": Trap(trap)}, path)
     with pytest.raises(pickle.UnpicklingError, match=r"state\.pt holds more than tensors"):
         load_safely(path)
     assert not trap.exists()
@@ -125,9 +117,9 @@ def test_a_file_with_code_in_it_is_refused_by_name_and_not_executed(tmp_path):
     assert trap.exists()
 
 
-def test_every_file_that_something_else_wrote_is_refused_by_name(tmp_path):
+def test_every_file_that_something_else_wrote_is_rejected_by_name(tmp_path):
     trap, path = tmp_path / "trap", tmp_path / "state.pt"
-    for content in (pickle.dumps({"a": Malicious(str(trap))}, protocol=2), b"", b"a,b\n1,2\n" * 50):
+    for content in (pickle.dumps({"a": Trap(trap)}, protocol=2), b"", b"a,b\n1,2\n" * 50):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"state\.pt is cut short, or was not written by"):
             load_safely(path)

@@ -11,7 +11,7 @@ from torchrl_mpfa import SignalMemmapStorage
 
 
 @pytest.mark.parametrize("capacity", [100, 16, 3])
-def test_a_folder_in_use_is_refused_and_the_user_of_it_goes_on(tmp_path, capacity):
+def test_a_folder_in_use_is_rejected_and_the_user_of_it_goes_on(tmp_path, capacity):
     buffer = make_buffer(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
     buffer.extend(make_transitions(16))
     before = buffer.storage.signal_table.rows.clone()

@@ -222,7 +222,7 @@ def test_rewards_and_own_signals_are_read_under_the_keys_they_are_given():
 
 
 @pytest.mark.parametrize("rows", [2, 3])
-def test_what_is_not_one_finite_number_a_transition_is_refused_before_it_is_written(rows):
+def test_what_is_not_one_finite_number_a_transition_is_rejected_before_it_is_written(rows):
     storage = SignalTensorStorage(4)
     storage.set(torch.arange(1), make_transitions(1))
     before = storage.signal_table.state_dict()
@@ -238,7 +238,7 @@ def test_what_is_not_one_finite_number_a_transition_is_refused_before_it_is_writ
     assert same(before, storage.signal_table.state_dict())
 
 
-def test_a_priority_function_that_gives_a_negative_signal_is_refused():
+def test_a_priority_function_that_gives_a_negative_signal_is_rejected():
     bad = Signal("bad", key=("next", "reward"), known_at="write", priority=torch.neg)
     storage = SignalTensorStorage(4, signals=["td_error", bad])
     with pytest.raises(ValueError, match=r"signal 'bad' must not be negative, got -1.0"):

@@ -66,7 +66,7 @@ def test_weights_are_those_of_torchrl_for_the_same_slots():
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0])
-def test_a_histogram_of_50000_draws_has_the_probabilities_of_eq_8(alpha):
+def test_a_histogram_of_50000_samples_has_the_probabilities_of_eq_8(alpha):
     sampler = TreeSampler(20, alpha, 0.4)
     storage = filled(sampler, 20, 20)
     priority = torch.rand(20, generator=seeded(1)) + 0.05
@@ -106,22 +106,6 @@ def test_beta_follows_the_linear_scheduler_of_torchrl():
     assert info["priority_weight"].tolist() == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("within", [True, False])
-def test_the_highest_priority_falls_with_its_row_only_within_the_buffer(within):
-    sampler = TreeSampler(8, 0.6, 0.4, 0.0, max_priority_within_buffer=within)
-    filled(sampler, 4, 8)
-    assert sampler.default_priority == 1.0
-    sampler.update_priority(torch.tensor([0, 1]), torch.tensor([5.0, 3.0]))
-    assert sampler.default_priority == 5.0
-    sampler.update_priority(torch.tensor([1]), torch.tensor([2.0]))
-    assert sampler.default_priority == 5.0
-    sampler.update_priority(torch.tensor([0]), torch.tensor([0.5]))
-    assert sampler.default_priority == (2.0 if within else 5.0)
-    sampler.mark_update(4)
-    expected = 2.0 if within else 5.0
-    assert float(sampler._sum_tree[4]) == pytest.approx(expected**0.6)
-
-
 def test_slots_of_minus_one_are_skipped():
     sampler = TreeSampler(4, 1.0, 0.4, 0.0)
     filled(sampler, 4, 4)
@@ -148,7 +132,7 @@ def test_of_a_slot_that_appears_twice_the_last_entry_counts():
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -0.5])
-def test_a_priority_that_would_poison_the_tree_is_refused_where_it_enters(wrong):
+def test_a_priority_that_would_poison_the_tree_is_rejected_where_it_enters(wrong):
     sampler = TreeSampler(4, 0.6, 0.4)
     filled(sampler, 4, 4)
     before = sampler.state_dict()
@@ -158,7 +142,7 @@ def test_a_priority_that_would_poison_the_tree_is_refused_where_it_enters(wrong)
 
 
 @pytest.mark.parametrize("slot", [4, 7, -2])
-def test_a_slot_outside_the_buffer_is_refused(slot):
+def test_a_slot_outside_the_buffer_is_rejected(slot):
     sampler = TreeSampler(4, 0.6, 0.4)
     filled(sampler, 4, 4)
     before = sampler.state_dict()
@@ -169,7 +153,7 @@ def test_a_slot_outside_the_buffer_is_refused(slot):
     assert same(before, sampler.state_dict())
 
 
-def test_priorities_that_do_not_fit_the_slots_are_refused():
+def test_priorities_that_do_not_fit_the_slots_are_rejected():
     sampler = TreeSampler(4, 0.6, 0.4)
     with pytest.raises(RuntimeError, match="priority should be a number or an iterable"):
         sampler.update_priority(torch.arange(3), torch.ones(2))
@@ -195,7 +179,7 @@ def test_a_batch_of_one_can_be_sampled_from_a_buffer_of_one():
     assert info["priority_weight"].tolist() == [1.0]
 
 
-def test_without_a_generator_of_the_buffer_draws_follow_the_global_seed():
+def test_without_a_generator_of_the_buffer_samples_follow_the_global_seed():
     sampled = []
     for _ in range(2):
         torch.manual_seed(5)
@@ -232,7 +216,7 @@ def test_a_saved_sampler_goes_on_as_if_nothing_had_happened(tmp_path):
         assert (sampler.alpha, sampler.beta) == (0.6, 0.4)
 
 
-def test_a_saved_sampler_of_another_capacity_or_format_is_refused_and_changes_nothing():
+def test_a_saved_sampler_of_another_capacity_or_format_is_rejected_and_changes_nothing():
     first, other = TreeSampler(10, 0.6, 0.4), TreeSampler(20, 0.6, 0.4)
     filled(other, 5, 20)
     before = other.state_dict()
@@ -286,7 +270,7 @@ def states_of(sampler):
         ("beta", None, TypeError),
     ],
 )
-def test_an_exponent_that_cannot_be_is_refused_and_changes_nothing(kind, name, value, error):
+def test_an_exponent_that_cannot_be_is_rejected_and_changes_nothing(kind, name, value, error):
     sampler = kind(64, 0.6, 0.4, 0.01)
     sampler.update_priority(torch.arange(64), torch.logspace(-2, 5, 64))
     before = states_of(sampler)

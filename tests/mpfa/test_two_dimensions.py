@@ -94,7 +94,7 @@ def test_adding_a_step_of_every_environment_equals_extending_by_it():
     assert one.storage[:]["observation"].equal(many.storage[:STEPS]["observation"])
 
 
-def test_adding_a_step_of_no_environment_is_refused():
+def test_adding_a_step_of_no_environment_is_rejected():
     buffer = make_deep_buffer()
     with pytest.raises(ValueError, match=r"one step of each environment, .* got \[\]"):
         buffer.add(make_trajectories()[0, 0])
@@ -149,7 +149,7 @@ def test_training_goes_on_bit_for_bit_in_two_dimensions(tmp_path):
     assert same(sampled[0].to_dict(), sampled[2].to_dict())
 
 
-def test_another_number_of_environments_is_refused_and_nothing_changes():
+def test_another_number_of_environments_is_rejected_and_nothing_changes():
     buffer = make_deep_buffer()
     with pytest.raises(ValueError, match=r"max_size must be a multiple of the 5 transitions .* 24"):
         buffer.extend(TensorDict({"next": {"reward": torch.ones(5, 2, 1)}}, [5, 2]))

@@ -1,5 +1,6 @@
 """Transitions and buffers that the tests of the replay parts share."""
 
+import os
 from copy import deepcopy
 
 import torch
@@ -81,3 +82,28 @@ def same(first, second):
 def snapshot(buffer):
     """A copy of the whole state of a buffer, generator included."""
     return deepcopy(buffer.state_dict())
+
+
+MISSING = object()
+"""In place of a value that is deleted."""
+
+
+def spoil(state, path, value):
+    """Put a value in place of another, somewhere in a nested state."""
+    *outer, last = path
+    for key in outer:
+        state = state[key]
+    if value is MISSING:
+        del state[last]
+    else:
+        state[last] = value
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)

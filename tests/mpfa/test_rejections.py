@@ -1,4 +1,4 @@
-"""What a buffer refuses: the error names argument and value, and nothing has changed."""
+"""What a buffer rejects: the error names argument and value, and nothing has changed."""
 
 import pytest
 import torch
@@ -41,7 +41,7 @@ def test_a_missing_signal_is_named(buffer, name):
     assert same(before, snapshot(buffer))
 
 
-def test_a_batch_without_any_signal_or_index_is_refused(buffer):
+def test_a_batch_without_any_signal_or_index_is_rejected(buffer):
     batch = buffer.sample()
     before = snapshot(buffer)
     with pytest.raises(KeyError, match="signal 'td_error' is missing"):
@@ -78,7 +78,7 @@ def test_a_signal_of_the_wrong_shape_is_named_with_its_shape(buffer, shape):
     assert same(before, snapshot(buffer))
 
 
-def test_times_of_writing_for_half_of_the_batch_are_refused(buffer):
+def test_times_of_writing_for_half_of_the_batch_are_rejected(buffer):
     batch = write_signals(buffer.sample())
     before = snapshot(buffer)
     with pytest.raises(ValueError, match=r"written_at must have one .*shape \[2\] for 4 slots"):
@@ -92,7 +92,7 @@ def test_times_of_writing_for_half_of_the_batch_are_refused(buffer):
 
 
 @pytest.mark.parametrize("slot", [10, 16, 1000, -2, -1])
-def test_a_slot_that_was_never_filled_is_refused(buffer, slot):
+def test_a_slot_that_was_never_filled_is_rejected(buffer, slot):
     batch = write_signals(buffer.sample())
     batch["index"][1] = slot
     before = snapshot(buffer)
@@ -114,8 +114,8 @@ def test_an_empty_buffer_cannot_be_sampled_or_updated():
 
 @pytest.mark.parametrize("way", ["extend", "add"])
 @pytest.mark.parametrize("start", ["empty", "half full"])
-def test_transitions_without_a_reward_are_refused_and_leave_no_hole(way, start):
-    # The writer had moved on before the storage refused: the rows that were refused stayed
+def test_transitions_without_a_reward_are_rejected_and_leave_no_hole(way, start):
+    # The writer had moved on before the storage rejected: the rows that were rejected stayed
     # unwritten slots, which were counted as filled once the next transitions came.
     buffer = make_buffer(8)
     if start == "half full":
@@ -138,7 +138,7 @@ def test_transitions_without_a_reward_are_refused_and_leave_no_hole(way, start):
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
-def test_transitions_with_a_reward_that_is_not_finite_are_refused(buffer, wrong):
+def test_transitions_with_a_reward_that_is_not_finite_are_rejected(buffer, wrong):
     before = snapshot(buffer)
     with pytest.raises(
         ValueError, match=rf"\('next', 'reward'\) must be finite, got {wrong} in row 1"
@@ -152,7 +152,7 @@ def test_capacities_of_sampler_and_storage_must_agree():
         SignalReplayBuffer(storage=SignalTensorStorage(16), sampler=MPFASampler(8), batch_size=4)
 
 
-def test_sequences_are_refused_where_signals_are_fused():
+def test_sequences_are_rejected_where_signals_are_fused():
     parts = {"storage": SignalTensorStorage(8), "sampler": MPFASampler(8), "batch_size": 4}
     with pytest.raises(ValueError, match=r"sample_unit must be None .*, got Sequence: signals"):
         SignalReplayBuffer(**parts, sample_unit=Sequence(3))
@@ -177,7 +177,7 @@ def test_a_batch_size_that_is_no_count_is_rejected_before_anything_changes(buffe
     assert same(before, snapshot(buffer))
 
 
-def test_a_storage_without_signals_is_refused():
+def test_a_storage_without_signals_is_rejected():
     with pytest.raises(TypeError, match=r"storage must keep signals .*got LazyTensorStorage"):
         SignalReplayBuffer(storage=LazyTensorStorage(8), sampler=MPFASampler(8), batch_size=4)
 
@@ -203,7 +203,7 @@ def test_stored_transitions_that_lack_a_reward_are_found_at_the_update():
         buffer.update_tensordict_priority(batch)
 
 
-def test_update_signals_can_be_called_by_hand_with_the_same_refusals(buffer):
+def test_update_signals_can_be_called_by_hand_with_the_same_rejections(buffer):
     sampler, storage = buffer.sampler, buffer.storage
     signals = {"td_error": torch.ones(2), "action_gradient": torch.ones(2)}
     assert sampler.update_signals(torch.tensor([0, 1]), signals, storage=storage) == 0
@@ -216,7 +216,7 @@ def test_update_signals_can_be_called_by_hand_with_the_same_refusals(buffer):
     assert same(before, snapshot(buffer))
 
 
-def test_a_complex_reward_is_refused_and_changes_nothing(buffer):
+def test_a_complex_reward_is_rejected_and_changes_nothing(buffer):
     before = snapshot(buffer)
     data = make_transitions(2)
     data["next", "reward"] = torch.tensor([[1 + 2j], [0.5]])
