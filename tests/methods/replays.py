@@ -3,14 +3,11 @@
 import torch
 from tensordict import TensorDict
 
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
 
 SPREAD = 4.5
 """Standard deviations by which a frequency may miss its probability."""
-
-
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 def make_transitions(count, *, seed=0):

@@ -8,12 +8,9 @@ from tensordict import TensorDict
 from torch.distributions import MultivariateNormal, kl_divergence
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from tests.mpfa.transitions import seeded
 from torchrl_mpfa import make_actor
 from torchrl_mpfa.methods.klper import KLPERSelection, gaussian_divergence
-
-
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])

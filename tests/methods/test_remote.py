@@ -12,6 +12,7 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 
 from tests.methods.replays import make_transitions
+from tests.mpfa.transitions import same
 from torchrl_mpfa import ReplayHistory
 from torchrl_mpfa.methods import METHODS, MethodReplayBuffer, can_be_remote, make_ray_replay
 from torchrl_mpfa.methods import make_replay as make_local_replay
@@ -67,7 +68,7 @@ def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
         history.add(0, buffer)
     known, found = (history.state_dict() for history in histories)
     assert sorted(found) == ["priority", "reward", "weight"]
-    assert_same(found, known)
+    assert same(found, known)
 
 
 def test_methods_that_look_into_their_buffer_stay_with_it() -> None:
@@ -117,24 +118,13 @@ def test_samples_of_a_remote_buffer_are_those_of_eq_8_and_late_signals_are_left_
         before = buffer.state_dict()["_storage"]
         buffer.update_tensordict_priority(batch, batches=1)
         assert buffer.stats()["stale_updates"] == len(batch)
-        assert_same(buffer.state_dict()["_storage"], before)
+        assert same(buffer.state_dict()["_storage"], before)
 
         # Saved there, it goes on here.
         local = make_local_replay(per).buffer
         local.load_state_dict(buffer.state_dict())
         assert (local.sample() == buffer.sample()).all()
         assert torch.equal(local.rewards(), buffer.rewards())
-        assert_same(buffer.distributions(), local.distributions())
+        assert same(buffer.distributions(), local.distributions())
     finally:
         buffer.shutdown()
-
-
-def assert_same(one: Any, other: Any) -> None:
-    if isinstance(one, dict):
-        assert one.keys() == other.keys()
-        for key in one:
-            assert_same(one[key], other[key])
-    elif isinstance(one, torch.Tensor):
-        assert torch.equal(one.nan_to_num(-1.0), other.nan_to_num(-1.0))
-    else:
-        assert one == other

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from tests.mpfa.transitions import same, seeded
 from torchrl_mpfa import (
     DDPGLearner,
     MPFASampler,
@@ -24,10 +25,6 @@ from torchrl_mpfa.selection import SampledBatch, one_batch
 
 OBSERVATION, ACTION = 5, 2
 MANY, BATCH, UPDATES = 4000, 16, 4
-
-
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 def make_rows(count, seed=0):
@@ -83,21 +80,6 @@ def has_twins(batches):
     return len(index.unique()) < len(index)
 
 
-def assert_same(first, second):
-    assert type(first) is type(second)
-    if isinstance(first, dict):
-        assert first.keys() == second.keys()
-        for key in first:
-            assert_same(first[key], second[key])
-    elif isinstance(first, list | tuple):
-        for one, other in zip(first, second, strict=True):
-            assert_same(one, other)
-    elif isinstance(first, torch.Tensor):
-        torch.testing.assert_close(first, second, rtol=0, atol=0, equal_nan=True)
-    else:
-        assert first == second
-
-
 class Counting:
     """A learner that learns nothing: its signals are the number of the update."""
 
@@ -122,10 +104,10 @@ def test_updates_in_one_call_are_those_of_a_loop_whose_priorities_wait():
     for _ in range(3):
         log, batch = run_updates(ours, first, updates=UPDATES)
         expected, batches = run_loop(theirs, second, UPDATES)
-        assert_same(log, expected)
-        assert_same(batch.to_dict(), batches[-1].to_dict())
-    assert_same(first.state_dict(), second.state_dict())
-    assert_same(ours.state_dict(), theirs.state_dict())
+        assert same(log, expected)
+        assert same(batch.to_dict(), batches[-1].to_dict())
+    assert same(first.state_dict(), second.state_dict())
+    assert same(ours.state_dict(), theirs.state_dict())
     assert first.updates == 3 * UPDATES
 
 
@@ -152,7 +134,7 @@ def test_each_batch_has_places_and_a_mean_of_its_own(position):
     theirs = copy.deepcopy(ours)
     run_updates(ours, make_learner(), updates=UPDATES)
     run_loop(theirs, make_learner(), UPDATES)
-    assert_same(ours.sampler.priorities(), theirs.sampler.priorities())
+    assert same(ours.sampler.priorities(), theirs.sampler.priorities())
 
 
 def test_of_a_transition_that_was_sampled_twice_the_last_update_counts():
@@ -199,7 +181,7 @@ def test_rows_that_were_overwritten_meanwhile_are_left_out_of_their_own_batch():
     run_updates(ours, first, updates=UPDATES)
     run_loop(theirs, second, UPDATES)
     assert 0 < ours.stale_updates == theirs.stale_updates < UPDATES * BATCH
-    assert_same(ours.sampler.priorities(), theirs.sampler.priorities())
+    assert same(ours.sampler.priorities(), theirs.sampler.priorities())
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -295,7 +277,7 @@ def test_what_prepares_a_draw_comes_before_the_learner(updates):
     _, batch = run_updates(buffer, learner, updates=updates, prepare=prepare)
     assert all(bool((each["next", "reward"] > 50).all()) for each in learner.batches)
     assert bool((batch["next", "reward"] > 50).all())
-    assert_same(buffer.storage["next", "reward"], before)
+    assert same(buffer.storage["next", "reward"], before)
     found = buffer.storage.signal_table
     written = found.rows[batch["index"], found.column["td_error"]]
     assert bool((written == updates).all())
@@ -361,7 +343,7 @@ def test_batches_on_another_device_than_the_signals_update_them():
             written_at=batch["written_at"].as_subclass(kind),
         )
         assert 0 < stale < BATCH
-    assert_same(ours.sampler.state_dict(), theirs.sampler.state_dict())
+    assert same(ours.sampler.state_dict(), theirs.sampler.state_dict())
 
 
 @pytest.mark.parametrize("sampler", [RandomSampler(), PrioritizedSampler(300, 0.6, 0.4)])
@@ -434,4 +416,4 @@ def test_rows_that_are_no_equal_batches_are_refused():
     before = buffer.sampler.priorities()
     with pytest.raises(ValueError, match="16 slots cannot make 3 equal batches"):
         buffer.update_tensordict_priority(batch, batches=3)
-    assert_same(buffer.sampler.priorities(), before)
+    assert same(buffer.sampler.priorities(), before)
