@@ -71,7 +71,15 @@ def test_a_transition_that_takes_the_place_of_a_spent_one_counts_anew():
     assert not spent.all()
 
 
-def test_weights_are_relative_to_the_lowest_share_that_can_be_drawn():
+def test_an_update_that_raises_uses_no_transition_up():
+    buffer = make_capped(6, 4, 1)
+    buffer.sampler.adjustments = (lambda priority, batch: priority * torch.nan,)
+    with pytest.raises(ValueError, match="adjusted priorities must be finite"):
+        train(buffer)
+    assert not buffer.sampler._spent.any()
+
+
+def test_weights_are_relative_to_the_lowest_share_that_can_be_sampled():
     buffer = make_capped(10, 3, 2)
     set_signals(buffer, td_error=torch.arange(1.0, 11.0))
     for _ in range(3):

@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler, Weighing
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.saved import Entry
-from torchrl_mpfa.storages.table import SignalTable
 
 _NO_LEAF = float("inf")
 
@@ -65,10 +64,10 @@ class MWSampler(SignalSampler):
             self._spent[slots] = False  # The count of a fresh transition starts again.
         super()._write(slots, priority, learned=learned)
 
-    def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
-        priority = super()._fused(table, rows, slots, weighing)
-        self._spent[slots] = rows.select(1, table.count_column) >= self.replay_cap
-        return priority
+    def _set(self, slots: Tensor, priority: Tensor, highest: float) -> None:
+        if self._table is not None:
+            self._spent[slots] = self._table.replay_counts(slots) >= self.replay_cap
+        super()._set(slots, priority, highest)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         super()._write_leaves(slots, leaf)

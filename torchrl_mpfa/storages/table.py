@@ -224,6 +224,10 @@ class SignalTable:
         """Time of writing of each slot, as a count of writes, shape ``[B]``."""
         return self.rows[:, self.time_column].index_select(0, index)
 
+    def replay_counts(self, index: Tensor) -> Tensor:
+        """Replays of each slot, shape ``[B]``."""
+        return self.rows[:, self.count_column].index_select(0, index)
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that restores the table; tensors and plain values only."""
         return {
