@@ -85,7 +85,7 @@ _NAMES = {
     "worlds.world_file": "load_world save_world",
     "worlds.yaml_nodes": "WorldFileError",
 }
-"""Public names by module. A module is imported when a name of it is first asked for: a robot that
+"""Public names by module. A module is imported when a name of it is first used: a robot that
 runs :mod:`mpfa_envs.deploy` has neither SciPy nor torch, and Numba takes half a second."""
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(["EXAMPLE_WORLD", *_MODULE_OF], key=lambda name: (not name.isupper(), name))
@@ -126,7 +126,7 @@ _OF_THE_EXTRA = ("gymnasium", "networkx", "numba", "PIL", "yaml", "scipy")
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name when it is first asked for."""
+    """Import a name when it is first used."""
     module = _MODULE_OF.get(name)
     if name in _RENAMED:
         message = f"mpfa_envs.{name} is now mpfa_envs.{_RENAMED[name]}"

@@ -41,7 +41,7 @@ def write_atomically(content: bytes, path: Path) -> None:
             new.write(content)
             new.flush()
             os.fsync(new.fileno())
-            # Temporary files are for their owner alone; this one is for all who read the folder.
+            # Temporary files are readable by their owner alone; this one by all.
             os.chmod(new.name, 0o644)
             os.replace(new.name, path)
         except BaseException:

@@ -1,1 +1,1 @@
-"""Greedy episodes of a policy, and what they gave."""
+"""Greedy episodes of a policy and their results."""

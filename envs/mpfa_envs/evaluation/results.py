@@ -42,7 +42,7 @@ class EpisodeResult:
     world: str = ""
     """Name of the world."""
     walker_distance: float | None = None
-    """Least distance between the robot's rim and a walker's [m]; None where nobody walks."""
+    """Least distance between the robot's rim and a walker's [m]; None without walkers."""
     intrusion_time: float | None = None
     """Time in the personal space of a walker, within 0.5 m of its rim [s]."""
     time_to_collision: float | None = None

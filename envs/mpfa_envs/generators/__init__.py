@@ -1,4 +1,4 @@
-"""Generators of worlds: a generator's name and a seed give everyone the same world, for ever.
+"""Generators of worlds: a generator's name and a seed give everyone the same world, always.
 
 A generator is a function of a source of randomness and a difficulty. :func:`generate_world` seeds
 it, and samples again where no robot can drive. Seeds for training, validation and test are apart
@@ -122,7 +122,7 @@ def generate_world(name: str, seed: int, *, difficulty: float | None = None) -> 
     Args:
         name: A generator, one of :data:`GENERATORS`.
         seed: Seed below 3 * 10⁹, as :func:`world_seed` gives them.
-        difficulty: From 0 to 1; each generator says what it means. None: the seed's own, uniform
+        difficulty: From 0 to 1; its meaning depends on the generator. None: the seed's own, uniform
             over this range; 0.5 for ``"rooms"`` and ``"crowd"``.
 
     Returns:
@@ -227,7 +227,7 @@ def split_worlds(
 def generator_tasks(
     name: str, split: Split, *, worlds: int = 100, tasks: int = 4
 ) -> list[tuple[World, Task]]:
-    """Make the tasks of a generator that policies are compared on, fixed for ever.
+    """Make the tasks of a generator that policies are compared on, which never change.
 
     Args:
         name: A generator, one of :data:`GENERATORS`.

@@ -49,7 +49,7 @@ def fields(rng: random.Random, difficulty: float) -> World:
     width = round(columns * cell, 3)
     if rng.random() < 0.5:
         filled, width, depth = filled.T, depth, width
-    # A hair's breadth thinner than their cells: at a wall, sums of rounded numbers stay inside.
+    # Thinner than their cells: at a wall, sums of rounded numbers stay inside.
     thin = round(radius - 0.001, 3)
     shape = filled.shape
     cylinders = tuple(
@@ -83,7 +83,7 @@ def _grow(
 
 def _is_passable(filled: NDArray[np.bool_], cell: float) -> bool:
     """Tell whether a disc gets from one end of the field to the other."""
-    # From center to center: what is needed, and the cylinder's radius.
+    # From center to center: the needed distance and the cylinder's radius.
     reach = _NEEDED + cell / 2
     steps = np.arange(-int(reach / cell), int(reach / cell) + 1) * cell
     disc = np.hypot(steps[:, None], steps) < reach

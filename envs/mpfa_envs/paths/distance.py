@@ -3,7 +3,7 @@
 Where :mod:`~mpfa_envs.paths.planner` answers one question exactly, a field answers it for all cells
 at once, and in milliseconds however many obstacles there are. Moves lead from a free cell to its 16
 neighbors, hence a path in the open is up to 1.4 % too long or too short. Around corners and in
-narrow passages the size of the cells adds to it: ``docs/worlds.md`` has what was measured.
+narrow passages the size of the cells adds to it: ``docs/worlds.md`` has measurements.
 
 Centers of free cells keep the distance d. Between two that are a step L apart a path keeps
 √(d² - L²/4) at least: whatever is nearest to its middle is d away from both ends.
@@ -72,7 +72,7 @@ class FreeGrid:
             raise ValueError(
                 f"resolution must be at most the distance, {distance} m, got {resolution}"
             )
-        # The grid is as wide as the room or a little wider; what is behind a wall is not free.
+        # The grid is as wide as the room or a little wider; cells behind a wall are not free.
         sides = [max(1, math.ceil(round(side / resolution, 6))) for side in world.size]
         if math.prod(sides) > _MOST_CELLS:
             raise ValueError(

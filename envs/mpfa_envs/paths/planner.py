@@ -64,11 +64,9 @@ class PathPlanner:
         self.world = world
         self.radius = check_positive("radius", radius)
         reach = self.radius - _TOUCH
-        boxes: list[tuple[float, float, float, float]] = []
         circles: list[tuple[float, float, float]] = []
         corners: list[NDArray[np.float64]] = []
         for box in world.boxes:
-            boxes.append((box.x_min, box.y_min, box.x_max, box.y_max))
             for quarter, (x, y) in enumerate(
                 (
                     (box.x_max, box.y_max),
@@ -98,7 +96,7 @@ class PathPlanner:
                     outer = self.radius / math.cos(turn / count / 2)
                     corners.append(_polygon(x, y, outer, around))
         # Sides, rectangles in the last axis; centers and squared radii, circles in the last axis.
-        self._low, self._high = np.array(boxes).reshape(-1, 2, 2).transpose(1, 2, 0)
+        self._low, self._high = world.arrays.boxes.reshape(-1, 2, 2).transpose(1, 2, 0)
         *self._centers, radii = np.array(circles).reshape(-1, 3).T
         self._squares = radii * radii
         self._segments = world.arrays.segments.T
@@ -240,7 +238,7 @@ class PathPlanner:
 
     def _crosses_edges(self, origin: Point, targets: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which lines from the origin to the targets ``[N, 2]`` cross an edge, ``[N]``."""
-        # A line through the end of an edge is not asked for: it passes a corner too near.
+        # A line through the end of an edge does not occur: it passes a corner too near.
         x0, y0, x1, y1 = self._segments
         x, y = origin
         to_x, to_y = targets[:, :1], targets[:, 1:]

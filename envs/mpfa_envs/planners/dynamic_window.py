@@ -177,7 +177,7 @@ class DynamicWindow:
         speed = row[parts["linear_speed"]] * robot.max_wheel_speed
         across = 0.5 * robot.wheel_base * row[parts["angular_speed"]] * robot.max_angular_speed
         now = np.concatenate((speed - across, speed + across))
-        # A wheel that slips, or stands as in the beginning, has speeds that cannot be asked for.
+        # A wheel that slips, or stands as in the beginning, is outside the range of speeds.
         now = np.clip(now, robot.min_wheel_speed, robot.max_wheel_speed)
         changes = np.abs(self.pairs - now).max(axis=1)
         # The nearest where none of few samples is near enough.

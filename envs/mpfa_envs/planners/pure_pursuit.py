@@ -38,7 +38,7 @@ class PurePursuit:
     :math:`l` that point is on the arc of curvature :math:`\kappa = 2 \sin(\alpha) / l`. One wheel
     is at its fastest; the other is slower by what the arc asks for, as far as it can be. To a point
     beside or behind it the robot turns on its tightest circle. Of the arcs that are free for the
-    next half meter it takes the one nearest to what it wants.
+    next half meter it takes the one nearest to the wanted arc.
 
     Args:
         path: Positions from the start to the goal [m].

@@ -45,7 +45,7 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
         return None
     graph = grid.graph_to(goal)
     last = graph.shape[0] - 1
-    # From the goal, as every move leads both ways; what is before a cell is next on its path.
+    # From the goal, as every move can be reversed; the predecessor of a cell is next on its path.
     lengths, following = dijkstra(graph, indices=[last], return_predecessors=True)
     length, cell = min((lengths[0, cell] + gap, cell) for cell, gap in grid.cells_around(start))
     if math.isinf(length):

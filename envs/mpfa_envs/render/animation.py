@@ -77,7 +77,7 @@ def _palette(pictures: Sequence[Image.Image], size: int) -> Image.Image:
     # Trails and maps are longest at the end, scans differ in the middle.
     samples = np.concatenate([np.asarray(pictures[n]) for n in (0, len(pictures) // 2, -1)])
     found, counts = np.unique(samples.reshape(-1, 3), axis=0, return_counts=True)
-    # A few pixels of a color of its own are a mark; a few of many colors are blurred edges.
+    # A few pixels of one color are a mark; a few of many colors are blurred edges.
     there = {tuple(color) for color in found[counts > 3].tolist()}
     kept = sorted({color for color in _kit() if color in there})[: min(_KIT, size // 2)]
     most = Image.fromarray(samples).quantize(size - len(kept)).getpalette() or []

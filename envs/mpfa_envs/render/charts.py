@@ -1,4 +1,4 @@
-"""Charts of runs and of what they replay; matplotlib is imported where one is made."""
+"""Charts of runs and of their replay; matplotlib is imported where one is made."""
 
 from __future__ import annotations
 

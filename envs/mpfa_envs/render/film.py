@@ -46,8 +46,7 @@ def film_episode(
     the last ten seconds and, if it is known, the value of what the robot sensed so far.
 
     Args:
-        policy: What :func:`~mpfa_envs.run_tasks` takes; with ``env_arguments`` of its own, these
-            hold where none are given here.
+        policy: As for :func:`~mpfa_envs.run_tasks`; its ``env_arguments`` hold where none are given.
         episode: The task and its world.
         values: From observations, ``[1, O]``, to their value, ``[1]``, such as Q.
         traces: Whether speeds and values are beside the picture.

@@ -61,7 +61,7 @@ def observe_room(
 
     Returns:
         Poses (x, y, heading), ``[N, 3]``, where the robot fits and has not reached the goal, and
-        observations, ``[N, O]``. It has seen nothing before and nobody walks.
+        observations, ``[N, O]``. It has seen nothing before, and there are no walkers.
 
     Raises:
         ValueError: If an argument is out of its range.

@@ -34,7 +34,7 @@ def render_samples(
     title: str = "",
     size: int = 360,
 ) -> NDArray[np.uint8]:
-    """Render three pictures of a buffer: its transitions, their priorities, what is sampled.
+    """Render three pictures of a buffer: its transitions, their priorities, their samples.
 
     Each cell has the color of how many transitions lie in it, of the mean of their priorities, and
     of how often they are sampled, in units of uniform sampling: 1 is as often as any other. All

@@ -24,7 +24,7 @@ class Window:
             raise DependencyNotInstalled(
                 "a live window needs pygame: pip install 'torchrl-mpfa[live]'"
             ) from error
-        # A picture needs no 3D, and a driver that renders in software brings an LLVM of its own:
+        # A picture needs no 3D, and a driver that renders in software brings another LLVM:
         # importing PyTorch's Triton after that ends the process.
         os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
         self._pygame: Any = pygame

@@ -175,7 +175,7 @@ def _parse(path: Path, text: bytes) -> _Element:
 
 
 class _Reader:
-    """Collects the obstacles of one file, and counts what is left out."""
+    """Collects the obstacles of one file, and counts the parts left out."""
 
     def __init__(self, path: Path, height: float) -> None:
         self._path = path
@@ -272,7 +272,7 @@ class _Reader:
     def _numbers(self, element: _Element, count: int) -> list[float]:
         """Read finite numbers."""
         numbers = [read_number(word) for word in element.text.split()]
-        # Sums and squares of what is farther away are not finite.
+        # Sums and squares of larger numbers are not finite.
         if len(numbers) != count or not all(abs(number) < _FARTHEST for number in numbers):
             raise self._error(
                 element, f"{element.tag} must be {count} numbers, got {element.text!r}"

@@ -17,11 +17,11 @@ def world_to_plain(world: World) -> dict[str, Any]:
     return {
         "name": world.name,
         "size": list(world.size),
-        "boxes": [_edges(box) for box in world.boxes],
+        "boxes": [list(box.bounds) for box in world.boxes],
         "cylinders": [[c.x, c.y, c.radius] for c in world.cylinders],
         "polygons": [[list(vertex) for vertex in polygon.vertices] for polygon in world.polygons],
-        "start_regions": [_edges(box) for box in world.start_regions],
-        "goal_regions": [_edges(box) for box in world.goal_regions],
+        "start_regions": [list(box.bounds) for box in world.start_regions],
+        "goal_regions": [list(box.bounds) for box in world.goal_regions],
         "walkers": [walker_to_plain(walker) for walker in world.walkers],
         **({} if world.occupancy is None else {"occupancy": world.occupancy.plain}),
     }
@@ -67,7 +67,3 @@ def fingerprint(world: World) -> str:
     # 1 and 1.0 are the same number, but not the same text.
     values = json.loads(json.dumps(world_to_plain(world), default=float), parse_int=float)
     return f"{world.name} ({hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]})"
-
-
-def _edges(box: Box) -> list[float]:
-    return [box.x_min, box.y_min, box.x_max, box.y_max]

@@ -3,7 +3,7 @@
 A pixel's shade says how sure it is that something is there: p = (255 - shade) / 255, or shade / 255
 with ``negate``. Above ``occupied_thresh`` it is occupied, below ``free_thresh`` free. What is in
 between depends on ``mode``: with ``trinary`` it is unknown; with ``scale`` it is occupied from the
-middle of the two thresholds, and what is transparent is unknown. With ``raw`` shades of 0 to 100
+middle of the two thresholds, and transparent pixels are unknown. With ``raw`` shades of 0 to 100
 are p in percent, and above that unknown.
 
 With ``trinary`` and without ``negate`` the shade 205 is always unknown: ROS's own map_saver writes
@@ -169,7 +169,7 @@ class _Reader(NodeReader):
         try:
             content = io.BytesIO(read_file(path, _LARGEST_IMAGE))
             with warnings.catch_warnings():
-                # Pillow warns of what is rejected below.
+                # Pillow warns of sizes that are rejected below.
                 warnings.simplefilter("ignore", Image.DecompressionBombWarning)
                 image = Image.open(content, formats=_FORMATS)
             with image:

@@ -172,7 +172,7 @@ class World:
         return World(name=path.stem, size=grid.size, occupancy=grid)
 
     def to_map(self, path: str | os.PathLike[str], *, resolution: float | None = None) -> None:
-        """Write a map for ROS, as :func:`~mpfa_envs.worlds.ros_map.save_map` does.
+        """Write a map for ROS, with the walls one cell thick and without walkers and regions.
 
         Args:
             path: The YAML file; an image with the ending .pgm is written beside it.
@@ -235,19 +235,14 @@ class World:
 
     def holds(self, shape: Shape) -> bool:
         """Tell whether a shape lies in the room; it may touch the walls."""
-        room = self.room
+        left, low, right, high = self.room.bounds
         x_min, y_min, x_max, y_max = shape.bounds
-        return (
-            room.x_min <= x_min
-            and x_max <= room.x_max
-            and room.y_min <= y_min
-            and y_max <= room.y_max
-        )
+        return left <= x_min and x_max <= right and low <= y_min and y_max <= high
 
     @cached_property
     def arrays(self) -> WorldArrays:
         """All numbers of the world in arrays, for kernels."""
-        boxes = [(box.x_min, box.y_min, box.x_max, box.y_max) for box in self.boxes]
+        boxes = [box.bounds for box in self.boxes]
         circles = [(cylinder.x, cylinder.y, cylinder.radius) for cylinder in self.cylinders]
         edges = [edge for polygon in self.polygons for edge in polygon.edges]
         counts = [len(polygon.vertices) for polygon in self.polygons]

@@ -32,7 +32,7 @@ def read_nodes(path: Path) -> yaml.Node | None:
 
 def parse_nodes(content: bytes, path: Path) -> yaml.Node | None:
     """Turn the content of a file into nodes."""
-    if len(content) > _LARGEST_FILE:  # Not yet looked at where it is about to be written.
+    if len(content) > _LARGEST_FILE:  # A file to be written has not been checked.
         raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
     try:
         return yaml.compose(content.decode(), Loader=yaml.SafeLoader)
