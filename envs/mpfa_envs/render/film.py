@@ -46,7 +46,7 @@ def film_episode(
     the last ten seconds and, if it is known, the value of what the robot sensed so far.
 
     Args:
-        policy: As for :func:`~mpfa_envs.run_tasks`; its ``env_arguments`` hold where none are given.
+        policy: As for :func:`~mpfa_envs.run_tasks`; its ``env_arguments`` hold unless given here.
         episode: The task and its world.
         values: From observations, ``[1, O]``, to their value, ``[1]``, such as Q.
         traces: Whether speeds and values are beside the picture.
