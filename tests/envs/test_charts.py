@@ -15,7 +15,7 @@ STEPS = np.arange(0, 101, 10)
 
 
 def colored(path: Path, color: tuple[int, ...], *, spread: int = 12) -> np.ndarray:
-    """Which pixels of a picture have about this color, shape ``[height, width]``."""
+    """Pixels of a picture with about this color, shape ``[height, width]``."""
     with Image.open(path) as picture:
         found = np.asarray(picture.convert("RGB")).astype(int)
     return (abs(found - color) <= spread).all(-1)

@@ -73,7 +73,7 @@ def oracle(grid: FreeGrid, goal: tuple[int, int]) -> dict[tuple[int, int], float
 
 
 @pytest.mark.parametrize("world", [MIXED, CUT, WORLDS["test"]], ids=lambda world: world.name)
-def test_values_are_the_lengths_of_the_shortest_chains_of_moves(world: World) -> None:
+def test_lengths_of_a_field_are_those_of_plain_dijkstra(world: World) -> None:
     grid = FreeGrid(world, distance=0.2, resolution=0.15)
     cell = tuple(grid.cells[len(grid.cells) // 3].tolist())
     values = DistanceField(grid, grid.center(*cell)).lengths
@@ -141,7 +141,7 @@ def test_a_goal_off_the_free_cells_is_reached_from_the_nearest() -> None:
     assert field.lengths[i, j] == pytest.approx(3.75 - field.grid.ys[j], abs=0.11)
 
 
-def test_tasks_keep_what_they_are_asked_for() -> None:
+def test_tasks_keep_regions_distances_and_clearances() -> None:
     world = World(
         name="sides",
         boxes=WORLDS["test"].boxes,
@@ -164,7 +164,7 @@ def test_tasks_keep_what_they_are_asked_for() -> None:
         assert field.goal == task.goal
 
 
-def test_a_detour_is_one() -> None:
+def test_tasks_are_detours_as_often_as_asked() -> None:
     rng = np.random.default_rng(0)
     grid = FreeGrid(generate_world("bars", 3, difficulty=0.7), distance=0.25)
     for chance, low, high in ((1.0, 1.0, 1.0), (0.5, 0.5, 0.95), (0.0, 0.1, 0.8)):
@@ -230,7 +230,7 @@ def test_an_impossible_grid_field_or_task_is_rejected(
         call()
 
 
-def test_a_world_has_a_task_or_none() -> None:
+def test_has_task_knows_worlds_without_a_task() -> None:
     assert has_task(FreeGrid(CUT, distance=0.25))
     assert not has_task(FreeGrid(World(name="closet", size=(2.2, 2.2)), distance=0.25))
     walls = tuple(Box(x, -1.5, x + 0.1, 1.5) for x in (-1.0, -0.4, 0.2, 0.8))

@@ -248,7 +248,7 @@ def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, object], me
         evaluate(steer, **{"physics": "kinematic", **arguments})
 
 
-def test_a_policy_of_one_observation_is_told_what_to_do() -> None:
+def test_the_error_for_a_policy_of_one_observation_names_the_remedy() -> None:
     def single(observation: NDArray[np.float32]) -> NDArray[np.float64]:
         return np.zeros(2)
 

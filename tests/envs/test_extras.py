@@ -1,4 +1,4 @@
-"""What a user reads who has installed the package without an extra."""
+"""Errors where an extra of the package is not installed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ POLICY = Path(__file__).parents[2] / "examples" / "policies" / "td3-mpfa_per.npz
         ),
     ],
 )
-def test_what_lacks_its_extra_names_it(
+def test_the_error_of_a_missing_package_names_its_extra(
     without: str, code: str, message: str, tmp_path: Path
 ) -> None:
     hidden = f"import sys; sys.modules[{without!r}] = None; {code}"

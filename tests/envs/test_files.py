@@ -54,7 +54,7 @@ def map_of(path: Path) -> object:
         ("policy.json", card_of_nothing, CardError),
     ],
 )
-def test_what_may_never_end_is_not_read(
+def test_pipes_and_devices_are_not_read(
     name: str, kind: str, load: Callable[[Path], object], error: type[Exception], tmp_path: Path
 ) -> None:
     path = tmp_path / name

@@ -95,7 +95,7 @@ def test_the_room_is_as_large_as_the_obstacles(tmp_path):
     assert resolve_world(str(path)) == world
 
 
-def test_what_is_above_and_what_lies_flat_is_no_obstacle(tmp_path):
+def test_shapes_above_the_robot_or_in_the_floor_are_no_obstacles(tmp_path):
     slab = "<box><size>1 1 0.1</size></box>"
     models = "".join(model(slab, f"0 0 {z} 0 0 0") for z in (-0.045, 0.3, 0.6))
     world = load_gazebo_world(write(tmp_path, models))
@@ -103,7 +103,7 @@ def test_what_is_above_and_what_lies_flat_is_no_obstacle(tmp_path):
     assert len(load_gazebo_world(write(tmp_path, models), height=1.0).boxes) == 2
 
 
-def test_what_is_left_out_is_counted(tmp_path):
+def test_a_warning_counts_the_parts_left_out(tmp_path):
     content = "".join(
         (
             model(CYLINDER),

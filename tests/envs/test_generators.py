@@ -85,7 +85,7 @@ def test_a_seed_is_one_world_and_another_seed_another(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "expected"), PINNED.items())
-def test_a_seed_is_one_world_for_ever(name: str, expected: tuple[str, str]) -> None:
+def test_the_world_of_a_seed_never_changes(name: str, expected: tuple[str, str]) -> None:
     # Results refer to worlds by their names.
     found = generate_world(name, 7), generate_world(name, world_seed("test", 7), difficulty=1.0)
     assert tuple(fingerprint(world) for world in found) == expected
@@ -100,9 +100,7 @@ def test_a_seed_is_one_world_for_ever(name: str, expected: tuple[str, str]) -> N
         ("mazes", (3.0771, 2.84, -0.3046, 3.9075, -3.9064)),
     ],
 )
-def test_the_tasks_of_the_tables_are_the_same_for_ever(
-    name: str, expected: tuple[float, ...]
-) -> None:
+def test_the_tasks_of_a_generator_never_change(name: str, expected: tuple[float, ...]) -> None:
     pairs = generator_tasks(name, "test", worlds=2, tasks=2)
     assert pairs[:2] == generator_tasks(name, "test", worlds=1, tasks=2)
     start, goal = pairs[1][1]
@@ -126,7 +124,7 @@ def test_splits_share_no_seed_and_no_world() -> None:
         ("mazes", "7@0.3333333333333333"),
     ],
 )
-def test_a_world_can_be_asked_for_by_its_name(name: str, ending: str) -> None:
+def test_a_generated_world_is_found_by_its_name(name: str, ending: str) -> None:
     world = resolve_world(f"{name}-{ending}")
     assert world.name == f"{name}-{ending}"
     assert resolve_world(world.name) == world
@@ -357,7 +355,7 @@ def test_a_registered_generator_works_like_a_built_in_one() -> None:
     assert [result.world for result in ahead] == ["pillars-test-0", "pillars-test-0"]
 
 
-def test_a_generator_of_ones_own_may_be_defined_again() -> None:
+def test_a_registered_generator_may_be_replaced() -> None:
     register_generator("pillars", lambda source, difficulty: World(name="empty"))
     assert not generate_world("pillars", 0).cylinders
     register_generator("pillars", pillars)
@@ -370,7 +368,7 @@ def test_rooms_beyond_the_bounds_of_observations_are_rejected() -> None:
         VectorNavigationEnv(1, world="long", physics="kinematic")
 
 
-def test_a_generator_that_gives_no_world_is_named() -> None:
+def test_the_error_names_a_generator_that_returns_no_world() -> None:
     register_generator("nothing", lambda source, difficulty: None)  # type: ignore[arg-type, return-value]
     with pytest.raises(TypeError, match="generator 'nothing' must give a World, got NoneType"):
         generate_world("nothing", 0)

@@ -96,7 +96,7 @@ def test_rays_meet_cells_where_they_meet_boxes_in_their_place(scattered):
         np.testing.assert_allclose(*(lidar.cast(x, y, heading) for lidar in lidars), atol=1e-9)
 
 
-def test_rays_along_the_cells_edges_meet_what_they_point_at():
+def test_rays_along_the_edges_of_cells_meet_the_cell_ahead():
     occupied = np.zeros((20, 20), dtype=bool)
     occupied[15, 10] = occupied[10, 15] = True
     lidar = Lidar(World(name="two", occupancy=OccupancyGrid(occupied, 0.5)), sectors=3)
@@ -192,7 +192,7 @@ def test_the_origin_of_an_image_is_its_lower_left_corner(tmp_path):
     assert world.clearance(-0.475, 0.475) == 0.0
 
 
-def test_what_lies_around_the_free_cells_is_cut_off(tmp_path):
+def test_a_map_is_cut_to_its_free_cells(tmp_path):
     shades = np.full((60, 50), 205, dtype=np.uint8)
     shades[10:30, 15:40] = 254
     shades[10:30, 14] = 0

@@ -21,7 +21,7 @@ PARTS = observation_slices()
 def observation(
     *, goal: tuple[float, float] = (3.0, 0.0), left: float = 0.3, right: float = 0.3
 ) -> np.ndarray:
-    """What a robot in the open senses that drives with some wheel speeds [m/s]."""
+    """The observation of a robot in the open that drives with some wheel speeds [m/s]."""
     seen = np.zeros(24, np.float32)
     seen[PARTS["lidar"]] = 0.25 / 10.0
     distance = math.hypot(*goal)

@@ -118,7 +118,7 @@ def test_a_cell_of_fewer_than_three_transitions_stays_empty() -> None:
     ]
 
 
-def test_how_often_is_told_in_units_of_uniform_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_are_in_units_of_uniform_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
     ends, real = {}, samples.Scale
 
     def scale(name: str, low: float, high: float) -> samples.Scale:

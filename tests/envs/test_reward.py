@@ -82,7 +82,7 @@ def test_a_bad_payment_is_rejected_before_anything_is_built(make) -> None:
 
 
 @pytest.mark.parametrize("step", [one_robot, two_robots])
-def test_without_progress_no_payment_of_the_equation_pays_an_approach(step) -> None:
+def test_without_progress_an_approach_is_not_rewarded(step) -> None:
     reward = partial(navigation_reward, goal_reward=20.0, progress_scale=3.0)
     assert step(reward=reward) != 0.0
     assert step(reward=reward, progress="none") == 0.0

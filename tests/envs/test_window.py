@@ -28,7 +28,7 @@ def no_screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def on_screen() -> np.ndarray:
-    """What the open window shows, shape ``[height, width, 3]``."""
+    """The picture in the open window, shape ``[height, width, 3]``."""
     return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
 
 

@@ -201,7 +201,9 @@ start:
         ),
     ],
 )
-def test_what_could_not_be_loaded_is_not_saved(world: World, message: str, tmp_path: Path) -> None:
+def test_a_world_that_cannot_be_loaded_is_not_saved(
+    world: World, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "world.yaml"
     path.write_text("kept")
     with pytest.raises(ValueError, match=f"world must be one that can be loaded.*{message}"):

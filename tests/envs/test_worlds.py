@@ -246,7 +246,7 @@ def test_equal_worlds_have_one_hash_across_processes() -> None:
         assert {World(name="x", walkers=(Walker(),)): 1}.get(world) == 1
 
 
-def test_clearances_of_many_points_are_those_of_each() -> None:
+def test_clearances_of_many_points_are_those_of_plain_geometry() -> None:
     world = World(
         name="both",
         size=(10.0, 6.0),
