@@ -60,7 +60,6 @@ def film_episode(
 
     Examples:
         >>> import numpy as np
-    from gymnasium.vector import AutoresetMode
         >>> from mpfa_envs import world_tasks
         >>> from mpfa_envs.render import film_episode
         >>> ahead = lambda observations: np.ones((len(observations), 2), np.float32)
