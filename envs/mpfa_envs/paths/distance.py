@@ -27,8 +27,6 @@ from mpfa_envs.paths.grid_loops import (
     clearance_grid,
     fill_from_nearest,
     interpolate,
-    neighbor_lists,
-    number_cells,
 )
 from mpfa_envs.worlds.cell_loops import lower_clearances
 from mpfa_envs.worlds.world import World
@@ -99,7 +97,9 @@ class FreeGrid:
     @cached_property
     def _numbers(self) -> NDArray[np.int32]:
         """Place of each free cell in :attr:`cells`, -1 for the others, ``[nx, ny]``."""
-        return number_cells(self.free)
+        numbers = np.full(self.free.shape, -1, dtype=np.int32)
+        numbers[self.free] = np.arange(len(self.cells))
+        return numbers
 
     @cached_property
     def moves(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
@@ -108,7 +108,16 @@ class FreeGrid:
         Where the moves of each of :attr:`cells` begin, ``[cells + 1]``; the numbers of the cells
         that they lead to, and their lengths [m], ``[moves]``.
         """
-        return neighbor_lists(self.free, self._numbers, MOVES, self.resolution * STEP_SCALE)
+        # Two more cells on each side, none of them free, so that no move leads out of the grid.
+        numbers = np.pad(self._numbers, 2, constant_values=-1)
+        columns, rows = (self.cells[:, None] + 2).transpose(2, 0, 1)
+        to, *passed = (
+            numbers[columns + across, rows + up] for across, up in MOVES.T.reshape(3, 2, -1)
+        )
+        is_open = (to >= 0) & (passed[0] >= 0) & (passed[1] >= 0)
+        starts = np.append(0, is_open.sum(axis=1).cumsum()).astype(np.int32)
+        lengths = np.sqrt((MOVES[:, :2] ** 2).sum(axis=1)) * (self.resolution * STEP_SCALE)
+        return starts, to[is_open], np.broadcast_to(lengths, to.shape)[is_open]
 
     def index(self, x: float, y: float) -> tuple[int, int]:
         """Column and row of a position's cell [m], the nearest one for a position outside."""

@@ -163,56 +163,6 @@ def clearance_grid(
 
 
 @njit
-def number_cells(free: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Number the free cells, -1 for the others, ``[nx, ny]``."""
-    numbers = np.full(free.shape, -1, np.int32)
-    count = 0
-    for i in range(free.shape[0]):
-        for j in range(free.shape[1]):
-            if free[i, j]:
-                numbers[i, j] = count
-                count += 1
-    return numbers
-
-
-@njit
-def neighbor_lists(
-    free: NDArray[np.bool_],  # [nx, ny]
-    numbers: NDArray[np.int32],  # [nx, ny]
-    moves: NDArray[np.int64],
-    step: float,  # [m]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Moves in compressed rows: starts ``[cells + 1]``, neighbors and lengths [m]."""
-    nx, ny = free.shape
-    # Two more cells on each side, none of them free, so that no move leads out of the grid.
-    wide = ny + 4
-    padded = np.zeros((nx + 4) * wide, np.bool_)
-    number_of = np.zeros((nx + 4) * wide, np.int32)
-    for i in range(nx):
-        for j in range(ny):
-            padded[(i + 2) * wide + j + 2] = free[i, j]
-            number_of[(i + 2) * wide + j + 2] = numbers[i, j]
-    to = moves[:, 0] * wide + moves[:, 1]
-    one, other = moves[:, 2] * wide + moves[:, 3], moves[:, 4] * wide + moves[:, 5]
-    steps = np.sqrt((moves[:, 0] ** 2 + moves[:, 1] ** 2).astype(np.float64)) * step
-    count = numbers.max() + 1
-    starts = np.zeros(count + 1, np.int32)
-    neighbors = np.empty(count * len(moves) + 1, np.int32)
-    lengths = np.empty(count * len(moves) + 1)
-    filled, cell = 0, 0
-    for at in range(len(padded)):
-        if padded[at]:
-            for k in range(len(moves)):
-                # Written in any case, and kept if the move is open: there is no branch to guess.
-                neighbors[filled] = number_of[at + to[k]]
-                lengths[filled] = steps[k]
-                filled += padded[at + to[k]] & padded[at + one[k]] & padded[at + other[k]]
-            cell += 1
-            starts[cell] = filled
-    return starts, neighbors[:filled], lengths[:filled]
-
-
-@njit
 def fill_from_nearest(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Give each infinite value the nearest finite one, ``[nx, ny]``."""
     # Two sweeps hand on where the nearest is, as in Danielsson's distance transform, which may be
