@@ -125,12 +125,12 @@ def sample_task_on_grid(
     )
 
 
-def has_task(grid: FreeGrid, *, min_goal_distance: float = 2.0) -> bool:
-    """Tell whether there is a start and a goal with a path between them."""
-    # It looks for a part of the free cells that hangs together and is wide enough in x or in y.
+def has_task(grid: FreeGrid) -> bool:
+    """Tell whether there is a start and a goal 2 m apart with a path between them."""
+    # That is a connected part of the free cells that is wide enough in x or in y.
     parts, _ = label(grid.free)
     parts = np.where(grid.clearance >= np.float32(_clearance(grid, None)), parts, 0)
-    steps = min_goal_distance / grid.resolution + 1.0
+    steps = 2.0 / grid.resolution + 1.0
     return any(
         place is not None and max(span.stop - span.start - 1 for span in place) > steps
         for place in find_objects(parts)

@@ -63,10 +63,6 @@ class Canvas:
         """Pixel of a position [m]."""
         return (x + self._left) * self._scale, (self._top - y) * self._scale
 
-    def length(self, meters: float) -> float:
-        """Pixels of a length [m]."""
-        return meters * self._scale
-
     def _draw_world(self, world: World) -> None:
         room = world.room
         self.rectangle(room.x_min, room.y_min, room.x_max, room.y_max, fill=FLOOR)
