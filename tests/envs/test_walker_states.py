@@ -43,7 +43,7 @@ def test_a_map_is_shown_no_walker_by_a_noisy_lidar_either() -> None:
     states = np.array([[[2.0, 0.5, 0.3, 0.0], [1.5, -1.0, 0.3, 0.0]]])
     batch.read({"states": states, "targets": np.zeros((1, 2), dtype=np.int64)}, [world])()
     lidar, rng, seen, met = Lidar(world, noise=0.1), np.random.default_rng(0), 0, 0
-    pose, motions, circles = (0.0, 0.0, 0.0), np.zeros((1, 5)), batch.circles(0)
+    pose, motions, circles = (0.0, 0.0, 0.0), np.zeros((1, 5)), batch.of(0)[:, [0, 1, 4]]
     hits = lidar.cast(*pose, moving=circles) < lidar.cast(*pose)
     for _ in range(50):
         ranges = lidar.measure(*pose, rng=rng, moving=circles)[None]

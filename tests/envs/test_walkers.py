@@ -196,7 +196,8 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
         for heading in np.linspace(-3.0, 3.0, 60):
             batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
             motions = np.array([[0.0, -1.0, heading, 0.0, 0.0]])
-            ranges = lidar.measure(*motions[0, :3], rng=rng, moving=batch.circles(0))[None]
+            circles = batch.of(0)[:, [0, 1, 4]]
+            ranges = lidar.measure(*motions[0, :3], rng=rng, moving=circles)[None]
             seen = batch.without(motions, lidar, ranges)
             hits += int((seen != ranges).sum())
             memory.remember(motions, np.array([[4.0, 4.0]]), seen)

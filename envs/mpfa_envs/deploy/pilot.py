@@ -256,20 +256,10 @@ class Pilot:
         *,
         scan_pose: tuple[float, float, float] | None = None,
     ) -> Command:
-        """Choose the speeds for the next :attr:`period`.
-
-        Args:
-            scan: As in :meth:`observe`.
-            pose: As there.
-            speeds: As there.
-            scan_pose: As there.
+        """Choose the speeds for the next :attr:`period`; arguments and errors as :meth:`observe`.
 
         Returns:
             The speeds.
-
-        Raises:
-            ScanError: If the scan does not tell the range of every sector.
-            ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
         action = self._network(self.observe(scan, pose, speeds, scan_pose=scan_pose)[None])[0]
         if not np.isfinite(action).all():

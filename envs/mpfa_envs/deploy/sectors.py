@@ -70,21 +70,9 @@ class Points(NamedTuple):
     met."""
 
     def seen_from(
-        self,
-        pose: tuple[float, ...],
-        taken: tuple[float, ...],
-        max_range: float,
+        self, pose: tuple[float, ...], taken: tuple[float, ...], max_range: float
     ) -> Points:
-        """Give the points that were met, around the robot's present pose.
-
-        Args:
-            pose: Where it is (x, y, heading) [m, m, rad].
-            taken: Where it was when it measured this.
-            max_range: Range at which nothing was met [m].
-
-        Returns:
-            The points that were met, in the robot's frame of now.
-        """
+        """The points that were met, seen from a pose in place of the one where they were taken."""
         met = self.ranges < max_range
         angles = self.angles[met] + taken[2]
         x = taken[0] - pose[0] + self.ranges[met] * np.cos(angles)

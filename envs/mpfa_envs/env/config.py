@@ -160,6 +160,11 @@ class TaskConfig:
         # They check what was given.
         _ = self.reward_function, self.observation_slices
 
+    @property
+    def action_time(self) -> float:
+        """Time for which an action is held [s]."""
+        return self.time_step * self.action_repeat
+
     def _set(self, name: str, value: Any) -> None:
         """Set a field of the frozen dataclass, before it is used."""
         object.__setattr__(self, name, value)

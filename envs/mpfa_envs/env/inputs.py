@@ -1,4 +1,4 @@
-"""Checks of what reset() and load_state_dict() are given, before anything changes."""
+"""Checks of what environments are given, before anything changes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,17 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 _KEYS: Final = ("reset_mask", "tasks", "worlds")
+
+
+def read_view(
+    metadata: Mapping[str, Any], render_mode: str | None, shown_for: float
+) -> dict[str, Any]:
+    """Check the render mode; the metadata for pictures that stand for so long in real time [s]."""
+    modes = metadata["render_modes"]
+    if render_mode not in (None, *modes):
+        names = " or ".join(map(repr, modes))
+        raise ValueError(f"render_mode must be None or {names}, got {render_mode!r}")
+    return {**metadata, "render_fps": max(round(1 / shown_for), 1)}
 
 
 def read_mask(name: str, mask: NDArray[np.bool_] | None, robots: int) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -10,7 +10,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from mpfa_envs.checks import check_seed
-from mpfa_envs.env.live_view import LiveView, RenderMode
+from mpfa_envs.env.inputs import read_view
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.sensing.observation import INFO_TYPES
 
@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 
     from mpfa_envs.env.config import TaskConfig
     from mpfa_envs.env.episodes import WorldChoice
+    from mpfa_envs.scene.window import Window
     from mpfa_envs.sensing.lidar import Lidar
     from mpfa_envs.worlds.task import Task
     from mpfa_envs.worlds.world import World
 
 
-class NavigationEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
+class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
     """A two-wheeled robot drives to goals by lidar, in one world or in new ones.
 
     It is a :class:`~mpfa_envs.VectorNavigationEnv` of one robot behind gymnasium's interface of
@@ -115,7 +116,7 @@ class NavigationEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.f
         self,
         *,
         world: WorldChoice = "A",
-        render_mode: RenderMode | None = None,
+        render_mode: Literal["human", "rgb_array"] | None = None,
         **kwargs: Any,
     ) -> None:
         self.robots = VectorNavigationEnv(
@@ -125,11 +126,13 @@ class NavigationEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.f
             **kwargs,
         )
         """The robot."""
-        self._set_view(render_mode, self.config.time_step * self.config.action_repeat)
+        self.metadata = read_view(self.metadata, render_mode, self.config.action_time)
+        self.render_mode = render_mode
         self.robots.render_mode = render_mode and "rgb_array"
         self.observation_space = self.robots.single_observation_space
         self.action_space = self.robots.single_action_space
         self._running = False
+        self._window: Window | None = None
 
     @property
     def config(self) -> TaskConfig:
@@ -247,12 +250,24 @@ class NavigationEnv(LiveView, gymnasium.Env["NDArray[np.float32]", "NDArray[np.f
             ResetNeeded: If no episode has started.
         """
         pictures = self.robots.render()
-        return None if pictures is None else self._show(pictures[0])
+        if pictures is None:
+            return None
+        if self.render_mode != "human":
+            return pictures[0]
+        if self._window is None:
+            # Imported here because it needs pygame.
+            from mpfa_envs.scene.window import Window
+
+            self._window = Window(type(self).__name__, fps=self.metadata["render_fps"])
+        self._window.show(pictures[0])
+        return None
 
     def close(self) -> None:
         """Release the physics server and the window; a second call does nothing."""
         self._running = False
-        self._close_window()
+        if self._window is not None:
+            self._window.close()
+            self._window = None
         self.robots.close()
 
 

@@ -160,19 +160,10 @@ class NavigationTorchEnv(EnvBase):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """Load a state of TorchRL's, which is empty in this class.
+        """Load a state of TorchRL's, which holds nothing of the robots, and warn if ``strict``.
 
         TorchRL's creators and collectors pass such states on without the observations that belong
         to them. The state of the robots is that of :attr:`env`.
-
-        Args:
-            state_dict: What ``state_dict()`` gave.
-            strict: Whether it must have all keys and no other, and to warn that the robots do not
-                move.
-            assign: Passed on to TorchRL.
-
-        Returns:
-            The keys that do not match.
         """
         if strict:
             warnings.warn(

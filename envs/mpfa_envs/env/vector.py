@@ -23,9 +23,9 @@ from mpfa_envs.env.inputs import (
     read_reset_mask,
     read_seed,
     read_tasks,
+    read_view,
     spawn_generators,
 )
-from mpfa_envs.env.live_view import LiveView
 from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.env.step_loops import outcomes
 from mpfa_envs.generators.resolve import resolve_world
@@ -41,9 +41,7 @@ _MASKS = tuple(f"_{name}" for name in INFO_TYPES)
 _INFO_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 
 
-class VectorNavigationEnv(
-    LiveView, VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]
-):
+class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]):
     """Many robots drive to goals by lidar, each in a world of its own and without the others.
 
     It is :class:`~mpfa_envs.NavigationEnv` N times, with the same observations, actions, rewards,
@@ -112,7 +110,8 @@ class VectorNavigationEnv(
         self.num_envs = check_count("num_envs", num_envs)
         self.config = TaskConfig(**task)
         """The settings of the task."""
-        self._set_view(render_mode, self.config.time_step * self.config.action_repeat)
+        self.metadata = read_view(self.metadata, render_mode, self.config.action_time)
+        self.render_mode = render_mode
         if autoreset_mode not in tuple(AutoresetMode):
             raise ValueError(
                 f"autoreset_mode must be a gymnasium.vector.AutoresetMode, got {autoreset_mode!r}"

@@ -139,7 +139,7 @@ def describe(policy: Policy, *, results: Sequence[Mapping[str, Any]] = ()) -> di
             "meaning": "left and right wheel, from min_wheel_speed at -1 to max_wheel_speed at 1",
         },
         "limits": {
-            "period": config.time_step * config.action_repeat,
+            "period": config.action_time,
             "goal_radius": config.goal_radius,
             "time_limit": config.time_step * config.max_steps,
             "linear_speed": [robot.min_wheel_speed, robot.max_wheel_speed],

@@ -80,10 +80,6 @@ class WalkerBatch:
             (self._arrays.states[index, :count], self._arrays.bodies[index, :count, :1]), axis=1
         )
 
-    def circles(self, index: int) -> NDArray[np.float64]:
-        """The same as circles (x, y, radius) [m], ``[K, 3]``."""
-        return self.of(index)[:, [0, 1, 4]]
-
     def clearance(self, index: int, x: float, y: float) -> float:
         """Distance from a point to the nearest walker of a robot [m]; infinite without one."""
         return float(nearest_walker(self._arrays, index, x, y))
