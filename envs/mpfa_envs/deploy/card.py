@@ -51,15 +51,15 @@ _ENTRIES: Final[Mapping[str, tuple[str, Callable[[str, Any], Any]]]] = {
     "env_arguments": ("env_arguments", lambda _, values: dict(values)),
     "training": ("training", lambda _, values: dict(values)),
 }
-"""Where the fields of a card are in its JSON file, and how they are read."""
+"""Entry of each field in the JSON file, and the check that reads it."""
 _LARGEST = 2**28
 """A file larger than this is no policy [bytes]."""
 _LARGEST_CARD = 2**24
-"""Nor is this one a card: what JSON holds may take fifty times the room [bytes]."""
+"""Nor is this one a card: parsed JSON may take fifty times its size [bytes]."""
 
 
 class CardError(ValueError):
-    """A policy, its card, or what a robot has do not fit; the message says what."""
+    """A policy, its card and a robot do not fit together; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def _read(path: Path, what: str, most: int) -> bytes:
 
 
 def check_finite(name: str, values: Any, size: int) -> tuple[float, ...]:
-    """Read so many finite numbers."""
+    """Read a number of finite numbers."""
     found = tuple(check_number(name, value) for value in values)
     if len(found) != size:
         raise ValueError(f"{name} must be {size} numbers, got {len(found)}")

@@ -22,7 +22,7 @@ class MapPath:
     """A square map around a place, of a side [m], and the path over it to the goal."""
 
     def __init__(self, card: Card, *, size: float) -> None:
-        # Without it the loops over the map would run, a thousand times too slowly.
+        # Without Numba the loops would run, but a thousand times more slowly.
         import_module("numba")
         # The rays come with each scan, and of the room only the size is known.
         lidar: Any = SimpleNamespace(angles=np.zeros(1), max_range=card.max_range)
@@ -34,7 +34,7 @@ class MapPath:
         self.sense((0.0, 0.0, 0.0), (1.0, 0.0), Points(np.zeros(1), np.ones(1)))
 
     def begin(self, center: tuple[float, float]) -> None:
-        """Forget all, and map around another place [m]."""
+        """Begin an empty map around a place [m]."""
         self._center[:] = center
         self._memory.begin(0, self._room)
 

@@ -27,7 +27,7 @@ class Network:
     """
 
     def __init__(self, content: bytes, observation_size: int, action_size: int) -> None:
-        # The key of each tensor that lies elsewhere, spelled out wherever in the file it is.
+        # The key that every tensor in another file has, found anywhere in the content.
         if b"location" in content:
             raise CardError("the network must hold its weights, and this one names another file")
         try:
@@ -36,7 +36,7 @@ class Network:
             needs = f"an exported policy needs onnxruntime ({error})"
             raise ImportError(f"{needs}: pip install 'torchrl-mpfa[onnx]'") from error
         options = onnxruntime.SessionOptions()
-        # More threads wait for one another longer than so small a network takes.
+        # For so small a network threads wait longer for each other than they compute.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         try:

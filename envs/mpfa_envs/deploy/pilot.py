@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from mpfa_envs.deploy.map_path import MapPath
 
 _WIDER: Final = 0.01
-"""By how much a robot may be wider than that of the training [m]."""
+"""A robot's radius may exceed that in training by this [m]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _BEYOND: Final = 0.02
-"""By what share of its speed range a wheel may be told to go beyond it."""
+"""Share of its speed range by which a wheel's command may exceed it."""
 
 
 class Command(NamedTuple):
@@ -147,7 +147,7 @@ class Pilot:
     def begin(
         self, goal: tuple[float, float], *, map_center: tuple[float, float] | None = None
     ) -> None:
-        """Set out for a goal, and forget what was seen before.
+        """Set out for a goal with an empty memory.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
@@ -167,7 +167,7 @@ class Pilot:
         self._goal = None
 
     def move_goal(self, goal: tuple[float, float]) -> None:
-        """Correct the goal while driving: what was seen is still true.
+        """Correct the goal while driving; the map is kept.
 
         Args:
             goal: Position (x, y) in the frame of the odometry [m].
@@ -302,7 +302,7 @@ def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:
-    """Two finite numbers, and none that the observation could not hold."""
+    """Two finite numbers within the range of observations."""
     x, y = check_finite(name, place, 2)
     if max(abs(x), abs(y)) > _FARTHEST:
         raise ValueError(f"{name} must be within {_FARTHEST:g} m of the origin, got {place}")

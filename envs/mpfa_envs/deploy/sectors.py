@@ -26,7 +26,7 @@ _TURNS = 1.05
 
 
 class ScanError(ValueError):
-    """A scan does not tell what the policy must know; the message says what is missing."""
+    """A scan lacks information that the policy needs; the message says which."""
 
 
 class Scan(NamedTuple):
@@ -205,7 +205,7 @@ class Sectors:
         turn = self.mount[2]
         directions = _wrapped(start + turn + step * np.arange(ranges.size, dtype=np.float64))
         valid = ranges >= least
-        # A lidar that is broken, or covered, is not one that meets nothing, whatever it reports.
+        # A broken or covered lidar does not mean free space, whatever it reports.
         if not valid.any():
             raise ScanError(f"none of the scan's {ranges.size} rays is valid")
         too_near = (ranges < least) & ((ranges > 0.0) | (ranges == -math.inf))
@@ -224,7 +224,7 @@ class Sectors:
         near: float,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Add near returns of earlier scans where a lidar has fallen silent since."""
-        # They keep their directions, so that reading a scan twice is reading it once.
+        # They keep their directions, so that a scan that is read twice gives the same twice.
         held_angles, held = self._near
         if held.size:
             off = np.abs(_wrapped(rays.directions - held_angles[:, None]))
@@ -239,14 +239,14 @@ class Sectors:
     def _around_center(
         self, angles: NDArray[np.float64], distances: NDArray[np.float64], missed: NDArray[np.bool_]
     ) -> Points:
-        """From the robot's center what the sensor has measured."""
+        """The sensor's measurements seen from the robot's center."""
         across, up, _ = self.mount
         far = self.card.max_range
         distances = np.where(missed, far, distances)
         if across or up:
             met_x = across + distances * np.cos(angles)
             met_y = up + distances * np.sin(angles)
-            # What met nothing is too far away to be seen in another direction from the center.
+            # A ray that met nothing has the same direction from the center.
             angles = np.where(missed, angles, np.arctan2(met_y, met_x))
             distances = np.where(missed, far, np.hypot(met_x, met_y))
         return Points(angles, np.minimum(distances, far))

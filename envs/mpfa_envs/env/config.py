@@ -38,12 +38,12 @@ PAPER_TASK: Final[Mapping[str, Any]] = MappingProxyType(
         "detour_chance": 0.0,
     }
 )
-"""Settings of the paper's task, for its TurtleBot2, where they are not the defaults.
+"""Settings of the paper's task, for its TurtleBot2, that differ from the defaults.
 
 The paper gives no ε_p; its curves, about 0.5 reward a step of 0.05 m at most, suggest 10 to 20.
 """
 _MOST_STEPS: Final = 1_000_000
-"""No episode has more time steps: a policy that never arrives must come to an end."""
+"""Most time steps of an episode."""
 _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
     "physics": partial(check_choice, kinds=Physics),
     "progress": partial(check_choice, kinds=Progress),
@@ -147,8 +147,8 @@ class TaskConfig:
                 f"min_goal_distance must be above goal_radius = {self.goal_radius}, "
                 f"got {self.min_goal_distance}"
             )
-        # Collisions are looked for at the ends of time steps. Of a robot that does not drive
-        # farther than the collision distance in one, the center cannot get into an obstacle before.
+        # Collisions are checked at the end of each time step. A robot that drives no farther than
+        # the collision distance in one cannot get its center into an obstacle in between.
         fastest = max(abs(robot.min_wheel_speed), abs(robot.max_wheel_speed))
         if self.time_step * fastest > self.collision_distance:
             raise ValueError(
@@ -157,7 +157,7 @@ class TaskConfig:
                 f"{self.collision_distance} m at its fastest, got {self.time_step}"
             )
         self._set("lidar", self._read_lidar())
-        # They check what was given.
+        # Building these checks the fields that they are made from.
         _ = self.reward_function, self.observation_slices
 
     @property
@@ -191,7 +191,7 @@ class TaskConfig:
             ) from error
 
     def make_noise(self, robots: int) -> NoisyMotion | None:
-        """Make what disturbs the motion of some robots, if anything does."""
+        """Make the errors of some robots' motion, if there are any."""
         if not self.noise.is_in_motion:
             return None
         base, step = self.robot.wheel_base, self.time_step
@@ -225,7 +225,7 @@ class TaskConfig:
         robot = asdict(self.robot)
         described["robot"] = robot.pop("name")
         described.update({f"robot.{name}": float(value) for name, value in robot.items()})
-        # None without, as states had it before there was any.
+        # Older states have None for no noise.
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
         described["reward"] = "a function of your own"
         if payments := payments_of(self.reward_function):

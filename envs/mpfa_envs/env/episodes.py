@@ -33,7 +33,7 @@ WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 GENERATED_DIAGONAL: Final = 50.0
 """No room of a generator is longer than this from corner to corner [m]."""
 _WORLDS: Final = 50
-"""Worlds of a generator that are tried before it is said to have no task."""
+"""Worlds of a generator that are tried before an error is raised."""
 
 
 class Episode(NamedTuple):
@@ -57,7 +57,7 @@ def _grid_of(world: World, distance: float) -> FreeGrid:
 
 
 _kept_grid_of = lru_cache(maxsize=4)(_grid_of)
-"""The same for worlds that stay; a grid takes some megabytes."""
+"""The same, cached for fixed worlds; a grid takes some megabytes."""
 
 
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
@@ -105,7 +105,7 @@ class EpisodeSource:
         fixed = [] if self._generator else _resolve_worlds(world)
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
-        # A task of each world, or the lack of one, shows before anything runs.
+        # A world without any task fails here, before anything runs.
         rng = np.random.default_rng(0)
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
         self.diagonal = GENERATED_DIAGONAL
@@ -154,7 +154,7 @@ class EpisodeSource:
         return episode
 
     def forget(self, robot: int) -> None:
-        """Let the next episode of a robot be in a new world, as after a seed."""
+        """Have the next episode of a robot in a new world, as after a seed."""
         self._left[robot] = 0
 
     def fixed(self, robot: int) -> World | None:
@@ -265,7 +265,7 @@ class EpisodeSource:
         return Episode(world, task, length, field, start_walkers(world, task.start[:2], rng))
 
     def _sample_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
-        """Sample an episode over the cells of a grid, in milliseconds however full the world is."""
+        """Sample an episode over the cells of a grid, in milliseconds even in crowded worlds."""
         config = self._config
         task, field = sample_task_on_grid(
             (_grid_of if self._generator else _kept_grid_of)(world, config.collision_distance),
@@ -296,7 +296,7 @@ def _generator_of(world: object) -> str | None:
 
 
 def _resolve_worlds(world: WorldChoice | Sequence[WorldChoice]) -> list[World]:
-    """The fixed worlds that are meant."""
+    """Look up the fixed worlds."""
     if isinstance(world, Sequence) and not isinstance(world, str):
         if not world:
             raise ValueError("world must hold at least one world, got an empty sequence")

@@ -58,7 +58,7 @@ def read_tasks(
     robots: int,
     source: EpisodeSource,
 ) -> list[tuple[World, Task | None] | None]:
-    """World and task for each robot: None where nothing is fixed, no task for a world alone."""
+    """World and task given for each robot: None where neither is, no task where only a world is."""
     worlds, tasks = (_read_list(options, key, robots) for key in ("worlds", "tasks"))
     found: list[tuple[World, Task | None] | None] = []
     for robot, (choice, task) in enumerate(zip(worlds, tasks, strict=True)):
@@ -93,7 +93,7 @@ def _read_list(options: Mapping[str, Any] | None, key: str, robots: int) -> Sequ
 def read_seed(
     seed: int | Sequence[int | None] | None, robots: int
 ) -> Sequence[np.random.Generator | None]:
-    """A source of randomness for each robot; None where the old one goes on."""
+    """A generator for each robot; None where the present one is kept."""
     if seed is None:
         return [None] * robots
     if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
@@ -105,7 +105,7 @@ def read_seed(
 
 
 def spawn_generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:
-    """A source of randomness for each robot that does not depend on how many there are."""
+    """A generator for each robot that does not depend on the number of robots."""
     return [np.random.default_rng(child) for child in sequence.spawn(robots)]
 
 
@@ -120,7 +120,7 @@ def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]
         )
     found = state["arguments"]
     for name, value in expected.items():
-        # States did not always describe all of them.
+        # Older states describe fewer of them.
         if name in found and found[name] != value:
             raise ValueError(
                 f"state must be of an environment with {name} = {value!r}, got one with "
@@ -130,7 +130,7 @@ def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]
 
 
 def read_generators(states: object, robots: int, *, begun: bool) -> list[np.random.Generator]:
-    """Make each robot's source of randomness again; before the first reset there may be none."""
+    """Restore each robot's generator; before the first reset there may be none."""
     counts = (robots,) if begun else (0, robots)
     if not isinstance(states, Sequence) or len(states) not in counts:
         raise ValueError(f"rngs of the state must have {robots} entries, got {states!r}")

@@ -141,12 +141,12 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
 
     @property
     def lidar(self) -> Lidar:
-        """The robot's lidar, in the world that it is in."""
+        """The robot's lidar, in its present world."""
         return self.config.make_lidar(self.world)
 
     @property
     def world(self) -> World:
-        """The world that the robot is in."""
+        """The robot's present world."""
         return self.robots.worlds[0]
 
     @property

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 _TRAIL = 500
-"""Time steps that there is room for at first."""
+"""Time steps that trails have room for at first."""
 _NO_PATHS = np.zeros((0, 3))
 
 
@@ -61,7 +61,7 @@ class RobotBatch:
         self.tasks: list[Task | None] = [None] * count
         """Start and goal of each robot's episode; None before the first."""
         self.worlds = WorldBatch(worlds)
-        """The world that each robot is in."""
+        """The present world of each robot."""
         self.walkers = WalkerBatch(
             self.worlds, radius=config.robot.radius, time_step=config.time_step
         )
@@ -84,14 +84,14 @@ class RobotBatch:
         self.ranges = np.zeros((count, lidar.angles.size))
         """Range of each ray [m], ``[N, rays]``."""
         self.memory = MapMemory(count, config.robot, lidar) if config.memory == "map" else None
-        """The maps that they make, if they make any."""
+        """The robots' maps, if they have any."""
         width = max(part.stop for part in config.observation_slices.values())
         self.observations = np.zeros((count, width), dtype=np.float32)
         """The last observations, ``[N, O]``."""
         self.drives = make_drives(config.physics, config.robot, count, time_step=config.time_step)
         """The physics."""
         self.noise = config.make_noise(count)
-        """Errors of their motion, if there are any."""
+        """Errors of the robots' motion, if there are any."""
         self._held = np.zeros((len(NUMBERS), count))
         robot = config.robot
         self._lengths = (
@@ -214,7 +214,7 @@ class RobotBatch:
         starts[:, 2] = [math.remainder(heading, math.tau) for heading in starts[:, 2]]
         load_walkers = self.walkers.read(state.get("walkers", {}), worlds)
         load_drives = self.drives.read(state.get("drives", {}), starts)
-        # The compiled loops write a trail at the number of its steps.
+        # The compiled loops use the number of steps as an index, unchecked.
         steps, most = values["steps"], self._config.max_steps
         if steps.min() < 0 or steps.max() > most:
             raise ValueError(f"steps of the state must be in [0, {most}], got {steps.tolist()}")
@@ -233,9 +233,9 @@ class RobotBatch:
         load_drives()
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays that a robot's episode is in, by name."""
+        """The arrays of the episodes by name."""
         return {
-            # Saved states have the name that the remaining paths had first.
+            # The name in saved states.
             **{"ways" if n == "remaining" else n: a for n, a in self.episodes._asdict().items()},
             "running": self.running,
             "observations": self.observations,
@@ -244,7 +244,7 @@ class RobotBatch:
         }
 
     def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
-        """Add what a reward of the user's gives, robot by robot."""
+        """Add the rewards of the user's function, robot by robot."""
         episodes = self.episodes
         for index in np.flatnonzero(running).tolist():
             outcome = StepOutcome(
@@ -288,7 +288,7 @@ class RobotBatch:
         )
 
     def _by_odometry(self) -> EpisodeArrays:
-        """The episodes with the poses, speeds and distances that the robots hold to be true."""
+        """The episodes with poses, speeds and distances by the robots' odometry."""
         if self.noise is None or not self.noise.has_odometry:
             return self.episodes
         motions = self.noise.odometry

@@ -86,7 +86,7 @@ class NavigationTorchEnv(EnvBase):
         batch_size = torch.Size([] if num_envs is None else [env.num_envs])
         super().__init__(device=device, batch_size=batch_size)
         self.env = env
-        """The robots, in the order of the batch."""
+        """The robots in the order of the batch."""
         self._flag_names = [name for name in FLAGS if name in keys]
         self._number_names = [name for name in NUMBERS if name in keys]
         self._flag_rows = [FLAGS.index(name) for name in self._flag_names]
@@ -200,7 +200,7 @@ class NavigationTorchEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach().cpu().numpy()
-        # A rollout that waits for the last episode of a batch masks those that are over.
+        # A rollout that waits for the last episode of a batch masks the ended ones.
         observations, rewards, terminated, truncated, _ = self.env.step(
             actions.reshape(self.env.num_envs, 2), only=self._mask(tensordict, "_step")
         )
@@ -213,12 +213,12 @@ class NavigationTorchEnv(EnvBase):
         )
 
     def _pack(self, observations: NDArray[np.float32], **entries: torch.Tensor) -> TensorDictBase:
-        """Build what a reset gives, and with further entries what a step gives."""
+        """Build the output of a reset, or with further entries of a step."""
         shape = (*self.batch_size, observations.shape[1])
         rows: dict[str, Any] = {"observation": self._to_device(observations).view(shape), **entries}
         if self._number_rows or self._flag_rows:
             flags, numbers = self.env.info_tables
-            # Two tensors are made and cut, as making one costs more than all else.
+            # Two tensors, split into entries: creating a tensor costs more than anything else here.
             numbers = numbers[self._number_rows].astype(np.float32)
             info = dict(zip(self._number_names, self._tensor(numbers).unbind(), strict=True))
             flags = flags[self._flag_rows]

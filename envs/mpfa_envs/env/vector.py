@@ -42,7 +42,7 @@ _INFO_KEYS = (*FLAGS, *NUMBERS, *_MASKS)
 
 
 class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[Any]"]):
-    """Many robots drive to goals by lidar, each in a world of its own and without the others.
+    """Many robots drive to goals by lidar, each in its own world and without the others.
 
     It is :class:`~mpfa_envs.NavigationEnv` N times, with the same observations, actions, rewards,
     ends and infos, and a robot drives the same trajectory in it; but compiled loops move, sense and
@@ -142,7 +142,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
     @property
     def worlds(self) -> list[World]:
-        """The world that each robot is in."""
+        """The present world of each robot."""
         return list(self._batch.worlds)
 
     @property

@@ -1,4 +1,4 @@
-"""Trained policies as ONNX files, with a card that says all that a robot must know."""
+"""Trained policies as ONNX files, with a card that has all that a robot needs."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def onnx_content(layers: Sequence[Layer], observation_size: int, *, quantize: bo
 
 
 class _Graph:
-    """Nodes one after the other, and their weights."""
+    """A chain of nodes and their weights."""
 
     def __init__(self, precision: type[np.float32] | type[np.float64]) -> None:
         from onnx import TensorProto
@@ -197,14 +197,14 @@ class _Graph:
         self.size = 0
 
     def add(self, operator: str, *inputs: str, **attributes: Any) -> None:
-        """A node; what it gives is :attr:`last`."""
+        """Add a node, whose output becomes :attr:`last`."""
         from onnx import helper
 
         self.last = f"{operator.lower()}{len(self.nodes)}"
         self.nodes.append(helper.make_node(operator, inputs, [self.last], **attributes))
 
     def weight(self, values: NDArray[Any]) -> str:
-        """Keep a weight; its name."""
+        """Add a weight, and return its name."""
         from onnx import numpy_helper
 
         name = f"weight{len(self.weights)}"
@@ -213,7 +213,7 @@ class _Graph:
         return name
 
     def add_layer(self, layer: Layer) -> None:
-        """The nodes of a layer."""
+        """Add the nodes of a layer."""
         if isinstance(layer, Linear):
             self.add("MatMul", self.last, self.weight(layer.weight.T))
             self.add("Add", self.last, self.weight(layer.bias))
@@ -240,7 +240,7 @@ def _quantized(model: Any) -> bytes:
 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "quantized.onnx"
-        # It recommends steps for other networks than these.
+        # Its recommendations do not apply to these networks.
         logging.disable(logging.WARNING)
         try:
             quantize_dynamic(model, file, weight_type=QuantType.QInt8)

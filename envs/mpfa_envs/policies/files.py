@@ -25,7 +25,7 @@ FILE_NAME: Final = "policy.npz"
 """Name of the file in the folder of a run."""
 _FORMAT: Final = 1
 _ABOUT: Final = "about"
-"""The entry with all that is not a weight: JSON as bytes."""
+"""The entry with everything but the weights: JSON as bytes."""
 _LARGEST: Final = 2**28
 """A file that unpacks to more than this is no policy [bytes]."""
 
@@ -162,7 +162,7 @@ class OnnxPolicy(Policy):
         self.env_arguments: dict[str, Any] = dict(card.env_arguments)
 
     def _choose(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        # One at a time: a quantized network finds its scales in all rows that it is given.
+        # One at a time: a quantized network takes its scales from all rows of a call.
         actions = [self._network(row[None]) for row in rows]
         return np.concatenate(actions or [np.empty((0, self.action_size), np.float32)])
 

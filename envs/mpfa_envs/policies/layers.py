@@ -1,4 +1,4 @@
-"""Layers of a trained network in NumPy, so that a policy runs where there is no PyTorch."""
+"""Layers of a trained network in NumPy, so that a policy runs without PyTorch."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def from_torch(modules: Iterable[Any]) -> list[Layer]:
 
 
 def _scale(module: Any, before: Sequence[Layer]) -> Scale:
-    """Read an affine map from what it makes of actions in [-1, 1]."""
+    """Read an affine map from its values at actions in [-1, 1]."""
     import torch
 
     linear = [layer for layer in before if isinstance(layer, Linear)]

@@ -103,7 +103,7 @@ class Policy:
 
     def _choose(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         """From ``[N, O]`` to ``[N, A]``."""
-        # Always as many rows at once: a matrix product of another height adds in another order.
+        # Always the same number of rows: products of other heights add in another order.
         padding = -len(rows) % _BLOCK
         padded = np.pad(rows.astype(np.float64), ((0, padding), (0, 0)))
         blocks = padded.reshape(-1, _BLOCK, self.observation_size)

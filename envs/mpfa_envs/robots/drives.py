@@ -73,8 +73,8 @@ class WheelDrives(Drives):
     """Moves robots by PyBullet: motors turn the wheels, friction moves the robot."""
 
     # Up to 32 robots have a physics server each and drive the same bits as alone. A server takes 35
-    # MB; more robots therefore share 32 of them, where they pass through each other. There
-    # PyBullet's solver stops at other last digits, and trajectories part slowly.
+    # MB, so more robots share 32 of them and pass through each other. There PyBullet's solver
+    # stops at other last digits, and trajectories diverge slowly.
 
     def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
         # Imported here so that kinematic environments run without PyBullet.
@@ -127,14 +127,14 @@ class WheelDrives(Drives):
             motions[index] = x, y, heading, forward, turn
 
     def _remember(self, running: NDArray[np.bool_], speeds: NDArray[np.float64]) -> None:
-        """Keep what the robots have driven since the start of their episodes."""
+        """Record the wheel speeds since the start of the episodes."""
         if self._counts.max() == self._driven.shape[1]:
             self._driven = grown(self._driven, 2 * self._driven.shape[1])
         self._driven[running, self._counts[running]] = speeds[running]
         self._counts[running] += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """The wheel speeds of the episodes so far: the engine cannot save all that it knows."""
+        """The wheel speeds of the episodes so far: the engine cannot save its whole state."""
         counts = self._counts.copy()
         return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
 
@@ -169,7 +169,7 @@ class WheelDrives(Drives):
 
 
 def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:
-    """Make the drives that a name stands for."""
+    """Make the drives of a kind of physics."""
     if physics == "kinematic":
         return KinematicDrives(robot, time_step=time_step)
     return WheelDrives(robot, robots, time_step=time_step)

@@ -129,7 +129,7 @@ class RobotModel:
         Returns:
             An URDF document with the links ``base``, ``left_wheel`` and ``right_wheel``.
         """
-        # A body nearer to the floor than 2 cm would be given contacts with it, which cost time.
+        # The engine makes contacts, which cost time, with a body less than 2 cm above the floor.
         clearance = self.wheel_radius
         body = self.height - clearance
         caster = 0.5 * self.wheel_radius
@@ -144,7 +144,7 @@ class RobotModel:
         disc = f'<cylinder radius="{self.radius}" length="{body}"/>'
         ball = f'<sphere radius="{caster}"/>'
         middle = (0.0, 0.0, clearance + body / 2)
-        # Half a millimeter above the floor, or they would carry the robot and the wheels spin.
+        # Half a millimeter above the floor, or they would carry the robot while the wheels spin.
         lift = caster + 0.0005
         front, rear = (0.8 * self.radius, 0.0, lift), (-0.8 * self.radius, 0.0, lift)
         parts = [
@@ -188,7 +188,7 @@ def _shape(use: str, geometry: str, at: tuple[float, float, float], look: str = 
 
 
 def _escape(text: str) -> str:
-    """Make a name fit for an XML attribute."""
+    """Escape a name for an XML attribute."""
     return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
 
 
@@ -203,7 +203,7 @@ ROBOTS: Final[Mapping[str, RobotModel]] = {
         "turtlebot4": (0.175, 0.351, 3.9, 0.233, 0.03575, 0.031, 0.306),
     }.items()
 }
-"""The robots that have a name. As for the TurtleBot2, no wheel stops or turns backwards."""
+"""The robots known by name. As on the TurtleBot2, no wheel stops or turns backwards."""
 
 
 def resolve_robot(robot: str | RobotModel) -> RobotModel:

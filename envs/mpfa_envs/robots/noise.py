@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MOST_SLIP = 0.45
-"""Above this mean a wheel could lose nearly all of its path."""
+"""At a larger mean a wheel could lose nearly all of its path."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotNoise:
-    """Errors as a robot has them; none by default.
+    """Errors of a real robot; none by default.
 
-    The task is judged by where the robot is: success, collision, reward and info know no errors.
+    The task is judged by true positions: success, collision, reward and info have no errors.
 
     Args:
         range_noise: Standard deviation of the Gaussian error of each ray of the lidar [m].
@@ -79,7 +79,7 @@ class RobotNoise:
 
     @property
     def is_in_motion(self) -> bool:
-        """Whether there is more than noise of the lidar."""
+        """Whether more than the lidar is noisy."""
         return self.slip > 0.0 or self.latency > 0 or self.drift > 0.0
 
 
@@ -98,7 +98,7 @@ def resolve_noise(noise: RobotNoise | Mapping[str, Any] | None) -> RobotNoise:
 
 
 class NoisyMotion:
-    """The late and slipping wheels of many robots, and where their odometry holds them to be."""
+    """Latency and slip of many robots' wheels, and their odometry."""
 
     def __init__(
         self, noise: RobotNoise, robots: int, *, wheel_base: float, time_step: float
@@ -107,7 +107,7 @@ class NoisyMotion:
         self._wheel_base = wheel_base
         self._time_step = time_step
         self.has_odometry = noise.slip > 0.0 or noise.drift > 0.0
-        """Whether robots may be wrong about where they are."""
+        """Whether odometry may differ from the true poses."""
         self._commands = np.zeros((robots, noise.latency + 1, 2))
         self._kept = np.ones((robots, 2))
         self._scales = np.ones((robots, 2))
@@ -141,13 +141,13 @@ class NoisyMotion:
         return due * self._kept
 
     def measure(self, motions: NDArray[np.float64], running: NDArray[np.bool_]) -> None:
-        """Let odometry follow a time step to motions ``[N, 5]``."""
+        """Update the odometry after a time step to motions ``[N, 5]``."""
         if not self.has_odometry:
             return
         before, now = self._poses[running], motions[running, :3]
         turned = _wrapped(now[:, 2] - before[:, 2])
         driven = _arc(now[:, :2] - before[:, :2], before[:, 2], turned)
-        # What the wheels have turned: what they have driven, and what they have lost.
+        # The paths that the wheels have turned: those driven and those lost.
         across = 0.5 * turned * self._wheel_base
         left, right = (np.stack((driven - across, driven + across), axis=1) / self._kept[running]).T
         driven = 0.5 * (left + right) * self._scales[running, 0]
@@ -163,7 +163,7 @@ class NoisyMotion:
         self._poses[running] = now
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """All that it knows, by name; to be changed in place."""
+        """The arrays of its state by name, changed in place."""
         return {
             "noise_commands": self._commands,
             "noise_kept": self._kept,
@@ -181,7 +181,7 @@ def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 def _arc(
     steps: NDArray[np.float64], headings: NDArray[np.float64], turned: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Lengths of the arcs that lead to places ``[N, 2]`` [m], negative if backwards, ``[N]``."""
+    """Lengths of the arcs along steps ``[N, 2]`` [m], negative if backwards, ``[N]``."""
     middle = headings + 0.5 * turned
     chord = steps[:, 0] * np.cos(middle) + steps[:, 1] * np.sin(middle)
     return chord / np.sinc(0.5 * turned / np.pi)

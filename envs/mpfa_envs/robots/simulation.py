@@ -29,7 +29,7 @@ _MOTOR_TORQUE = 3.0
 
 
 class Simulation:
-    """A PyBullet server with a floor and robots that have names, apart from other servers."""
+    """A PyBullet server with a floor and named robots, independent of other servers."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class Simulation:
             )
 
     def place_robot(self, x: float, y: float, heading: float, *, name: str = "robot") -> None:
-        """Put a robot at rest at a pose [m, m, rad], without traces of earlier motion."""
+        """Put a robot at rest at a pose [m, m, rad], without any trace of earlier motion."""
         body, server = self.bodies[name], self._server
         for wheel in self._wheels[name]:
             server.resetJointState(body, wheel, 0.0, 0.0)
@@ -149,7 +149,7 @@ class Simulation:
 
 
 class _Server:
-    """PyBullet's functions for a server of its own."""
+    """A new PyBullet server, and PyBullet's functions bound to it."""
 
     def __init__(self) -> None:
         self.number: int = pybullet.connect(pybullet.DIRECT)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mpfa_envs.deploy.sectors import Scan
 
 _EARLY: Final = 0.2
-"""By how much of its period a decision may come early: scans do not come like clockwork."""
+"""Share of its period by which a decision may come early, as scans are irregular."""
 
 
 class Order(NamedTuple):
@@ -65,7 +65,7 @@ class Controller:
         self._told = True
 
     def see(self, scan: Scan, time: float) -> None:
-        """Take a scan of some time [s]."""
+        """Take a scan and its time [s]."""
         self._sight.take(scan, time, self._track)
 
     def feel(
@@ -80,7 +80,7 @@ class Controller:
         """Set out for a goal (x, y) in the odometry's frame [m], or stop for a reason."""
         self._command, self._told = None, False
         self._idle, self._held = reason, ""
-        # Where the goal is, is meant by the odometry from now on.
+        # The goal is in the frame of the odometry from now on.
         self._track.forget()
         self._sight.forget()
         self.pilot.stop()
@@ -99,11 +99,11 @@ class Controller:
                 self.aim(None, str(error))
 
     def hold(self, reason: str) -> None:
-        """Stand still for a reason known elsewhere, until it is empty or the goal is new."""
+        """Stand still for a reason from outside, until it is empty or the goal is new."""
         self._held = reason
 
     def tick(self, now: float) -> Order | None:
-        """The order to publish at a time [s], if any; to be called some times a second."""
+        """The order to publish at a time [s], if any; call it several times a second."""
         order = self._choose(now)
         self._ordered = 0.0 if order is None else order.linear
         return order
@@ -129,7 +129,7 @@ class Controller:
             return self._choose(now)
         try:
             order = self._drive(seen, felt, now)
-        # Whatever the policy raises: who cannot decide once is not asked again.
+        # Whatever the policy raises: a policy that has failed is not asked again.
         except Exception as error:
             self.aim(None, str(error) if isinstance(error, ValueError) else f"failed: {error!r}")
             return self._choose(now)

@@ -1,4 +1,4 @@
-"""The last scan and the odometry of the last second, and which of them cannot be true."""
+"""The last scan and the odometry of the last second, checked for what cannot be true."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Pose = tuple[float, float, float]
 _AHEAD: Final = 0.15
-"""By how much a stamp may be ahead of the clock [s]: simulated clocks tick some tenths late."""
+"""A stamp may be ahead of the clock by this [s]: simulated clocks tick some tenths late."""
 _MEMORY: Final = 1.0
 """Time for which odometry is kept [s], unless the timeout of scans is longer."""
 _SLACK: Final = 0.2, 0.5
@@ -25,9 +25,9 @@ _SLACK: Final = 0.2, 0.5
 _MOVED: Final = 0.05, 0.1
 """A robot that has come this far, or has turned by this, sees something else [m, rad]."""
 _LAG: Final = 0.25
-"""By how much odometry may lag behind the scans, and a robot seem to drive that stands [s]."""
+"""Odometry may lag behind the scans by this, and show a standing robot as driving [s]."""
 _PUSHED: Final = 0.5
-"""Of how far a robot is told to drive, it has moved before this [m]."""
+"""A robot that was told to drive this far must have moved [m]."""
 _GAP: Final = 0.5
 """Longest time between two odometries that counts [s]."""
 
@@ -68,7 +68,7 @@ class Sight:
         self._from: Pose | None = None
 
     def take(self, scan: Scan, time: float, track: Track) -> None:
-        """Take a scan of some time [s]."""
+        """Take a scan and its time [s]."""
         try:
             self._sectors.read(scan)
             points = self._sectors.around(scan)
@@ -86,7 +86,7 @@ class Sight:
         self.last = Seen(scan, when, ahead, behind, fault, repeated)
 
     def forget(self) -> None:
-        """The odometry may be another one from now on."""
+        """Stop comparing with earlier odometry."""
         self._from = None
 
     def missing(self, now: float, timeout: float) -> str:
@@ -101,7 +101,7 @@ class Sight:
     def _repeats(self, scan: Scan, time: float, points: Points, track: Track) -> bool:
         """Whether the robot has moved since the first scan with these numbers."""
         # Where nothing is in reach, scans are alike.
-        # A copy: who reuses an array does not repeat a scan.
+        # A copy, as the caller may reuse the array.
         ranges = np.array(scan.ranges, dtype=np.float64)
         met = bool((points.ranges < self._sectors.card.max_range).any())
         if not met or not np.array_equal(ranges, self._ranges, equal_nan=True):
@@ -164,7 +164,7 @@ class Track:
         return lost
 
     def forget(self) -> None:
-        """Poses are compared with the next one, and not with those until now."""
+        """Stop comparing with earlier poses."""
         self._past.clear()
         self._pushed, self._from = 0.0, None
 

@@ -1,4 +1,4 @@
-"""The ROS 2 node of a policy: messages in and out, all else is :class:`Controller`'s."""
+"""The ROS 2 node of a policy: messages in and out, all else is in :class:`Controller`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "goal_topic": "goal_pose",
     "command_topic": "cmd_vel",
 }
-"""The parameters with their defaults; docs/robot.md tells what they are."""
+"""The parameters with their defaults; docs/robot.md explains them."""
 
 
 class PolicyNode(Node):
@@ -139,7 +139,7 @@ class PolicyNode(Node):
             self._waits = ""
 
     def _in_odometry(self, place: tuple[float, float], frame: str) -> tuple[float, float]:
-        """A place of another frame in that of the odometry."""
+        """Transform a place of another frame into that of the odometry."""
         if frame in ("", self._odometry_frame):
             return place
         if self._transforms is None:
@@ -155,7 +155,7 @@ class PolicyNode(Node):
         return transformed(place, found.transform)
 
     def _correct(self) -> None:
-        """The goal by the newest transform; an old one keeps the robot from driving."""
+        """Update the goal by the newest transform; an old one keeps the robot from driving."""
         if self._goal is None or self._goal[1] in ("", self._odometry_frame):
             return
         try:
@@ -217,7 +217,7 @@ def main() -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     hangup = getattr(signal, "SIGHUP", None)
-    # Who has it ignored wants the node to outlive the terminal.
+    # A user who ignores the signal wants the node to outlive the terminal.
     if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
         signal.signal(hangup, signal.default_int_handler)
     node = PolicyNode()
@@ -226,7 +226,7 @@ def main() -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        # Where this fails nothing can be published, and why the node ends is to be told.
+        # If this fails nothing can be published, and the first error must be seen.
         with suppress(Exception):
             node.stop()
         node.destroy_node()

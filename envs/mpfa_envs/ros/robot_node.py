@@ -1,4 +1,4 @@
-"""The ROS 2 node of a simulated robot: messages in and out, all else is its class's."""
+"""The ROS 2 node of a simulated robot: messages in and out, the rest in :class:`SimulatedRobot`."""
 
 from __future__ import annotations
 

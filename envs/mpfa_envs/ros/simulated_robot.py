@@ -1,4 +1,4 @@
-"""A robot in a simulated world as the outside of a real one: it obeys speeds, and measures."""
+"""A simulated robot with the interface of a real one: speeds in, measurements out."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class SimulatedRobot:
 
     def step(self) -> None:
         """Drive for a time step."""
-        # A sum of steps is no more exact than this.
+        # Sums of time steps are rounded.
         fresh = self.time - self._told_at <= self._timeout + 1e-9
         linear, angular = self._told if fresh else (0.0, 0.0)
         turn, fastest = 0.5 * angular * self.robot.wheel_base, self.robot.max_wheel_speed

@@ -1,4 +1,4 @@
-"""The observation as one number: which cell of a grid over a few of its features it lies in."""
+"""The observation as one number: its cell in a grid over a few of its features."""
 
 from __future__ import annotations
 

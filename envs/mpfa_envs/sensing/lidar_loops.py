@@ -1,4 +1,4 @@
-"""Lidar of many robots: each shape is met only by the rays that point at it.
+"""Lidar of many robots: each shape is intersected only with the rays that point at it.
 
 A room has tens or hundreds of shapes, and most are seen by a few rays or by none. The directions of
 a shape's two outermost points give the rays between them; only these are intersected with it, by
@@ -51,7 +51,7 @@ def cast_rays(
         inside = False
         boxes, circles = worlds.boxes[robot], worlds.circles[robot]
         for index in range(worlds.counts[robot, 0]):
-            # Plain numbers: a view of a row would cost more than what is done with it.
+            # Plain numbers: making a view of a row would cost more than the work on it.
             x0, y0, x1, y1 = boxes[index, 0], boxes[index, 1], boxes[index, 2], boxes[index, 3]
             inside |= _cast_at_box(x0 - x, y0 - y, x1 - x, y1 - y, ahead, view, reach, beams, row)
         for index in range(worlds.counts[robot, 1]):

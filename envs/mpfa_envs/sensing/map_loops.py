@@ -1,4 +1,4 @@
-"""Maps that robots make of what their lidar hit, and the paths to the goal on them."""
+"""Maps that robots make of their lidar's hits, and the paths to the goal on them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ FACTORS: Final = np.array((1, 3, 30), dtype=np.int64)
 """Cost of a step in a free cell, one near an obstacle and a blocked one. None is infinite: a
 robot may stand where it should not, and where all paths are blocked it goes on looking."""
 STRAIGHT: Final = 10
-"""Length of a step to the cell beside."""
+"""Length of a straight step."""
 DIAGONAL: Final = 14
-"""Length of a step over a corner."""
+"""Length of a diagonal step."""
 UNKNOWN: Final = int(np.iinfo(np.int32).max)
-"""Cost of a cell to which no path was looked for."""
+"""Cost of a cell without a known path."""
 _RING: Final = 512
 """More than the costliest step."""
 _NEXT_CELLS: Final = 20
@@ -133,8 +133,8 @@ def _step_cost(levels: NDArray[np.uint8], i: int, j: int, move: int) -> int:
 
 @njit
 def _costs_the_same(levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int, j: int) -> bool:
-    """Tell whether the path from a cell still costs what it did when it was found."""
-    # It is the cheapest then: what is seen makes other paths costlier, and none cheaper.
+    """Tell whether the path from a cell still has the cost at which it was found."""
+    # It is still the cheapest then: new hits make paths costlier, never cheaper.
     cells = follow_path(levels, costs, i, j)
     if len(cells) > 0:
         i, j = cells[-1, 0], cells[-1, 1]

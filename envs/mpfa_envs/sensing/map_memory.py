@@ -1,4 +1,4 @@
-"""A robot's memory: a map of what its lidar hit, and the path to the goal that it leaves."""
+"""A robot's memory: a map of its lidar's hits, and the path to the goal on it."""
 
 from __future__ import annotations
 
@@ -50,8 +50,7 @@ class MapMemory:
     times, found again whenever a scan makes it costlier. Its direction is that of the farthest of
     its next cells, two meters away at most, to which a straight line is no narrower than its ends.
 
-    It holds what the lidar told and where the robot was, as odometry gives it, and nothing else of
-    the room.
+    It knows of the room only the scans, entered at the poses that odometry gives.
 
     Args:
         count: Number of robots N.
@@ -84,7 +83,7 @@ class MapMemory:
         self._lengths = RESOLUTION, robot.radius + _BLOCKED, robot.radius + _NEAR, lidar.max_range
 
     def begin(self, index: int, world: World) -> None:
-        """Forget what a robot has seen.
+        """Clear a robot's map.
 
         Args:
             index: Number of the robot.

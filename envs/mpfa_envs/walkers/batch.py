@@ -55,11 +55,11 @@ class WalkerBatch:
         """Worlds of the robots around which walkers avoid others, by robot."""
 
     def begin(self, index: int, starts: WalkerStarts) -> None:
-        """Put the walkers of a robot's world where they start."""
+        """Put the walkers of a robot's world at their starts."""
         self._set(index, self._worlds[index], starts)
 
     def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
-        """Let walkers walk for one time step."""
+        """Move the walkers for one time step."""
         for index, room in self._rooms.items():
             if running[index]:
                 count = self._arrays.counts[index]
@@ -90,14 +90,14 @@ class WalkerBatch:
         running: NDArray[np.bool_],  # [N]
         counts: NDArray[np.float64],  # Gap [m], time near, to collision [s], [3, N]
     ) -> None:
-        """Take in how near the walkers are to robots that have moved."""
+        """Update the encounters with walkers of the robots that have moved."""
         if self.present:
             count_encounters(self._arrays, motions, running, self._radius, self._time_step, counts)
 
     def without(
         self, motions: NDArray[np.float64], lidar: Lidar, ranges: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Ranges [m], ``[N, rays]``, in which the rays that met a walker have met nothing."""
+        """Ranges [m], ``[N, rays]``, where rays that met a walker report the maximum."""
         if not self.present:
             return ranges
         seen = ranges.copy()
@@ -120,7 +120,7 @@ class WalkerBatch:
         targets = read_array(state, "targets", np.zeros((len(worlds), *most), dtype=np.int64))
         for world, row in zip(worlds, targets.tolist(), strict=True):
             for walker, target in zip(world.walkers, row, strict=False):
-                # The compiled loops do not look where an array ends.
+                # The compiled loops do not check bounds.
                 if not 0 <= target < max(len(walker.waypoints), 1):
                     raise ValueError(
                         f"targets of the state must be numbers of waypoints, got {target} for "
@@ -135,7 +135,7 @@ class WalkerBatch:
         return load
 
     def _set(self, index: int, world: World, starts: WalkerStarts) -> None:
-        """Take in the walkers of a robot's world, and write where they are into its circles."""
+        """Set the walkers of a robot's world, and write their places into its circles."""
         count = len(world.walkers)
         points = max((len(each.waypoints) for each in world.walkers), default=0)
         self._arrays = arrays = WalkerArrays(

@@ -78,7 +78,7 @@ def walk(
                     reach = walkers.bodies[robot, index, 0] + walkers.bodies[robot, other, 0]
                     near = other != index and across * across + up * up < reach * reach
                     is_free &= not near
-            # Plain numbers for most: to call a function with all arrays costs more than the step.
+            # Plain numbers for most: calling a function with all arrays costs more than the step.
             if is_free:
                 states[robot, index, 0] += states[robot, index, 2] * time_step
                 states[robot, index, 1] += states[robot, index, 3] * time_step
@@ -116,11 +116,11 @@ def _turn(walkers: WalkerArrays, robot: int, index: int, time_step: float) -> No
 def _glide(
     walkers: WalkerArrays, rooms: BatchArrays, robot: int, index: int, time_step: float
 ) -> None:
-    """Go with the velocity that was chosen, or stand where that leads into what stands."""
+    """Move at the chosen velocity, or stand still if that leads into an obstacle."""
     state, points = walkers.states[robot, index], walkers.waypoints[robot, index]
     x, y = state[0] + time_step * state[2], state[1] + time_step * state[3]
     room = clearance_at(rooms, robot, x, y)
-    # Who is too near already may leave.
+    # A walker that is too near already may leave.
     enough = min(walkers.bodies[robot, index, 0], clearance_at(rooms, robot, state[0], state[1]))
     if room < enough:
         state[2], state[3] = 0.0, 0.0
@@ -208,7 +208,7 @@ def hide_walkers(
     max_range: float,  # [m]
     ranges: NDArray[np.float64],  # [N, rays] [m]
 ) -> None:
-    """Let the rays that end at a walker report that they met nothing."""
+    """Have the rays that end at a walker report the maximum range."""
     for robot in range(ranges.shape[0]):
         if walkers.counts[robot] == 0:
             continue
@@ -231,7 +231,7 @@ def count_encounters(
     time_step: float,  # [s]
     counts: NDArray[np.float64],  # Least gap [m], time in personal space, to collision [s], [3, N]
 ) -> None:
-    """Take in how near the walkers are to their robots."""
+    """Update the encounters of robots with their walkers."""
     for robot in range(running.shape[0]):
         if not running[robot] or walkers.counts[robot] == 0:
             continue

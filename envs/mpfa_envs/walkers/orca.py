@@ -24,7 +24,7 @@ _CORNERS: Final = 12
 
 
 class OrcaRoom:
-    """One robot's world as the library sees it: all walkers, the robot, and what stands."""
+    """One robot's world for the library: all walkers, the robot, and the obstacles."""
 
     # ORCA (van den Berg et al. 2011, https://doi.org/10.1007/978-3-642-19457-3_1) gives each walker
     # the velocity nearest to the one that it wants with which none collide if both do their

@@ -23,7 +23,7 @@ _SLACK: Final = 0.02
 _SAMPLES: Final = 256
 """Places that are sampled at once."""
 _FEW: Final = 16
-"""Those of them that are looked at first."""
+"""Those of them that are checked first."""
 _ROUNDS: Final = 20
 
 
@@ -56,7 +56,7 @@ def _choose(
     taken: list[tuple[float, float, float]],
 ) -> int | None:
     """Number of the first free place that is far enough from what is taken, or of the farthest."""
-    # One of the first will nearly always do, and to look at all takes ten times as long.
+    # One of the first nearly always does; checking all takes ten times as long.
     for few in (places[:_FEW], places):
         gaps = np.min([np.hypot(few[:, 0] - x, few[:, 1] - y) - reach for x, y, reach in taken], 0)
         free = np.ones(len(few), dtype=np.bool_)
