@@ -11,6 +11,11 @@ ROWS = [
     for line in PAGE.read_text(encoding="utf-8").splitlines()
     if line.startswith("| `")
 ]
+GONE = [
+    tuple(part.strip("- `") for part in line.split(": "))
+    for line in PAGE.read_text(encoding="utf-8").splitlines()
+    if line.startswith("- `")
+]
 
 
 def found(path):
@@ -27,9 +32,17 @@ def test_an_old_name_warns_and_is_the_new_one(old, new):
 
 def test_every_old_name_is_on_the_page():
     from mpfa_envs import _RENAMED
-    from torchrl_mpfa.renamed import OF_METHODS, OF_SELECTION, TOP
+    from torchrl_mpfa.renamed import OF_CLIFFWALK, OF_METHODS, OF_SELECTION, TOP
 
     assert len(ROWS) == len(_RENAMED) + len(OF_METHODS) + len(OF_SELECTION) + len(TOP)
+    assert len(GONE) == len(OF_CLIFFWALK)
+
+
+@pytest.mark.parametrize(("old", "new"), GONE)
+def test_a_name_that_left_the_package_tells_where_it_went(old, new):
+    with pytest.raises(AttributeError, match=f"{old} is now {new}, which is not installed"):
+        found(old)
+    assert found(new)
 
 
 @pytest.mark.parametrize("package", ["torchrl_mpfa", "torchrl_mpfa.methods", "mpfa_envs"])

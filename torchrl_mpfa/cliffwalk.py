@@ -11,20 +11,19 @@ true one; what is counted is how many it takes.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.renamed import OF_CLIFFWALK, find
 
 Features = Literal["tabular", "linear"]
 Transition = tuple[int, int, int, float, bool]
 """State, action, next state, reward, and whether the episode ends there."""
 _LONGEST = 20
-_BATCHES = 512
 
 
 class Cliffwalk:
@@ -184,7 +183,7 @@ def updates_to_convergence(
     Args:
         cliff: The task.
         buffer: The buffer, with its sampler. Its batch size is how many updates are made before
-            priorities are written; :func:`batch_size_of` has one that costs little.
+            priorities are written.
         features: As in :class:`CliffwalkValues`.
         threshold: Mean squared error below which Q is the true one.
         limit: Updates after which to give up; None: a thousand for each transition.
@@ -234,69 +233,6 @@ def updates_to_convergence(
     return math.inf
 
 
-def batch_size_of(cliff: Cliffwalk) -> int:
-    """A 512th of the memory: priorities are at most so old, and long cliffs take minutes at most.
-
-    Args:
-        cliff: The task.
-
-    Returns:
-        Updates between two writings of priorities.
-
-    Examples:
-        >>> [batch_size_of(Cliffwalk(length)) for length in (2, 8, 12, 16)]
-        [1, 1, 15, 255]
-    """
-    return max(1, cliff.size // _BATCHES)
-
-
-def oracle_updates(
-    cliff: Cliffwalk,
-    *,
-    features: Features = "tabular",
-    threshold: float = 1e-3,
-    limit: int = 10_000,
-    seed: int = 0,
-) -> float:
-    """Updates until Q is the true one, if each is the one after which its error is the least.
-
-    No replay can know that; it is the paper's bound of what prioritization may gain.
-
-    Args:
-        cliff: The task.
-        features: As in :class:`CliffwalkValues`.
-        threshold: As in :func:`updates_to_convergence`.
-        limit: Updates after which to give up.
-        seed: Seed of the first values, as in :func:`updates_to_convergence`.
-
-    Returns:
-        Number of updates, or infinity where the limit was reached.
-
-    Examples:
-        >>> oracle_updates(Cliffwalk(6)) < 250
-        True
-    """
-    generator = torch.Generator().manual_seed(seed)
-    kinds = _kinds(cliff.transitions(generator))
-    values = CliffwalkValues(cliff, features=features, generator=generator)
-    for updates in range(1, limit + 1):
-        values.learn(*min(kinds, key=values.error_after))
-        if values.error < threshold:
-            return updates
-    return math.inf
-
-
-def _kinds(transitions: TensorDict) -> Sequence[Transition]:
-    """The different transitions."""
-    after = transitions["next"]
-    columns = [transitions["state"], transitions["action"], after["state"]]
-    return sorted(
-        set(
-            zip(
-                *(column.tolist() for column in columns),
-                after["reward"].squeeze(1).tolist(),
-                after["terminated"].squeeze(1).tolist(),
-                strict=True,
-            )
-        )
-    )
+def __getattr__(name: str) -> Any:
+    """Tell where names are that serve the study alone."""
+    return find(__name__, name, OF_CLIFFWALK)

@@ -56,17 +56,24 @@ OF_METHODS: Final[dict[str, str]] = {
     "value_schedule": "torchrl_mpfa.methods.hvper.value_schedule",
 }
 """Names that were in :mod:`torchrl_mpfa.methods`, and where they are."""
+OF_CLIFFWALK: Final[dict[str, str]] = {
+    "batch_size_of": "benchmarks.study.cliffwalk.batch_size_of",
+    "oracle_updates": "benchmarks.study.cliffwalk.oracle_updates",
+}
+"""Names that were in :mod:`torchrl_mpfa.cliffwalk`, and are not in the package any more."""
 
 
 def find(package: str, name: str, renamed: dict[str, str]) -> Any:
     """The new object of an old name of a package.
 
     Raises:
-        AttributeError: If there is no such name.
+        AttributeError: If there is no such name, or it is not in the package any more.
     """
     if name not in renamed:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
     module, _, new = renamed[name].rpartition(".")
     message = f"{package}.{name} is now {renamed[name]}"
+    if module.partition(".")[0] != "torchrl_mpfa":
+        raise AttributeError(f"{message}, which is not installed with the package")
     warnings.warn(message, DeprecationWarning, stacklevel=3)
     return getattr(import_module(module), new)

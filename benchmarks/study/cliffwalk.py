@@ -21,14 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, new_figure
 from torchrl_mpfa.cliffwalk import (
     Cliffwalk,
+    CliffwalkValues,
     Features,
-    batch_size_of,
-    oracle_updates,
+    Transition,
     updates_to_convergence,
 )
 from torchrl_mpfa.methods import make_replay
@@ -47,6 +48,7 @@ COLORS = ("0.45", "#0072b2", "#56b4e9", "#d55e00", "black")
 EPS = 1e-4
 """Of all methods. Rewards are one at most here, and most TD errors a tenth of that."""
 _UNIFORM_BATCH = 256
+_BATCHES = 512
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,74 @@ class Row:
     replay: str
     seed: int
     updates: float
+
+
+def batch_size_of(cliff: Cliffwalk) -> int:
+    """A 512th of the memory: priorities are at most so old, and long cliffs take minutes at most.
+
+    Args:
+        cliff: The task.
+
+    Returns:
+        Updates between two writings of priorities.
+
+    Examples:
+        >>> [batch_size_of(Cliffwalk(length)) for length in (2, 8, 12, 16)]
+        [1, 1, 15, 255]
+    """
+    return max(1, cliff.size // _BATCHES)
+
+
+def oracle_updates(
+    cliff: Cliffwalk,
+    *,
+    features: Features = "tabular",
+    threshold: float = 1e-3,
+    limit: int = 10_000,
+    seed: int = 0,
+) -> float:
+    """Updates until Q is the true one, if each is the one after which its error is the least.
+
+    No replay can know that; it is the paper's bound of what prioritization may gain.
+
+    Args:
+        cliff: The task.
+        features: As in :class:`~torchrl_mpfa.cliffwalk.CliffwalkValues`.
+        threshold: As in :func:`~torchrl_mpfa.cliffwalk.updates_to_convergence`.
+        limit: Updates after which to give up.
+        seed: Seed of the first values, as there.
+
+    Returns:
+        Number of updates, or infinity where the limit was reached.
+
+    Examples:
+        >>> oracle_updates(Cliffwalk(6)) < 250
+        True
+    """
+    generator = torch.Generator().manual_seed(seed)
+    kinds = _kinds(cliff.transitions(generator))
+    values = CliffwalkValues(cliff, features=features, generator=generator)
+    for updates in range(1, limit + 1):
+        values.learn(*min(kinds, key=values.error_after))
+        if values.error < threshold:
+            return updates
+    return math.inf
+
+
+def _kinds(transitions: TensorDict) -> Sequence[Transition]:
+    """The different transitions."""
+    after = transitions["next"]
+    columns = [transitions["state"], transitions["action"], after["state"]]
+    return sorted(
+        set(
+            zip(
+                *(column.tolist() for column in columns),
+                after["reward"].squeeze(1).tolist(),
+                after["terminated"].squeeze(1).tolist(),
+                strict=True,
+            )
+        )
+    )
 
 
 def run_one(arm: str, cliff: Cliffwalk, *, features: Features, eps: float, seed: int) -> float:

@@ -13,8 +13,6 @@ from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.cliffwalk import (
     Cliffwalk,
     CliffwalkValues,
-    batch_size_of,
-    oracle_updates,
     updates_to_convergence,
 )
 from torchrl_mpfa.methods import make_replay
@@ -85,39 +83,11 @@ def test_values_learn_as_a_plain_loop_does(features):
     assert values.error == pytest.approx(float((found - truth).square().mean()), abs=1e-12)
 
 
-def test_the_oracle_chooses_what_lowers_the_error_most():
-    cliff, seed = Cliffwalk(3), 1
-    generator = torch.Generator().manual_seed(seed)
-    kinds = sorted(set(rows_of(cliff, generator)))
-    values = CliffwalkValues(cliff, generator=generator)
-    count = 0
-    while values.error >= 1e-3:
-        errors = []
-        for kind in kinds:
-            trial = CliffwalkValues(cliff)
-            trial.q = [list(row) for row in values.q]
-            trial.learn(*kind)
-            truth = [
-                [v * (a == r) for v, r in zip(cliff.values, cliff.right, strict=True)]
-                for a in (0, 1)
-            ]
-            errors.append(
-                sum(
-                    (q - t) ** 2
-                    for row, true in zip(trial.q, truth, strict=True)
-                    for q, t in zip(row, true, strict=True)
-                )
-            )
-        values.learn(*kinds[errors.index(min(errors))])
-        count += 1
-    assert oracle_updates(cliff, seed=seed) == count
-
-
 @pytest.mark.parametrize(
     ("method", "settings"),
     [("per", {}), ("rank_per", {}), ("mpfa_per", {"signals": ["reward", "td_error"]})],
 )
-def test_priorities_save_updates_and_an_oracle_saves_more(method, settings):
+def test_priorities_save_updates(method, settings):
     cliff = Cliffwalk(7)
 
     def updates(name, batch_size, **more):
@@ -128,7 +98,7 @@ def test_priorities_save_updates_and_an_oracle_saves_more(method, settings):
         return updates_to_convergence(cliff, replay.buffer)
 
     found = updates(method, 4, eps=1e-3, **settings)
-    assert oracle_updates(cliff) < found < updates("uniform", 64) / 2
+    assert found < updates("uniform", 64) / 2
 
 
 class Uniform(SignalSampler):
@@ -167,7 +137,6 @@ def test_what_does_not_converge_is_infinite():
     cliff = Cliffwalk(4)
     replay = make_replay("uniform", capacity=cliff.size, batch_size=4)
     assert updates_to_convergence(cliff, replay.buffer, limit=20) == math.inf
-    assert oracle_updates(cliff, limit=5) == math.inf
 
 
 @pytest.mark.parametrize("length", [1, 21, 2.5, True])
@@ -178,7 +147,7 @@ def test_a_length_that_cannot_be_is_refused(length):
 
 def test_a_buffer_that_is_not_empty_is_refused():
     cliff = Cliffwalk(3)
-    replay = make_replay("per", capacity=cliff.size, batch_size=batch_size_of(cliff))
+    replay = make_replay("per", capacity=cliff.size, batch_size=1)
     replay.buffer.extend(cliff.transitions())
     with pytest.raises(ValueError, match="empty"):
         updates_to_convergence(cliff, replay.buffer)
