@@ -67,12 +67,6 @@ class Row:
 def batch_size_of(cliff: Cliffwalk) -> int:
     """A 512th of the memory: priorities are at most so old, and long cliffs take minutes at most.
 
-    Args:
-        cliff: The task.
-
-    Returns:
-        Updates between two writings of priorities.
-
     Examples:
         >>> [batch_size_of(Cliffwalk(length)) for length in (2, 8, 12, 16)]
         [1, 1, 15, 255]
@@ -91,16 +85,6 @@ def oracle_updates(
     """Updates until Q is the true one, if each is the one after which its error is the least.
 
     No replay can know that; it is the paper's bound of what prioritization may gain.
-
-    Args:
-        cliff: The task.
-        features: As in :class:`~torchrl_mpfa.cliffwalk.CliffwalkValues`.
-        threshold: As in :func:`~torchrl_mpfa.cliffwalk.updates_to_convergence`.
-        limit: Updates after which to give up.
-        seed: Seed of the first values, as there.
-
-    Returns:
-        Number of updates, or infinity where the limit was reached.
 
     Examples:
         >>> oracle_updates(Cliffwalk(6)) < 250
@@ -133,18 +117,7 @@ def _kinds(transitions: TensorDict) -> Sequence[Transition]:
 
 
 def run_one(arm: str, cliff: Cliffwalk, *, features: Features, eps: float, seed: int) -> float:
-    """Count the updates of a run.
-
-    Args:
-        arm: Which of :data:`ARMS`.
-        cliff: The task.
-        features: ``tabular`` or ``linear``.
-        eps: Added to every priority.
-        seed: Seed of first values, memory and sampling.
-
-    Returns:
-        Number of updates.
-    """
+    """Count the updates of a run."""
     if arm == ORACLE:
         return oracle_updates(cliff, features=features, seed=seed)
     settings = dict(ARMS[arm])
@@ -162,17 +135,7 @@ def run_one(arm: str, cliff: Cliffwalk, *, features: Features, eps: float, seed:
 
 
 def run_all(lengths: Sequence[int], *, seeds: int, features: Features, eps: float) -> Iterator[Row]:
-    """Count the updates of every run, the shortest cliffs first.
-
-    Args:
-        lengths: Numbers of states.
-        seeds: Number of runs for each.
-        features: ``tabular`` or ``linear``.
-        eps: Added to every priority.
-
-    Yields:
-        A row for each run.
-    """
+    """Count the updates of every run, the shortest cliffs first."""
     for length in lengths:
         cliff = Cliffwalk(length)
         for arm in ARMS:
@@ -225,14 +188,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what is asked for, and write table and figure.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status.
-    """
+    """Run what is asked for, and write table and figure."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.study cliffwalk",
         description=__doc__,

@@ -42,14 +42,6 @@ def plot_study(table: Table, rows: Rows, folder: Path) -> list[Path]:
     """Plot the figures of a table, of the arms that have enough runs to be compared.
 
     While no arm has, those with the most runs are shown.
-
-    Args:
-        table: The table.
-        rows: Its rows.
-        folder: Where they go.
-
-    Returns:
-        The files.
     """
     scores = scores_of(rows, table)
     if not scores:
@@ -103,11 +95,6 @@ def plot_curves(table: Table, rows: Rows, path: Path) -> None:
 
     That one, uniform replay where it is in the panel and else the first, is gray. Lines are means
     of the runs, bands their intervals; where these would fill the panel, thin lines are the runs.
-
-    Args:
-        table: Says which arms are shown together.
-        rows: Its rows.
-        path: The PNG file.
     """
     rng = np.random.default_rng(0)
     curves: dict[str, list[pd.Series[Any]]] = {}
@@ -156,13 +143,7 @@ def compared_arms(
 
 
 def plot_profiles(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) -> None:
-    """Plot the share of runs above each value of the primary measure, with Wilson's intervals.
-
-    Args:
-        table: Says which arms share a panel.
-        scores: The measures of each run, by arm.
-        path: The PNG file.
-    """
+    """Plot the share of runs above each value of the primary measure, with Wilson's intervals."""
     figure, axes = _panels(table)
     known = {arm: runs[table.primary].dropna().to_numpy() for arm, runs in scores.items()}
     for axis, labels in zip(axes, table.panels.values(), strict=True):
@@ -183,13 +164,7 @@ def plot_profiles(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) 
 
 
 def plot_arms(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) -> None:
-    """Plot the primary measure of every arm: its runs, their mean and its 95 % interval.
-
-    Args:
-        table: Says which arms share a panel.
-        scores: The measures of each run, by arm.
-        path: The PNG file.
-    """
+    """Plot the primary measure of every arm: its runs, their mean and its 95 % interval."""
     rng = np.random.default_rng(0)
     known = {arm: runs[table.primary].dropna().to_numpy() for arm, runs in scores.items()}
     tall = max(map(len, table.panels.values())) * 0.26 + 0.9
@@ -210,12 +185,7 @@ def plot_arms(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) -> N
 
 
 def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
-    """Plot the area by replay volume and method, colored by the difference from uniform replay.
-
-    Args:
-        scores: The measures of each run of table D, by arm.
-        path: The PNG file.
-    """
+    """Plot the area by replay volume and method, colored by the difference from uniform replay."""
     gaps: dict[tuple[str, int], dict[str, tuple[float, str]]] = {}
     for reward, volume in _VOLUMES:
         suffix = "" if volume == 32 else f"/v{volume}"

@@ -19,14 +19,6 @@ def keep(rows: Rows, folder: Path, name: str) -> list[Path]:
     """Write the rows of a table as two compressed files, the same bytes for the same rows.
 
     Runs that are kept there already stay, unless ``rows`` has them anew.
-
-    Args:
-        rows: The rows.
-        folder: Where they go.
-        name: Of the table.
-
-    Returns:
-        The files.
     """
     folder.mkdir(parents=True, exist_ok=True)
     whole = joined(rows, read_kept(folder, name))
@@ -43,15 +35,7 @@ def keep(rows: Rows, folder: Path, name: str) -> list[Path]:
 
 
 def read_kept(folder: Path, name: str) -> Rows:
-    """The rows that :func:`keep` wrote; none if it did not.
-
-    Args:
-        folder: Where they lie.
-        name: Of the table.
-
-    Returns:
-        The rows.
-    """
+    """The rows that :func:`keep` wrote; none if it did not."""
     found = []
     for end, columns in zip(_FILES, (CURVES, TESTS), strict=True):
         path = folder / f"{name}{end}"

@@ -22,15 +22,7 @@ _TITLES = {
 
 
 def write_study(folder: Path, output: Path) -> list[Path]:
-    """Write a page and the figures of each table that has rows, and name the runs it lacks.
-
-    Args:
-        folder: Of the study, or of what ``run --keep`` made of it.
-        output: Where they go.
-
-    Returns:
-        The files; none if there are no rows.
-    """
+    """Write a page and the figures of each table that has rows, and name the runs it lacks."""
     kept = is_kept(folder)
     # What is kept does not say where the runs were.
     root = ROOT if kept else folder

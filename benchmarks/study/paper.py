@@ -133,15 +133,7 @@ def missing_lines(wanted: Sequence[Study]) -> str:
 
 
 def read_runs(wanted: Sequence[Study], find: Callable[[Job], Path | None]) -> Runs:
-    """A table of each run that is at its end and has it, by method or arm.
-
-    Args:
-        wanted: The studies.
-        find: From a run to the file, if there is one.
-
-    Returns:
-        The tables; methods without any are left out.
-    """
+    """A table of each run that is at its end and has it, by method or arm."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
     for study in wanted:
         for name, jobs in study.runs().items():

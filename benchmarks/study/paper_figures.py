@@ -21,16 +21,7 @@ _BLOCK = 10_000
 
 
 def plot_paper(episodes: Runs, updates: Runs, folder: Path) -> list[Path]:
-    """Plot all figures of which there are runs.
-
-    Args:
-        episodes: Training episodes of each run, by method or arm.
-        updates: Rows of ``updates.csv`` of each run, by method.
-        folder: Where they go.
-
-    Returns:
-        The files.
-    """
+    """Plot all figures of which there are runs."""
     arms = tuple(f"phi{phi}" for phi in PHIS)
     figures: dict[str, tuple[Runs, Sequence[str], Callable[[Path], None]]] = {
         "figure_3": (updates, ("per",), lambda path: plot_figure_3(updates, episodes, path)),
@@ -59,14 +50,7 @@ def plot_paper(episodes: Runs, updates: Runs, folder: Path) -> list[Path]:
 
 
 def plot_figure_3(updates: Runs, episodes: Runs, path: Path, *, method: str = "per") -> None:
-    """Plot Fig. 3, TD error and average reward of PER, over episodes and over steps.
-
-    Args:
-        updates: Rows of ``updates.csv`` of each run.
-        episodes: Training episodes of each run.
-        path: The PNG file.
-        method: Whose runs.
-    """
+    """Plot Fig. 3, TD error and average reward of PER, over episodes and over steps."""
     figure, axes = new_figure(2, 2, panel=(5, 3), sharey="row")
     for column, x in enumerate(("episode", "total_steps")):
         errors = [_by(each, x, "td_error") for each in updates[method].values()]
@@ -82,12 +66,7 @@ def plot_figure_3(updates: Runs, episodes: Runs, path: Path, *, method: str = "p
 
 
 def plot_figure_5(episodes: Runs, path: Path) -> None:
-    """Plot Fig. 5, the average reward in map A with phi = 2, 3 and 4.
-
-    Args:
-        episodes: Training episodes of each run by ``phi2``, ``phi3``, ``phi4``.
-        path: The PNG file.
-    """
+    """Plot Fig. 5, the average reward in map A with phi = 2, 3 and 4."""
     figure, (axis,) = new_figure(panel=(7, 4))
     for place, phi in enumerate(PHIS):
         runs = _rewards(episodes.get(f"phi{phi}", {}), MAPS[0])
@@ -98,13 +77,7 @@ def plot_figure_5(episodes: Runs, path: Path) -> None:
 
 
 def plot_rewards_by_map(episodes: Runs, methods: Sequence[str], path: Path) -> None:
-    """Plot Figs. 8 to 11, the average reward of methods in each of the maps A to D.
-
-    Args:
-        episodes: Training episodes of each run, by method.
-        methods: Those of the figure; one without runs has no line.
-        path: The PNG file.
-    """
+    """Plot Figs. 8 to 11, the average reward of methods in each of the maps A to D."""
     figure, axes = new_figure(2, 2, panel=(5, 3.5), sharey=True)
     for axis, world in zip(axes, MAPS, strict=True):
         # A method has one color in all four figures.
@@ -119,13 +92,7 @@ def plot_rewards_by_map(episodes: Runs, methods: Sequence[str], path: Path) -> N
 
 
 def plot_figure_13(updates: Runs, methods: Sequence[str], path: Path) -> None:
-    """Plot Fig. 13, the total reward of every 10,000 steps.
-
-    Args:
-        updates: Rows of ``updates.csv`` of each run, by method.
-        methods: Those of the figure; one without runs has no line.
-        path: The PNG file.
-    """
+    """Plot Fig. 13, the total reward of every 10,000 steps."""
     figure, (axis,) = new_figure(panel=(8, 5))
     for method in methods:
         runs = [reward_of_blocks(each) for each in updates.get(method, {}).values()]
@@ -136,13 +103,7 @@ def plot_figure_13(updates: Runs, methods: Sequence[str], path: Path) -> None:
 
 
 def plot_claims(updates: Runs, methods: Sequence[str], path: Path) -> None:
-    """Plot what Section 2.4 says of PER: old TD errors, and a batch unlike the buffer.
-
-    Args:
-        updates: Rows of ``updates.csv`` of each run, by method.
-        methods: Those of the figure; one without runs has no line.
-        path: The PNG file.
-    """
+    """Plot what Section 2.4 says of PER: old TD errors, and a batch unlike the buffer."""
     panels = {
         "td_error_age": "age of the sampled TD errors [updates]",
         "positive_buffer": "positive transitions in the buffer",
@@ -163,15 +124,7 @@ def plot_claims(updates: Runs, methods: Sequence[str], path: Path) -> None:
 
 
 def reward_of_blocks(updates: pd.DataFrame, *, steps: int = _BLOCK) -> pd.Series[Any]:
-    """Total reward of every so many steps of a run, whole blocks alone.
-
-    Args:
-        updates: Rows of ``updates.csv``.
-        steps: Length of a block.
-
-    Returns:
-        Rewards by the step at which their block ended.
-    """
+    """Total reward of every so many steps of a run, whole blocks alone."""
     block = -(-updates["total_steps"] // steps)
     whole = updates[block * steps <= updates["total_steps"].max()]
     rewards = whole.groupby(block[whole.index] * steps)["reward"].sum()

@@ -54,14 +54,7 @@ def write_paper(wanted: Sequence[Study], output: Path) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Read the rows, write tables and figures.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status.
-    """
+    """Read the rows, write tables and figures."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.study paper",
         description=__doc__,

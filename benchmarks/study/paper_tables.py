@@ -12,15 +12,7 @@ from training.figures import Runs
 
 
 def unseen_table(tested: Runs, paper: Mapping[str, Tested]) -> str:
-    """Collisions, success and time in the unseen world: Table 2 or 4.
-
-    Args:
-        tested: Evaluation episodes of each run.
-        paper: The rows of the paper.
-
-    Returns:
-        A table in Markdown; cells of methods without runs are empty.
-    """
+    """Collisions, success and time in the unseen world: Table 2 or 4."""
     lines = []
     for method, row in paper.items():
         runs = tested.get(method, {})
@@ -42,14 +34,7 @@ def unseen_table(tested: Runs, paper: Mapping[str, Tested]) -> str:
 
 
 def trained_table(trained: Runs) -> str:
-    """Time and steps of the training: Table 3.
-
-    Args:
-        trained: Training episodes of each run.
-
-    Returns:
-        A table in Markdown; cells of methods without runs are empty.
-    """
+    """Time and steps of the training: Table 3."""
     lines = []
     for method, row in TABLE_3.items():
         runs = trained.get(method, {})

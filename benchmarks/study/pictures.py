@@ -216,14 +216,7 @@ OTHERS: dict[str, Callable[[Path], None]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Make the pictures that are asked for.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status.
-    """
+    """Make the pictures that are asked for."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.study pictures",
         description=__doc__,

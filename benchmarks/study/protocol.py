@@ -138,10 +138,6 @@ class Table:
 def label_of(job: Job, root: Path) -> str:
     """What the arm of a run is called in the study: its folder, learner, method and arm.
 
-    Args:
-        job: The run.
-        root: Folder of the study.
-
     Examples:
         >>> label_of(Job("td3", "per", 100, Path("runs/study/sparse")), Path("runs/study"))
         'sparse/td3/per'
@@ -152,12 +148,6 @@ def label_of(job: Job, root: Path) -> str:
 
 def short_names(labels: Sequence[str]) -> dict[str, str]:
     """Labels without the parts that all of them begin or end with.
-
-    Args:
-        labels: Of arms.
-
-    Returns:
-        Names by label.
 
     Examples:
         >>> list(short_names(["sparse/td3/per/v8", "sparse/td3/lap/v8"]).values())
@@ -183,16 +173,6 @@ def paper_studies(table: Table) -> tuple[Study, ...]:
 
 def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
     """The tables, in the order in which they are run.
-
-    Args:
-        root: Folder of the study.
-        most: Runs of each arm at most; None: all that are wanted.
-
-    Returns:
-        Tables by name.
-
-    Raises:
-        ValueError: If ``most`` is below 1.
 
     Examples:
         >>> [len(table.studies) for table in tables(Path("runs/study")).values()]

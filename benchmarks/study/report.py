@@ -47,14 +47,7 @@ def report_study(folder: Path, output: Path) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Read the rows, write pages and figures.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status.
-    """
+    """Read the rows, write pages and figures."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.study report",
         description=__doc__,

@@ -38,15 +38,7 @@ class Rows:
 
 
 def read_runs(table: Table, root: Path) -> Rows:
-    """The rows of the runs that are at their end.
-
-    Args:
-        table: The table.
-        root: Folder of the study.
-
-    Returns:
-        The rows, with as many digits as are kept.
-    """
+    """The rows of the runs that are at their end."""
     curves: dict[tuple[str, int], pd.DataFrame] = {}
     tests: dict[tuple[str, int, Evaluation], pd.DataFrame] = {}
     for study in table.studies:
@@ -129,16 +121,7 @@ def _success(worlds: pd.DataFrame) -> dict[int, float]:
 
 
 def without_rows(study: Study, rows: Rows, root: Path) -> list[Job]:
-    """The runs of a study that have no rows, or were not tested where they shall be.
-
-    Args:
-        study: The runs.
-        rows: What there is.
-        root: Folder of the study that the names of its arms begin from.
-
-    Returns:
-        The runs.
-    """
+    """The runs of a study that have no rows, or were not tested where they shall be."""
     trained = set(rows.curves[["arm", "seed"]].itertuples(index=False, name=None))
     kinds = rows.tests[["arm", "seed"]].assign(kind=rows.tests["world"].map(family))
     tested = set(kinds.drop_duplicates().itertuples(index=False, name=None))

@@ -61,16 +61,7 @@ class Transitions:
 
 
 def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
-    """Make up the buffer, oldest transition first.
-
-    Args:
-        policy: What later actions are near to.
-        count: Number of transitions ``N``.
-        seed: Seed of everything random.
-
-    Returns:
-        The transitions.
-    """
+    """Make up the buffer, oldest transition first."""
     rng = np.random.default_rng(seed)
     kind = rng.choice(len(KINDS), size=count, p=(0.6, 0.35, 0.02, 0.03))
     step = rng.uniform(0.02, 0.25, count) * np.array((1.0, -1.0, 0.0, 0.0))[kind]
@@ -167,12 +158,7 @@ def _update(
 
 
 def plot(name: str, path: Path) -> None:
-    """Plot the figure of a method.
-
-    Args:
-        name: The method.
-        path: The PNG file.
-    """
+    """Plot the figure of a method."""
     transitions, found = count_samples(METHODS[name])
     figure, axes = new_figure(1, 3, panel=(2.4, 2.6))
     error = transitions.signals["td_error"].numpy()
@@ -212,14 +198,7 @@ def plot(name: str, path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Plot the figures that are asked for.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status.
-    """
+    """Plot the figures that are asked for."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.study sampling",
         description=__doc__,

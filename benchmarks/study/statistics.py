@@ -154,14 +154,7 @@ def _difference(ours: Array, theirs: Array) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Read the rows, write tables and figure.
-
-    Args:
-        arguments: The command line.
-
-    Returns:
-        Exit status.
-    """
+    """Read the rows, write tables and figure."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.study statistics",
         description=__doc__,

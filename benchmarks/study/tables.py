@@ -205,16 +205,7 @@ def kind_lines(rows: Rows, labels: Sequence[str]) -> str:
 
 
 def study_tables(table: Table, rows: Rows, *, absent: str) -> str:
-    """Everything in words and numbers that the rows say on the question of a table.
-
-    Args:
-        table: The table.
-        rows: Its rows.
-        absent: What is missing.
-
-    Returns:
-        A page in Markdown.
-    """
+    """Everything in words and numbers that the rows say on the question of a table."""
     scores, worlds = scores_of(rows, table), worlds_of(rows, table)
     labels = list(dict.fromkeys([*(a for panel in table.panels.values() for a in panel), *scores]))
     order = sorted(MEASURES, key=lambda name: name != table.primary)

@@ -19,14 +19,7 @@ INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
 def check_physics(physics: str) -> None:
-    """Refuse simulated wheels where there is no PyBullet.
-
-    Args:
-        physics: ``wheels`` or ``kinematic``.
-
-    Raises:
-        ValueError: Then, with the way out.
-    """
+    """Refuse simulated wheels where there is no PyBullet."""
     if physics == "wheels":
         try:
             import_module("mpfa_envs.robots.simulation")
@@ -35,14 +28,7 @@ def check_physics(physics: str) -> None:
 
 
 def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
-    """What a policy must find again wherever it drives: robot, time, and lidar.
-
-    Args:
-        settings: The environment's settings in training.
-
-    Returns:
-        Arguments of :class:`mpfa_envs.NavigationEnv`.
-    """
+    """What a policy must find again wherever it drives: robot, time, and lidar."""
     # Only where it is not the default: policies are asked for no argument that they do not need.
     seen = {} if settings.field_of_view == _AHEAD else {"lidar": _lidar(settings.field_of_view)}
     return {

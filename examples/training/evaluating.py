@@ -42,15 +42,6 @@ def evaluation_folder(
 ) -> str:
     """Name of the folder of an evaluation: each choice has its own.
 
-    Args:
-        words: Worlds, as on the command line.
-        physics: ``wheels`` or ``kinematic``.
-        seed: Seed of the tasks in a world.
-        noise: Errors of the robot; None: none.
-
-    Returns:
-        The name; that of the first seed without noise may hold rows of a study.
-
     Examples:
         >>> evaluation_folder(["test", "bars:test"], "wheels", noise=RobotNoise(slip=0.1))
         'evaluation-test+bars-test-wheels-slip0.1'
@@ -68,17 +59,7 @@ def evaluation_folder(
 def tasks_of(
     policy: Drivable, worlds: Sequence[str], *, episodes: int | None, seed: int
 ) -> list[WorldTask]:
-    """The fixed tasks of some worlds, for the robot of a policy.
-
-    Args:
-        policy: The policy, or a planner.
-        worlds: What :func:`mpfa_envs.world_tasks` takes, each.
-        episodes: Number of tasks in each; None: as many as there usually are.
-        seed: Seed of the tasks in a world.
-
-    Returns:
-        The tasks, world by world.
-    """
+    """The fixed tasks of some worlds, for the robot of a policy."""
     robot = policy.env_arguments.get("robot", "turtlebot2")
     return [
         task

@@ -19,13 +19,7 @@ _SPREAD = 6
 
 
 def plot_learning_curve(episodes: pd.DataFrame, path: Path, *, window: int = 20) -> None:
-    """Plot success and average reward over the episodes of a run, and where its world changes.
-
-    Args:
-        episodes: A row for each training episode.
-        path: The PNG file.
-        window: Episodes of the running mean.
-    """
+    """Plot success and average reward over the episodes of a run, and where its world changes."""
     figure, axes = new_figure(2, 1, panel=(7, 2.5), sharex=True)
     number = np.arange(1, len(episodes) + 1)
     worlds = episodes["world"].to_numpy()
@@ -45,10 +39,6 @@ def plot_evaluations(runs: Runs, path: Path) -> None:
     """Plot greedy success in the validation world over the actions, and when 90 % were reached.
 
     Of a few runs of an arm each is a thin line, else there is the interval of their mean.
-
-    Args:
-        runs: Tables with a row for each evaluation.
-        path: The PNG file.
     """
     curves = {
         arm: [(each["total_steps"], each["success"]) for each in tables.values()]

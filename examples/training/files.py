@@ -41,14 +41,7 @@ def digest(file: Path) -> str:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written in, before anything is computed for it.
-
-    Args:
-        folder: The folder, which need not be there.
-
-    Raises:
-        ValueError: With the folder, and what is in its way.
-    """
+    """Refuse a folder that cannot be made or written in, before anything is computed for it."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise ValueError(f"{folder} cannot be a folder, as {there} is a file: name another one")
@@ -62,13 +55,6 @@ def lock(folder: Path) -> Iterator[None]:
 
     The system lets go of the lock when the process ends, however that ends. What a killed process
     had half written is removed.
-
-    Args:
-        folder: The folder; made if there is none.
-
-    Raises:
-        FolderInUse: If another process holds it.
-        ValueError: If it cannot be made or written in.
     """
     check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,11 +84,7 @@ def wait_until_free(folder: Path, seconds: float) -> None:
 
 
 def set_aside(folder: Path) -> None:
-    """Move the files of an earlier run to ``previous/``, in place of those that lie there.
-
-    Args:
-        folder: The folder of the run, which the caller holds.
-    """
+    """Move the files of an earlier run to ``previous/``, in place of those that lie there."""
     if not any((folder / name).exists() for name in _OF_A_RUN):
         return
     previous = folder / PREVIOUS

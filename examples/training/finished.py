@@ -34,11 +34,7 @@ def after_the_end(folder: Path) -> str:
 
 
 def read_json(path: Path) -> Mapping[str, Any]:
-    """A JSON file of a run; empty where there is none.
-
-    Raises:
-        ValueError: If it is damaged.
-    """
+    """A JSON file of a run; empty where there is none."""
     try:
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     except ValueError as error:

@@ -28,15 +28,6 @@ def watch(
     """Drive tasks one after another in a window, until it is closed.
 
     The key N goes on with the next task, Escape ends.
-
-    Args:
-        policy: The policy, or a planner.
-        tasks: The tasks.
-        speed: How many times as fast as real.
-        **env_arguments: Arguments of the environment in place of the policy's.
-
-    Yields:
-        How each episode ended that was not left.
     """
     window: Window | None = None
     for number, task in enumerate(tasks):

@@ -40,15 +40,7 @@ def write_pictures(
     values: Values | None = None,
     **env_arguments: Any,
 ) -> None:
-    """Write ``trajectories.png``, ``episode.gif`` and, of a policy, ``values.png``.
-
-    Args:
-        policy: The policy, or a planner.
-        driven: What it did, one for each row of the table.
-        folder: Where the pictures go.
-        values: What its critic thinks, if that is known; else there are arrows without colors.
-        **env_arguments: Arguments of the environment in place of the policy's.
-    """
+    """Write ``trajectories.png``, ``episode.gif`` and, of a policy, ``values.png``."""
     Image.fromarray(trajectories_of(driven)).save(folder / TRAJECTORIES, optimize=True)
     number, task = longest(driven)
     # The number of a task is the seed of its walkers, and of the noise.

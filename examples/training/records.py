@@ -85,15 +85,7 @@ def last_best(records: Sequence[EvaluationRecord]) -> EvaluationRecord:
 
 
 def as_table(rows: Sequence[Any], kind: type[Any]) -> pd.DataFrame:
-    """Rows of one kind as a table.
-
-    Args:
-        rows: Instances of ``kind``, a dataclass.
-        kind: Names the columns, of a table without rows as well.
-
-    Returns:
-        A table with a column for each field.
-    """
+    """Rows of one kind as a table."""
     columns = [entry.name for entry in fields(kind)]
     return pd.DataFrame([asdict(row) for row in rows], columns=columns)
 
@@ -104,11 +96,7 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read a table; one without rows if there is no such file.
-
-    Raises:
-        ValueError: If the file is damaged.
-    """
+    """Read a table; one without rows if there is no such file."""
     if not path.exists():
         return pd.DataFrame()
     # An arm may be called 3 or None: only an empty cell has no value.

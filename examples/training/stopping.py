@@ -37,11 +37,7 @@ class Stop:
         return 128 + (self.signal or 0)
 
     def ask(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
-        """Ask to stop; a handler of signals.
-
-        Raises:
-            KeyboardInterrupt: If that was asked for before.
-        """
+        """Ask to stop; a handler of signals."""
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number

@@ -61,12 +61,6 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
 def family(name: str) -> str:
     """What a world is one of: the worlds of a generator, those of BARN, or itself.
 
-    Args:
-        name: Of the world.
-
-    Returns:
-        The name of all of them, as :func:`mpfa_envs.world_tasks` takes it where that is possible.
-
     Examples:
         >>> [family(name) for name in ("bars-test-7", "rooms-7", "barn-3", "test", "my-room")]
         ['bars:test', 'rooms', 'barn', 'test', 'my-room']
@@ -79,9 +73,6 @@ def family(name: str) -> str:
 
 def is_of_a_test(word: str) -> bool:
     """Whether a policy is tested there, so that nothing may be chosen by it.
-
-    Args:
-        word: A world, or the worlds of a generator or of BARN.
 
     Examples:
         >>> [is_of_a_test(word) for word in ("test", "bars:test", "bars-test-3", "barn", "bars-3")]
@@ -98,12 +89,6 @@ def world_name(world: str) -> str:
 
 def worlds_label(words: Sequence[str]) -> str:
     """A name for the results in some worlds.
-
-    Args:
-        words: As given to :func:`parse_worlds`.
-
-    Returns:
-        Part of a file's name; other worlds have another one.
 
     Examples:
         >>> worlds_label(["test", "rooms:100-109"])

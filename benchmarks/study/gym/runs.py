@@ -64,21 +64,7 @@ class Run:
 def wanted(
     tasks: Sequence[str], methods: Sequence[str], seeds: Sequence[int], folder: Path, **regime: int
 ) -> list[Run]:
-    """Runs in the order in which they are made: of each task and method the first seed first.
-
-    Args:
-        tasks: Names of tasks.
-        methods: Names of methods.
-        seeds: Their seeds.
-        folder: Of all runs.
-        **regime: What is not to be as in the table.
-
-    Returns:
-        The runs.
-
-    Raises:
-        ValueError: If a task, a method, a seed or a number cannot be.
-    """
+    """Runs in the order in which they are made: of each task and method the first seed first."""
     of_all = Regime(**regime)
     return [
         Run(Settings(task, method, seed, of_all), folder)
@@ -89,11 +75,7 @@ def wanted(
 
 
 def make(run: Run) -> None:
-    """Train, and write settings and rows, each of them whole or not at all.
-
-    Args:
-        run: A run that is not done; what is left of an interrupted one is overwritten.
-    """
+    """Train, and write settings and rows, each of them whole or not at all."""
     found = train(run.settings)
     run.path.mkdir(parents=True, exist_ok=True)
     text = json.dumps(asdict(run.settings), indent=2) + "\n"

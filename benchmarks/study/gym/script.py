@@ -79,17 +79,7 @@ def workers(count: int) -> Executor:
 
 
 def make_all(waiting: Sequence[Run], *, jobs: int, done: int, stop: Stop) -> list[Run]:
-    """Make runs, some at a time, with a progress bar.
-
-    Args:
-        waiting: The runs.
-        jobs: How many at a time.
-        done: Runs that were done before.
-        stop: Once it is asked for, no other run is begun.
-
-    Returns:
-        Those that failed.
-    """
+    """Make runs, some at a time, with a progress bar."""
     left, running, failed = list(waiting), dict[Future[None], Run](), list[Run]()
     # All runs take about as long: the estimate is by the mean of them.
     bar = tqdm(total=done + len(left), initial=done, unit="run", smoothing=0)

@@ -54,14 +54,7 @@ TABLE_F = Table(
 
 
 def read_runs(folder: Path) -> Rows:
-    """The rows of the runs that are at their end.
-
-    Args:
-        folder: Of the runs.
-
-    Returns:
-        Curves whose ``success`` is the score, with the ``return`` beside it; no tests.
-    """
+    """The rows of the runs that are at their end."""
     found = []
     for run in runs_in(folder):
         if run.is_done():
@@ -75,14 +68,7 @@ def read_runs(folder: Path) -> Rows:
 
 
 def with_mean(rows: Rows) -> Rows:
-    """Rows with arms for the mean of the tasks, of the seeds that a method has in all of them.
-
-    Args:
-        rows: Of :func:`read_runs`, or kept.
-
-    Returns:
-        The rows, and those of ``all tasks``.
-    """
+    """Rows with arms for the mean of the tasks, of the seeds that a method has in all of them."""
     curves = rows.curves
     methods = curves["arm"].str.rsplit("/", n=1).str[-1]
     groups = curves.assign(arm="gym/" + ALL + "/" + methods).groupby(

@@ -38,9 +38,6 @@ class Task:
     def score(self, returned: float) -> float:
         """A return between 0 and 1, beyond the bounds one of these.
 
-        Args:
-            returned: Total reward of an episode, or a mean of several.
-
         Examples:
             >>> Task("x", low=-200.0, high=0.0).score(-50.0)
             0.75
@@ -64,11 +61,7 @@ TASKS = {
 
 
 def task_of(name: str) -> Task:
-    """The task of a name.
-
-    Raises:
-        ValueError: If there is none, or what it needs is not installed.
-    """
+    """The task of a name."""
     if name not in TASKS:
         raise ValueError(unknown("task", name, TASKS))
     task = TASKS[name]
@@ -101,14 +94,7 @@ class HeldAction(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def make_env(task: Task) -> gymnasium.Env[Any, Any]:
-    """The environment of a task: actions in [-1, 1], and so are observations that have bounds.
-
-    Args:
-        task: The task.
-
-    Returns:
-        The environment; its observations are single precision.
-    """
+    """The environment of a task: actions in [-1, 1], and so are observations that have bounds."""
     env: gymnasium.Env[Any, Any] = gymnasium.make(task.name, disable_env_checker=True)
     least, greatest = np.float32(-1), np.float32(1)
     env = RescaleAction(env, least, greatest)

@@ -178,18 +178,7 @@ def make_learner(settings: Settings, env: EnvBase) -> TD3Learner:
 def iterations(
     regime: Regime, env: EnvBase, learner: TD3Learner, replay: Replay, *, seed: int
 ) -> Iterator[int]:
-    """Act with noise, store, learn.
-
-    Args:
-        regime: How often, and with how much noise.
-        env: Where to act.
-        learner: What acts and learns.
-        replay: What it learns from.
-        seed: Of the noise.
-
-    Yields:
-        Actions so far, after each block of updates.
-    """
+    """Act with noise, store, learn."""
     noise = OrnsteinUhlenbeckProcessModule(
         env.action_spec,
         theta=regime.noise_return,

@@ -36,17 +36,7 @@ PLAIN = Arm()
 
 
 def parse_arms(texts: Sequence[str]) -> list[Arm]:
-    """The arms on a command line; :data:`PLAIN` if there are none.
-
-    Args:
-        texts: Each as :func:`parse_arm` takes it.
-
-    Returns:
-        The arms.
-
-    Raises:
-        ValueError: If one cannot be read, or two have the same name.
-    """
+    """The arms on a command line; :data:`PLAIN` if there are none."""
     arms: list[Arm] = []
     for text in texts:
         try:
@@ -87,14 +77,7 @@ def parse_arm(text: str) -> Arm:
 
 
 def check_free(settings: Sequence[str]) -> None:
-    """Refuse settings that the study itself gives its runs, and unknown ones.
-
-    Args:
-        settings: As on the command line of ``train.py``.
-
-    Raises:
-        ValueError: With the setting's name.
-    """
+    """Refuse settings that the study itself gives its runs, and unknown ones."""
     for setting in settings:
         if setting.startswith("-") or "=" not in setting:
             raise ValueError(f"{setting!r} is not NAME=VALUE")

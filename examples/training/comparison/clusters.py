@@ -44,11 +44,7 @@ class RemoteChild:
         self._task = ray.remote(**options)(_run).remote(list(command), log, Path.cwd())
 
     def ended(self) -> int | None:
-        """Exit status, or None while it runs or waits for a core.
-
-        Raises:
-            Lost: If its machine is gone.
-        """
+        """Exit status, or None while it runs or waits for a core."""
         done, _ = ray.wait([self._task], timeout=0)
         return self.wait() if done else None
 
@@ -57,11 +53,7 @@ class RemoteChild:
         ray.cancel(self._task)
 
     def wait(self) -> int:
-        """Wait for its end and give the exit status.
-
-        Raises:
-            Lost: If its machine is gone.
-        """
+        """Wait for its end and give the exit status."""
         try:
             return int(ray.get(self._task))
         except exceptions.TaskCancelledError:

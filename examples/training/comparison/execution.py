@@ -55,11 +55,7 @@ class Running:
         self._child = start(self._commands.pop(0), self.log)
 
     def ended(self) -> int | None:
-        """Exit status of the last command, or of one that failed; None while it runs.
-
-        Raises:
-            Lost: If its machine is gone.
-        """
+        """Exit status of the last command, or of one that failed; None while it runs."""
         status = self.job.status()
         self._bar.total, self._bar.n = status.get("total"), status.get("done", 0)
         self._bar.unit = status.get("unit", "it")
@@ -210,11 +206,7 @@ def make_runs(
 
 @contextmanager
 def _starting(address: str | None) -> Iterator[Start]:
-    """Whatever starts a command: on this machine, or on a cluster.
-
-    Raises:
-        ValueError: If Ray is not installed, or there is no such cluster.
-    """
+    """Whatever starts a command: on this machine, or on a cluster."""
     if address is None:
         yield Child
         return

@@ -81,11 +81,7 @@ class Job:
         return [*own, *with_defaults(self.arm.over(overrides))]
 
     def asked(self, overrides: Sequence[str]) -> TrainSettings:
-        """Its settings.
-
-        Raises:
-            ValueError: If they cannot be, or are those of several runs.
-        """
+        """Its settings."""
         try:
             first, *others = composed(self.overrides(overrides))
         except ValueError as error:
@@ -219,18 +215,7 @@ robots=4'
 
 
 def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job, list[str]]:
-    """Runs that were trained with other settings than those asked for.
-
-    Args:
-        jobs: The runs.
-        overrides: The settings of the study.
-
-    Returns:
-        Where they differ; runs as they should be are left out.
-
-    Raises:
-        ValueError: If settings cannot be.
-    """
+    """Runs that were trained with other settings than those asked for."""
     asked: dict[tuple[str, str, Arm], TrainSettings] = {}
     others = {}
     for job in jobs:
@@ -245,13 +230,7 @@ def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job,
 
 
 def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
-    """Write the rows of all evaluated runs in one file, and their settings in another.
-
-    Args:
-        jobs: The runs.
-        wanted: What they were asked to do.
-        folder: Of the study.
-    """
+    """Write the rows of all evaluated runs in one file, and their settings in another."""
     tables, settings = [], {}
     for job in jobs:
         if job.is_evaluated(wanted):

@@ -26,11 +26,7 @@ class Started(Protocol):
     """A command that was started, on this machine or on another."""
 
     def ended(self) -> int | None:
-        """Exit status, or None while it runs.
-
-        Raises:
-            Lost: If its machine is gone.
-        """
+        """Exit status, or None while it runs."""
         ...
 
     def stop(self) -> None:
@@ -38,11 +34,7 @@ class Started(Protocol):
         ...
 
     def wait(self) -> int:
-        """Wait for its end and give the exit status.
-
-        Raises:
-            Lost: If its machine is gone.
-        """
+        """Wait for its end and give the exit status."""
         ...
 
 

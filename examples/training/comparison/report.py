@@ -39,17 +39,7 @@ def write_report(
     tables: Callable[[pd.DataFrame], list[str]],
     *speeds: Callable[[Runs], str],
 ) -> int:
-    """Read the rows of the folders on a command line, write ``tables.md`` and a figure.
-
-    Args:
-        parser: Gets the arguments of both.
-        arguments: The command line.
-        tables: From the episodes of one family of worlds to its tables.
-        *speeds: From evaluations during training to a table each.
-
-    Returns:
-        Exit status.
-    """
+    """Read the rows of the folders on a command line, write ``tables.md`` and a figure."""
     parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
     parser.add_argument("--output", type=Path, help="folder (default: the first study's)")
     options = parser.parse_args(arguments)
@@ -131,15 +121,7 @@ def tables_of_runs(rows: pd.DataFrame, name: str) -> Runs:
 
 
 def sections(rows: pd.DataFrame, tables: Callable[[pd.DataFrame], list[str]]) -> list[str]:
-    """Headed tables of each physics and family of worlds, and success in all worlds together.
-
-    Args:
-        rows: Of :func:`read_comparisons`.
-        tables: From the rows of one family to its tables.
-
-    Returns:
-        The parts of a page.
-    """
+    """Headed tables of each physics and family of worlds, and success in all worlds together."""
     parts = []
     for physics, driven in rows.groupby("physics", sort=False):
         how = f", {physics!s}" if physics else ""
@@ -158,18 +140,7 @@ def table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def scores(rows: pd.DataFrame, column: str) -> Array:
-    """Values of a column, shape ``[runs, pairs]``; flags are 0 and 1.
-
-    Args:
-        rows: Evaluation episodes of one arm, each of its runs on the same pairs.
-        column: Its name.
-
-    Returns:
-        The values, runs in the order in which they come first.
-
-    Raises:
-        ValueError: If a run lacks pairs that another one has.
-    """
+    """Values of a column, shape ``[runs, pairs]``; flags are 0 and 1."""
     matrix = rows.pivot(index="run", columns=["world", "episode"], values=column)
     matrix = matrix.loc[rows["run"].unique()].astype(float)
     if matrix.isna().to_numpy().any():

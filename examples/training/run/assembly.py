@@ -49,18 +49,7 @@ def make_learner(
     *,
     device: str = "cpu",
 ) -> Learner:
-    """Networks, loss and optimizers; the loss writes those signals that the method asks for.
-
-    Args:
-        settings: Networks, loss and optimizers.
-        method: Signals, importance weights, distance, averaging and kind of optimizer.
-        observation_size: ``O``.
-        action_size: ``A``.
-        device: Where the networks are.
-
-    Returns:
-        The learner.
-    """
+    """Networks, loss and optimizers; the loss writes those signals that the method asks for."""
     if settings.algorithm == "q_learning":
         return _q_learning(settings, method, observation_size, action_size)
     network: Options = {
@@ -191,14 +180,7 @@ def method_of(settings: TrainSettings) -> Method:
 
 
 def policy_layers(policy: TensorDictModule) -> list[Layer]:
-    """The layers of a policy, from observation to the action without noise.
-
-    Args:
-        policy: Of a learner.
-
-    Returns:
-        Copies of the layers, as :class:`mpfa_envs.Policy` takes them.
-    """
+    """The layers of a policy, from observation to the action without noise."""
     choice = Choice(np.array(WHEEL_PAIRS, dtype=np.float32))
     module = getattr(policy, "module", None)
     if isinstance(module, ValueNetwork):

@@ -56,13 +56,7 @@ class Assessment:
         return self.over and self._taken > 0 and self.least >= self.best
 
     def begin(self, first: int, *, late: bool, at: tuple[int, int]) -> None:
-        """Assess a policy that stays as it is until :attr:`over`.
-
-        Args:
-            first: Number of the first episode that is wholly its own.
-            late: Whether the early part of the run is over.
-            at: Episodes and actions of the run so far.
-        """
+        """Assess a policy that stays as it is until :attr:`over`."""
         if late and not self._late and math.isfinite(self.best):
             # Of a negative score TD7's product would be higher, not lower.
             self.best -= (1.0 - self.settings.best_factor) * abs(self.best)
@@ -94,16 +88,7 @@ class Assessment:
         return sum(pays for name, pays in _AT_THE_END.items() if getattr(record, name))
 
     def conclude(self, policy: nn.Module, *, total_steps: int, episode: int) -> AssessmentRecord:
-        """Keep the policy if it passed, and tell what was found.
-
-        Args:
-            policy: The one that was assessed.
-            total_steps: Actions of the run so far.
-            episode: Episodes of the run that have ended.
-
-        Returns:
-            The record, with the best score as it was before.
-        """
+        """Keep the policy if it passed, and tell what was found."""
         record = AssessmentRecord(
             total_steps=total_steps,
             episode=episode,
@@ -136,12 +121,7 @@ class Assessment:
         }
 
     def load_state_dict(self, state: dict[str, Any], policy: nn.Module) -> None:
-        """Go on where :meth:`state_dict` was called.
-
-        Args:
-            state: What it gave.
-            policy: One like those that are kept.
-        """
+        """Go on where :meth:`state_dict` was called."""
         self.over, self.best, self.least = state["over"], state["best"], state["least"]
         self._late, self._first, self._taken = state["late"], state["first"], state["taken"]
         self._at, self.kept_at = tuple(state["at"]), tuple(state["kept_at"])

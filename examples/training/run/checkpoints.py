@@ -18,18 +18,7 @@ FORMAT = 5
 
 
 def read_checkpoint(folder: Path) -> dict[str, Any]:
-    """Read a run's checkpoint without executing anything in it.
-
-    Args:
-        folder: The folder of the run.
-
-    Returns:
-        What :meth:`training.run.loop.TrainingRun.save` wrote.
-
-    Raises:
-        FileNotFoundError: If there is none.
-        ValueError: If it is damaged, or another version wrote it.
-    """
+    """Read a run's checkpoint without executing anything in it."""
     file = folder / CHECKPOINT
     if not file.exists():
         raise FileNotFoundError(f"resume: there is no {CHECKPOINT} in {folder}")
@@ -44,26 +33,14 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
 
 
 def random_state(device: str) -> Any:
-    """Where PyTorch's random numbers are.
-
-    Args:
-        device: Of the networks; noise of targets is made there.
-
-    Returns:
-        The state of the CPU's generator, with a GPU both in a dictionary.
-    """
+    """Where PyTorch's random numbers are."""
     if torch.device(device).type != "cuda":
         return torch.get_rng_state()
     return {"cpu": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state(device)}
 
 
 def set_random_state(device: str, state: Any) -> None:
-    """Go on where :func:`random_state` was called.
-
-    Args:
-        device: Of the networks.
-        state: What it gave; that of the CPU alone leaves the GPU's generator as it is.
-    """
+    """Go on where :func:`random_state` was called."""
     if not isinstance(state, dict):
         state = {"cpu": state}
     torch.set_rng_state(state["cpu"])
@@ -72,14 +49,7 @@ def set_random_state(device: str, state: Any) -> None:
 
 
 def as_tensors(value: Any) -> Any:
-    """A state with tensors in place of NumPy's arrays, which a safe loader takes for code.
-
-    Args:
-        value: Plain values, arrays, and lists, tuples and dictionaries of these.
-
-    Returns:
-        The same with tensors.
-    """
+    """A state with tensors in place of NumPy's arrays, which a safe loader takes for code."""
     return _replaced(value, np.ndarray, torch.from_numpy)
 
 

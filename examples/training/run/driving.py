@@ -60,13 +60,7 @@ class Robots:
         self._begun = 0
 
     def make_replay(self, method: Method, *, seed: int, **policy: Any) -> Replay:
-        """The buffer that their transitions go to, and what is drawn from it.
-
-        Args:
-            method: What is kept and how it is drawn.
-            seed: Of the buffer's randomness.
-            **policy: ``policy`` and ``sigma`` of :func:`torchrl_mpfa.methods.make_replay`.
-        """
+        """The buffer that their transitions go to, and what is drawn from it."""
         return make_replay(method, generator=torch.Generator().manual_seed(seed), **policy)
 
     def environment(self, world: str) -> EnvBase:
@@ -83,13 +77,7 @@ class Robots:
         return self._env
 
     def begin(self, world: str, explorer: Explorer, *, seed: int) -> None:
-        """Begin an episode with each robot; those that were on their way are given up.
-
-        Args:
-            world: Of the stage, as in the settings.
-            explorer: What acts.
-            seed: Seed of the environment.
-        """
+        """Begin an episode with each robot; those that were on their way are given up."""
         env = self.environment(world)
         env.set_seed(seed)
         self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
@@ -220,11 +208,7 @@ class Robots:
         }
 
     def recall(self, state: dict[str, Any]) -> None:
-        """Take over what counts for the whole run, and which episodes were under way.
-
-        Args:
-            state: What :meth:`state_dict` gave.
-        """
+        """Take over what counts for the whole run, and which episodes were under way."""
         self.seconds = state["seconds"]
         self.given_up = state.get("given_up", 0)
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
@@ -236,12 +220,7 @@ class Robots:
         return state["environment"] is not None
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was called.
-
-        Args:
-            world: Of the stage.
-            state: The state.
-        """
+        """Go on where :meth:`state_dict` was called."""
         env = self.environment(world)
         # A reset makes the entries that a step wants; what is in them is replaced.
         self._state = env.reset()

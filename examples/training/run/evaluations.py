@@ -19,17 +19,7 @@ SEED = 1
 def exported_policy(
     policy: TensorDictModule, settings: TrainSettings, *, episodes: int = 0, steps: int = 0
 ) -> Policy:
-    """The policy without noise, with what is needed to use it and how it was trained.
-
-    Args:
-        policy: The policy in training.
-        settings: Of the run.
-        episodes: That it was trained for.
-        steps: Actions that it was trained for.
-
-    Returns:
-        The policy, whose weights are copies.
-    """
+    """The policy without noise, with what is needed to use it and how it was trained."""
     return Policy(
         policy_layers(policy),
         card={

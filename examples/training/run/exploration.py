@@ -225,16 +225,7 @@ class RandomPolicy:
 def make_explorer(
     policy: DirectModule | StochasticActor, settings: ExplorationSettings, action_spec: TensorSpec
 ) -> Explorer:
-    """Noise for a policy without any, none for one that is random, chance for one that chooses.
-
-    Args:
-        policy: The policy.
-        settings: The noise.
-        action_spec: Range of actions.
-
-    Returns:
-        The explorer.
-    """
+    """Noise for a policy without any, none for one that is random, chance for one that chooses."""
     if isinstance(policy, StochasticActor):
         return RandomPolicy(policy, settings)
     if "action_value" in policy.out_keys:

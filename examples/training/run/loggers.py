@@ -73,12 +73,7 @@ class CSVLog:
 
 
 def forget_after(actions: int, path: Path) -> None:
-    """Remove the rows of a CSV file that were logged after so many actions.
-
-    Args:
-        actions: Of the last row that is kept.
-        path: The file. A last row that was cut short is removed too.
-    """
+    """Remove the rows of a CSV file that were logged after so many actions."""
     rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
     kept = [row for row in rows if row.endswith("\n") and int(row.partition(",")[0]) <= actions]
     if kept != rows:

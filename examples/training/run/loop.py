@@ -144,12 +144,6 @@ class TrainingRun:
         """Run to the end of the curriculum, or until asked to stop.
 
         Whatever ends it, the run is saved as it is then, unless an error broke its parts.
-
-        Args:
-            on_iteration: Called after each iteration.
-
-        Returns:
-            Whether the curriculum was finished.
         """
         bar = tqdm(
             total=self.schedule.total,

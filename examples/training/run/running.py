@@ -103,19 +103,7 @@ def start(settings: TrainSettings, folder: Path) -> int:
 
 
 def resume(folder: Path, overrides: list[Override]) -> int:
-    """Go on with a run where its checkpoint was written.
-
-    Args:
-        folder: Of the run.
-        overrides: Settings that shall be others from now on.
-
-    Returns:
-        As :func:`start`.
-
-    Raises:
-        Refused: If there is no checkpoint, if it cannot be read, if a setting may not change, or if
-            another run is using the folder.
-    """
+    """Go on with a run where its checkpoint was written."""
     with ExitStack() as held:
         with refusing():
             check_single(overrides)

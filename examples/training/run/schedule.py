@@ -56,22 +56,13 @@ class Schedule:
         return self.done == self.total
 
     def count(self, *, actions: int, episodes: int) -> None:
-        """Count what an iteration brought.
-
-        Args:
-            actions: Actions of all robots.
-            episodes: Episodes that ended.
-        """
+        """Count what an iteration brought."""
         self.actions += actions
         self.episodes += episodes
         self._in_stage += episodes if self.unit == "episode" else actions
 
     def advance(self) -> bool:
-        """Go to the next stage if the present one is over and not the last.
-
-        Returns:
-            Whether another stage begins.
-        """
+        """Go to the next stage if the present one is over and not the last."""
         is_last = self.stage == len(self.stages) - 1
         if is_last or self._in_stage < self.stages[self.stage].length:
             return False

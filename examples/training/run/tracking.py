@@ -110,14 +110,7 @@ class Tracker:
     def log_policy(
         self, entries: Mapping[str, Any], *, file: Path, card: Mapping[str, Any], actions: int
     ) -> None:
-        """Log pictures and tables of what a policy does, and to wandb the policy.
-
-        Args:
-            entries: Pictures, the file of an animation and tables, by their names.
-            file: The policy's.
-            card: How it was trained.
-            actions: Of all robots so far.
-        """
+        """Log pictures and tables of what a policy does, and to wandb the policy."""
         self._log(entries, actions)
         for log in self._logs:
             if isinstance(log, WandbLog):
@@ -221,11 +214,6 @@ def _as_wandb(value: Any) -> Any:
 
 def upload_command(wanted: TrackingSettings, folder: Path, run_id: str) -> str | None:
     """The command line that uploads all parts of an offline run, as one run.
-
-    Args:
-        wanted: Of the run.
-        folder: Of the run.
-        run_id: wandb's.
 
     Examples:
         >>> upload_command(TrackingSettings(mode="offline"), Path("runs/demo"), "1a2b3c4d")

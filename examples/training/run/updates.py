@@ -82,13 +82,7 @@ class UpdateLog:
         self._squares = losses.get("td_error")
 
     def add(self, total_steps: int, *, episode: int, buffer: SignalReplayBuffer) -> None:
-        """Add a row.
-
-        Args:
-            total_steps: Actions of the run so far.
-            episode: Episodes of the run that have ended.
-            buffer: What is sampled from.
-        """
+        """Add a row."""
         rewards = buffer.rewards()
         stats = buffer.stats()
         seen = self._learned_at[: len(rewards)]

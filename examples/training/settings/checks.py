@@ -47,14 +47,7 @@ def _is_number(value: Any) -> bool:
 
 
 def check_settings(settings: TrainSettings) -> None:
-    """Refuse a value that cannot be.
-
-    Args:
-        settings: The settings.
-
-    Raises:
-        ValueError: With the setting's name and its value.
-    """
+    """Refuse a value that cannot be."""
     if not settings.curriculum.stages:
         raise ValueError("curriculum.stages must name at least one world, got []")
     check_rules(settings, rules_of(settings), "")

@@ -35,17 +35,7 @@ def known_settings(settings: Any = TrainSettings, prefix: str = "") -> Iterator[
 
 
 def parse_overrides(arguments: Sequence[str]) -> list[Override]:
-    """The settings on a command line.
-
-    Args:
-        arguments: The command line; options of Hydra are passed over.
-
-    Returns:
-        The settings, those of Hydra itself left out.
-
-    Raises:
-        ValueError: If one cannot be read, is unknown, or an unknown choice; with the nearest one.
-    """
+    """The settings on a command line."""
     texts = [
         text
         for before, text in pairwise(["", *arguments])
@@ -91,17 +81,7 @@ def _check_choices(group: str, words: Sequence[str]) -> None:
 
 
 def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
-    """The settings of each run that a command line asks for, checked.
-
-    Args:
-        arguments: Settings as on the command line of ``train.py``.
-
-    Yields:
-        The settings of the run, of each one if it is a sweep.
-
-    Raises:
-        ValueError: If a setting cannot have its value, with its name.
-    """
+    """The settings of each run that a command line asks for, checked."""
     alternatives = []
     for override in parse_overrides(arguments):
         text = override.input_line or ""

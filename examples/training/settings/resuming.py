@@ -42,18 +42,7 @@ OF_THE_CALL = ("resume", "run_dir", "overwrite")
 
 
 def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
-    """The settings of a run with those of a command line on top.
-
-    Args:
-        saved: The settings in its checkpoint.
-        overrides: The command line.
-
-    Returns:
-        The settings.
-
-    Raises:
-        omegaconf.errors.OmegaConfBaseException: If a value is of another type.
-    """
+    """The settings of a run with those of a command line on top."""
     before = as_settings(saved)
     config = OmegaConf.structured(before)
     for override in overrides:
@@ -76,14 +65,7 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
 
 
 def check_single(overrides: list[Override]) -> None:
-    """Refuse settings of several runs, as a sweep has them.
-
-    Args:
-        overrides: The command line.
-
-    Raises:
-        ValueError: With the first one.
-    """
+    """Refuse settings of several runs, as a sweep has them."""
     for override in overrides:
         if override.is_sweep_override():
             key, _, values = (override.input_line or "").partition("=")
@@ -98,16 +80,7 @@ def choices_of(override: Override) -> list[str]:
 
 
 def check_lawful(before: TrainSettings, after: TrainSettings, folder: Path) -> None:
-    """Refuse what a run cannot change on its way.
-
-    Args:
-        before: Its settings.
-        after: Those that it shall go on with.
-        folder: Its folder.
-
-    Raises:
-        ValueError: With the settings that differ.
-    """
+    """Refuse what a run cannot change on its way."""
     old, new = dict(settings_by_name(before)), dict(settings_by_name(after))
     fixed = [n for n in new if n not in (*LAWFUL, *OF_THE_CALL, "curriculum.stages")]
     wrong = [f"{name}={new[name]} (it has {old[name]})" for name in fixed if new[name] != old[name]]

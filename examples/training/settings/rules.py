@@ -44,15 +44,7 @@ WORD: Rule = (lambda value: bool(value.strip()), "not be empty")
 
 
 def settings_by_name(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every setting with its dotted name.
-
-    Args:
-        settings: The settings.
-        prefix: Start of their names.
-
-    Yields:
-        Name and value; the settings of a group are single ones, stages are one value.
-    """
+    """Every setting with its dotted name."""
     for entry in fields(settings):
         if not prefix and entry.name in ("hydra", "defaults"):
             continue
@@ -73,16 +65,7 @@ def rules_of(settings: Any) -> dict[str, Rule]:
 
 
 def check_rules(settings: Any, rules: Mapping[str, Rule], prefix: str) -> None:
-    """Reject a value that its rule does not allow.
-
-    Args:
-        settings: A group of settings.
-        rules: By the names of its fields.
-        prefix: Start of their names on the command line.
-
-    Raises:
-        ValueError: With the setting's name and its value.
-    """
+    """Reject a value that its rule does not allow."""
     for name, rule in rules.items():
         value, (allowed, wanted) = getattr(settings, name), rule
         if value is not None and not allowed(value):

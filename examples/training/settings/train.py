@@ -106,12 +106,6 @@ _LONGEST_NAME = 60
 def curriculum_name(stages: Sequence[Stage]) -> str:
     """What a curriculum is called unless the user names it: after what is really run.
 
-    Args:
-        stages: The stages.
-
-    Returns:
-        The name of one of :data:`CURRICULA`, or worlds and episodes.
-
     Examples:
         >>> curriculum_name([Stage("A", 100)]), curriculum_name([Stage("A", 5), Stage("B", 7)])
         ('A', 'A5+B7')
@@ -353,17 +347,7 @@ def _resolve_name(name: str | None, stages: Sequence[Any]) -> str:
 
 
 def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
-    """Typed settings from what Hydra composed or a checkpoint holds.
-
-    Args:
-        config: The values; those that it lacks are the defaults.
-
-    Returns:
-        The settings, with the curriculum and the worlds of the evaluations named.
-
-    Raises:
-        omegaconf.errors.OmegaConfBaseException: If a value is of another type, or unknown.
-    """
+    """Typed settings from what Hydra composed or a checkpoint holds."""
     values = OmegaConf.create(config) if isinstance(config, dict) else config.copy()
     OmegaConf.set_struct(values, False)
     for name in ("defaults", "hydra"):
