@@ -21,8 +21,7 @@ from torchrl.envs import GymWrapper, InitTracker, TransformedEnv
 
 from benchmarks.study import pages as study_pages
 from benchmarks.study import report
-from benchmarks.study.gym import runs, table, tasks, training
-from benchmarks.study.gym import script as gym_study
+from benchmarks.study.gym import runs, script, table, tasks, training
 from benchmarks.study.gym.runs import EVALUATIONS, SETTINGS, Run, wanted
 from benchmarks.study.gym.table import ALL, SEEDS, TABLE_F, label_of, missing, read_runs, with_mean
 from benchmarks.study.gym.tasks import TASKS, make_env, task_of
@@ -224,10 +223,10 @@ def test_an_evaluation_adds_the_rewards_of_each_episode_up_to_its_end() -> None:
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs in a thread of this process, which take no second."""
-    monkeypatch.setattr(gym_study, "workers", ThreadPoolExecutor)
-    real = gym_study.wanted
+    monkeypatch.setattr(script, "workers", ThreadPoolExecutor)
+    real = script.wanted
     monkeypatch.setattr(
-        gym_study,
+        script,
         "wanted",
         lambda *words, **_: [
             replace(run, settings=replace(run.settings, regime=TINY)) for run in real(*words)
@@ -244,7 +243,7 @@ def asked(folder: Path, *more: str) -> list[str]:
 def test_what_is_done_is_left_alone_and_what_was_interrupted_is_made_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert gym_study.main(asked(tmp_path)) == 0
+    assert script.main(asked(tmp_path)) == 0
     assert "2 runs, 0 of them done" in capsys.readouterr().out
     done, cut = (tmp_path / f"Pendulum-v1-{method}-100" for method in ("uniform", "per"))
     assert pd.read_csv(done / EVALUATIONS)["actions"].tolist() == [48, 96]
@@ -252,7 +251,7 @@ def test_what_is_done_is_left_alone_and_what_was_interrupted_is_made_again(
     before = (done / EVALUATIONS).stat().st_mtime_ns, (cut / EVALUATIONS).read_bytes()
     # As a kill leaves it: the evaluations come last.
     (cut / EVALUATIONS).unlink()
-    assert gym_study.main(asked(tmp_path)) == 0
+    assert script.main(asked(tmp_path)) == 0
     assert "2 runs, 1 of them done" in capsys.readouterr().out
     assert (done / EVALUATIONS).stat().st_mtime_ns == before[0]
     again = pd.read_csv(cut / EVALUATIONS)
@@ -270,7 +269,7 @@ def test_a_run_of_other_settings_is_not_taken_for_one_of_these(
     (run / EVALUATIONS).write_text("actions,return,score,trained_for\n")
     other = Settings("Pendulum-v1", "per", 100, replace(TINY, width=9))
     (run / SETTINGS).write_text(json.dumps(asdict(other)))
-    assert gym_study.main(asked(tmp_path)) == 2
+    assert script.main(asked(tmp_path)) == 2
     assert "was made with width=9, asked for is 8" in (found := capsys.readouterr().err)
     assert found.count("\n") == 1
     assert not (tmp_path / "Pendulum-v1-uniform-100").exists()
@@ -285,8 +284,8 @@ def test_a_run_that_fails_does_not_keep_the_others_from_theirs(
             raise ValueError("no luck")
         runs.make(run)
 
-    monkeypatch.setattr(gym_study, "make", make)
-    assert gym_study.main(asked(tmp_path)) == 1
+    monkeypatch.setattr(script, "make", make)
+    assert script.main(asked(tmp_path)) == 1
     assert "Pendulum-v1-uniform-100: failed, ValueError: no luck" in capsys.readouterr().out
     assert (tmp_path / "Pendulum-v1-per-100" / EVALUATIONS).exists()
 
@@ -297,9 +296,9 @@ def test_a_signal_lets_the_run_that_is_under_way_end_and_begins_no_other(
 ) -> None:
     begun = []
     stops = []
-    real = gym_study.Stop
+    real = script.Stop
 
-    def stop(answer: str) -> gym_study.Stop:
+    def stop(answer: str) -> script.Stop:
         stops.append(real(answer))
         return stops[0]
 
@@ -307,9 +306,9 @@ def test_a_signal_lets_the_run_that_is_under_way_end_and_begins_no_other(
         begun.append(run.name)
         stops[0].ask()
 
-    monkeypatch.setattr(gym_study, "Stop", stop)
-    monkeypatch.setattr(gym_study, "make", make)
-    assert gym_study.main(asked(tmp_path)) == 130
+    monkeypatch.setattr(script, "Stop", stop)
+    monkeypatch.setattr(script, "make", make)
+    assert script.main(asked(tmp_path)) == 130
     assert begun == ["Pendulum-v1-uniform-100"]
 
 
@@ -329,7 +328,7 @@ def test_what_cannot_be_is_refused(
     wrong: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
-        gym_study.parse(["--tasks", "Pendulum-v1", *wrong])
+        script.parse(["--tasks", "Pendulum-v1", *wrong])
     assert message in capsys.readouterr().err
 
 
@@ -400,7 +399,7 @@ def test_page_and_figures_are_made_of_runs_and_of_kept_rows(
     assert "last policy" not in text and "Missing" not in text
     for name in ("curves", "profiles", "arms"):
         assert (pages / f"F_{name}.png").stat().st_size > 10_000
-    gym_study.main(["--folder", str(folder), "--keep", str(kept), "--tasks", "Pendulum-v1"])
+    script.main(["--folder", str(folder), "--keep", str(kept), "--tasks", "Pendulum-v1"])
     assert "written" in capsys.readouterr().out
     rows = read_kept(kept, "F")
     curves = read_runs(folder).curves.sort_values(["arm", "seed"], kind="stable", ignore_index=True)

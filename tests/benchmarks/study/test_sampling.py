@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from benchmarks.study import sampling as plot_sampling
+from benchmarks.study import sampling
 from benchmarks.study.sampling import COLORS, KINDS, count_samples, main, samples_uniformly
 from torchrl_mpfa.methods import ALIASES, METHODS
 
@@ -19,8 +19,8 @@ NAMES = sorted(set(METHODS) - set(ALIASES))
 
 @pytest.fixture(autouse=True)
 def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plot_sampling, "COUNT", 400)
-    monkeypatch.setattr(plot_sampling, "ROUNDS", 60)
+    monkeypatch.setattr(sampling, "COUNT", 400)
+    monkeypatch.setattr(sampling, "ROUNDS", 60)
 
 
 def means_by_kind(name: str, who: str = "critic") -> dict[str, float]:
@@ -70,7 +70,7 @@ def test_replay_by_age_samples_the_newest_most() -> None:
 
 def test_a_reliable_error_is_sampled_more_often_than_one_early_in_its_episode() -> None:
     _, found = count_samples(METHODS["reaper"])
-    by_step = found["critic"].reshape(-1, plot_sampling.EPISODE_LENGTH).mean(0)
+    by_step = found["critic"].reshape(-1, sampling.EPISODE_LENGTH).mean(0)
     assert by_step[-10:].mean() > 1.2 * by_step[:10].mean()
 
 
