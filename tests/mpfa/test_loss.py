@@ -28,7 +28,7 @@ from tests.mpfa.losses import (
 )
 from torchrl_mpfa import SignalDDPGLoss, SignalSACLoss, SignalTD3Loss, make_ddpg_loss
 from torchrl_mpfa.losses import SignalLoss
-from torchrl_mpfa.losses.functional import pal_distance
+from torchrl_mpfa.losses.functional import distance, pal_distance
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -342,6 +342,18 @@ def test_the_exponent_of_pal_reaches_the_loss(alpha):
     error = found["target_value"] - found["pred_value"]
     assert float(error.abs().max()) > 1
     torch.testing.assert_close(found["loss_value"], pal_distance(error, alpha=alpha).mean())
+
+
+@pytest.mark.parametrize("name", ["smooth_l1", "pal"])
+def test_a_loss_bends_where_the_batch_says_in_units_of_the_reward(name):
+    loss, batch = make_loss(loss_function=name, reward_scale=0.5), make_batch()
+    batch["bend"] = torch.linspace(0.1, 1.0, 6).unsqueeze(-1)
+    found = loss(batch)
+    unit = 0.5 * batch["bend"].squeeze(-1)
+    expected = distance(found["pred_value"], found["target_value"], name, unit=unit)
+    torch.testing.assert_close(found["loss_value"], expected.mean())
+    plain = loss(batch.exclude("bend"))["loss_value"]
+    assert not torch.allclose(found["loss_value"], plain)
 
 
 def test_an_action_spec_takes_the_place_of_bounds():
