@@ -66,7 +66,8 @@ COMMON = [
     *[
         (name, NOTHING, f"'{name}' is missing in the saved sampler")
         for name in (
-            *("_alpha", "_beta", "_eps", "_max_capacity", "_highest", "_highest_slot", "_kind"),
+            *("_alpha", "_beta", "_eps", "_max_capacity", "_highest", "_highest_slot"),
+            *("_kind", "_format"),
             *("_priorities", "_learned", "_sum_tree", "_min_tree", "_signals", "_weights"),
             *("_weighed_at", "_mean_reward"),
         )

@@ -34,7 +34,8 @@ def test_an_empty_buffer_gives_one():
 def test_fresh_rows_do_not_hand_on_what_they_were_given():
     buffer = make_plain(8)
     buffer.extend(make_transitions(4))
-    update(buffer, [0], [20.0])
+    update(buffer, [0, 1], [20.0, 0.4])
+    update(buffer, [1], [0.3])  # A lower one leaves it as it is.
     buffer.extend(make_transitions(3))
     assert buffer.sampler.priorities()[4:7].tolist() == [20.0] * 3
     update(buffer, [0], [0.5])  # Its slot was sampled again.

@@ -14,7 +14,6 @@ from tests.mpfa.transitions import (
     make_buffer,
     make_transitions,
     same,
-    seeded,
     snapshot,
     spoil,
     train_rounds,
@@ -106,16 +105,6 @@ def test_priorities_set_after_saving_are_forgotten_by_loading(tmp_path):
     train_rounds(buffer, 5)
     buffer.loads(tmp_path / "buffer")
     assert same(before, snapshot(buffer))
-
-
-def test_a_second_save_replaces_the_first(tmp_path):
-    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
-    for number in range(2):
-        first.extend(make_transitions(15, seed=number))
-        train_rounds(first, 3)
-        first.dumps(tmp_path / "buffer")
-    second.loads(tmp_path / "buffer")
-    assert go_on(first).equal(go_on(second))
 
 
 def seal_again(folder):
@@ -216,15 +205,6 @@ def test_a_folder_may_be_moved_before_it_is_loaded(tmp_path):
     shutil.move(tmp_path / "here", tmp_path / "there")
     second.loads(tmp_path / "there")
     assert first.sample()["index"].equal(second.sample()["index"])
-
-
-def test_the_state_holds_tensors_and_plain_values_only(tmp_path):
-    buffer = make_kind("memory", tmp_path)
-    buffer.extend(make_transitions(24))
-    train_rounds(buffer, 2)
-    save_atomically(buffer.sampler.state_dict(), tmp_path / "sampler.pt")
-    assert same(load_safely(tmp_path / "sampler.pt"), buffer.sampler.state_dict())
-    assert seeded(0).get_state().equal(seeded(0).get_state())
 
 
 @pytest.mark.parametrize("way", [by_state_dict, by_folder], ids=lambda way: way.__name__)

@@ -185,25 +185,6 @@ def test_a_fresh_transition_gets_the_highest_priority_in_the_buffer_before_alpha
     assert leaves(buffer)[index].tolist() == pytest.approx([float(highest) ** 0.6] * 3)
 
 
-def test_the_highest_priority_falls_when_its_row_is_lowered_and_not_otherwise():
-    buffer = make_buffer(8, adjustments=[], fusion=FixedFusion({"td_error": 1.0}), eps=0.0)
-    buffer.extend(make_transitions(8))
-
-    def update(index, values):
-        batch = set_batch(buffer, index)
-        count = len(index)
-        batch["signals"] = TensorDict(
-            {"td_error": torch.tensor(values), "action_gradient": torch.zeros(count)}, [count]
-        )
-        buffer.update_tensordict_priority(batch)
-
-    update(list(range(8)), [9.0, 4.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-    update([1], [3.0])
-    assert buffer.sampler.default_priority == 9.0
-    update([0], [0.5])
-    assert buffer.sampler.default_priority == 3.0
-
-
 def test_replays_are_counted_with_duplicates_and_start_again_with_a_new_transition():
     buffer = make_buffer(4, 64)
     buffer.extend(make_transitions(4))
