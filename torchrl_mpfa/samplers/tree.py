@@ -61,6 +61,8 @@ class TreeSampler(SavedTrees):
 
     _alpha: float
     _rng: torch.Generator | None
+    _alpha: float
+    _beta: float
 
     def __init__(
         self,
@@ -117,8 +119,7 @@ class TreeSampler(SavedTrees):
             ValueError: If the number is negative, not finite, or leaves priorities of zero or
                 without a finite sum; nothing is changed then.
         """
-        alpha: float = self._alpha
-        return alpha
+        return self._alpha
 
     @alpha.setter
     def alpha(self, value: float) -> None:
@@ -148,8 +149,7 @@ class TreeSampler(SavedTrees):
             TypeError: If it is set to anything but a number.
             ValueError: If the number is negative or not finite; nothing is changed then.
         """
-        beta: float = self._beta
-        return beta
+        return self._beta
 
     @beta.setter
     def beta(self, value: float) -> None:
