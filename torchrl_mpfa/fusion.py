@@ -66,7 +66,7 @@ def binary_entropy(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _split_entropy(reward: Tensor, level: float) -> Tensor:
-    """Entropy of lying above a level; what equals it does not."""
+    """Entropy of being above a level; a reward equal to it is not."""
     if reward.numel() == 0:
         raise ValueError(f"reward must hold at least one transition, got shape {[*reward.shape]}")
     above = (reward > level).double().mean()

@@ -11,7 +11,7 @@ from torch import Tensor
 Level = float | Literal["mean"]
 """A reward, or ``"mean"``: the mean reward of the buffer."""
 _ENOUGH = 1000
-"""Rewards from which on it is worth a warning that all are on one side."""
+"""With fewer rewards there is no warning that all are on one side."""
 
 
 def check_level(positive_above: Level) -> None:

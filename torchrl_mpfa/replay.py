@@ -30,7 +30,7 @@ _MISSING = (
     "write batch[{key!r}] = ..., one number per transition"
 )
 _UNRETURNED = 100
-"""Batches without an update of priorities in between that are worth a warning."""
+"""Batches in a row without an update of priorities after which a warning is given."""
 
 
 class SignalReplayBuffer(FollowedReplayBuffer):
@@ -264,9 +264,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         self._warned = True
         warnings.warn(
             f"{_UNRETURNED} batches in a row were sampled and no priority was updated: call "
-            "update_tensordict_priority(batch) after the loss. A trainer of TorchRL skips it once "
-            "it has an optimization stepper whose step() does not; "
-            "torchrl_mpfa.trainer.PriorityStepper does",
+            "update_tensordict_priority(batch) after the loss. TorchRL's trainers with an "
+            "optimization stepper do not call it; use torchrl_mpfa.trainer.PriorityStepper",
             stacklevel=3,
         )
 

@@ -2,8 +2,8 @@ r"""Curiosity: a bonus for transitions whose outcome the robot cannot foresee ye
 
 Intrinsic curiosity module of Pathak et al. (2017), https://arxiv.org/abs/1705.05363, which Li et
 al. (2021), https://doi.org/10.1155/2021/5169460, add to DDPG with RAdam and PER. Features
-:math:`\phi` of observations are learned such that the action can be told from those before and
-after it; the bonus is the error of foreseeing the latter from the former and the action.
+:math:`\phi` of observations are learned such that they tell the action from the observations before
+and after it; the bonus is the error of predicting the latter from the former and the action.
 """
 
 from __future__ import annotations
@@ -167,6 +167,6 @@ class Curiosity(nn.Module):
         return {"models": self.state_dict(), "optimizer": self.optimizer.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`checkpoint` gave."""
+        """Restore what :meth:`checkpoint` gave."""
         self.load_state_dict(state["models"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -35,7 +35,7 @@ from torchrl_mpfa.saved import count, number
 from torchrl_mpfa.selection import SampledBatch
 
 LEAST_SIGMA = 0.2
-"""Noise below this counts as this, the authors' own: a policy without any has no ratio."""
+"""Lower bound of the noise, as in the authors' code: without noise there is no ratio."""
 _CUTOFF_DECAY = 5e-7
 _RATE = 0.1
 _FIRST_WEIGHT = 1e-4

@@ -78,7 +78,7 @@ class SignalTable:
 
     @property
     def writes(self) -> int:
-        """Count of all writes; ``clock`` holds it for whoever has to see it go on."""
+        """Count of all writes; saved states share ``clock``, which has it, and see it change."""
         return self.clock[0]
 
     @writes.setter
@@ -86,12 +86,12 @@ class SignalTable:
         self.clock[0] = count
 
     def stop_clock(self) -> None:
-        """Tell those who hold the clock that the data are no longer those of its writes."""
+        """Invalidate states that share the clock: the data are no longer those of its writes."""
         count, self.clock[0] = self.writes, -1
         self.clock = [count]
 
     def clear(self) -> None:
-        """Forget every slot; the count of writes goes on, so that old batches stay old."""
+        """Forget every slot; the count of writes goes on, so that earlier batches stay stale."""
         self.rows.copy_(self._blank)
         self.cleared = max(self.cleared, self.size)
         self.size = 0
@@ -190,7 +190,7 @@ class SignalTable:
         return None
 
     def write(self, index: Tensor, rows: Tensor) -> None:
-        """Put new transitions in their slots: nothing of what was there before stays."""
+        """Put new transitions in their slots, and reset everything else of these."""
         count = len(rows)
         if count > self.capacity:
             # Of a slot that is named twice the last row must win, which indexing leaves open.
