@@ -49,3 +49,10 @@ def test_the_newest_transition_is_saved(tmp_path, way):
         first.dumps(tmp_path / "buffer")
         second.loads(tmp_path / "buffer")
     assert int(second.sample()["index"][0]) == 5
+
+
+def test_a_file_of_an_earlier_version_has_the_place_without_its_name(tmp_path):
+    (tmp_path / "newest.json").write_text("[3]", encoding="utf-8")
+    sampler = CERSampler()
+    sampler.loads(tmp_path)
+    assert sampler.newest == [3]

@@ -153,7 +153,7 @@ class SavedValues(RandomSampler):
     def check_dump(self, path: str | Path) -> dict[str, Any]:
         """Read a saved sampler and reject it as :meth:`check_state` does."""
         found = json.loads((Path(path) / self.FILE).read_text(encoding="utf-8"))
-        # A file of version 0.1 has a single value without its name.
+        # A file of an earlier version has a single value without its name.
         state = found if isinstance(found, dict) else {self.ENTRIES[0].name: found}
         self.check_state(state)
         return state
