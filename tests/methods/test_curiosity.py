@@ -56,7 +56,7 @@ def test_the_losses_are_their_formulas():
     assert log["forward_loss"].item() == pytest.approx(forward, rel=1e-4)
 
 
-def test_the_bonus_falls_on_what_is_seen_often_and_less_so_on_what_is_not():
+def test_the_bonus_falls_fastest_for_what_is_seen_often():
     torch.manual_seed(0)
     curiosity = Curiosity(6, 2)
     often, rare = make_batch(seed=1), make_batch(seed=2, shift=5.0)
@@ -73,7 +73,7 @@ def test_the_bonus_falls_on_what_is_seen_often_and_less_so_on_what_is_not():
     assert after[0] / before[0] < 0.5 * after[1] / before[1]
 
 
-def test_the_bonus_is_new_whenever_a_transition_is_sampled_and_the_reward_is_kept():
+def test_the_bonus_is_computed_at_each_sampling_and_the_reward_is_kept():
     curiosity, stored = Curiosity(6, 2), make_batch()
     first, second = stored.clone(), stored.clone()
     curiosity(first)

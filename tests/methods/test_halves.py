@@ -31,7 +31,7 @@ def steps_of(name, **settings):
     }, {who: sum(trains in (who, "both") for trains, _ in found) for who in ("critic", "actor")}
 
 
-def test_critic_and_actor_make_as_many_updates_on_as_many_transitions_as_with_la3p():
+def test_halves_make_as_many_updates_on_as_many_transitions_as_la3p():
     halves, la3p = steps_of("uniform_halves"), steps_of("la3p")
     assert halves == la3p == ({"critic": 32, "actor": 32}, {"critic": 2, "actor": 2})
     assert steps_of("ddpg") == ({"critic": 32, "actor": 32}, {"critic": 1, "actor": 1})
@@ -48,7 +48,7 @@ def test_both_halves_are_uniform():
         assert (shares - 0.1).abs().max() < 0.01
 
 
-def test_an_odd_batch_is_parted_as_nearly_as_can_be_and_one_transition_is_rejected():
+def test_an_odd_batch_is_split_and_a_single_transition_is_rejected():
     buffer = make_buffer(make_replay("ddpg").buffer.sampler, 9, 5)
     assert [len(draw.batch) for draw in uniform_halves(buffer)] == [2, 3]
     alone = make_buffer(make_replay("ddpg").buffer.sampler, 9, 1)

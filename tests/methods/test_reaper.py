@@ -167,7 +167,7 @@ def test_frequencies_are_those_of_the_product(combined):
     assert_shares(buffer.sample()["index"], shares, samples=60_000)
 
 
-def test_an_error_early_in_an_episode_of_errors_counts_less_than_the_same_error_at_its_end():
+def test_an_early_error_counts_less_than_the_same_error_at_the_end():
     """What bootstraps from badly known values, against what a reward alone makes."""
     buffer = make_reaper([0] * 50)
     set_signals(buffer, td_error=torch.ones(50))

@@ -84,7 +84,7 @@ def test_far_transitions_have_no_weight_and_near_ones_have_all_of_it():
 
 
 @pytest.mark.parametrize("batches", [0, 4_000_000])
-def test_near_is_what_is_within_the_limit_on_both_sides_by_a_spread_of_a_fifth_at_least(batches):
+def test_near_transitions_have_ratios_within_the_limit_and_noise_of_at_least_a_fifth(batches):
     learner = make_learner(**loss_options("ref_er"))
     rows = make_rows(COUNT)
     rows["action"], rows["behavior_mean"] = (random_actions(seed).float() for seed in (1, 2))
@@ -107,7 +107,7 @@ def test_near_is_what_is_within_the_limit_on_both_sides_by_a_spread_of_a_fifth_a
     assert far == {"low", "high", "near"}
 
 
-def test_how_fast_the_weight_moves_goes_by_the_slots_and_not_by_what_is_in_them():
+def test_the_rate_of_the_weight_depends_on_the_capacity():
     learner = make_learner(**loss_options("ref_er"))
     replay = make_replay("ref_er", capacity=10 * COUNT, batch_size=50, policy=learner.policy)
     replay.buffer.extend(rows_near_and_far(learner, 1.0))
@@ -133,7 +133,7 @@ def test_what_is_far_teaches_neither_critic_nor_actor():
         torch.testing.assert_close(losses[name], scaled, rtol=1e-4, atol=1e-6)
 
 
-def test_the_weight_moves_as_its_rule_says_and_the_policy_is_held_once_too_many_are_far():
+def test_the_weight_falls_while_too_many_transitions_are_far():
     learner = make_learner(**loss_options("ref_er"))
     replay = make_ref_er(learner, rows_near_and_far(learner, 1.0))
     sampler = replay.buffer.sampler
@@ -155,7 +155,7 @@ def test_the_weight_moves_as_its_rule_says_and_the_policy_is_held_once_too_many_
 
 
 @pytest.mark.parametrize("rate", [0.0003, 0.1])
-def test_the_weight_starts_next_to_zero_and_no_step_is_longer_than_what_is_left(rate):
+def test_the_weight_starts_near_zero_and_never_leaves_its_range(rate):
     """The authors' rule in plain steps, up from their start and down from the end."""
     weight = ReFERSampler().policy_weight
     assert weight == 1e-4

@@ -91,7 +91,7 @@ def cluster() -> Iterator[Any]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cluster")
-def test_samples_of_a_remote_buffer_are_those_of_eq_8_and_late_signals_are_left_out() -> None:
+def test_a_remote_buffer_samples_by_eq_8_and_leaves_late_signals_out() -> None:
     per = method("per")
     buffer = make_ray_replay(per, seed=1).buffer
     try:

@@ -55,7 +55,7 @@ def test_threshold_is_the_mean_of_the_batch():
     assert float(decay_threshold(torch.tensor([1.0, 2.0, 6.0]))) == pytest.approx(3.0)
 
 
-def test_decay_of_a_hand_example_counts_places_from_one_and_spares_who_is_not_above_the_mean():
+def test_decay_of_a_hand_example_counts_places_from_one():
     # The mean is 3. The first and the third lie above it; the third is not positive.
     found = PositiveDecay(sharpness=1.0)(torch.tensor([5.0, 1.0, 4.0, 2.0]), facts([1, 1, -1, 1]))
     assert found.tolist() == pytest.approx([5.0 * 0.7310586, 1.0, 4.0, 2.0])

@@ -113,7 +113,7 @@ def test_a_mixture_samples_by_each_signal_in_its_turn():
     assert 0 < batch["priority_weight"].max() <= 1.0
 
 
-def test_the_weights_of_the_fusion_are_the_shares_of_a_mixture_and_alpha_may_change():
+def test_the_shares_of_a_mixture_are_the_weights_and_alpha_may_change():
     rewards, errors = random_signals()
     sampler = MixtureSampler(
         COUNT, 1.0, 0.4, EPS, signals=SIGNALS, fusion=FixedFusion({"reward": 3, "td_error": 1})
@@ -210,7 +210,7 @@ def test_updates_of_many_robots_go_through_every_combination(combination):
     assert replay.buffer.stats()["weight/reward"] == 1.0  # Not divided by its mean.
 
 
-def test_a_product_passes_the_checks_of_a_sampler_and_a_mixture_goes_on_where_it_was_saved(
+def test_a_product_passes_the_checks_and_a_mixture_is_saved_and_loaded(
     tmp_path,
 ):
     check_sampler(lambda: SignalSampler(64, 0.6, 0.4, EPS, combination="product", signals=SIGNALS))

@@ -47,7 +47,7 @@ def train(buffer, rounds):
         buffer.update_tensordict_priority(batch)
 
 
-def test_an_adjustment_counts_when_a_sixteenth_of_the_buffer_was_learned_from_or_written():
+def test_an_adjustment_counts_after_a_sixteenth_of_the_buffer_changed():
     buffer, census = make_counted()  # A sixteenth are four transitions, a batch.
     train(buffer, 1)
     assert census.asked == 1
@@ -109,7 +109,7 @@ def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(name, setti
 
 
 @pytest.mark.parametrize("value", [None, [], [torch.tensor(torch.nan), None], [1.0, None]])
-def test_a_saved_count_that_does_not_fit_is_rejected_and_nothing_counted_is_none(value):
+def test_a_saved_count_that_does_not_fit_is_rejected(value):
     first, second = (
         make_replay("mpfa_adaptive", capacity=9, batch_size=2).buffer.sampler for _ in range(2)
     )
@@ -194,7 +194,7 @@ def share_of_goals(name, goals):
     return float((replay.buffer.sample()["index"] < goals).double().mean())
 
 
-def test_rare_goals_are_sampled_more_often_than_by_a_constant_and_common_ones_less():
+def test_an_adaptive_boost_favors_rare_goals_over_common_ones():
     assert share_of_goals("mpfa_adaptive", 40) > 1.5 * share_of_goals("mpfa_per", 40)
     assert share_of_goals("mpfa_adaptive", 1200) < share_of_goals("mpfa_per", 1200)
 
@@ -227,7 +227,7 @@ def lap_frequencies(scale, **settings):
     return torch.bincount(found["index"], minlength=100) / 50_000, found
 
 
-def test_with_small_rewards_lap_is_uniform_and_with_a_quantile_it_is_what_it_is_with_large_ones():
+def test_lap_is_uniform_for_small_rewards_unless_its_bend_is_a_quantile():
     uniform, _ = lap_frequencies(0.01)
     assert (uniform - 0.01).abs().max() < 0.002
     small, of_small = lap_frequencies(0.01, floor_quantile=0.5)

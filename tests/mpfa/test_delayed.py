@@ -25,7 +25,7 @@ def make_delayed(capacity=16, **kwargs):
     )
 
 
-def test_parts_that_are_made_later_are_those_that_would_have_been_made_at_once():
+def test_parts_that_are_made_later_equal_those_made_at_once():
     now, later = make_buffer(), make_delayed()
     for buffer in (now, later):
         buffer.extend(make_transitions(15))

@@ -25,7 +25,7 @@ from torchrl_mpfa.samplers import TreeSampler
 
 
 @pytest.mark.parametrize("key", ["td_error", "unknown"])
-def test_a_buffer_of_torchrl_is_told_of_once(key):
+def test_a_buffer_of_torchrl_causes_one_warning(key):
     buffer = TensorDictReplayBuffer(
         storage=SignalTensorStorage(16), sampler=MPFASampler(16), batch_size=4, priority_key=key
     )
@@ -38,7 +38,7 @@ def test_a_buffer_of_torchrl_is_told_of_once(key):
     assert len(seen) == 1
 
 
-def test_a_storage_of_torchrl_is_told_of_once():
+def test_a_storage_of_torchrl_causes_one_warning():
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(16), sampler=MPFASampler(16), batch_size=4
     )

@@ -112,7 +112,7 @@ def test_one_signal_of_weight_one_is_plain_per():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_entropy_fusion_gives_the_weights_of_the_oracle_in_the_order_of_the_names(seed):
+def test_entropy_fusion_gives_the_weights_of_the_oracle_by_name(seed):
     rewards = torch.randn(50, generator=seeded(seed)) + 0.4
     of_positive = oracles.entropy_of_positive(rewards.tolist())
     of_reward = oracles.entropy_of_reward(rewards.tolist())
@@ -133,14 +133,14 @@ def test_the_population_is_the_filled_buffer_or_the_batch():
     assert filled.tolist() == pytest.approx([1.0] * 3)
 
 
-def test_when_every_reward_is_positive_only_the_reward_has_weight_unless_there_is_a_floor():
+def test_if_all_rewards_are_positive_a_floor_keeps_the_other_weights():
     table, index = make_table([1.0, 2.0, 6.0, 7.0]), torch.arange(4)
     assert EntropyFusion().weights(NAMES, table, index).tolist() == [0.0, 0.0, 1.0]
     floored = EntropyFusion(floor=0.1).weights(NAMES, table, index)
     assert floored.tolist() == pytest.approx([0.1 / 1.2, 0.1 / 1.2, 1 / 1.2])
 
 
-def test_a_signal_of_ones_own_gets_the_entropy_of_positive_training_unless_told_otherwise():
+def test_an_own_signal_gets_the_entropy_of_positive_training_by_default():
     table, index = make_table([4.0, 1.0, 1.0, 1.0, -2.0]), torch.arange(5)
     of_reward = oracles.entropy_of_reward([4.0, 1.0, 1.0, 1.0, -2.0])
     names = ["novelty", "reward"]

@@ -218,7 +218,7 @@ def test_a_signal_of_ones_own_follows_and_must_not_become_negative():
     assert buffer[:]["novelty"].tolist() == [1.0, 5.0, 3.0]
 
 
-def test_transitions_that_come_later_go_to_the_entry_that_was_written_by_its_key():
+def test_later_transitions_go_to_an_entry_written_by_its_key():
     buffer = make_tracked_buffer(CAPACITY)
     given = all_rewards(buffer)
     buffer[KEY] = given

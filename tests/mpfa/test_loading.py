@@ -163,7 +163,7 @@ def test_a_state_whose_data_were_overwritten_since_is_rejected(pair, way):
     assert same(copy, snapshot(buffer))
 
 
-def test_a_state_may_be_loaded_again_and_elsewhere_as_long_as_nothing_is_written(pair):
+def test_a_state_may_be_loaded_several_times_before_a_write(pair):
     _, buffer = pair
     state, other = buffer.state_dict(), make_buffer(8)
     train_rounds(buffer, 2)

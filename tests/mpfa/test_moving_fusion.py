@@ -38,7 +38,7 @@ def test_scaled_signals_have_the_shares_that_their_weights_say():
     assert weights.tolist() == pytest.approx([1 / 2, 1 / 400])
 
 
-def test_a_signal_that_is_zero_everywhere_or_known_of_nothing_is_left_as_it_is():
+def test_a_signal_without_a_scale_is_not_scaled():
     table = make_table([(None, 0.0), (None, 0.0)])
     weights = ScaledFusion(FixedFusion(dict.fromkeys(NAMES, 1.0))).weights(NAMES, table, None)
     assert weights.tolist() == [1.0, 1.0]

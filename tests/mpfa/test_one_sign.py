@@ -38,7 +38,7 @@ def test_one_warning_names_the_cure():
     assert buffer.sampler.weights == {"td_error": 0.0, "action_gradient": 0.0, "reward": 1.0}
 
 
-def test_rewards_that_are_all_positive_are_told_of_too():
+def test_rewards_that_are_all_positive_cause_a_warning_too():
     buffer = make_buffer(2000, 32)
     buffer.extend(make_transitions(1000, rewards=torch.rand(1000) + 0.1))
     with pytest.warns(UserWarning, match="all of the 1000 rewards in the buffer are above 0.0"):
@@ -80,7 +80,7 @@ def test_the_mean_as_level_is_told_to_make_all_weights_equal(make):
     assert len(told) == 1
 
 
-def test_weights_of_ones_own_beside_the_mean_are_not_told_of():
+def test_own_weights_beside_the_mean_cause_no_warning():
     fusion = FixedFusion({"reward": 1.0, "td_error": 2.0})
     MPFASampler(8, fusion=fusion, positive_above="mean")
 

@@ -194,7 +194,7 @@ def test_changing_a_batch_does_not_change_the_buffer():
     assert buffer[:]["observation"].min() == 0
 
 
-def test_two_buffers_of_one_seed_draw_the_same_and_another_seed_samples_otherwise():
+def test_batches_of_two_buffers_are_equal_if_their_seeds_are():
     sampled = []
     for seed in (1, 1, 2):
         buffer = make_buffer(64, 16, seed=seed)
@@ -273,7 +273,7 @@ def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():
 
 
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
-def test_to_read_a_full_buffer_through_a_transform_leaves_the_storage_as_it_is(kind):
+def test_reading_through_a_transform_does_not_change_the_storage(kind):
     buffer = make_buffer(8, storage=kind(8))
     buffer.append_transform(RewardScaling(loc=0.0, scale=10.0, in_keys=[("next", "reward")]))
     data = make_transitions(8)

@@ -85,9 +85,7 @@ def inserted(transform):
 
 @pytest.mark.parametrize("inside", [False, True], ids=["", "composed"])
 @pytest.mark.parametrize("give", [given, made_at_first_use, appended, inserted])
-def test_steps_summed_past_the_end_of_an_episode_are_told_once_when_the_buffer_gets_them(
-    give, inside
-):
+def test_a_transform_that_bootstraps_past_an_episode_causes_one_warning(give, inside):
     transform = MultiStepTransform(n_steps=3, gamma=0.99)
     with pytest.warns(UserWarning, match=r"bootstrapped past .* done_keys=\['done'\]") as told:
         give(Compose(DoubleToFloat(), transform) if inside else transform)
@@ -95,5 +93,5 @@ def test_steps_summed_past_the_end_of_an_episode_are_told_once_when_the_buffer_g
 
 
 @pytest.mark.parametrize("done_keys", [["done"], ["done", "truncated"], None])
-def test_steps_that_know_the_end_of_an_episode_are_not_told_of(done_keys):
+def test_a_transform_that_stops_at_the_end_of_an_episode_causes_none(done_keys):
     appended(MultiStepTransform(3 if done_keys else 1, gamma=0.99, done_keys=done_keys))

@@ -51,7 +51,7 @@ def test_a_crash_before_the_rename_leaves_the_old_file(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["state.pt"]
 
 
-def test_what_a_killed_save_left_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
+def test_a_save_removes_the_leftovers_of_killed_processes_alone(tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     for name in (f"{gone.pid}", f"{gone.pid}-0123456789abcdef"):

@@ -222,7 +222,7 @@ def test_rewards_and_own_signals_are_read_under_the_keys_they_are_given():
 
 
 @pytest.mark.parametrize("rows", [2, 3])
-def test_what_is_not_one_finite_number_a_transition_is_rejected_before_it_is_written(rows):
+def test_rewards_that_are_not_one_finite_number_are_rejected_before_the_write(rows):
     storage = SignalTensorStorage(4)
     storage.set(torch.arange(1), make_transitions(1))
     before = storage.signal_table.state_dict()

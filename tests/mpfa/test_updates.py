@@ -247,7 +247,7 @@ def test_batches_that_are_more_than_their_rows_are_sampled_one_by_one(name, sett
         assert all(map(newest_in, sampled))
 
 
-def test_a_selection_of_ones_own_is_asked_update_by_update_by_the_priorities_before():
+def test_an_own_selection_sees_the_priorities_of_the_update_before():
     buffer, seen = make_buffer(), []
 
     def select(buffer):
@@ -264,7 +264,7 @@ def test_a_selection_of_ones_own_is_asked_update_by_update_by_the_priorities_bef
 
 
 @pytest.mark.parametrize("updates", [1, 3])
-def test_what_prepares_a_draw_comes_before_the_learner(updates):
+def test_batches_are_prepared_before_the_learner_gets_them(updates):
     learner = Counting()
 
     def prepare(draw):
@@ -377,12 +377,12 @@ def test_a_batch_size_of_several_batches_is_not_warned_of(recwarn):
 
 
 @pytest.mark.parametrize("updates", [0, -1, 1.5, True])
-def test_a_number_of_updates_that_is_none_is_refused(updates):
+def test_a_number_of_updates_that_is_no_count_is_rejected(updates):
     with pytest.raises(ValueError, match=r"updates must be an integer from 1 to 2147483647, got"):
         run_updates(make_buffer(), make_learner(), updates=updates)
 
 
-def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_refused():
+def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_rejected():
     learner = make_learner()
     storage = SignalTensorStorage(MANY)
     buffer = SignalReplayBuffer(storage=storage, sampler=MPFASampler(MANY))
@@ -400,7 +400,7 @@ def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_refused():
     assert learner.updates == 2
 
 
-def test_a_selection_without_a_draw_for_the_critic_is_refused():
+def test_a_selection_without_a_batch_for_the_critic_is_rejected():
     def none(buffer):
         yield SampledBatch(buffer.sample(), trains="actor")
 
@@ -408,7 +408,7 @@ def test_a_selection_without_a_draw_for_the_critic_is_refused():
         run_updates(make_buffer(), make_learner(), none)
 
 
-def test_rows_that_are_no_equal_batches_are_refused():
+def test_rows_that_make_no_equal_batches_are_rejected():
     buffer = make_buffer()
     learner = Counting()
     batch = buffer.sample()
