@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
-from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_counts, check_finite, check_index
+from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_finite
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
@@ -239,24 +239,11 @@ class SignalSampler(TreeSampler):
                 not finite, or the slots are not so many equal batches.
             TypeError: If the storage keeps no signals, or the index holds anything but integers.
         """
-        table = self.bind(storage)
-        slots = as_slots(index, storage)
+        table, slots = self.bind(storage), as_slots(index, storage)
         if slots.numel() == 0:
             return 0
-        check_counts(batches=batches)
-        if len(slots) % batches:
-            raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
-        # A batch from before the buffer was emptied is stale, as its times of writing tell.
-        filled = table.size if written_at is None else table.known
-        if len(check_index(slots, filled)) < len(slots):
-            raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
-        rows, live = table.rows.index_select(0, slots), None
-        sizes = [len(slots) // batches] * batches
-        if written_at is not None and not (same := table.same(rows, written_at)).all():
-            live, sizes = same, same.reshape(batches, -1).sum(1).tolist()
-            rows, slots = rows[same], slots[same]
+        rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
         stale = 0 if live is None else len(live) - len(slots)
-
         # Eqs. (13)-(14); the reward of Eq. (12) was read at the write.
         table.fill_learned(rows, signals, self._learned, live, sizes)
         table.check_fused(rows, self._names, self._columns)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.checks import bounds, check_finite
+from torchrl_mpfa.checks import bounds, check_counts, check_finite, check_index
 from torchrl_mpfa.saved import Entry, check_entries, count, exactly
 from torchrl_mpfa.signals import Signal, as_signals
 
@@ -171,14 +171,38 @@ class SignalTable:
                 raise KeyError(f"signal {name!r} is missing: the stored transitions lack it")
             check_finite(f"signal {name!r}", value)
 
-    def same(self, rows: Tensor, written_at: Tensor) -> Tensor:
-        """Rows of transitions that were sampled and not overwritten since, shape ``[B]``."""
+    def live_rows(
+        self, slots: Tensor, written_at: Tensor | None, batches: int
+    ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
+        """Copies of the rows of sampled slots that were not overwritten since.
+
+        Args:
+            slots: Slots of equal batches, one after the other, shape ``[B]``.
+            written_at: When they had been written, ``[B]``; None: nothing was overwritten.
+            batches: Number of batches.
+
+        Returns:
+            Rows and slots, which of the slots they are (None: all), and the sizes of the batches.
+        """
+        check_counts(batches=batches)
+        if len(slots) % batches:
+            raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
+        # A batch from before the table was cleared is stale, as its times of writing tell.
+        filled = self.size if written_at is None else self.known
+        if len(check_index(slots, filled)) < len(slots):
+            raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
+        rows, sizes = self.rows.index_select(0, slots), [len(slots) // batches] * batches
+        if written_at is None:
+            return rows, slots, None, sizes
         if written_at.numel() != len(rows):
             raise ValueError(
                 "written_at must have one number per transition, got shape "
                 f"{[*written_at.shape]} for {len(rows)} slots"
             )
-        return rows.select(1, self.time_column) == written_at.reshape(-1).to(rows.device)
+        live = rows.select(1, self.time_column) == written_at.reshape(-1).to(rows.device)
+        if live.all():
+            return rows, slots, None, sizes
+        return rows[live], slots[live], live, live.reshape(batches, -1).sum(1).tolist()
 
     def missing(self, rows: Tensor) -> str | None:
         """Name of the first entry known at the write that some of the rows lack."""
