@@ -87,7 +87,7 @@ class Replay:
 
     Attributes:
         buffer: Where transitions are stored and sampled.
-        select: From the buffer to what the updates of one training step are made from.
+        select: Samples the batches of one training step from the buffer.
         signals: The signals that the loss has to write, by name.
         method: The settings that it was made from.
         entries: Names of the entries that transitions must have beside the usual: ``"episode"``, a

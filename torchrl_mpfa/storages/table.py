@@ -174,16 +174,7 @@ class SignalTable:
     def live_rows(
         self, slots: Tensor, written_at: Tensor | None, batches: int
     ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
-        """Copies of the rows of sampled slots that were not overwritten since.
-
-        Args:
-            slots: Slots of equal batches, one after the other, shape ``[B]``.
-            written_at: When they had been written, ``[B]``; None: nothing was overwritten.
-            batches: Number of batches.
-
-        Returns:
-            Rows and slots, which of the slots they are (None: all), and the sizes of the batches.
-        """
+        """Rows and slots that are not stale, which of the slots they are, and sizes of batches."""
         check_counts(batches=batches)
         if len(slots) % batches:
             raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
