@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from mpfa_envs import Box, Lidar, NavigationEnv, VectorNavigationEnv, World, generate_world
 from mpfa_envs.robots.model import ROBOTS
-from mpfa_envs.scene.colors import WAY
+from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.shapes import random_shapes
@@ -184,6 +184,6 @@ def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     assert len(sketch.blocked) == (memory.arrays.levels[0] == 2).sum() > 50
     # Past what it sees of an arm of the pocket, which is the part before it.
     assert min(x for x, y in sketch.path if abs(y) > 1.4) < -0.3
-    orange = (env.render() == WAY[:3]).all(axis=-1)
+    orange = (env.render() == PATH[:3]).all(axis=-1)
     assert 50 < orange.sum() < 5000
     env.close()
