@@ -15,7 +15,7 @@ import numpy as np
 
 from mpfa_envs.checks import check_choice, check_count, check_number, check_positive, check_share
 from mpfa_envs.sensing.lidar_loops import cast_rays
-from mpfa_envs.sensing.observation_loops import sector_range
+from mpfa_envs.sensing.observation_loops import sector_ranges
 from mpfa_envs.worlds.batch import WorldBatch
 
 if TYPE_CHECKING:
@@ -214,5 +214,4 @@ class Lidar:
         Returns:
             Range of each sector [m], shape ``[sectors]``.
         """
-        median = self.reduction == "median"
-        return np.array([sector_range(rays, median) for rays in np.split(ranges, self.sectors)])
+        return sector_ranges(ranges, self.sectors, self.reduction == "median")

@@ -40,16 +40,14 @@ def observe_all(
     for robot in range(observations.shape[0]):
         if not chosen[robot]:
             continue
-        seen = observations[robot]
+        seen, rays = observations[robot], ranges[robot]
         start = seen.shape[0] - sectors * history
         # The last scan moves to the first place of the earlier ones, and these one place on.
         for index in range(seen.shape[0] - 1, start - 1, -1):
             seen[index] = seen[index - sectors] if index >= start + sectors else seen[index - start]
         for sector in range(sectors):
-            first = sector * count
-            seen[sector] = near / max(
-                sector_range(ranges[robot, first : first + count], median), near
-            )
+            nearest = _sector_range(rays, sector * count, count, median)
+            seen[sector] = near / max(nearest, near)
         if fresh[robot]:
             for index in range(start, seen.shape[0]):
                 seen[index] = seen[(index - start) % sectors]
@@ -72,15 +70,25 @@ def observe_all(
 
 
 @njit
-def sector_range(rays: NDArray[np.float64], median: bool) -> float:
-    """Range of a sector by its rays: their median, or the nearest."""
+def sector_ranges(rays: NDArray[np.float64], sectors: int, median: bool) -> NDArray[np.float64]:
+    """Range of each sector, ``[sectors]``, of a scan ``[rays]``."""
+    count = rays.shape[0] // sectors
+    ranges = np.empty(sectors)
+    for sector in range(sectors):
+        ranges[sector] = _sector_range(rays, sector * count, count, median)
+    return ranges
+
+
+@njit
+def _sector_range(rays: NDArray[np.float64], first: int, count: int, median: bool) -> float:
+    """Range of the sector that begins at a ray: the median of its rays, or the nearest."""
     if median:
-        ordered = np.sort(rays)
-        half = rays.shape[0] // 2
-        if rays.shape[0] % 2 == 1:
+        ordered = np.sort(rays[first : first + count])
+        half = count // 2
+        if count % 2 == 1:
             return ordered[half]
         return 0.5 * (ordered[half - 1] + ordered[half])
-    nearest = rays[0]
-    for ray in range(1, rays.shape[0]):
+    nearest = rays[first]
+    for ray in range(first + 1, first + count):
         nearest = min(nearest, rays[ray])
     return nearest
