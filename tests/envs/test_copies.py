@@ -1,4 +1,4 @@
-"""Copies of an environment: of their own, or refused."""
+"""Copies of an environment: independent, or rejected."""
 
 from __future__ import annotations
 

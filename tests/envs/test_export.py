@@ -1,4 +1,4 @@
-"""ONNX files of policies: the same actions, a card that fits, and refusals."""
+"""ONNX files of policies: the same actions, a card that fits, and what is rejected."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_the_same_seed_gives_the_same_bits_after_other_episodes(physics: str) ->
 
 
 def test_the_first_step_is_the_same_bits_after_a_reset(physics: str) -> None:
-    # PyBullet keeps the contacts of a robot that is moved until it looks for contacts anew.
+    # PyBullet keeps the contacts of a robot that is moved until it looks for contacts again.
     env = paper_env(physics=physics)
     seen = []
     for seed in (123, 123, 4, 123):
@@ -356,11 +356,11 @@ def test_an_episode_goes_on_if_the_next_lacks_room(
     for each in (env, twin):
         each.reset(seed=0)
 
-    def refuse(world: World, start: object, rng: object) -> None:
+    def reject(world: World, start: object, rng: object) -> None:
         raise ValueError(f"world {world.name!r} has no place")
 
     with monkeypatch.context() as patch, pytest.raises(ValueError, match="'A' has no place"):
-        patch.setattr("mpfa_envs.env.episodes.start_walkers", refuse)
+        patch.setattr("mpfa_envs.env.episodes.start_walkers", reject)
         env.reset(seed=seed)
     assert (env.task, env.np_random_seed) == (twin.task, 0)
     np.testing.assert_array_equal(env.step([1.0, 0.5])[0], twin.step([1.0, 0.5])[0])

@@ -1,4 +1,4 @@
-"""Policies in NumPy: equal to the network, and a file that is right or refused."""
+"""Policies in NumPy: equal to the network, and a file that is right or rejected."""
 
 from __future__ import annotations
 

@@ -350,7 +350,7 @@ def test_pictures_show_each_world() -> None:
 
 
 def test_what_was_never_built_can_be_closed() -> None:
-    # gymnasium 1.2 closes an environment whose arguments were refused, when it is collected.
+    # gymnasium 1.2 closes an environment whose arguments were rejected, when it is collected.
     VectorNavigationEnv.__new__(VectorNavigationEnv).close_extras()
 
 

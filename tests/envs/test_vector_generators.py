@@ -74,7 +74,7 @@ def test_a_world_can_be_kept_for_some_episodes() -> None:
     assert rows[0] == rows[1] == rows[2] != rows[3] == rows[4] == rows[5] != rows[6]
     tasks = []
     env.reset(seed=3)
-    assert env.worlds[0].name == rows[0]  # A seed starts anew.
+    assert env.worlds[0].name == rows[0]  # A seed starts again.
     tasks.append(env.tasks[0])
     env.reset()
     assert env.tasks[0] not in tasks

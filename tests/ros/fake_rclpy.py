@@ -78,7 +78,7 @@ def _node(world: World) -> type:
 
 
 def install(patch: pytest.MonkeyPatch, world: World) -> Any:
-    """Put the fakes in the place of rclpy, and import the node's module anew."""
+    """Put the fakes in the place of rclpy, and import the node's module again."""
 
     def module(name: str, **values: Any) -> None:
         made = ModuleType(name)

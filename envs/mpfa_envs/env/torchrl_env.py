@@ -87,10 +87,10 @@ class NavigationTorchEnv(EnvBase):
         super().__init__(device=device, batch_size=batch_size)
         self.env = env
         """The robots in the order of the batch."""
-        self._flag_names = [name for name in FLAGS if name in keys]
-        self._number_names = [name for name in NUMBERS if name in keys]
-        self._flag_rows = [FLAGS.index(name) for name in self._flag_names]
-        self._number_rows = [NUMBERS.index(name) for name in self._number_names]
+        self._flags, self._numbers = (
+            {name: row for row, name in enumerate(names) if name in keys}
+            for names in (FLAGS, NUMBERS)
+        )
         self._worlds: list[World | None] = [None] * env.num_envs
         self._tasks: list[Task | None] = [None] * env.num_envs
         self._make_specs()
@@ -103,11 +103,9 @@ class NavigationTorchEnv(EnvBase):
             for bound in (space.low, space.high)
         )
         entries: dict[str, TensorSpec] = {
-            name: Binary(shape=one, dtype=torch.bool) for name in self._flag_names
+            name: Binary(shape=one, dtype=torch.bool) for name in self._flags
         }
-        entries.update(
-            {name: Unbounded(shape=one, dtype=torch.float32) for name in self._number_names}
-        )
+        entries.update({name: Unbounded(shape=one, dtype=torch.float32) for name in self._numbers})
         self.observation_spec = Composite(
             observation=Bounded(low=low, high=high, dtype=torch.float32), shape=self.batch_size
         )
@@ -216,13 +214,13 @@ class NavigationTorchEnv(EnvBase):
         """Build the output of a reset, or with further entries of a step."""
         shape = (*self.batch_size, observations.shape[1])
         rows: dict[str, Any] = {"observation": self._to_device(observations).view(shape), **entries}
-        if self._number_rows or self._flag_rows:
+        if self._numbers or self._flags:
             flags, numbers = self.env.info_tables
             # Two tensors, split into entries: creating a tensor costs more than anything else here.
-            numbers = numbers[self._number_rows].astype(np.float32)
-            info = dict(zip(self._number_names, self._tensor(numbers).unbind(), strict=True))
-            flags = flags[self._flag_rows]
-            info.update(zip(self._flag_names, self._tensor(flags).unbind(), strict=True))
+            numbers = numbers[list(self._numbers.values())].astype(np.float32)
+            info = dict(zip(self._numbers, self._tensor(numbers).unbind(), strict=True))
+            flags = flags[list(self._flags.values())]
+            info.update(zip(self._flags, self._tensor(flags).unbind(), strict=True))
             rows["info"] = TensorDict(info, batch_size=self.batch_size, device=self.device)
         return TensorDict(rows, batch_size=self.batch_size, device=self.device)
 
