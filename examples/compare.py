@@ -37,7 +37,7 @@ from torchrl_mpfa.spelling import unknown
 from training import files
 from training.comparison.arms import check_free, parse_arms
 from training.comparison.execution import JOBS, make_runs
-from training.comparison.jobs import TESTED, Evaluation, Study
+from training.comparison.jobs import TESTED, Comparison, Evaluation
 from training.environments import check_physics
 from training.settings.train import GROUPS, register
 from training.worlds import parse_worlds
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.ray is not None:
         # The other machines know it by this name.
         options.folder = options.folder.resolve()
-    study = Study(
+    comparison = Comparison(
         options.folder,
         tuple(options.methods),
         tuple(options.overrides),
@@ -135,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Evaluation(tuple(options.worlds), options.episodes, options.physics),
     )
     try:
-        status = make_runs(study, most=options.jobs, ray=options.ray, anew=options.anew)
+        status = make_runs(comparison, most=options.jobs, ray=options.ray, anew=options.anew)
     except (ValueError, files.FolderInUse) as error:
         print(f"compare.py: {error}", file=sys.stderr)
         return 2

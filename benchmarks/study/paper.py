@@ -10,14 +10,14 @@ import pandas as pd
 
 from training import files
 from training.comparison.arms import Arm
-from training.comparison.jobs import TESTED, Job, Study
+from training.comparison.jobs import TESTED, Comparison, Job
 from training.figures import Runs
 from training.records import read_table
 
 RUNS = 10
 """Experiments that each curve of the paper is the mean of."""
 PHI = "phi"
-"""Folder of the study of Fig. 5, in that of the others."""
+"""Folder of the comparison of Fig. 5, in that of the others."""
 
 
 class Tested(NamedTuple):
@@ -91,8 +91,8 @@ CLAIMS = ("uniform", "per", "mpfa_per")
 """Those by which Section 2.4's claims on PER are looked at."""
 
 
-def studies(folder: Path, *, seeds: int = RUNS) -> tuple[Study, Study]:
-    """The study of all figures and tables but Fig. 5, and that of Fig. 5.
+def comparisons(folder: Path, *, seeds: int = RUNS) -> tuple[Comparison, Comparison]:
+    """The comparison of all figures and tables but Fig. 5, and that of Fig. 5.
 
     Args:
         folder: Where the first is; the second is in a folder in it.
@@ -102,7 +102,7 @@ def studies(folder: Path, *, seeds: int = RUNS) -> tuple[Study, Study]:
         Both.
 
     Examples:
-        >>> studies(Path("runs/paper"), seeds=1)[1].command
+        >>> comparisons(Path("runs/paper"), seeds=1)[1].command
         'python examples/compare.py --folder runs/paper/phi --arm=phi2:method.boost_factor=2 \
 --arm=phi3:method.boost_factor=3 --arm=phi4:method.boost_factor=4 --methods mpfa_per --seeds 0 \
 -- regime=paper curriculum=A'
@@ -110,33 +110,35 @@ def studies(folder: Path, *, seeds: int = RUNS) -> tuple[Study, Study]:
     of_all = range(seeds)
     arms = tuple(Arm(f"phi{phi}", (f"method.boost_factor={phi}",)) for phi in PHIS)
     return (
-        Study(folder, tuple(NAMES), ("regime=paper",), of_all),
-        Study(folder / PHI, ("mpfa_per",), ("regime=paper", "curriculum=A"), of_all, arms=arms),
+        Comparison(folder, tuple(NAMES), ("regime=paper",), of_all),
+        Comparison(
+            folder / PHI, ("mpfa_per",), ("regime=paper", "curriculum=A"), of_all, arms=arms
+        ),
     )
 
 
-def missing(study: Study) -> list[str]:
+def missing(comparison: Comparison) -> list[str]:
     """Runs that are not at their end, have no rows, or were not tested; by name."""
-    return [job.name for jobs in study.runs().values() for job in jobs if not _is_whole(job)]
+    return [job.name for jobs in comparison.runs().values() for job in jobs if not _is_whole(job)]
 
 
-def missing_lines(wanted: Sequence[Study]) -> str:
+def missing_lines(wanted: Sequence[Comparison]) -> str:
     """Which runs are missing, and the commands that make them."""
     lines = []
-    for study in wanted:
-        found = missing(study)
+    for comparison in wanted:
+        found = missing(comparison)
         if found:
             runs = "1 run is" if len(found) == 1 else f"{len(found)} runs are"
-            lines.append(f"{runs} missing in {study.folder}: {', '.join(found)}.")
-            lines.append(f"\n    {study.command}\n")
+            lines.append(f"{runs} missing in {comparison.folder}: {', '.join(found)}.")
+            lines.append(f"\n    {comparison.command}\n")
     return "\n".join(lines).rstrip()
 
 
-def read_runs(wanted: Sequence[Study], find: Callable[[Job], Path | None]) -> Runs:
+def read_runs(wanted: Sequence[Comparison], find: Callable[[Job], Path | None]) -> Runs:
     """A table of each run that is at its end and has it, by method or arm."""
     found: dict[str, dict[str, pd.DataFrame]] = {}
-    for study in wanted:
-        for name, jobs in study.runs().items():
+    for comparison in wanted:
+        for name, jobs in comparison.runs().items():
             for job in jobs:
                 file = find(job) if job.is_trained() else None
                 rows = pd.DataFrame() if file is None else read_table(file)

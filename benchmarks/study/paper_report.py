@@ -13,19 +13,19 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.study.paper import RUNS, evaluation_of, missing_lines, read_runs, studies
+from benchmarks.study.paper import RUNS, comparisons, evaluation_of, missing_lines, read_runs
 from benchmarks.study.paper_figures import plot_paper
 from benchmarks.study.paper_tables import paper_tables
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.comparison.jobs import Study
+from training.comparison.jobs import Comparison
 
 
-def write_paper(wanted: Sequence[Study], output: Path) -> int:
+def write_paper(wanted: Sequence[Comparison], output: Path) -> int:
     """Make the paper's tables and figures of the runs that there are, and name the others.
 
     Args:
-        wanted: The study of all methods, and that of Fig. 5.
+        wanted: The comparison of all methods, and that of Fig. 5.
         output: Where they go.
 
     Returns:
@@ -71,6 +71,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--seeds must be at least 1, got {options.seeds}")
     try:
         files.check_folder(output)
-        return write_paper(studies(options.folder, seeds=options.seeds), output)
+        return write_paper(comparisons(options.folder, seeds=options.seeds), output)
     except ValueError as error:
         parser.error(" ".join(str(error).split()))

@@ -198,8 +198,8 @@ def curves(output: Path) -> None:
         rows = read_kept(ROOT / "docs/results/study", table).curves
         found: dict[str, list[Any]] = {name: [] for name in names.values()}
         for arm, _, each in by_run(rows):
-            study, learner, method, *other = arm.split("/")
-            if (study, learner) == (reward, "td3") and method in names and not other:
+            comparison, learner, method, *other = arm.split("/")
+            if (comparison, learner) == (reward, "td3") and method in names and not other:
                 found[names[method]].append((each["total_steps"], each["success"]))
         draw_seeds(axis, found, limits=(0.0, 1.0))
         axis.set(title=title, xlabel="actions")

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
-from benchmarks.study.paper import NAMES, TABLE_2, TABLE_4, Tested, studies
+from benchmarks.study.paper import NAMES, TABLE_2, TABLE_4, Tested, comparisons
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.catalogue import ALIASES
 from training.comparison.arms import Arm
-from training.comparison.jobs import TESTED, Evaluation, Job, Study
+from training.comparison.jobs import TESTED, Comparison, Evaluation, Job
 
 ROOT = Path("runs/study")
 """Folder of the study unless a command line says otherwise."""
@@ -118,7 +118,7 @@ class Table:
 
     name: str
     question: str
-    studies: tuple[Study, ...]
+    comparisons: tuple[Comparison, ...]
     planned: tuple[Pair, ...]
     """Comparisons that are corrected for each other."""
     explored: tuple[Pair, ...]
@@ -162,12 +162,14 @@ def short_names(labels: Sequence[str]) -> dict[str, str]:
     return {label: "/".join(part) for label, part in zip(labels, parts, strict=True)}
 
 
-def paper_studies(table: Table) -> tuple[Study, ...]:
+def paper_comparisons(table: Table) -> tuple[Comparison, ...]:
     """Those of table A that the paper's own figures and tables are made of."""
     return tuple(
-        study
-        for study in table.studies
-        if study.learners == ("ddpg",) and study.evaluation == TESTED and study.arms != (ONE_ROBOT,)
+        comparison
+        for comparison in table.comparisons
+        if comparison.learners == ("ddpg",)
+        and comparison.evaluation == TESTED
+        and comparison.arms != (ONE_ROBOT,)
     )
 
 
@@ -175,7 +177,7 @@ def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
     """The tables, in the order in which they are run.
 
     Examples:
-        >>> [len(table.studies) for table in tables(Path("runs/study")).values()]
+        >>> [len(table.comparisons) for table in tables(Path("runs/study")).values()]
         [3, 4, 2, 8, 1]
     """
     if most is not None and most < 1:
@@ -186,7 +188,8 @@ def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
 
 def _at_most(table: Table, most: int | None) -> Table:
     return replace(
-        table, studies=tuple(replace(each, seeds=each.seeds[:most]) for each in table.studies)
+        table,
+        comparisons=tuple(replace(each, seeds=each.seeds[:most]) for each in table.comparisons),
     )
 
 
@@ -230,9 +233,9 @@ def _table_c(root: Path) -> Table:
         "C",
         "Sparse reward: does any priority learn faster than uniform replay, and MPFA-PER than PER?",
         (
-            Study(folder, EVERY, SPARSE, seeds, ("td3",), evaluation=TEST),
-            Study(folder, KEY, SPARSE, seeds, ("ddpg",), evaluation=TEST),
-            Study(folder, ("lap",), SPARSE, seeds, ("td3",), (MEDIAN,), TEST),
+            Comparison(folder, EVERY, SPARSE, seeds, ("td3",), evaluation=TEST),
+            Comparison(folder, KEY, SPARSE, seeds, ("ddpg",), evaluation=TEST),
+            Comparison(folder, ("lap",), SPARSE, seeds, ("td3",), (MEDIAN,), TEST),
         ),
         _pairs("sparse/td3", *_SIX),
         (
@@ -269,10 +272,12 @@ def _table_d(root: Path) -> Table:
         "D",
         "Replay volume: how often must transitions be replayed for priorities to pay?",
         (
-            Study(sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), evaluation=TEST),
-            Study(sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), tuple(arms.values()), TEST),
-            Study(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), evaluation=TEST),
-            Study(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), (arms[256],), TEST),
+            Comparison(sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), evaluation=TEST),
+            Comparison(
+                sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), tuple(arms.values()), TEST
+            ),
+            Comparison(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), evaluation=TEST),
+            Comparison(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), (arms[256],), TEST),
         ),
         # Those of volume 32 are in tables C and B, and corrected there.
         tuple(pair for at, end in where.values() if end for pair in _pairs(at, *_FIVE, suffix=end)),
@@ -294,8 +299,8 @@ def _table_e(root: Path) -> Table:
         "E",
         "Which part of MPFA-PER does it?",
         (
-            Study(folder, methods, SPARSE, seeds, ("td3",), evaluation=TEST),
-            Study(folder, ("mpfa_per",), SPARSE, seeds, ("td3",), PARTS, TEST),
+            Comparison(folder, methods, SPARSE, seeds, ("td3",), evaluation=TEST),
+            Comparison(folder, ("mpfa_per",), SPARSE, seeds, ("td3",), PARTS, TEST),
         ),
         tuple((other, whole) for other in (*parts, *others)),
         (),
@@ -310,14 +315,14 @@ def _table_e(root: Path) -> Table:
 def _table_a(root: Path) -> Table:
     folder = root / "paper"
     first = ("mpfa_per", "per", "uniform")
-    _, phi = studies(folder, seeds=10)
+    _, phi = comparisons(folder, seeds=10)
     phi = replace(phi, settings=(*PAPER, *phi.settings[1:]), seeds=_seeds(10))
     tested = (
-        Study(folder, first, PAPER, _seeds(10)),
-        Study(folder, tuple(n for n in NAMES if n not in first), PAPER, _seeds(10)),
-        Study(folder, first, PAPER, _seeds(10), ("plain",), (LETTER,)),
+        Comparison(folder, first, PAPER, _seeds(10)),
+        Comparison(folder, tuple(n for n in NAMES if n not in first), PAPER, _seeds(10)),
+        Comparison(folder, first, PAPER, _seeds(10), ("plain",), (LETTER,)),
     )
-    unseen = tuple(replace(study, evaluation=UNSEEN) for study in tested)
+    unseen = tuple(replace(comparison, evaluation=UNSEEN) for comparison in tested)
     neighbors = [f"{a}-{b}" for rows in (TABLE_2, TABLE_4) for a, b in pairwise(_in_order(rows))]
     distant = [f"mpfa_per-{name}" for name in NAMES if name != "mpfa_per"]
     phis = "paper/phi/ddpg/mpfa_per"
@@ -325,7 +330,12 @@ def _table_a(root: Path) -> Table:
     return Table(
         "A",
         "The paper's own task: are its tables confirmed?",
-        (*tested, Study(folder, ("mpfa_per",), PAPER, _seeds(3), arms=(ONE_ROBOT,)), phi, *unseen),
+        (
+            *tested,
+            Comparison(folder, ("mpfa_per",), PAPER, _seeds(3), arms=(ONE_ROBOT,)),
+            phi,
+            *unseen,
+        ),
         _pairs("paper/ddpg", *neighbors),
         (
             *_pairs("paper/ddpg", *(d for d in distant if d not in neighbors), "per-uniform"),
@@ -354,7 +364,7 @@ def _table_b(root: Path) -> Table:
     return Table(
         "B",
         "Dense reward: does any priority help where every step is rewarded, and does any harm?",
-        (Study(root / "dense", KEY, DENSE, _seeds(10), learners, evaluation=TEST),),
+        (Comparison(root / "dense", KEY, DENSE, _seeds(10), learners, evaluation=TEST),),
         tuple(pair for name in learners for pair in _pairs(f"dense/{name}", *_SIX)),
         tuple(pair for name in learners for pair in _pairs(f"dense/{name}", *_CONTROLS)),
         {name.upper(): _arms(f"dense/{name}", *KEY) for name in learners},

@@ -1,4 +1,4 @@
-"""How far studies are: runs that are done, and the time that the others will take."""
+"""How far comparisons are: runs that are done, and the time that the others will take."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from statistics import median
 
 from training import files
 from training.comparison.arms import Arm
-from training.comparison.jobs import Evaluation, Job, Study
+from training.comparison.jobs import Comparison, Evaluation, Job
 from training.records import read_table
 
 
-def jobs_done(study: Study) -> list[Job]:
-    """Runs of a study that are trained and evaluated."""
-    return [job for job in study.jobs if job.is_evaluated(study.evaluation)]
+def jobs_done(comparison: Comparison) -> list[Job]:
+    """Runs of a comparison that are trained and evaluated."""
+    return [job for job in comparison.jobs if job.is_evaluated(comparison.evaluation)]
 
 
-def free_checkpoints(study: Study) -> None:
+def free_checkpoints(comparison: Comparison) -> None:
     """Remove the checkpoints of runs that are done: thousands of them fill a disk."""
-    for job in jobs_done(study):
+    for job in jobs_done(comparison):
         (job.path / files.CHECKPOINT).unlink(missing_ok=True)
 
 
-def parts_left(study: Study, missing: Collection[Job]) -> list[Study]:
-    """What of a study its missing runs are made by.
+def parts_left(comparison: Comparison, missing: Collection[Job]) -> list[Comparison]:
+    """What of a comparison its missing runs are made by.
 
     Args:
-        study: The runs.
+        comparison: The runs.
         missing: Those of them that have to be made.
 
     Returns:
-        Studies that have these runs and no others, methods and arms that lack the same seeds
+        Comparisons that have these runs and no others, methods and arms that lack the same seeds
         together.
     """
     lacking: dict[tuple[str, Arm, str], list[int]] = {}
-    for job in study.jobs:
+    for job in comparison.jobs:
         if job in missing:
             lacking.setdefault((job.learner, job.arm, job.method), []).append(job.seed)
     methods: dict[tuple[str, Arm, tuple[int, ...]], list[str]] = {}
@@ -46,17 +46,17 @@ def parts_left(study: Study, missing: Collection[Job]) -> list[Study]:
     for (learner, arm, of_arm), names in methods.items():
         arms.setdefault((learner, tuple(names), of_arm), []).append(arm)
     return [
-        replace(study, learners=(learner,), methods=names, seeds=of_arms, arms=tuple(alike))
+        replace(comparison, learners=(learner,), methods=names, seeds=of_arms, arms=tuple(alike))
         for (learner, names, of_arms), alike in arms.items()
     ]
 
 
-def seconds_of(job: Job, study: Study) -> tuple[float, float] | None:
+def seconds_of(job: Job, comparison: Comparison) -> tuple[float, float] | None:
     """Time that a run and its evaluation took, alone in its process.
 
     Args:
         job: A run that is done.
-        study: What it is a run of.
+        comparison: What it is a run of.
 
     Returns:
         Wall-clock time of the training and of the evaluation [s]; None for a run without
@@ -69,34 +69,35 @@ def seconds_of(job: Job, study: Study) -> tuple[float, float] | None:
     # begins at once. A second one begins some time later: it takes no longer than a training.
     trained, tested = (
         path.stat().st_mtime
-        for path in (job.path / files.POLICY, job.results(study.evaluation) / files.EPISODES)
+        for path in (job.path / files.POLICY, job.results(comparison.evaluation) / files.EPISODES)
     )
     training = float(found["trained_for"].iloc[-1] + found["seconds"].sum())
     return training, min(tested - trained, training)
 
 
-def hours_left(studies: Sequence[Study], *, jobs: int) -> float | None:
-    """Time until all runs of some studies are done.
+def hours_left(comparisons: Sequence[Comparison], *, jobs: int) -> float | None:
+    """Time until all runs of some comparisons are done.
 
     Args:
-        studies: What is wanted; a run that two of them want is made once.
+        comparisons: What is wanted; a run that two of them want is made once.
         jobs: Runs at a time.
 
     Returns:
-        Hours, by the median run of each study, or of all if it has none yet; None before the first.
+        Hours, by the median run of each comparison, or of all if it has none yet; None before
+        the first.
     """
-    typical = [_medians(_seconds(study)) for study in studies]
+    typical = [_medians(_seconds(comparison)) for comparison in comparisons]
     of_all = _medians([each for each in typical if each is not None])
     if of_all is None:
         return None
     left = 0.0
     training: set[Path] = set()
     testing: set[tuple[Path, Evaluation]] = set()
-    for study, seconds in zip(studies, typical, strict=True):
+    for comparison, seconds in zip(comparisons, typical, strict=True):
         to_train, to_test = seconds or of_all
-        done = {job.path for job in jobs_done(study)}
-        for job in study.jobs:
-            test = job.path, study.evaluation
+        done = {job.path for job in jobs_done(comparison)}
+        for job in comparison.jobs:
+            test = job.path, comparison.evaluation
             if job.path in done or test in testing:
                 continue
             testing.add(test)
@@ -107,18 +108,18 @@ def hours_left(studies: Sequence[Study], *, jobs: int) -> float | None:
     return left / jobs / 3600
 
 
-def counts(studies: Sequence[Study]) -> tuple[int, int]:
+def counts(comparisons: Sequence[Comparison]) -> tuple[int, int]:
     """Runs that are trained and tested wherever they shall be, and all that are wanted."""
     done: dict[Path, bool] = {}
-    for study in studies:
-        whole = {job.path for job in jobs_done(study)}
-        for job in study.jobs:
+    for comparison in comparisons:
+        whole = {job.path for job in jobs_done(comparison)}
+        for job in comparison.jobs:
             done[job.path] = done.get(job.path, True) and job.path in whole
     return sum(done.values()), len(done)
 
 
-def _seconds(study: Study) -> list[tuple[float, float]]:
-    found = (seconds_of(job, study) for job in jobs_done(study))
+def _seconds(comparison: Comparison) -> list[tuple[float, float]]:
+    found = (seconds_of(job, comparison) for job in jobs_done(comparison))
     return [seconds for seconds in found if seconds is not None]
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks.study.kept_rows import is_kept
 from benchmarks.study.pages import write_study
 from benchmarks.study.paper_report import write_paper
-from benchmarks.study.protocol import paper_studies, tables
+from benchmarks.study.protocol import paper_comparisons, tables
 from training import files
 
 
@@ -42,7 +42,7 @@ def report_study(folder: Path, output: Path) -> int:
             file=sys.stderr,
         )
     elif output / "A.md" in made and not is_kept(folder):
-        write_paper(paper_studies(tables(folder)["A"]), output / "paper")
+        write_paper(paper_comparisons(tables(folder)["A"]), output / "paper")
     return 0 if made else 1
 
 

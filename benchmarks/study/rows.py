@@ -14,7 +14,7 @@ import pandas as pd
 from benchmarks.study.protocol import Table, label_of
 from benchmarks.study.remaining import parts_left
 from training import files
-from training.comparison.jobs import Evaluation, Job, Study
+from training.comparison.jobs import Comparison, Evaluation, Job
 from training.records import read_table
 from training.worlds import family
 
@@ -41,15 +41,15 @@ def read_runs(table: Table, root: Path) -> Rows:
     """The rows of the runs that are at their end."""
     curves: dict[tuple[str, int], pd.DataFrame] = {}
     tests: dict[tuple[str, int, Evaluation], pd.DataFrame] = {}
-    for study in table.studies:
-        for job in study.jobs:
+    for comparison in table.comparisons:
+        for job in comparison.jobs:
             if not job.is_trained():
                 continue
             run = label_of(job, root), job.seed
             curves[run] = _rows(run, job.path / files.EVALUATIONS, CURVES)
-            if job.is_evaluated(study.evaluation):
-                rows = job.results(study.evaluation) / files.EPISODES
-                tests[(*run, study.evaluation)] = _rows(run, rows, TESTS)
+            if job.is_evaluated(comparison.evaluation):
+                rows = job.results(comparison.evaluation) / files.EPISODES
+                tests[(*run, comparison.evaluation)] = _rows(run, rows, TESTS)
     return Rows(together(curves.values(), CURVES), together(tests.values(), TESTS))
 
 
@@ -120,15 +120,15 @@ def _success(worlds: pd.DataFrame) -> dict[int, float]:
     return {int(str(seed)): float(value) for seed, value in means.items()}
 
 
-def without_rows(study: Study, rows: Rows, root: Path) -> list[Job]:
-    """The runs of a study that have no rows, or were not tested where they shall be."""
+def without_rows(comparison: Comparison, rows: Rows, root: Path) -> list[Job]:
+    """The runs of a comparison that have no rows, or were not tested where they shall be."""
     trained = set(rows.curves[["arm", "seed"]].itertuples(index=False, name=None))
     kinds = rows.tests[["arm", "seed"]].assign(kind=rows.tests["world"].map(family))
     tested = set(kinds.drop_duplicates().itertuples(index=False, name=None))
-    asked = {_kind(word) for word in study.evaluation.words}
+    asked = {_kind(word) for word in comparison.evaluation.words}
     return [
         job
-        for job in study.jobs
+        for job in comparison.jobs
         for run in [(label_of(job, root), job.seed)]
         if run not in trained or any((*run, kind) not in tested for kind in asked)
     ]
@@ -137,15 +137,15 @@ def without_rows(study: Study, rows: Rows, root: Path) -> list[Job]:
 def missing(table: Table, rows: Rows, root: Path) -> str:
     """Which runs have no rows, or were not tested, and the commands that make them."""
     lines = []
-    for study in table.studies:
+    for comparison in table.comparisons:
         absent: dict[str, list[int]] = {}
-        jobs = without_rows(study, rows, root)
+        jobs = without_rows(comparison, rows, root)
         for job in jobs:
             absent.setdefault(label_of(job, root), []).append(job.seed)
         if absent:
             names = "; ".join(f"{arm} {_span(seeds)}" for arm, seeds in absent.items())
             lines.append(f"Missing: {names}.\n")
-            lines += [f"    {part.command}\n" for part in parts_left(study, jobs)]
+            lines += [f"    {part.command}\n" for part in parts_left(comparison, jobs)]
     return "\n".join(lines).rstrip()
 
 

@@ -28,7 +28,7 @@ from benchmarks.study.remaining import counts, free_checkpoints, hours_left, par
 from benchmarks.study.rows import Rows, read_runs, without_rows
 from training import files
 from training.comparison.execution import make_runs
-from training.comparison.jobs import Study
+from training.comparison.jobs import Comparison
 from training.settings.train import register
 
 
@@ -81,18 +81,18 @@ def left_of(table: Table, rows: Rows, root: Path) -> Table:
     """A table with the runs alone that are not among the rows."""
     parts = (
         part
-        for study in table.studies
-        for part in parts_left(study, without_rows(study, rows, root))
+        for comparison in table.comparisons
+        for part in parts_left(comparison, without_rows(comparison, rows, root))
     )
-    return replace(table, studies=tuple(parts))
+    return replace(table, comparisons=tuple(parts))
 
 
 def summary(chosen: Sequence[Table], *, jobs: int) -> str:
     """How much of some tables is done, and what is left of it."""
-    studies = [study for table in chosen for study in table.studies]
-    done, wanted = counts(studies)
+    comparisons = [comparison for table in chosen for comparison in table.comparisons]
+    done, wanted = counts(comparisons)
     text = f"{', '.join(table.name for table in chosen)}: {done} of {wanted} runs"
-    hours = hours_left(studies, jobs=jobs) if done < wanted else 0.0
+    hours = hours_left(comparisons, jobs=jobs) if done < wanted else 0.0
     return text if not hours else f"{text}, about {hours:.1f} h left with {jobs} at a time"
 
 
@@ -100,11 +100,11 @@ def listing(chosen: Sequence[Table]) -> str:
     """The questions, runs and commands of some tables."""
     lines = []
     for table in chosen:
-        done, wanted = counts(table.studies)
+        done, wanted = counts(table.comparisons)
         lines.append(f"{table.name}  {table.question}  {done} of {wanted} runs")
-        for study in table.studies:
-            done, wanted = counts([study])
-            lines += ["", f"    # {done} of {wanted}", f"    {study.command}"]
+        for comparison in table.comparisons:
+            done, wanted = counts([comparison])
+            lines += ["", f"    # {done} of {wanted}", f"    {comparison.command}"]
         lines.append("")
     return "\n".join(lines)
 
@@ -116,7 +116,9 @@ def kept(chosen: Sequence[Table], root: Path, folder: Path) -> str:
         rows = read_runs(table, root)
         if len(rows.curves):
             # Runs that it shares with another table may be kept there alone.
-            labels = {label_of(job, root) for study in table.studies for job in study.jobs}
+            labels = {
+                label_of(job, root) for comparison in table.comparisons for job in comparison.jobs
+            }
             rows = joined(rows, of_arms(others, labels))
         for path in keep(rows, folder, table.name) if len(rows.curves) else []:
             lines.append(f"written: {path}, {path.stat().st_size / 1e6:.2f} MB")
@@ -143,24 +145,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     register()
     worst = 0
     for table in options.tables:
-        for study in table.studies:
-            done, wanted = counts([study])
+        for comparison in table.comparisons:
+            done, wanted = counts([comparison])
             if done < wanted:
                 print(
-                    f"{summary(options.tables, jobs=options.jobs)}\n{table.name}: {study.command}"
+                    f"{summary(options.tables, jobs=options.jobs)}\n"
+                    f"{table.name}: {comparison.command}"
                 )
-                worst = max(worst, _make(study, options.jobs))
-            free_checkpoints(study)
+                worst = max(worst, _make(comparison, options.jobs))
+            free_checkpoints(comparison)
             if worst >= 128:
                 return worst
     print(summary(options.tables, jobs=options.jobs))
     return worst
 
 
-def _make(study: Study, jobs: int) -> int:
-    """Make the runs of a study; 2 if they cannot be, as of ``compare.py``."""
+def _make(comparison: Comparison, jobs: int) -> int:
+    """Make the runs of a comparison; 2 if they cannot be, as of ``compare.py``."""
     try:
-        return make_runs(study, most=jobs)
+        return make_runs(comparison, most=jobs)
     except (ValueError, files.FolderInUse) as error:
         print(f"run: {error}", file=sys.stderr)
         return 2

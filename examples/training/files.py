@@ -51,7 +51,7 @@ def check_folder(folder: Path) -> None:
 
 @contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that no other run or study writes in it.
+    """Hold a folder, so that no other run or comparison writes in it.
 
     The system lets go of the lock when the process ends, however that ends. What a killed process
     had half written is removed.

@@ -23,12 +23,12 @@ def one_store() -> Iterator[None]:
 
 @pytest.fixture
 def tables_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the report of a study make no figure, which takes longer than all of its tables."""
+    """Let the report of a comparison make no figure, which takes longer than all of its tables."""
     monkeypatch.setattr("training.comparison.report.plot_evaluations", lambda *_: None)
 
 
 @pytest.fixture
-def study(tmp_path: Path) -> Path:
+def comparison(tmp_path: Path) -> Path:
     """Two methods, two seeds, four pairs: the first method fails once, the other always."""
     evaluation = []
     for method, failures in (("mpfa_per", {(1, 3)}), ("per", None)):

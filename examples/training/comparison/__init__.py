@@ -1,1 +1,1 @@
-"""Studies of many runs: what is asked, as data, and the processes that answer it."""
+"""Comparisons of many runs: what is asked, as data, and the processes that answer it."""

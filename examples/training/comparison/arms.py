@@ -1,4 +1,4 @@
-"""The arms of a study: what is other in some of its runs, by a name."""
+"""The arms of a comparison: what is other in some of its runs, by a name."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from training.settings.command_line import parse_overrides
 from training.settings.rules import NAME
 
 DEFAULTS = ("tracking=off", "evaluation.every=5000")
-"""What a study has unless its command line says otherwise."""
-_OF_THE_STUDY = ("learner", "method", "seed", "run_dir", "overwrite", "resume")
-"""Settings that a study gives each of its runs."""
+"""What a comparison has unless its command line says otherwise."""
+_OF_THE_COMPARISON = ("learner", "method", "seed", "run_dir", "overwrite", "resume")
+"""Settings that a comparison gives each of its runs."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Settings of ``train.py`` that some runs of a study have, and a name for them."""
+    """Settings of ``train.py`` that some runs of a comparison have, and a name for them."""
 
     name: str = ""
     """Part of the name of its runs."""
@@ -24,7 +24,7 @@ class Arm:
     """As on the command line of ``train.py``."""
 
     def over(self, overrides: Sequence[str]) -> list[str]:
-        """The settings of a study with those of the arm in the place of the same ones."""
+        """The settings of a comparison with those of the arm in the place of the same ones."""
         own = [_key(setting) for setting in self.settings]
         # The whole of a group takes the place of each setting in it.
         kept = [o for o in overrides if not any(f"{_key(o)}.".startswith(f"{k}.") for k in own)]
@@ -32,7 +32,7 @@ class Arm:
 
 
 PLAIN = Arm()
-"""The only arm of a study for which none is named."""
+"""The only arm of a comparison for which none is named."""
 
 
 def parse_arms(texts: Sequence[str]) -> list[Arm]:
@@ -59,7 +59,7 @@ def parse_arm(text: str) -> Arm:
         The arm.
 
     Raises:
-        ValueError: If it is no such thing, or a setting is unknown or one that the study gives.
+        ValueError: If it is no such thing, or a setting is unknown or given by the comparison.
 
     Examples:
         >>> parse_arm("short:robots=1,curriculum.stages=[{world: A, actions: 500}]").settings
@@ -77,18 +77,18 @@ def parse_arm(text: str) -> Arm:
 
 
 def check_free(settings: Sequence[str]) -> None:
-    """Refuse settings that the study itself gives its runs, and unknown ones."""
+    """Refuse settings that the comparison itself gives its runs, and unknown ones."""
     for setting in settings:
         if setting.startswith("-") or "=" not in setting:
             raise ValueError(f"{setting!r} is not NAME=VALUE")
     for override in parse_overrides(settings):
         key = override.key_or_group
-        if key in _OF_THE_STUDY:
-            raise ValueError(f"{key} is what the study gives each run, not a setting of all")
+        if key in _OF_THE_COMPARISON:
+            raise ValueError(f"{key} is what the comparison gives each run, not a setting of all")
 
 
 def with_defaults(overrides: Sequence[str]) -> list[str]:
-    """The settings of a study, but where the command line has others."""
+    """The settings of a comparison, but where the command line has others."""
     given = {_key(override) for override in overrides}
     return [*(d for d in DEFAULTS if _key(d) not in given), *overrides]
 

@@ -1,4 +1,4 @@
-"""The commands of a study on the machines of a Ray cluster, each as a task of one core."""
+"""The commands of a comparison on the machines of a Ray cluster, each as a task of one core."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ def connected(address: str | None) -> Iterator[None]:
 
 
 def _run(command: list[str], log: Path, folder: Path) -> int:
-    """Run a command where the study would have run it; cancelling it stops it by SIGTERM."""
+    """Run a command where the comparison would have run it; cancelling it stops it by SIGTERM."""
     os.chdir(folder)
     if not log.parent.is_dir():
         raise FileNotFoundError(
             f"{os.uname().nodename} does not have {log.parent.resolve()}: the machines of the "
-            "cluster must share the study's folder"
+            "cluster must share the comparison's folder"
         )
     # The run may have been begun on a machine that is gone, or takes its time to be.
     files.wait_until_free(log.parent, _PATIENCE)

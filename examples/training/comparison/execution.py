@@ -1,4 +1,4 @@
-"""The runs of a study on their way: trained, then evaluated, and begun again where one is lost."""
+"""The runs of a comparison: trained, then evaluated, and begun again where one is lost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from training import files
-from training.comparison.jobs import Evaluation, Job, Study, collect, other_than_asked
+from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
 from training.comparison.processes import Child, Lost, Started
 from training.stopping import Stop
 
@@ -84,7 +84,7 @@ class Running:
 
 
 class Runs:
-    """The runs of a study that are not done, some of them on their way at a time.
+    """The runs of a comparison that are not done, some of them on their way at a time.
 
     Args:
         waiting: The runs.
@@ -166,12 +166,12 @@ class Runs:
 
 
 def make_runs(
-    study: Study, *, most: int | None = None, ray: str | None = None, anew: bool = False
+    comparison: Comparison, *, most: int | None = None, ray: str | None = None, anew: bool = False
 ) -> int:
     """Train what is not trained, evaluate it, collect the rows.
 
     Args:
-        study: The runs.
+        comparison: The runs.
         most: How many at a time; None: :data:`JOBS`, or on a cluster as many as there are.
         ray: Address of a Ray cluster, empty for the one that there is; None: on this machine.
         anew: Whether runs with other settings are trained again.
@@ -183,9 +183,9 @@ def make_runs(
         ValueError: If a run was trained with other settings, or Ray cannot be used.
         FolderInUse: If another process makes runs there.
     """
-    jobs, wanted = study.jobs, study.evaluation
-    with files.lock(study.folder):
-        others = other_than_asked(jobs, study.settings)
+    jobs, wanted = comparison.jobs, comparison.evaluation
+    with files.lock(comparison.folder):
+        others = other_than_asked(jobs, comparison.settings)
         if others and not anew:
             job, found = next(iter(others.items()))
             raise ValueError(
@@ -193,14 +193,16 @@ def make_runs(
                 "train it again with --anew"
             )
         waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
-        print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {study.folder}")
+        print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {comparison.folder}")
         with _starting(ray if waiting else None) as start:
             most = most or (JOBS if ray is None else len(waiting))
-            runs = Runs(waiting, study.settings, wanted, anew=set(others), start=start, most=most)
+            runs = Runs(
+                waiting, comparison.settings, wanted, anew=set(others), start=start, most=most
+            )
             stop = _run_all(runs)
         if stop:
             return stop.exit_status
-        collect(jobs, wanted, study.folder)
+        collect(jobs, wanted, comparison.folder)
     return 1 if runs.failed else 0
 
 

@@ -1,4 +1,4 @@
-"""Studies: the runs of several methods, learners, arms and seeds, their settings and rows."""
+"""Comparisons: the runs of several methods, learners, arms and seeds, their settings and rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCRIPTS = Path(__file__).resolve().parents[2]
 _OF_THE_RESULT = ("evaluation.every", "ray.workers", "ray.steps", "ray.sync")
 """Settings that a run may change on its way, although it becomes another one by them."""
 _FREE = {*LAWFUL, *OF_THE_CALL, "device", "threads"} - {*_OF_THE_RESULT}
-"""Settings that may be others than those that a study asks for."""
+"""Settings that may be others than those that a comparison asks for."""
 
 
 def run_name(learner: str, method: str, arm: str, seed: int) -> str:
@@ -37,7 +37,7 @@ def run_name(learner: str, method: str, arm: str, seed: int) -> str:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What every policy of a study is asked to do."""
+    """What every policy of a comparison is asked to do."""
 
     words: tuple[str, ...]
     """Worlds, as on the command line."""
@@ -53,13 +53,13 @@ TESTED = Evaluation(("test",), 200)
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a study."""
+    """One run of a comparison."""
 
     learner: str
     method: str
     seed: int
     folder: Path
-    """Of the study."""
+    """Of the comparison."""
     arm: Arm = PLAIN
 
     @property
@@ -88,7 +88,7 @@ class Job:
             where = f"--arm {self.arm.name}: " if self.arm.name else ""
             raise ValueError(f"{where}{error}") from error
         if others:
-            raise ValueError("a study takes one value for each setting, not a sweep")
+            raise ValueError("a comparison takes one value for each setting, not a sweep")
         return first
 
     def trains(self, overrides: Sequence[str], *, anew: bool = False) -> list[str]:
@@ -134,7 +134,7 @@ class Job:
             and found.get("episodes") == wanted.episodes
             and found.get("words") == list(wanted.words)
             and found.get("physics") == self.physics(wanted)
-            # A study drives the pairs of the first seed, and robots without errors.
+            # A comparison drives the pairs of the first seed, and robots without errors.
             and found.get("seed", 0) == 0
             and found.get("noise") is None
             and policy.exists()
@@ -155,7 +155,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Study:
+class Comparison:
     """Runs that one command of ``compare.py`` makes: each learner, method, arm and seed."""
 
     folder: Path
@@ -187,7 +187,8 @@ class Study:
         """What makes the runs, and leaves alone those that are made.
 
         Examples:
-            >>> one = Study(Path("runs/x"), ("per",), ("robots=4",), range(2), arms=(Arm("a"),))
+            >>> settings, arms = ("robots=4",), (Arm("a"),)
+            >>> one = Comparison(Path("runs/x"), ("per",), settings, range(2), arms=arms)
             >>> one.command
             'python examples/compare.py --folder runs/x --arm=a: --methods per --seeds 0 1 -- \
 robots=4'
@@ -199,7 +200,7 @@ robots=4'
         """Its runs, in the order in which they are made."""
         return [
             Job(learner, method, seed, self.folder, arm)
-            # Seeds outside: a study that is cut short has as much of each method.
+            # Seeds outside: a comparison that is cut short has as much of each method.
             for seed in self.seeds
             for learner in self.learners
             for method in self.methods

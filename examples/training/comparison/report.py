@@ -40,8 +40,8 @@ def write_report(
     *speeds: Callable[[Runs], str],
 ) -> int:
     """Read the rows of the folders on a command line, write ``tables.md`` and a figure."""
-    parser.add_argument("folders", type=Path, nargs="+", help="folders of studies")
-    parser.add_argument("--output", type=Path, help="folder (default: the first study's)")
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of comparisons")
+    parser.add_argument("--output", type=Path, help="folder (default: the first comparison's)")
     options = parser.parse_args(arguments)
     output = options.output or options.folders[0]
     there = [folder.resolve() for folder in options.folders]
@@ -90,7 +90,7 @@ def read_comparisons(folders: Sequence[Path]) -> pd.DataFrame:
         if missing:
             raise ValueError(
                 f"{folder / files.EPISODES} has no column {missing[0]}: name the folder of a "
-                "study, which compare.py made, not that of a run"
+                "comparison, which compare.py made, not that of a run"
             )
         for column in ("arm", "physics"):
             found[column] = found[column].fillna("") if column in found else ""

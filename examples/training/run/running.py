@@ -179,6 +179,6 @@ def _train(training: TrainingRun) -> int:
 
 
 def write_settings(settings: TrainSettings, path: Path) -> None:
-    """Keep the settings of a run where people and studies can read them."""
+    """Keep the settings of a run where people and comparisons can read them."""
     values = {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}
     write_text_atomically(json.dumps(values, indent=2) + "\n", path)

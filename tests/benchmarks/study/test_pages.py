@@ -21,7 +21,7 @@ from benchmarks.study.figures import (
 from benchmarks.study.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
 from benchmarks.study.paper import NAMES, PHIS
 from benchmarks.study.permutation import deal_p
-from benchmarks.study.protocol import Table, paper_studies, tables
+from benchmarks.study.protocol import Table, paper_comparisons, tables
 from benchmarks.study.rows import (
     Rows,
     missing,
@@ -32,7 +32,7 @@ from benchmarks.study.rows import (
 from benchmarks.study.tables import arm_lines, comparison_lines, study_tables
 from training import files
 from training.comparison.arms import Arm
-from training.comparison.jobs import Evaluation, Job, Study
+from training.comparison.jobs import Comparison, Evaluation, Job
 from training.records import write_table
 
 TEST = Evaluation(("bars:test", "halls:test"), 4, "wheels")
@@ -41,11 +41,11 @@ PAIRS = (("s/td3/per", "s/td3/uniform"), ("s/td3/uniform/wide", "s/td3/uniform")
 
 def small_table(root: Path, *, seeds: int = 4) -> Table:
     """Three arms, one of them by a name of its own."""
-    plain = Study(
+    plain = Comparison(
         root / "s", ("uniform", "per"), ("robots=2",), range(seeds), ("td3",), evaluation=TEST
     )
     wide = Arm("wide", ("learner.width=128",))
-    other = Study(root / "s", ("uniform",), (), range(seeds), ("td3",), (wide,), TEST)
+    other = Comparison(root / "s", ("uniform",), (), range(seeds), ("td3",), (wide,), TEST)
     arms = tuple(dict.fromkeys(label for pair in PAIRS for label in pair))
     return Table(
         *("C", "Which?", (plain, other), PAIRS[:1], PAIRS[1:], {"all": arms}), kinds=TEST.words
@@ -79,7 +79,7 @@ def write_run(job: Job, heights: Sequence[float], outcomes: Sequence[Sequence[bo
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Four runs of each arm; PER is better by as much in each seed."""
     root = tmp_path / "runs"
-    for each in small_table(root).studies:
+    for each in small_table(root).comparisons:
         for job in each.jobs:
             first = 0.1 * job.seed + 0.4 * (job.method == "per")
             outcomes = [[job.seed > 0] * 4, [True, True, job.method == "per", False]]
@@ -322,7 +322,7 @@ def test_a_folder_without_rows_is_an_error(
 
 def test_the_figures_of_the_paper_are_made_of_table_a() -> None:
     found: dict[str, list[Job]] = {}
-    for each in paper_studies(tables(Path("x"))["A"]):
+    for each in paper_comparisons(tables(Path("x"))["A"]):
         assert "robots=16" in each.settings and "updates=16" in each.settings
         for name, jobs in each.runs().items():
             assert name not in found

@@ -18,10 +18,10 @@ from benchmarks.study.paper import (
     PHIS,
     TABLE_2,
     TABLE_4,
+    comparisons,
     evaluation_of,
     missing,
     read_runs,
-    studies,
 )
 from benchmarks.study.paper_figures import plot_claims, reward_of_blocks
 from benchmarks.study.paper_tables import trained_table, unseen_table
@@ -48,7 +48,7 @@ def say_tested(job: Job, **other: object) -> None:
 def paper_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of every name in the paper, some of which were tested."""
     folder = tmp_path_factory.mktemp("paper")
-    first, second = studies(folder, seeds=1)
+    first, second = comparisons(folder, seeds=1)
     for name, (job,) in {**first.runs(), **second.runs()}.items():
         settings = tiny(
             name if name in NAMES else "mpfa_per", [Stage(world, 1) for world in "ABCD"]
@@ -85,7 +85,7 @@ def test_all_figures_and_tables_are_made_of_what_there_is(
 
 
 def test_the_commands_that_are_named_make_the_runs_that_are_looked_for(tmp_path: Path) -> None:
-    for study in studies(tmp_path, seeds=2):
+    for study in comparisons(tmp_path, seeds=2):
         words = shlex.split(study.command)
         assert words[:2] == ["python", "examples/compare.py"]
         options = compare.parse(words[2:])
@@ -102,7 +102,7 @@ def test_the_commands_that_are_named_make_the_runs_that_are_looked_for(tmp_path:
 
 
 def test_a_run_that_is_not_at_its_end_is_missing_and_in_no_table(tmp_path: Path) -> None:
-    first, _ = wanted = studies(tmp_path, seeds=1)
+    first, _ = wanted = comparisons(tmp_path, seeds=1)
     (job,) = first.runs()["per"]
     (job.path / "evaluation-test-wheels").mkdir(parents=True)
     for name in ("updates.csv", "episodes.csv", "evaluation-test-wheels/episodes.csv"):
@@ -130,7 +130,7 @@ def test_a_folder_without_runs_gets_the_commands(
 ) -> None:
     assert report.main([str(tmp_path)]) == 1
     said = capsys.readouterr().out
-    for study in studies(tmp_path):
+    for study in comparisons(tmp_path):
         assert study.command in said
     assert not list(tmp_path.iterdir())
 
@@ -182,4 +182,4 @@ def test_the_claims_have_a_line_for_each_method_where_its_values_are(tmp_path: P
 
 
 def test_the_phis_of_the_figure_are_the_arms() -> None:
-    assert [f"phi{phi}" for phi in PHIS] == [arm.name for arm in studies(Path("x"))[1].arms]
+    assert [f"phi{phi}" for phi in PHIS] == [arm.name for arm in comparisons(Path("x"))[1].arms]

@@ -19,8 +19,8 @@ PAGES = {
 }
 
 
-def tables(folder: Path, *studies: str) -> str:
-    statistics.main([*(str(DOCS / study) for study in studies), "--output", str(folder)])
+def tables(folder: Path, *comparisons: str) -> str:
+    statistics.main([*(str(DOCS / study) for study in comparisons), "--output", str(folder)])
     return (folder / "tables.md").read_text(encoding="utf-8")
 
 

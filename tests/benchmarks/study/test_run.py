@@ -30,7 +30,7 @@ from torchrl_mpfa.methods.catalogue import check_ranges
 from training import files
 from training.comparison import execution
 from training.comparison.arms import Arm, with_defaults
-from training.comparison.jobs import Evaluation, Study
+from training.comparison.jobs import Comparison, Evaluation
 from training.run import running
 from training.settings.command_line import composed
 from training.settings.train import TrainSettings, register
@@ -39,13 +39,13 @@ from training.worlds import parse_worlds
 ROOT = Path("runs/study")
 
 
-def every_study() -> list[Study]:
-    return [each for table in tables(ROOT).values() for each in table.studies]
+def every_comparison() -> list[Comparison]:
+    return [each for table in tables(ROOT).values() for each in table.comparisons]
 
 
 def test_the_tables_have_the_runs_that_were_planned() -> None:
     arms = {
-        name: {label_of(job, ROOT) for each in table.studies for job in each.jobs}
+        name: {label_of(job, ROOT) for each in table.comparisons for job in each.jobs}
         for name, table in tables(ROOT).items()
     }
     assert list(arms) == ["C", "D", "E", "A", "B"]
@@ -60,7 +60,7 @@ def test_the_tables_have_the_runs_that_were_planned() -> None:
 
 def test_every_comparison_is_of_arms_that_are_run() -> None:
     for table in tables(ROOT).values():
-        labels = {label_of(job, ROOT) for each in table.studies for job in each.jobs}
+        labels = {label_of(job, ROOT) for each in table.comparisons for job in each.jobs}
         pairs = [*table.planned, *table.explored]
         assert len(set(pairs)) == len(pairs) > 0
         for pair in pairs:
@@ -106,7 +106,7 @@ def test_the_order_of_the_paper_is_compared_neighbor_by_neighbor() -> None:
 
 def test_the_method_of_every_arm_is_accepted() -> None:
     found = set()
-    for each in every_study():
+    for each in every_comparison():
         for job in each.jobs:
             words = [w for w in job.overrides(each.settings) if w.startswith("method")]
             found.add(tuple(words))
@@ -120,36 +120,36 @@ def test_the_method_of_every_arm_is_accepted() -> None:
 
 def test_no_two_studies_want_other_settings_of_one_run() -> None:
     wanted: dict[Path, list[str]] = {}
-    for each in every_study():
+    for each in every_comparison():
         for job in each.jobs:
             asked = job.overrides(each.settings)
             assert wanted.setdefault(job.path, asked) == asked, job.path
 
 
 def test_the_seeds_of_the_tables_were_used_for_no_choice() -> None:
-    seeds = {seed for each in every_study() for seed in each.seeds}
+    seeds = {seed for each in every_comparison() for seed in each.seeds}
     assert min(seeds) == FIRST_SEED and max(seeds) < 1000
 
 
 def test_fewer_seeds_are_the_first_ones_of_every_arm() -> None:
     for name, table in tables(ROOT, most=2).items():
-        assert {tuple(each.seeds) for each in table.studies} == {(100, 101)}, name
+        assert {tuple(each.seeds) for each in table.comparisons} == {(100, 101)}, name
     with pytest.raises(ValueError, match="most must be at least 1, got 0"):
         tables(ROOT, most=0)
 
 
 def test_the_commands_are_understood_as_they_were_meant(monkeypatch: pytest.MonkeyPatch) -> None:
-    for words in {each.evaluation.words for each in every_study()}:
+    for words in {each.evaluation.words for each in every_comparison()}:
         parse_worlds(words)
     # That takes a second, and is done.
     monkeypatch.setattr(compare, "parse_worlds", list)
-    for each in every_study():
+    for each in every_comparison():
         options = compare.parse(shlex.split(each.command)[2:])
         assert tuple(options.arms) == each.arms
         assert tuple(options.overrides) == each.settings
         assert tuple(options.worlds) == each.evaluation.words
         assert options.physics == each.evaluation.physics
-        read = Study(
+        read = Comparison(
             options.folder,
             tuple(options.methods),
             tuple(options.overrides),
@@ -162,7 +162,7 @@ def test_the_commands_are_understood_as_they_were_meant(monkeypatch: pytest.Monk
 
 def settings_of(table: Table, label: str) -> TrainSettings:
     register()
-    for each in table.studies:
+    for each in table.comparisons:
         for job in each.jobs:
             if label_of(job, ROOT) == label:
                 (found,) = composed(job.overrides(each.settings))
@@ -214,7 +214,7 @@ def test_the_settings_of_each_task_are_those_of_the_design() -> None:
 @pytest.mark.slow
 def test_every_arm_of_every_table_can_be_trained() -> None:
     register()
-    for each in every_study():
+    for each in every_comparison():
         for job in each.jobs:
             if job.seed == FIRST_SEED:
                 job.asked(each.settings)
@@ -230,8 +230,8 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         worlds = Evaluation(("B",), 2)
         seeds = range(100, 102)[:most]
         of = {
-            "C": Study(root / "s", ("per", "uniform"), settings, seeds, evaluation=worlds),
-            "D": Study(root / "s", ("per",), settings, seeds, evaluation=worlds),
+            "C": Comparison(root / "s", ("per", "uniform"), settings, seeds, evaluation=worlds),
+            "D": Comparison(root / "s", ("per",), settings, seeds, evaluation=worlds),
         }
         return {name: Table(name, "Why?", (each,), (), (), {}) for name, each in of.items()}
 
@@ -296,7 +296,7 @@ def test_runs_that_are_kept_are_not_made_again(
 
 def test_the_parts_of_a_study_that_are_left_have_the_missing_runs_and_no_others() -> None:
     arms = (Arm("", ()), Arm("wide", ("learner.width=128",)))
-    whole = Study(ROOT, ("per", "uniform", "lap"), (), range(4), ("td3", "ddpg"), arms)
+    whole = Comparison(ROOT, ("per", "uniform", "lap"), (), range(4), ("td3", "ddpg"), arms)
     rng = np.random.default_rng(0)
     missing = [job for job in whole.jobs if rng.random() < 0.6]
     parts = parts_left(whole, missing)
@@ -313,7 +313,7 @@ def test_a_study_stops_where_a_signal_stopped_its_runs(
 ) -> None:
     asked = []
 
-    def stopped(wanted: Study, *, most: int) -> int:
+    def stopped(wanted: Comparison, *, most: int) -> int:
         asked.append(most)
         return 130
 
@@ -332,7 +332,7 @@ def test_a_failed_run_does_not_keep_the_other_tables_from_theirs(
 
 
 def test_what_is_left_is_told_by_the_time_that_runs_took(small: Path) -> None:
-    wanted = [each for table in study.tables(small).values() for each in table.studies]
+    wanted = [each for table in study.tables(small).values() for each in table.comparisons]
     assert hours_left(wanted, jobs=2) is None
     study.main(["--folder", str(small), "D", "--seeds", "1"])
     assert counts(wanted) == (1, 4)

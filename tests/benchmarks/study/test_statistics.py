@@ -440,9 +440,9 @@ def test_the_least_p_is_that_of_the_most_extreme_deal() -> None:
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_every_statistic_of_a_comparison_is_in_its_tables(study: Path) -> None:
-    assert statistics.main([str(study)]) == 0
-    text = (study / "tables.md").read_text(encoding="utf-8")
+def test_every_statistic_of_a_comparison_is_in_its_tables(comparison: Path) -> None:
+    assert statistics.main([str(comparison)]) == 0
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     no = "none, no spread"
     assert "| ddpg | mpfa_per | 87.5% | 100.0%, 75.0% | 12.5% | 0.0% | 0.700 | 20.4 |" in text
     assert f"| ddpg/per | 2 | success | 0.000 | {no} | {no} | {no} |  |" in text
@@ -454,12 +454,12 @@ def test_every_statistic_of_a_comparison_is_in_its_tables(study: Path) -> None:
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_runs_that_differ_much_have_their_tables(study: Path) -> None:
-    rows = pd.read_csv(study / "episodes.csv")
+def test_runs_that_differ_much_have_their_tables(comparison: Path) -> None:
+    rows = pd.read_csv(comparison / "episodes.csv")
     good = rows["seed"] == 1
     rows = rows.assign(success=good, collision=~good)
-    write_table(rows, study / "episodes.csv")
-    assert statistics.main([str(study)]) == 0
-    text = (study / "tables.md").read_text(encoding="utf-8")
+    write_table(rows, comparison / "episodes.csv")
+    assert statistics.main([str(comparison)]) == 0
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     assert "from run to run by 70.71 points" in text
     assert "80 % power: more than 10,000 for 2 points, 3141 for 5 points." in text

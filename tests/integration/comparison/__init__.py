@@ -1,1 +1,1 @@
-"""Tests of studies of many runs."""
+"""Tests of comparisons of many runs."""

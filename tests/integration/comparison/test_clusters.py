@@ -1,4 +1,4 @@
-"""Studies on a real Ray cluster, of two machines that are simulated on this one."""
+"""Comparisons on a real Ray cluster, of two machines that are simulated on this one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import compare
-from tests.integration.comparison.test_compare import InThisProcess, assert_same_rows, study
+from tests.integration.comparison.test_compare import InThisProcess, assert_same_rows, comparison
 from training import files
 from training.comparison import execution
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def cluster() -> Iterator[Any]:
-    """Two machines of one core; the first one has the study."""
+    """Two machines of one core; the first one has the comparison."""
     from ray.cluster_utils import Cluster
 
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
@@ -34,14 +34,14 @@ def cluster() -> Iterator[Any]:
         made.shutdown()
 
 
-def test_a_study_loses_a_machine_and_gives_the_rows_of_one_machine(
+def test_a_comparison_loses_a_machine_and_gives_the_rows_of_one_machine(
     tmp_path: Path,
     cluster: Any,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     other = cluster.add_node(num_cpus=1)
-    arguments = [*study(tmp_path / "ray", "--ray", cluster.address, length=60)]
+    arguments = [*comparison(tmp_path / "ray", "--ray", cluster.address, length=60)]
     arguments.append("checkpoint_every=20")
 
     def lose() -> None:

@@ -1,4 +1,4 @@
-"""The study: what is trained, what is left alone, what goes on, and what is kept of it."""
+"""The comparison: what is trained, what is left alone, what goes on, and what is kept of it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from training.settings.train import register
 EPISODES = "curriculum.stages=[{{world: A, episodes: {}}}]"
 
 
-def study(
+def comparison(
     folder: Path, *more: str, methods: tuple[str, ...] = ("mpfa_per", "uniform"), length: int = 2
 ) -> list[str]:
     return [
@@ -75,10 +75,10 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_study_keeps_every_episode_and_refuses_other_settings(
+def test_a_comparison_keeps_every_episode_and_refuses_other_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert compare.main(study(tmp_path)) == 0
+    assert compare.main(comparison(tmp_path)) == 0
     found = read_table(tmp_path / files.EPISODES)
     worlds = ["B", "B", "rooms-7", "rooms-7", "rooms-8", "rooms-8"]
     assert list(found["world"]) == worlds * 2
@@ -94,22 +94,22 @@ def test_a_study_keeps_every_episode_and_refuses_other_settings(
     # Again: nothing happens.
     checkpoint = tmp_path / "ddpg-mpfa_per-0" / files.CHECKPOINT
     before = checkpoint.stat().st_mtime_ns
-    assert compare.main(study(tmp_path)) == 0
+    assert compare.main(comparison(tmp_path)) == 0
     assert checkpoint.stat().st_mtime_ns == before
     assert "2 runs, 2 of them done" in capsys.readouterr().out
 
     # Other settings: refused by name, nothing touched.
-    other = [*study(tmp_path, methods=("mpfa_per",)), "method.alpha=0.9"]
+    other = [*comparison(tmp_path, methods=("mpfa_per",)), "method.alpha=0.9"]
     assert compare.main(other) == 2
     message = capsys.readouterr().err
     assert "ddpg-mpfa_per-0 was trained with method.alpha=0.6, asked for is 0.9" in message
     assert checkpoint.stat().st_mtime_ns == before
 
     # Trained anew only if asked to; other pairs are driven without training.
-    assert compare.main([*study(tmp_path, "--anew", methods=("mpfa_per",)), other[-1]]) == 0
+    assert compare.main([*comparison(tmp_path, "--anew", methods=("mpfa_per",)), other[-1]]) == 0
     assert json.loads((checkpoint.parent / files.SETTINGS).read_text())["method"]["alpha"] == 0.9
     before = checkpoint.stat().st_mtime_ns
-    more = [*study(tmp_path, methods=("mpfa_per",)), other[-1]]
+    more = [*comparison(tmp_path, methods=("mpfa_per",)), other[-1]]
     more[more.index("--episodes") + 1] = "3"
     assert compare.main(more) == 0
     assert len(read_table(tmp_path / files.EPISODES)) == 9
@@ -128,7 +128,7 @@ def test_a_study_keeps_every_episode_and_refuses_other_settings(
         ("tracking.project=other", False),
     ],
 )
-def test_what_makes_another_run_of_it_is_not_what_a_study_asked_for(
+def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
     setting: str, matters: bool, tmp_path: Path
 ) -> None:
     register()
@@ -141,11 +141,11 @@ def test_what_makes_another_run_of_it_is_not_what_a_study_asked_for(
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_study_is_evaluated_again_in_other_physics_and_trains_nothing_for_it(
+def test_a_comparison_is_evaluated_again_in_other_physics_and_trains_nothing_for_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plain = study(tmp_path, methods=("per",))
-    on_wheels = study(tmp_path, "--physics", "wheels", methods=("per",))
+    plain = comparison(tmp_path, methods=("per",))
+    on_wheels = comparison(tmp_path, "--physics", "wheels", methods=("per",))
     assert compare.main(plain) == 0
     as_trained = read_table(tmp_path / files.EPISODES)
     checkpoint = tmp_path / "ddpg-per-0" / files.CHECKPOINT
@@ -167,7 +167,7 @@ def test_a_study_is_evaluated_again_in_other_physics_and_trains_nothing_for_it(
 def test_a_run_that_ends_in_the_middle_of_an_episode_is_evaluated_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = study(tmp_path, "--seeds", "0", "1", methods=("per",))
+    arguments = comparison(tmp_path, "--seeds", "0", "1", methods=("per",))
     arguments[-1] = "curriculum.stages=[{world: A, actions: 30}]"
     assert compare.main(arguments) == 0
     assert list(read_table(tmp_path / files.EPISODES)["seed"]) == [0] * 6 + [1] * 6
@@ -180,7 +180,7 @@ def test_arms_are_trained_with_settings_of_their_own_and_told_apart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arms = ["--arm", "default:", "--arm", "None:method.alpha=0.3,learner.width=4"]
-    arguments = study(tmp_path, *arms, methods=("per",))
+    arguments = comparison(tmp_path, *arms, methods=("per",))
     assert compare.main(arguments) == 0
     found = read_table(tmp_path / files.EPISODES)
     assert list(found["arm"]) == ["default"] * 6 + ["None"] * 6
@@ -203,7 +203,7 @@ def test_arms_are_trained_with_settings_of_their_own_and_told_apart(
 
 
 def assert_same_rows(one: Path, other: Path) -> None:
-    """Assert that two studies have the same episodes, but for the time that they took."""
+    """Assert that two comparisons have the same episodes, but for the time that they took."""
     found, expected = (
         read_table(folder / files.EPISODES).drop(columns=["plan_s", "decision_s"])
         for folder in (one, other)
@@ -226,10 +226,10 @@ def descendants(process: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
-def test_a_killed_study_leaves_no_training_behind_and_goes_on_to_the_same_rows(
+def test_a_killed_comparison_leaves_no_training_behind_and_goes_on_to_the_same_rows(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    arguments = [*study(tmp_path / "killed", methods=("mpfa_per",), length=20)]
+    arguments = [*comparison(tmp_path / "killed", methods=("mpfa_per",), length=20)]
     arguments.append("checkpoint_every=20")
     process = subprocess.Popen(
         [sys.executable, compare.__file__ or "", *arguments],
@@ -246,7 +246,7 @@ def test_a_killed_study_leaves_no_training_behind_and_goes_on_to_the_same_rows(
     process.send_signal(signal.SIGKILL)
     process.wait()
     while any(map(alive, started)):
-        assert time.monotonic() < deadline, "a training outlived the study"
+        assert time.monotonic() < deadline, "a training outlived the comparison"
         time.sleep(0.05)
     # It was stopped: one that nobody stops comes to its end, and is gone as well.
     assert not json.loads((checkpoint.parent / files.STATUS).read_text())["finished"]
@@ -280,27 +280,27 @@ def test_a_run_whose_machine_is_gone_goes_on_at_its_last_checkpoint(
             return super().ended()
 
     monkeypatch.setattr(execution, "Child", OnMachinesThatFail)
-    assert compare.main(study(tmp_path / "lost", methods=("per",))) == 0
+    assert compare.main(comparison(tmp_path / "lost", methods=("per",))) == 0
     assert commands == ["train.py", *["evaluate.py"] * 3]
     assert capsys.readouterr().out.count("its machine is gone") == 3
     assert not (tmp_path / "lost" / "ddpg-per-0" / files.PREVIOUS).exists()
     monkeypatch.setattr(execution, "Child", InThisProcess)
-    assert compare.main(study(tmp_path / "whole", methods=("per",))) == 0
+    assert compare.main(comparison(tmp_path / "whole", methods=("per",))) == 0
     assert_same_rows(tmp_path / "lost", tmp_path / "whole")
 
     # A run that takes down whatever it runs on is given up.
     commands.clear()
     monkeypatch.setattr(execution, "_MOST_LOSSES", 2)
     monkeypatch.setattr(execution, "Child", OnMachinesThatFail)
-    assert compare.main(study(tmp_path / "never", methods=("per",))) == 1
+    assert compare.main(comparison(tmp_path / "never", methods=("per",))) == 1
     assert "ddpg-per-0: failed, lost 2 machines" in capsys.readouterr().out
 
 
 def test_training_again_that_is_lost_goes_on_with_the_new_settings(
     tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = [*study(tmp_path, "--anew", methods=("per",)), "method.alpha=0.9"]
-    assert compare.main(study(tmp_path, methods=("per",))) == 0
+    arguments = [*comparison(tmp_path, "--anew", methods=("per",)), "method.alpha=0.9"]
+    assert compare.main(comparison(tmp_path, methods=("per",))) == 0
     losses = [True]
 
     class Gone(InThisProcess):
@@ -322,12 +322,12 @@ def test_training_again_that_is_lost_goes_on_with_the_new_settings(
     assert kept["method"]["alpha"] == 0.9
 
 
-def test_a_study_says_what_it_needs_where_there_is_no_ray(
+def test_a_comparison_says_what_it_needs_where_there_is_no_ray(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "training.comparison.clusters", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
-    assert compare.main(study(tmp_path, "--ray")) == 2
+    assert compare.main(comparison(tmp_path, "--ray")) == 2
     assert "--ray needs Ray: pip install 'torchrl-mpfa[ray]'" in capsys.readouterr().err
     assert not (tmp_path / "ddpg-mpfa_per-0").exists()
 
@@ -339,20 +339,20 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
     # A file where the run wants its checkpoint, which is no checkpoint.
     (tmp_path / "ddpg-mpfa_per-0").mkdir()
     (tmp_path / "ddpg-mpfa_per-0" / files.CHECKPOINT).write_bytes(b"no checkpoint")
-    assert compare.main(study(tmp_path, "--jobs", "1")) == 1
+    assert compare.main(comparison(tmp_path, "--jobs", "1")) == 1
     assert "ddpg-mpfa_per-0: failed, see" in capsys.readouterr().out
     assert set(read_table(tmp_path / files.EPISODES)["method"]) == {"uniform"}
 
 
-def test_two_studies_do_not_work_in_one_folder(
+def test_two_comparisons_do_not_work_in_one_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with files.lock(tmp_path):
-        assert compare.main(study(tmp_path)) == 2
+        assert compare.main(comparison(tmp_path)) == 2
     assert f"another process is using {tmp_path}" in capsys.readouterr().err
 
 
-def test_defaults_of_a_study_give_way_to_its_command_line() -> None:
+def test_defaults_of_a_comparison_give_way_to_its_command_line() -> None:
     assert with_defaults(["tracking=offline"]) == ["evaluation.every=5000", "tracking=offline"]
 
 
@@ -380,8 +380,8 @@ def test_an_arm_gives_way_to_nothing_and_keeps_what_is_in_brackets_together() ->
         (["--arm", "a/b:robots=2"], "with a NAME of letters, digits"),
         (["--arm", "a:robtos=2"], "unknown setting 'robtos': did you mean 'robots'?"),
         (["--arm", "a:method.alpha=0.5,0.6"], "--arm a:method.alpha=0.5,0.6: '0.6' is not NAME="),
-        (["--arm", "a:seed=3"], "seed is what the study gives each run"),
-        (["--", "learner=td3"], "learner is what the study gives each run"),
+        (["--arm", "a:seed=3"], "seed is what the comparison gives each run"),
+        (["--", "learner=td3"], "learner is what the comparison gives each run"),
         (["--", "robtos=2"], "unknown setting 'robtos'"),
         (["--physics", "magic"], "invalid choice: 'magic'"),
     ],
@@ -397,6 +397,6 @@ def test_a_wrong_command_line_is_refused(
 def test_a_setting_that_cannot_be_is_refused_before_anything_is_trained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert compare.main([*study(tmp_path), "learner.gamma=2"]) == 2
+    assert compare.main([*comparison(tmp_path), "learner.gamma=2"]) == 2
     assert "compare.py: learner.gamma must be in [0, 1]" in capsys.readouterr().err
     assert not (tmp_path / "ddpg-mpfa_per-0").exists()

@@ -1,4 +1,4 @@
-"""Tables and figures of a study, from rows that are made up here."""
+"""Tables and figures of a comparison, from rows that are made up here."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ LINE = "| ddpg | mpfa_per | 87.5% | [0.0%, 100.0%] | 100.0%, 75.0% | 12.5% | 0.0
 NO = "none, no spread"
 
 
-def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert report.main([str(study)]) == 0
-    text = (study / "tables.md").read_text(encoding="utf-8")
+def test_the_tables_say_what_the_rows_say(
+    comparison: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report.main([str(comparison)]) == 0
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     assert text.strip() == capsys.readouterr().out.strip()
     # Seven of eight pairs, of which four took 20 s and three 21 s.
     assert LINE in text
@@ -28,28 +30,28 @@ def test_the_tables_say_what_the_rows_say(study: Path, capsys: pytest.CaptureFix
     assert f"| ddpg | per | 0.0% | {NO} | 0.0%, 0.0% | 100.0% | 0.0% | 0.000 |  |" in text
     # Two runs against two: six ways to deal them out, two of which differ as much.
     assert "| ddpg/mpfa_per − ddpg/per | +0.875 | [-0.713, +2.463] | 0.333 |" in text
-    with Image.open(study / "evaluations.png") as picture:
+    with Image.open(comparison / "evaluations.png") as picture:
         assert picture.width == 840
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_random_worlds_have_tables_of_their_own(study: Path) -> None:
-    rows = pd.read_csv(study / "episodes.csv")
+def test_random_worlds_have_tables_of_their_own(comparison: Path) -> None:
+    rows = pd.read_csv(comparison / "episodes.csv")
     rooms = rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))
-    write_table(pd.concat([rows, rooms]), study / "episodes.csv")
-    report.main([str(study)])
-    test, random = (study / "tables.md").read_text(encoding="utf-8").split("## rooms")
+    write_table(pd.concat([rows, rooms]), comparison / "episodes.csv")
+    report.main([str(comparison)])
+    test, random = (comparison / "tables.md").read_text(encoding="utf-8").split("## rooms")
     assert LINE in test
     assert LINE in random
 
 
-def test_the_arms_of_a_study_have_rows_of_their_own(study: Path) -> None:
-    rows = pd.read_csv(study / "episodes.csv")
-    write_table(rows.assign(arm=rows["method"].map({"per": "None"})), study / "episodes.csv")
+def test_the_arms_of_a_comparison_have_rows_of_their_own(comparison: Path) -> None:
+    rows = pd.read_csv(comparison / "episodes.csv")
+    write_table(rows.assign(arm=rows["method"].map({"per": "None"})), comparison / "episodes.csv")
     for seed in (0, 1):
-        (study / f"ddpg-per-{seed}").rename(study / f"ddpg-per-None-{seed}")
-    report.main([str(study)])
-    text = (study / "tables.md").read_text(encoding="utf-8")
+        (comparison / f"ddpg-per-{seed}").rename(comparison / f"ddpg-per-None-{seed}")
+    report.main([str(comparison)])
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     assert "| learner | method | arm | success | 95 % | of each run |" in text
     assert "| ddpg | mpfa_per |  | 87.5% |" in text
     assert "| ddpg | per | None | 0.0% |" in text
@@ -58,25 +60,25 @@ def test_the_arms_of_a_study_have_rows_of_their_own(study: Path) -> None:
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_other_physics_have_tables_of_their_own(study: Path) -> None:
-    rows = pd.read_csv(study / "episodes.csv")
+def test_other_physics_have_tables_of_their_own(comparison: Path) -> None:
+    rows = pd.read_csv(comparison / "episodes.csv")
     both = [rows.assign(physics=physics) for physics in ("wheels", "kinematic")]
-    write_table(pd.concat(both), study / "episodes.csv")
-    report.main([str(study)])
-    text = (study / "tables.md").read_text(encoding="utf-8")
+    write_table(pd.concat(both), comparison / "episodes.csv")
+    report.main([str(comparison)])
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     assert text.index("## test, wheels") < text.index("## test, kinematic")
     assert text.count(LINE) == 2
 
 
 @pytest.mark.usefixtures("tables_alone")
 def test_the_worlds_of_a_generator_and_those_of_barn_are_a_row_each_with_the_worst_run(
-    study: Path,
+    comparison: Path,
 ) -> None:
-    rows = pd.read_csv(study / "episodes.csv")
+    rows = pd.read_csv(comparison / "episodes.csv")
     names = ["bars-test-5", "bars-validation-5", "barn-3", "barn-4"]
-    write_table(rows.assign(world=[*names] * (len(rows) // 4)), study / "episodes.csv")
-    report.main([str(study)])
-    text = (study / "tables.md").read_text(encoding="utf-8")
+    write_table(rows.assign(world=[*names] * (len(rows) // 4)), comparison / "episodes.csv")
+    report.main([str(comparison)])
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     assert "| mean of the runs (the worst one) | ddpg/mpfa_per | ddpg/per |" in text
     assert "| bars:test | 100.0% (0: 100.0%) | 0.0% (0: 0.0%) |" in text
     assert "| bars:validation | 100.0% (0: 100.0%) | 0.0% (0: 0.0%) |" in text
@@ -86,16 +88,16 @@ def test_the_worlds_of_a_generator_and_those_of_barn_are_a_row_each_with_the_wor
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(study: Path) -> None:
+def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(comparison: Path) -> None:
     steps = [1000, 2000, 3000]
     of_runs = {"mpfa_per": ([0.9, 0.2, 0.96], [0.1, 0.9, 0.94]), "per": ([0.9, 1, 1], [0, 0, 0.8])}
     for method, runs in of_runs.items():
         for seed, success in enumerate(runs):
             table = pd.DataFrame({"total_steps": steps, "success": success})
             table["trained_for"] = table["total_steps"] / 100
-            write_table(table, study / f"ddpg-{method}-{seed}" / "evaluations.csv")
-    report.main([str(study)])
-    text = (study / "tables.md").read_text(encoding="utf-8")
+            write_table(table, comparison / f"ddpg-{method}-{seed}" / "evaluations.csv")
+    report.main([str(comparison)])
+    text = (comparison / "tables.md").read_text(encoding="utf-8")
     assert "| ddpg | mpfa_per | 90% | 1,000 | 10 | 0 of 2 |" in text
     assert "| ddpg | mpfa_per | 95% | 3,000 | 30 | 1 of 2 |" in text
     assert "| ddpg | per | 90% | 1,000 | 10 | 1 of 2 |" in text
@@ -103,26 +105,30 @@ def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(study: Path) ->
     # Runs of which their time is not known.
     table = pd.DataFrame({"total_steps": steps, "success": [0, 1, 1]})
     for seed in (0, 1):
-        write_table(table, study / f"ddpg-per-{seed}" / "evaluations.csv")
-    report.main([str(study)])
-    assert "| ddpg | per | 90% | 2,000 |  | 0 of 2 |" in (study / "tables.md").read_text("utf-8")
+        write_table(table, comparison / f"ddpg-per-{seed}" / "evaluations.csv")
+    report.main([str(comparison)])
+    assert "| ddpg | per | 90% | 2,000 |  | 0 of 2 |" in (comparison / "tables.md").read_text(
+        "utf-8"
+    )
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_two_studies_together_have_the_runs_of_both(
-    study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_two_comparisons_together_have_the_runs_of_both(
+    comparison: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     more = tmp_path / "more"
     more.mkdir()
-    rows = pd.read_csv(study / "episodes.csv").query("method == 'per' and seed == 0")
+    rows = pd.read_csv(comparison / "episodes.csv").query("method == 'per' and seed == 0")
     write_table(rows, more / "episodes.csv")
-    report.main([str(study), str(more), "--output", str(tmp_path / "both")])
+    report.main([str(comparison), str(more), "--output", str(tmp_path / "both")])
     assert f"| ddpg | per | 0.0% | {NO} | 0.0%, 0.0%, 0.0% |" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_two_studies_of_one_name_have_the_runs_of_both(study: Path, tmp_path: Path) -> None:
-    rows = pd.read_csv(study / "episodes.csv").query("method == 'per'")
+def test_two_comparisons_of_one_name_have_the_runs_of_both(
+    comparison: Path, tmp_path: Path
+) -> None:
+    rows = pd.read_csv(comparison / "episodes.csv").query("method == 'per'")
     folders = [tmp_path / parent / "cmp" for parent in "ab"]
     for folder in folders:
         folder.mkdir(parents=True)
@@ -131,20 +137,22 @@ def test_two_studies_of_one_name_have_the_runs_of_both(study: Path, tmp_path: Pa
     text = (tmp_path / "both" / "tables.md").read_text("utf-8")
     assert f"| ddpg | per | 0.0% | {NO} | 0.0%, 0.0%, 0.0%, 0.0% |" in text
     assert set(read_comparisons(folders)["run"]) == {f"{f}/{n}" for f in folders for n in (0, 1)}
-    assert set(read_comparisons([study, folders[0]])["run"]) == {
-        *(f"{study.name}/{seed}" for seed in (0, 1)),
+    assert set(read_comparisons([comparison, folders[0]])["run"]) == {
+        *(f"{comparison.name}/{seed}" for seed in (0, 1)),
         *(f"cmp/{seed}" for seed in (0, 1)),
     }
 
 
-def test_a_study_is_not_counted_twice(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_comparison_is_not_counted_twice(
+    comparison: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        report.main([str(study), f"{study}/../{study.name}"])
+        report.main([str(comparison), f"{comparison}/../{comparison.name}"])
     assert "is named twice: its runs count once" in capsys.readouterr().err
 
 
-def test_the_figures_may_go_elsewhere(study: Path, tmp_path: Path) -> None:
-    assert report.main([str(study), "--output", str(tmp_path / "images")]) == 0
+def test_the_figures_may_go_elsewhere(comparison: Path, tmp_path: Path) -> None:
+    assert report.main([str(comparison), "--output", str(tmp_path / "images")]) == 0
     assert (tmp_path / "images" / "evaluations.png").exists()
 
 
@@ -158,12 +166,12 @@ def test_a_folder_without_rows_is_refused(
 
 @pytest.mark.usefixtures("tables_alone")
 def test_runs_on_other_pairs_are_not_compared(
-    study: Path, capsys: pytest.CaptureFixture[str]
+    comparison: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = pd.read_csv(study / "episodes.csv")
-    write_table(rows.iloc[:-1], study / "episodes.csv")
+    rows = pd.read_csv(comparison / "episodes.csv")
+    write_table(rows.iloc[:-1], comparison / "episodes.csv")
     with pytest.raises(SystemExit) as ended:
-        report.main([str(study)])
+        report.main([str(comparison)])
     assert ended.value.code == 2
     assert "not tested on the same pairs" in capsys.readouterr().err
 
