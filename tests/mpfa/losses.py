@@ -14,7 +14,7 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     make_td3_loss,
 )
-from torchrl_mpfa.learners.gradients import Gradients
+from torchrl_mpfa.learners.program import CompiledGradients
 from torchrl_mpfa.networks import StochasticActor
 
 GAMMA = 0.9
@@ -101,17 +101,7 @@ def parameter_gradients(loss):
 
 
 def differentiate_at_once(loss, batch, *, trains="both", loss_function=None):
-    """Set gradients and write signals by the function that a compiled update is made of."""
-    gradients = Gradients(loss)
-    parts = gradients.parts
-    actor = dict(parts.actor.module.named_parameters())
-    given = gradients.inputs(batch, trains, loss_function)
-    found = gradients(actor, parts.critic_parameters, *parts.target_parameters, given)
-    for parameters, of in (
-        (actor, found.of_actor),
-        (parts.critic_parameters, found.of_critic),
-    ):
-        for name, value in parameters.items():
-            value.grad = of.get(name)
-    gradients.write_signals(batch, found.signals)
-    return found.log
+    """Set gradients and write signals by the trace that a compiled update is made of."""
+    for parameter in loss.parameters():
+        parameter.grad = None
+    return CompiledGradients(loss, {"disable": True})(batch, trains, loss_function)

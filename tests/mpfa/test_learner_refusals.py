@@ -249,11 +249,6 @@ def test_a_loss_that_is_not_reduced_is_refused():
     DDPGLearner(make_ddpg_loss(*make_networks(), reduction="sum")).update(make_batch())
 
 
-def test_sac_has_no_compile():
-    with pytest.raises(TypeError, match="compile"):
-        SACLearner(make_learner("sac").loss, compile=True)
-
-
 @pytest.mark.parametrize("name", ["actor_lr", "critic_lr", "critic_weight_decay", "tau"])
 def test_rates_that_are_no_numbers_are_refused(name):
     for value in (float("nan"), float("inf")):

@@ -1,7 +1,6 @@
 """Learners: networks, loss, optimizers and target networks behind one ``update``."""
 
 from torchrl_mpfa.learners.base import ActorCriticLearner, Learner
-from torchrl_mpfa.learners.compiled import CompilableLearner
 from torchrl_mpfa.learners.ddpg import DDPGLearner
 from torchrl_mpfa.learners.dqn import DQNLearner, TabularQLearner
 from torchrl_mpfa.learners.sac import SACLearner
@@ -10,7 +9,6 @@ from torchrl_mpfa.learners.td3 import TD3Learner
 
 __all__ = [
     "ActorCriticLearner",
-    "CompilableLearner",
     "DDPGLearner",
     "DQNLearner",
     "Learner",

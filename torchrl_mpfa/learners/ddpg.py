@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from torchrl_mpfa.learners.compiled import CompilableLearner
+from torchrl_mpfa.learners.base import ActorCriticLearner
 from torchrl_mpfa.losses import SignalDDPGLoss
 
 
-class DDPGLearner(CompilableLearner):
+class DDPGLearner(ActorCriticLearner):
     r"""DDPG with target networks, Eqs. (4)-(7), and the actor's sampled policy gradient.
 
     Options: see :class:`~torchrl_mpfa.learners.ActorCriticLearner`.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_mpfa.learners.compiled import CompilableLearner
+from torchrl_mpfa.learners.base import ActorCriticLearner
 from torchrl_mpfa.losses import SignalTD3Loss
 
 
-class TD3Learner(CompilableLearner):
+class TD3Learner(ActorCriticLearner):
     r"""TD3: two critics at each update, the actor and all targets at every other one.
 
     Fujimoto et al. (2018), https://arxiv.org/abs/1802.09477

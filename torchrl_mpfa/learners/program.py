@@ -1,0 +1,169 @@
+"""Gradients and signals of an update as one compiled program, traced from the losses themselves.
+
+With networks of a hundred units an update is mostly the cost of calling some five hundred small
+operations, of which ``torch.compile`` makes one. They are recorded while the losses run once, so
+that nothing is said a second time, and what a loss or network of a user does is in the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, fx
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
+
+from torchrl_mpfa.selection import Trains
+
+Entries = dict[NestedKey, Tensor]
+
+
+class Program(NamedTuple):
+    """Losses with their gradients, for batches of one form."""
+
+    call: Callable[..., list[Tensor]]
+    """From the entries of a batch and ``state`` to gradients, signals, and values for the log."""
+    state: list[Tensor]
+    """Tensors of the loss, which later updates change in place."""
+    moved: list[Tensor]
+    """Parameters that the gradients belong to."""
+    written: list[NestedKey]
+    """Entries that the loss writes in a batch."""
+    log: list[str]
+    """Names of the values for the log."""
+
+
+class CompiledGradients:
+    """Differentiates the losses of an update by a program, one for each form of a batch.
+
+    Args:
+        loss: The loss; its networks must not move to another device later.
+        compile: Arguments of ``torch.compile``.
+    """
+
+    def __init__(self, loss: Any, compile: dict[str, Any]) -> None:
+        self._loss = loss
+        if not compile.keys() & {"backend", "mode"}:
+            # The random numbers that the losses would have.
+            compile = {
+                **compile,
+                "options": {"fallback_random": True, **compile.get("options", {})},
+            }
+        self._arguments = {"fullgraph": True, "dynamic": False, **compile}
+        self._programs: dict[Any, Program] = {}
+
+    def __call__(
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
+    ) -> dict[str, Tensor]:
+        """Set the gradients and write the signals, as the losses and a backward pass do.
+
+        Args:
+            batch: Transitions, batch size ``[B]``.
+            trains: Whose losses are differentiated.
+            loss_function: Distance of the critics' loss; None: the loss's own.
+
+        Returns:
+            Detached losses and other values for the log.
+
+        Raises:
+            KeyError: If the batch lacks an entry.
+            ValueError: If the losses cannot be one program.
+        """
+        entries = self._entries(batch)
+        form = trains, loss_function, self._options(), *map(_form, entries.items())
+        program = self._programs.get(form)
+        if program is None:
+            program = self._programs[form] = self._make(entries, trains, loss_function)
+        with torch.no_grad():
+            found = iter(program.call(*entries.values(), *program.state))
+        for parameter in program.moved:
+            parameter.grad = next(found)
+        for key in program.written:
+            batch.set(key, next(found))
+        return dict(zip(program.log, found, strict=True))
+
+    def _entries(self, batch: TensorDictBase) -> Entries:
+        """What a program may read: all tensors but those that the loss itself writes."""
+        keys = self._loss.tensor_keys
+        written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
+        written.add(keys.value_signal)
+        found = batch.items(True, True)
+        return {k: v for k, v in found if isinstance(v, Tensor) and k not in written}
+
+    def _options(self) -> tuple[Any, ...]:
+        """What a trace takes for given in a loss: its options, and how it makes targets."""
+        plain = (bool, int, float, str, tuple)
+        values = [value for value in vars(self._loss).values() if isinstance(value, plain)]
+        return id(self._loss.value_estimator), *values
+
+    def _make(self, entries: Entries, trains: Trains, loss_function: str | None) -> Program:
+        loss = self._loss
+        loss._networks()  # Of real tensors, before those of a trace could be held for good.
+        state = {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
+        parameters = [value for value in state.values() if value.requires_grad]
+        batch_size = next(iter(entries.values())).shape[:1]
+        moved: list[Tensor] = []
+        written: Entries = {}
+        log: dict[str, Tensor] = {}
+
+        def differentiate(*values: Tensor) -> list[Tensor]:
+            batch = TensorDict(dict(zip(entries, values, strict=True)), batch_size)
+            with torch.enable_grad():
+                losses, more = loss.losses(
+                    batch, trains=trains, loss_function=loss_function, defer_gradient=False
+                )
+                roots = [value for value in losses.values() if value.requires_grad]
+                gradients = torch.autograd.grad(roots, parameters, allow_unused=True)
+            moved.extend(p for p, g in zip(parameters, gradients, strict=True) if g is not None)
+            written.update((k, v) for k, v in batch.items(True, True) if k not in entries)
+            log.update({**losses, **more})
+            of_log = [value.detach() for value in log.values()]
+            return [*(each for each in gradients if each is not None), *written.values(), *of_log]
+
+        trace = make_fx(differentiate, tracing_mode="fake", _allow_non_fake_inputs=True)
+        try:
+            graph_module = trace(*entries.values())
+        except GuardOnDataDependentSymNode as error:
+            raise ValueError(
+                "compile needs a loss whose operations do not depend on the numbers in a batch, "
+                f"got a {type(loss).__name__} where they do: {error}"
+            ) from error
+        names = _take_state(graph_module, state)
+        # Another one, without what the first one held.
+        program = torch.compile(fx.GraphModule(graph_module, graph_module.graph), **self._arguments)
+        taken = [state[name].detach() for name in names]
+        return Program(program, taken, moved, list(written), list(log))
+
+
+def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
+    key, value = entry
+    return key, value.shape, value.dtype, value.device
+
+
+def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[str]:
+    """Have a trace take tensors of a loss as inputs, where it holds them or views of them.
+
+    Returns:
+        Their names in the order of the inputs, which follow those that are there.
+    """
+    graph, inputs = trace.graph, dict[str, fx.Node]()
+    of_storage = {value.untyped_storage().data_ptr(): name for name, value in state.items()}
+    last = graph.find_nodes(op="placeholder")[-1]
+    for node in graph.find_nodes(op="get_attr"):
+        value = getattr(trace, node.target)
+        name = of_storage.get(value.untyped_storage().data_ptr())
+        if name is None:
+            continue
+        if name not in inputs:
+            with graph.inserting_after(last):
+                inputs[name] = last = graph.placeholder(f"state_{len(inputs)}")
+        view = value.shape, value.stride(), value.storage_offset()
+        with graph.inserting_before(node):
+            taken = graph.call_function(torch.ops.aten.as_strided.default, (inputs[name], *view))
+        node.replace_all_uses_with(taken)
+        graph.erase_node(node)
+    return list(inputs)
