@@ -180,7 +180,7 @@ class ActorCriticLearner:
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
-        """Set the gradients; a parameter without one stays as it is, decay and all; give the log."""
+        """Set the gradients and give the log; a parameter without one stays, decay and all."""
         self.optimizer.zero_grad(set_to_none=True)
         if self._program is not None:
             return self._program(batch, trains, loss_function)

@@ -15,7 +15,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, fx
 from torch.fx.experimental.proxy_tensor import make_fx
-from torch.fx.experimental.symbolic_shapes import GuardOnDataDependentSymNode
 
 from torchrl_mpfa.selection import Trains
 
@@ -102,7 +101,7 @@ class CompiledGradients:
 
     def _make(self, entries: Entries, trains: Trains, loss_function: str | None) -> Program:
         loss = self._loss
-        loss._networks()  # Of real tensors, before those of a trace could be held for good.
+        loss._networks()  # Modules are copied, which no trace can hold.
         state = {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
         parameters = [value for value in state.values() if value.requires_grad]
         batch_size = next(iter(entries.values())).shape[:1]
@@ -124,10 +123,15 @@ class CompiledGradients:
             of_log = [value.detach() for value in log.values()]
             return [*(each for each in gradients if each is not None), *written.values(), *of_log]
 
-        trace = make_fx(differentiate, tracing_mode="fake", _allow_non_fake_inputs=True)
+        # Recorded with real numbers, as a loss may make tensors that it keeps; but with none of the
+        # random numbers that the update will have.
+        devices = {value.device for value in entries.values() if value.is_cuda}
         try:
-            graph_module = trace(*entries.values())
-        except GuardOnDataDependentSymNode as error:
+            with torch.random.fork_rng(devices):
+                graph_module = make_fx(differentiate)(*entries.values())
+        except RuntimeError as error:
+            if "data-dependent" not in str(error):
+                raise
             raise ValueError(
                 "compile needs a loss whose operations do not depend on the numbers in a batch, "
                 f"got a {type(loss).__name__} where they do: {error}"
@@ -135,7 +139,7 @@ class CompiledGradients:
         names = _take_state(graph_module, state)
         # Another one, without what the first one held.
         program = torch.compile(fx.GraphModule(graph_module, graph_module.graph), **self._arguments)
-        taken = [state[name].detach() for name in names]
+        taken = [state[name] for name in names]
         return Program(program, taken, moved, list(written), list(log))
 
 
