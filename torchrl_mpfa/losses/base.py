@@ -34,7 +34,6 @@ from torchrl_mpfa.losses.functional import (
     scale_rewards,
     trusted_loss,
 )
-from torchrl_mpfa.losses.parts import Parts, parts_of
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
 from torchrl_mpfa.selection import Trains
@@ -422,14 +421,6 @@ class SignalLoss:
         """Critics that hold the parameters whose name has this prefix, and get no gradient."""
         name = self._critic_name
         return bind_frozen(getattr(self, name), getattr(self, f"{prefix}{name}_params"))
-
-    def parts(self) -> Parts:
-        """The networks as functions of tensors, for a compiled update."""
-        return parts_of(self, self._networks())
-
-    def forget_networks(self) -> None:
-        """Have the networks that hold the parameters made again: those lie elsewhere now."""
-        self._bound = None
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
         self._bound = None

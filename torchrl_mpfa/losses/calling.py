@@ -79,7 +79,10 @@ class StackedNetworks:
 
     def __init__(self, network: TensorDictModule, params: TensorDictBase) -> None:
         self.network = deepcopy(network)
-        self._params = bare(params) if isinstance(network, DirectModule) else _by_name(params)
+        names = _by_name(params)
+        if isinstance(network, DirectModule):  # Its own module is called, which knows no prefix.
+            names = {name.removeprefix("module."): value for name, value in names.items()}
+        self._params = names
 
     def call(self, source: TensorDictBase, chosen: Sequence[Tensors]) -> list[Tensors]:
         """Outputs of each network for what was chosen for it, see :func:`call`."""
@@ -96,11 +99,6 @@ class StackedNetworks:
                 out = functional_call(self.network, weights, (TensorDict(inputs),))
             found.append(dict(out.items(True, True)))
         return found
-
-
-def bare(params: TensorDictBase) -> dict[str, Tensor]:
-    """Parameters by the names that the module in a :class:`DirectModule` has for them."""
-    return {name.removeprefix("module."): value for name, value in _by_name(params).items()}
 
 
 def _by_name(params: TensorDictBase) -> dict[str, Tensor]:
