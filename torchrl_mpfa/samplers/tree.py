@@ -59,7 +59,6 @@ class TreeSampler(SavedTrees):
         1.0
     """
 
-    _alpha: float
     _rng: torch.Generator | None
     _alpha: float
     _beta: float
