@@ -216,6 +216,24 @@ def test_no_gradient_reaches_the_batch_and_only_signals_are_added(kind):
     for key in ("observation", "action", ("next", "reward")):
         assert batch[key].equal(before[key])
     assert set(batch.keys()) - set(before.keys()) == {"signals", "td_error"}
+    seen = make_batch()
+    seen["observation"].requires_grad_(True)
+    losses = loss(seen)
+    (losses[CRITICS_LOSS[kind]] + losses["loss_actor"]).backward()
+    assert seen["observation"].grad is None
+
+
+@pytest.mark.parametrize("importance", ["critic", "torchrl"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_losses_of_an_update_are_those_that_torchrl_asks_for(kind, importance):
+    loss = make_of(kind, importance=importance, saturation_penalty=0.1, saturation_limit=0.1)
+    expected = evaluate(loss, make_batch(weighted=True))
+    torch.manual_seed(1)
+    losses, _ = loss.losses(make_batch(weighted=True))
+    losses[CRITICS_LOSS[kind]] = losses.pop("loss_value")
+    assert losses.keys() == {key for key in expected.keys() if key.startswith("loss")}  # noqa: SIM118
+    for key, value in losses.items():
+        torch.testing.assert_close(value, expected[key], msg=key)
 
 
 @pytest.mark.parametrize("kind", KINDS)
