@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa.losses.functional import distance, pal_distance
+from torchrl_mpfa.losses.functional import distance, pal_distance, smoothing_noise
 
 ALPHA = 0.4
 
@@ -74,3 +74,9 @@ def test_a_bend_for_each_transition_is_that_of_the_loss_in_its_units(name):
     by_all = distance(torch.zeros(2, 20), error.expand(2, 20), name, unit=0.3)
     torch.testing.assert_close(by_row, by_all)
     assert not torch.allclose(by_row, distance(torch.zeros(2, 20), error.expand(2, 20), name))
+
+
+def test_noise_of_targets_has_its_deviation_and_reaches_both_limits():
+    noise = smoothing_noise(torch.zeros(10_000, 2), deviation=0.2, limit=0.5)
+    assert (noise.amin().item(), noise.amax().item()) == (-0.5, 0.5)
+    assert noise.std().item() == pytest.approx(0.2, rel=0.05)
