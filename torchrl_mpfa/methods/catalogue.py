@@ -29,16 +29,16 @@ class Method:
     """
 
     name: str = "mpfa_per"
-    """What the method is called."""
+    """Name of the method."""
     signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
     """Signals of the priority."""
     fusion: str = "entropy"
     """``entropy`` (Eqs. 15-20), ``fixed`` (equal weights), ``scaled`` (equal shares: each signal
     is divided by its mean) or ``value_schedule`` (HVPER)."""
     combination: str = "sum"
-    """What is made of the weighted signals: their ``sum`` (Eq. 21) or ``product``, or a
-    ``mixture``: each signal has a tree of its own, and its share of a batch. The latter two need
-    no scale: ``scaled`` is the same as ``fixed``."""
+    """Combination of the weighted signals: their ``sum`` (Eq. 21) or ``product``, or a
+    ``mixture``: each signal has its own tree, and its share of a batch. The latter two need no
+    scale: ``scaled`` is the same as ``fixed``."""
     boost: bool = _within(SWITCH, True)
     """Raise positive transitions, Eq. 22."""
     decay: bool = _within(SWITCH, True)
