@@ -157,7 +157,9 @@ class _Server:
         self.close = weakref.finalize(self, _disconnect, self.number)
 
     def __getattr__(self, name: str) -> Any:
-        return partial(getattr(pybullet, name), physicsClientId=self.number)
+        bound = partial(getattr(pybullet, name), physicsClientId=self.number)
+        setattr(self, name, bound)  # Found at once the next time.
+        return bound
 
 
 def _disconnect(number: int) -> None:
