@@ -337,6 +337,7 @@ def test_long_episodes_keep_their_trail() -> None:
         env.step(np.array([[0.2, 0.6]]))
     trail = env.trail(0)
     assert len(trail) == 1401 and trail[0] == (0.0, 0.0)
+    assert (0.0, 0.0) not in trail[1:]
     assert trail[-1] == tuple(env.poses[0, :2])
 
 
