@@ -422,6 +422,10 @@ class SignalLoss:
         name = self._critic_name
         return bind_frozen(getattr(self, name), getattr(self, f"{prefix}{name}_params"))
 
+    def forget_networks(self) -> None:
+        """Have the networks that hold the parameters made again: those lie elsewhere now."""
+        self._bound = None
+
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
         self._bound = None
         return super()._apply(*args, **kwargs)  # type: ignore[misc]
