@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check, check_counts
 from torchrl_mpfa.learners.program import CompiledGradients
-from torchrl_mpfa.learners.states import check_state, naming, refuse_copy, refuse_unfinished
+from torchrl_mpfa.learners.states import check_state, naming, refuse_unfinished
 from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
 from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.selection import SampledBatch, Trains
@@ -59,7 +59,78 @@ class Learner(Protocol):
         ...
 
 
-class ActorCriticLearner:
+class OptimizedLearner:
+    """A learner with a loss, one optimizer, target networks, and rates that can be lowered.
+
+    Args:
+        loss: The loss with its networks in it.
+        groups: Parameters with their learning rates and decays.
+        optimizer: ``"adam"`` or ``"radam"``.
+        tau: Share of the networks in the target networks' step.
+
+    Raises:
+        ValueError: If the optimizer is unknown.
+    """
+
+    def __init__(
+        self, loss: Any, groups: list[dict[str, Any]], optimizer: OptimizerName, tau: float
+    ) -> None:
+        self.loss: Any = loss
+        self.optimizer = make_optimizer(optimizer, groups)
+        self._rates = [group["lr"] for group in groups]
+        self.targets = MultiTensorSoftUpdate(loss, tau=tau)
+        self.updates = 0
+        """Training steps taken."""
+
+    def end_episode(self) -> None:
+        """Nothing changes."""
+
+    def anneal(self, factor: float) -> None:
+        """Set the learning rates to a fraction of what the constructor was given.
+
+        Args:
+            factor: The fraction, in [0, 1].
+
+        Raises:
+            ValueError: If ``factor`` is outside.
+        """
+        check(SHARE, factor=factor)
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate * factor
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        # TorchRL's losses hold parameters in ways that a deep copy takes apart: the optimizer of a
+        # copy would move none of them.
+        raise TypeError(
+            f"a {type(self).__name__} cannot be copied: make another one, and have it load the "
+            "state_dict() of this one"
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks, target networks, optimizer and count; tensors and plain values only."""
+        return {
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave.
+
+        Args:
+            state_dict: The state of a learner of the same kind, with networks of the same sizes.
+
+        Raises:
+            ValueError: If it is not; nothing is changed then.
+        """
+        check_state(state_dict, self.state_dict(), self.optimizer)
+        self.loss.load_state_dict(state_dict["loss"])
+        # PyTorch would share the tensors with whoever gave the state.
+        self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
+        self.updates = state_dict["updates"]
+
+
+class ActorCriticLearner(OptimizedLearner):
     r"""One optimizer for actor and critics, target networks, and rates that can be lowered.
 
     All gradients of an update are taken at the same networks, by one backward pass; then all
@@ -120,21 +191,16 @@ class ActorCriticLearner:
                 "weight_decay": critic_weight_decay,
             },
         ]
-        self.optimizer = make_optimizer(optimizer, groups)
-        self._rates: tuple[float, ...] = (actor_lr, critic_lr)
-        self.loss: Any = loss
+        super().__init__(loss, groups, optimizer, tau)
         self.policy: TensorDictModule = getattr(loss, "actor_network")  # noqa: B009
-        self.targets = MultiTensorSoftUpdate(loss, tau=tau)
         self.policy_delay = policy_delay
-        self.updates = 0
-        """Training steps taken."""
         arguments = compile if isinstance(compile, dict) else {}
         self._program = CompiledGradients(loss, arguments) if compile else None
 
     def _add_parameters(self, parameters: list[torch.nn.Parameter], *, lr: float) -> None:
         """Have the optimizer move further parameters of the loss, at a rate of their own."""
         self.optimizer.add_param_group({"params": parameters, "lr": lr})
-        self._rates = (*self._rates, lr)
+        self._rates.append(lr)
 
     def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """One step of the networks and of the target networks, as far as they are due.
@@ -194,60 +260,9 @@ class ActorCriticLearner:
         """Keep the target critics as they are now, if the loss averages several of them."""
         self.loss.keep_target_critics()
 
-    def anneal(self, factor: float) -> None:
-        """Set the learning rates to a fraction of what the constructor was given.
-
-        Args:
-            factor: The fraction, in [0, 1].
-
-        Raises:
-            ValueError: If ``factor`` is outside.
-        """
-        check(SHARE, factor=factor)
-        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
-            group["lr"] = rate * factor
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
-        """Refuse, see :func:`refuse_copy`."""
-        refuse_copy(self)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Networks, target networks, optimizer and count; tensors and plain values only."""
-        return {
-            "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "updates": self.updates,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Args:
-            state_dict: The state of a learner of the same kind, with networks of the same sizes.
-
-        Raises:
-            ValueError: If it is not; nothing is changed then.
-        """
-        check_state(state_dict, self.state_dict(), self.optimizer)
-        self.loss.load_state_dict(state_dict["loss"])
-        # PyTorch would share the tensors with whoever gave the state.
-        self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
-        self.updates = state_dict["updates"]
-
 
 def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-    """The optimizer of a learner, all tensors in one call.
-
-    Args:
-        name: ``"adam"`` or ``"radam"``.
-        groups: Parameters with their learning rates and decays.
-
-    Returns:
-        The optimizer.
-
-    Raises:
-        ValueError: If the name is unknown.
-    """
+    """The optimizer of this name, all tensors in one call."""
     if name == "adam":
         return torch.optim.Adam(groups, fused=True)
     if name == "radam":

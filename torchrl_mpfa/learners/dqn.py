@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.base import OptimizerName, make_optimizer
-from torchrl_mpfa.learners.states import (
-    check_state,
-    check_updates,
-    naming,
-    refuse_copy,
-    refuse_unfinished,
-)
-from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
+from torchrl_mpfa.learners.base import OptimizedLearner, OptimizerName
+from torchrl_mpfa.learners.states import naming, refuse_unfinished
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.functional import bootstrap_target
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
+from torchrl_mpfa.saved import Entry, check_entries, count
 from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import TD_ERROR
 
@@ -47,7 +41,7 @@ def _whole_batch(draw: SampledBatch | TensorDictBase, name: str) -> TensorDictBa
     return draw.batch
 
 
-class DQNLearner:
+class DQNLearner(OptimizedLearner):
     r"""DQN (Mnih et al. 2015, https://doi.org/10.1038/nature14236), double by default.
 
     Args:
@@ -84,20 +78,15 @@ class DQNLearner:
         check(POSITIVE, lr=lr)
         check(NOT_NEGATIVE, weight_decay=weight_decay)
         check(ABOVE_ZERO, tau=tau)
-        self.loss = loss
         network = loss.value_network
         if not isinstance(network, DirectModule):
             raise TypeError(f"network must be a DirectModule, got {type(network).__name__}")
         parameters = list(loss.value_network_params.values(True, True))
         groups = [{"params": parameters, "lr": lr, "weight_decay": weight_decay}]
-        self.optimizer = make_optimizer(optimizer, groups)
-        self._rate = lr
+        super().__init__(loss, groups, optimizer, tau)
         # A copy that holds the loss's own tensors, not copies of them.
         self.policy: DirectModule = copy.deepcopy(network)
         loss.value_network_params.to_module(self.policy)
-        self.targets = MultiTensorSoftUpdate(loss, tau=tau)
-        self.updates = 0
-        """Updates made."""
 
     def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """One step of the network and of the target network.
@@ -125,49 +114,6 @@ class DQNLearner:
         self.targets.step()
         self.updates += 1
         return {key: value.detach() for key, value in log.items()}
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
-        """Refuse, see :func:`refuse_copy`."""
-        refuse_copy(self)
-
-    def end_episode(self) -> None:
-        """Nothing changes."""
-
-    def anneal(self, factor: float) -> None:
-        """Set the learning rate to a fraction of what the constructor was given.
-
-        Args:
-            factor: The fraction, in [0, 1].
-
-        Raises:
-            ValueError: If ``factor`` is outside.
-        """
-        check(SHARE, factor=factor)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self._rate * factor
-
-    def state_dict(self) -> dict[str, Any]:
-        """Network, target network, optimizer and count; tensors and plain values only."""
-        return {
-            "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "updates": self.updates,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
-
-        Args:
-            state_dict: The state of a learner with networks of the same sizes.
-
-        Raises:
-            ValueError: If it is not; nothing is changed then.
-        """
-        check_state(state_dict, self.state_dict(), self.optimizer)
-        self.loss.load_state_dict(state_dict["loss"])
-        # PyTorch would share the tensors with whoever gave the state.
-        self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
-        self.updates = state_dict["updates"]
 
 
 class TabularQLearner:
@@ -297,14 +243,8 @@ class TabularQLearner:
         Raises:
             ValueError: If it is not; nothing is changed then.
         """
-        given = state_dict.get("loss", {}).get("table")
-        if not isinstance(given, Tensor) or given.shape != self.table.shape:
-            raise ValueError(
-                f"state_dict['loss']['table'] must have shape {tuple(self.table.shape)}, got "
-                f"{tuple(given.shape) if isinstance(given, Tensor) else given!r}"
-            )
-        if not bool(given.isfinite().all()):
-            raise ValueError("state_dict['loss']['table'] must be finite")
-        check_updates(state_dict.get("updates"))
-        self.table.copy_(given)
+        check_entries("learner", state_dict, [Entry("loss"), count("updates")], missing=ValueError)
+        table = Entry("table", torch.isfinite, "finite", self.table.dtype, tuple(self.table.shape))
+        check_entries("loss", state_dict["loss"], [table], missing=ValueError)
+        self.table.copy_(state_dict["loss"]["table"])
         self.updates = state_dict["updates"]

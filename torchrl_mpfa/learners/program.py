@@ -101,7 +101,10 @@ class CompiledGradients:
 
     def _make(self, entries: Entries, trains: Trains, loss_function: str | None) -> Program:
         loss = self._loss
-        loss._networks()  # Modules are copied, which no trace can hold.
+        # Views of parameters that lie elsewhere now are taken again, and before a trace, which
+        # cannot hold that modules are copied.
+        loss.forget_networks()
+        loss._networks()
         state = {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
         parameters = [value for value in state.values() if value.requires_grad]
         batch_size = next(iter(entries.values())).shape[:1]

@@ -1,32 +1,24 @@
-"""What a learner refuses before it changes: batches that spoil networks, and foreign states."""
+"""Batches that would spoil networks, and states of other learners: rejected before a change."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
+from torchrl_mpfa.saved import Entry, check_entries, count, exactly, number
 
 
 def refuse_unfinished(losses: Mapping[str, Tensor], batch: TensorDictBase) -> None:
-    """Refuse an update of which a loss is not finite.
-
-    One NaN in an observation would make all weights NaN. Losses are looked at and not the batch,
-    as that is one number for each.
-
-    Args:
-        losses: Values for the log, of which those whose name begins with ``"loss"`` are asked.
-        batch: What they were computed of.
-
-    Raises:
-        ValueError: If one is not finite, with the entry and the row that are the cause.
-    """
+    """Raise if a value whose name begins with ``"loss"`` is not finite, with entry and row."""
+    # One NaN in an observation would make all weights NaN. Losses are looked at and not the batch,
+    # as that is one number for each.
     wrong = {
         name: value
         for name, value in losses.items()
@@ -74,106 +66,65 @@ def naming(batch: TensorDictBase) -> Iterator[None]:
         raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
 
 
-def refuse_copy(learner: object) -> NoReturn:
-    """Refuse to copy a learner: the optimizer of a copy would move none of the copy's parameters.
-
-    TorchRL's losses hold parameters in ways that a deep copy takes apart.
-
-    Raises:
-        TypeError: Always.
-    """
-    raise TypeError(
-        f"a {type(learner).__name__} cannot be copied: make another one, and have it load the "
-        "state_dict() of this one"
-    )
-
-
-def check_state(given: Any, own: Mapping[str, Any], optimizer: torch.optim.Optimizer) -> None:
-    """Refuse what is not the state of such a learner.
-
-    Args:
-        given: What is to be loaded.
-        own: The learner's own state.
-        optimizer: Its optimizer.
+def check_state(state: Any, own: Mapping[str, Any], optimizer: torch.optim.Optimizer) -> None:
+    """Reject what is not the state of a learner whose own state is this, before it is loaded.
 
     Raises:
         ValueError: If an entry is missing, unknown, of another shape or type, or not finite.
     """
-    _check_keys("state_dict", given, own)
-    _check_keys("state_dict['loss']", given["loss"], own["loss"])
-    for name, value in own["loss"].items():
-        _check_entry(f"state_dict['loss'][{name!r}]", given["loss"][name], value)
-    check_updates(given["updates"])
-    _check_optimizer(given["optimizer"], own["optimizer"], optimizer)
-    if given["updates"] and not given["optimizer"]["state"]:
-        raise ValueError(
-            f"state_dict['optimizer']['state'] must not be empty after {given['updates']} updates"
-        )
-
-
-def check_updates(updates: Any) -> None:
-    """Refuse what is no number of updates.
-
-    Raises:
-        ValueError: If it is not an integer, or negative.
-    """
-    if isinstance(updates, bool) or not isinstance(updates, int) or updates < 0:
-        raise ValueError(f"state_dict['updates'] must be a count, got {updates!r}")
-
-
-def _check_keys(name: str, given: Any, own: Mapping[Any, Any]) -> None:
-    if not isinstance(given, Mapping):
-        raise ValueError(f"{name} must be a mapping, got {type(given).__name__}")
-    for word, keys in (("lacks", own.keys() - given.keys()), ("has", given.keys() - own.keys())):
-        if keys:
-            first = min(map(str, keys))
-            raise ValueError(f"{name} {word} {first!r}, unlike that of this learner")
-
-
-def _check_entry(name: str, given: Any, own: Any) -> None:
-    """Refuse a tensor of another shape or with numbers that are not finite."""
-    if not isinstance(own, Tensor):
-        if type(given) is not type(own):
-            raise ValueError(f"{name} must be a {type(own).__name__}, got {type(given).__name__}")
-        return
-    if not isinstance(given, Tensor):
-        raise ValueError(f"{name} must be a tensor, got {type(given).__name__}")
-    if given.shape != own.shape:
-        raise ValueError(f"{name} must have shape {tuple(own.shape)}, got {tuple(given.shape)}")
-    if given.is_floating_point() != own.is_floating_point():
-        raise ValueError(f"{name} must be of {own.dtype}, got {given.dtype}")
-    if not bool(given.isfinite().all()):
-        raise ValueError(f"{name} must be finite, got {given[~given.isfinite()][0].item()}")
-
-
-def _check_optimizer(given: Any, own: Mapping[str, Any], optimizer: torch.optim.Optimizer) -> None:
-    """Refuse the state of another optimizer, or of one for other parameters."""
-    name = "state_dict['optimizer']"
-    _check_keys(name, given, own)
-    groups, mine = given["param_groups"], own["param_groups"]
-    if not isinstance(groups, list) or len(groups) != len(mine):
-        raise ValueError(f"{name}['param_groups'] must have {len(mine)} groups, got {groups!r}")
-    for place, (group, expected) in enumerate(zip(groups, mine, strict=True)):
-        _check_keys(f"{name}['param_groups'][{place}]", group, expected)
-        for key in ("lr", "eps", "weight_decay"):
-            check(NOT_NEGATIVE, **{f"{name}['param_groups'][{place}][{key!r}]": group[key]})
-        if group["params"] != expected["params"]:
-            raise ValueError(
-                f"{name}['param_groups'][{place}]['params'] must be {expected['params']}, got "
-                f"{group['params']}"
-            )
+    _check("learner", state, [Entry("loss"), Entry("optimizer"), count("updates")])
+    _check("loss", state["loss"], [_alike(*pair) for pair in own["loss"].items()])
+    groups = own["optimizer"]["param_groups"]
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    state = given["state"]
-    if not isinstance(state, Mapping) or not set(state) <= set(range(len(parameters))):
-        raise ValueError(f"{name}['state'] must be of {len(parameters)} parameters")
-    for place, values in state.items():
-        _check_keys(f"{name}['state'][{place}]", values, dict.fromkeys(_MOMENTS))
-        for key, value in values.items():
-            like = torch.zeros(()) if key == "step" else parameters[place]
-            _check_entry(f"{name}['state'][{place}][{key!r}]", value, like)
-            if key != "exp_avg":
-                check_finite(f"{name}['state'][{place}][{key!r}]", value)
+    known = set(range(len(parameters)))
+
+    def of_known(found: Any) -> bool:
+        full = isinstance(found, Mapping) and set(found) <= known
+        return full and bool(found or not state["updates"])
+
+    words = f"of {len(parameters)} parameters, and not empty after {state['updates']} updates"
+    of_optimizer = [
+        Entry("state", of_known, words),
+        Entry(
+            "param_groups",
+            lambda found: isinstance(found, list) and len(found) == len(groups),
+            f"{len(groups)} groups",
+        ),
+    ]
+    _check("optimizer", state["optimizer"], of_optimizer)
+    for place, group in enumerate(groups):
+        rates = [number(name) for name in ("lr", "eps", "weight_decay")]
+        known_names = {*(rate.name for rate in rates), "params"}
+        others = [Entry(name) for name in group if name not in known_names]
+        entries = [*rates, exactly("params", group["params"]), *others]
+        _check(f"optimizer's group {place}", state["optimizer"]["param_groups"][place], entries)
+    for place, moments in state["optimizer"]["state"].items():
+        mean = _alike("exp_avg", parameters[place])
+        square = replace(mean, name="exp_avg_sq", holds=_not_negative, wanted=_NOT_NEGATIVE)
+        step = replace(square, name="step", dtype=torch.float32, shape=())
+        _check(f"moments of parameter {place}", moments, [step, mean, square])
 
 
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-"""What Adam and RAdam keep of a parameter."""
+_NOT_NEGATIVE = "finite and not negative"
+
+
+def _not_negative(found: Tensor) -> Tensor:
+    return found.isfinite() & (found >= 0)
+
+
+def _alike(name: str, own: Any) -> Entry:
+    """An entry with the form of what a learner has there."""
+    if isinstance(own, Tensor):
+        return Entry(name, torch.isfinite, "finite", own.dtype, tuple(own.shape))
+    kind = type(own)
+    return Entry(name, lambda found: type(found) is kind, f"a {kind.__name__}")
+
+
+def _check(part: str, state: Any, entries: list[Entry]) -> None:
+    """Reject a part of a state as :func:`check_entries` does, and one that has more entries."""
+    check_entries(part, state, entries, missing=ValueError)
+    unknown = set(state) - {each.name for each in entries}
+    if unknown:
+        raise ValueError(
+            f"the saved {part} has {min(map(str, unknown))!r}, unlike that of this learner"
+        )
