@@ -17,7 +17,7 @@ NAN = float("nan")
 
 
 def more(name):
-    """What KLPER and ReF-ER need besides."""
+    """Further arguments of KLPER and ReF-ER."""
     asks = name in {"klper", "ref_er"}
     return {"policy": make_actor(6, 2, width=8), "sigma": 0.2} if asks else {}
 

@@ -11,7 +11,7 @@ from torchrl_mpfa.methods.halves import uniform_halves
 
 
 def steps_of(name, **settings):
-    """How often critic and actor moved in a training step, and on how many transitions."""
+    """Updates of critic and actor in a training step, and their numbers of transitions."""
     learner = make_learner(**loss_options(name))
     replay = make_replay(name, capacity=100, batch_size=32, **settings)
     replay.buffer.extend(make_rows(100))

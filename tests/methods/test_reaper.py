@@ -65,7 +65,7 @@ def test_large_errors_of_one_episode_do_not_round_those_of_another_away():
 
 
 class Rules:
-    """What the authors' buffer does, row by row; rows are dictionaries in the order of writing."""
+    """The authors' buffer, row by row; rows are dictionaries in the order of writing."""
 
     def __init__(self):
         self.rows, self.highest = [], 1.0
@@ -168,7 +168,7 @@ def test_frequencies_are_those_of_the_product(combined):
 
 
 def test_an_early_error_counts_less_than_the_same_error_at_the_end():
-    """What bootstraps from badly known values, against what a reward alone makes."""
+    """Errors from badly known values to bootstrap from, against errors of a reward alone."""
     buffer = make_reaper([0] * 50)
     set_signals(buffer, td_error=torch.ones(50))
     buffer.extend(make_rows([0], [True]))  # It has ended: the sum is its own.

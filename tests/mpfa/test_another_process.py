@@ -1,4 +1,4 @@
-"""What only a process of its own shows; one for all, as each takes seconds to import PyTorch."""
+"""Tests that need another process; one for all, as each takes seconds to import PyTorch."""
 
 import subprocess
 import sys

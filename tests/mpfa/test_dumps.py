@@ -43,7 +43,7 @@ def rejected(folder, match):
 
 
 def sealed_by_hand(path, folder):
-    """What seal_dump writes, of whatever is there, links to folders left out."""
+    """The manifest of whatever is there, links to folders left out."""
     found = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != MANIFEST)
     files = {
         file.relative_to(folder).as_posix(): [file.stat().st_size, zlib.crc32(file.read_bytes())]

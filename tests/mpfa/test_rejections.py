@@ -1,4 +1,4 @@
-"""What a buffer rejects: the error names argument and value, and nothing has changed."""
+"""Rejections by a buffer: the error names argument and value, and nothing has changed."""
 
 import pytest
 import torch

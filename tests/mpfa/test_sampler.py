@@ -29,7 +29,7 @@ from torchrl_mpfa import (
 
 
 def priorities(buffer):
-    """What the sampler holds for every filled slot: eps included, alpha not applied."""
+    """Priorities of all filled slots: eps included, alpha not applied."""
     return buffer.sampler.priorities(torch.arange(len(buffer)))
 
 
