@@ -1,10 +1,13 @@
 """An update as one program: the same numbers as the losses give, whatever their options."""
 
 import copy
+import os
+from pathlib import Path
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from torch._dynamo.exc import BackendCompilerFailed
 from torchrl.objectives import ValueEstimators
 
 from tests.mpfa import sac_networks
@@ -113,6 +116,15 @@ def test_what_a_batch_may_say_beside_its_transitions_counts(name, more):
 )
 def test_critic_or_actor_alone_get_the_gradients_of_their_loss(name, trains):
     assert_same_gradients(name, {}, make_batch(), trains=trains)
+
+
+def fail_with(error):
+    """A function that raises this, whatever it is given."""
+
+    def fail(*args, **kwargs):
+        raise error
+
+    return fail
 
 
 def make_pair(name, compile=UNTRACED, *, loss=None, **options):
@@ -365,6 +377,29 @@ def test_a_loss_that_depends_on_the_numbers_in_a_batch_is_refused_as_a_program()
     with pytest.raises(ValueError, match=r"compile needs a loss .* got a Choosing"):
         learner.update(make_batch())
     assert learner.updates == 0
+
+
+def test_a_compiler_that_fails_is_not_taken_for_a_batch_that_does_not_fit():
+    fail = fail_with(OSError("no compiler"))
+    learner = DDPGLearner(make_loss("ddpg"), compile={"backend": fail})
+    with pytest.raises(BackendCompilerFailed, match="no compiler"):
+        learner.update(make_batch())
+
+
+def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "anything")
+    make_pair("ddpg")
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "anything"
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    make_pair("ddpg")
+    folder = Path(os.environ["TORCHINDUCTOR_CACHE_DIR"])
+    assert folder.is_relative_to(tmp_path)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    monkeypatch.setattr(Path, "chmod", fail_with(PermissionError("not yours")))
+    with pytest.raises(PermissionError, match="must be a folder of your own: set XDG_CACHE_HOME"):
+        make_pair("ddpg")
 
 
 @pytest.mark.slow

@@ -7,7 +7,10 @@ that nothing is said a second time, and what a loss or network of a user does is
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -42,9 +45,13 @@ class CompiledGradients:
     Args:
         loss: The loss; its networks must not move to another device later.
         compile: Arguments of ``torch.compile``.
+
+    Raises:
+        PermissionError: If the folder of the user's programs belongs to another one.
     """
 
     def __init__(self, loss: Any, compile: dict[str, Any]) -> None:
+        _keep_programs()
         self._loss = loss
         if not compile.keys() & {"backend", "mode"}:
             # The random numbers that the losses would have.
@@ -144,6 +151,28 @@ class CompiledGradients:
         program = torch.compile(fx.GraphModule(graph_module, graph_module.graph), **self._arguments)
         taken = [state[name] for name in names]
         return Program(program, taken, moved, list(written), list(log))
+
+
+def _keep_programs() -> None:
+    """Have PyTorch keep programs in a folder of the user, unless it was told where.
+
+    Its own default is a temporary folder, where others may have put something: a program is code.
+    """
+    if "TORCHINDUCTOR_CACHE_DIR" in os.environ:
+        return
+    kept = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    # Processors of several kinds may share the folder.
+    able = sorted(name for name, has in torch.cpu.get_capabilities().items() if has is True)
+    processor = hashlib.sha256(repr(able).encode()).hexdigest()[:16]
+    folder = Path(kept, "torchrl_mpfa", "programs", processor)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        folder.chmod(0o700)
+    except PermissionError as error:
+        raise PermissionError(
+            f"{folder} must be a folder of your own: set XDG_CACHE_HOME or TORCHINDUCTOR_CACHE_DIR"
+        ) from error
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder)
 
 
 def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:

@@ -22,7 +22,8 @@ class SACLearner(ActorCriticLearner):
         loss: A :class:`~torchrl_mpfa.SignalSACLoss` with all networks in it.
         alpha_lr: Learning rate of the temperature's logarithm, unless that is fixed. The
             temperature takes some ``1 / alpha_lr`` updates to change by a factor of e.
-        **kwargs: ``actor_lr``, ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``.
+        **kwargs: ``actor_lr``, ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``,
+            ``policy_delay``, ``compile``.
 
     Raises:
         TypeError: If the loss is another learner's.

@@ -58,9 +58,9 @@ def naming(batch: TensorDictBase) -> Iterator[None]:
     """Say of which batch an error of PyTorch is, such as that two matrices do not fit."""
     try:
         yield
-    except torch.OutOfMemoryError:
-        raise
     except RuntimeError as error:
+        if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
+            raise
         found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
         forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
         raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error

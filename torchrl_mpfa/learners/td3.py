@@ -18,12 +18,12 @@ class TD3Learner(ActorCriticLearner):
     Args:
         loss: A :class:`~torchrl_mpfa.SignalTD3Loss` with all networks in it.
         policy_delay: Updates of the critics for one of the actor and of the targets.
-        **kwargs: ``actor_lr``, ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``, and
-            ``compile`` as of :class:`~torchrl_mpfa.DDPGLearner`.
+        **kwargs: ``actor_lr``, ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``,
+            ``compile``.
 
     Raises:
         TypeError: If the loss is another learner's.
-        ValueError: If an argument is out of its range, or the loss cannot be compiled.
+        ValueError: If an argument is out of its range,.
 
     Examples:
         >>> from torchrl_mpfa import make_actor, make_critic, make_td3_loss

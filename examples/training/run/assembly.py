@@ -123,7 +123,8 @@ def _sac(
     of_learner: Options,
 ) -> Learner:
     loss = make_sac_loss(actor, critic, alpha_init=settings.alpha_init, **of_loss)
-    return SACLearner(loss, alpha_lr=settings.alpha_lr, **of_learner)
+    alpha_lr, compile = settings.alpha_lr, settings.compile
+    return SACLearner(loss, alpha_lr=alpha_lr, compile=compile, **of_learner)
 
 
 ALGORITHMS: dict[str, Callable[..., Learner]] = {"ddpg": _ddpg, "td3": _td3, "sac": _sac}

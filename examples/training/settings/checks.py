@@ -78,11 +78,10 @@ def check_settings(settings: TrainSettings) -> None:
     if settings.assessment.episodes:
         _check_one_rule(settings)
     _check_ray(settings)
-    if settings.learner.compile and settings.learner.algorithm not in ("ddpg", "td3"):
-        name = settings.learner.algorithm
-        name = "SAC" if name == "sac" else name
-        raise ValueError(f"learner.compile must be false with {name}, got True")
     if is_discrete(settings.learner):
+        if settings.learner.compile:
+            name = settings.learner.algorithm
+            raise ValueError(f"learner.compile must be false with {name}, got True")
         _check_values_alone(settings)
     _check_device(settings.device)
     check_physics(settings.environment.physics)

@@ -283,7 +283,7 @@ def test_a_value_that_cannot_be_is_one_sentence_with_its_name(
             r"stages\[0\].world, environment.max_goal_distance=0.5: max_goal_distance must be",
         ),
         ("method.positive_above=high", "method.positive_above must be a finite number or mean"),
-        ("learner=sac learner.compile=true", "learner.compile must be false with SAC"),
+        ("learner=dqn learner.compile=true", "learner.compile must be false with dqn"),
         ("seed=0,-1", "seed must be from 0 to 4294967295, got -1"),
         ("learner.gamma=[", r"'learner.gamma=\[' is not NAME=VALUE"),
         ("gamma", "'gamma' is not NAME=VALUE"),
