@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--actions", type=int, default=50_000, help="of all robots together")
+    parser.add_argument("--actions", type=int, default=40_000, help="of all robots together")
     parser.add_argument("--out", type=Path, default=Path("runs/ddpg"), help="folder of the policy")
     options = parser.parse_args(arguments)
     if options.actions < 1:
@@ -78,17 +78,14 @@ def main(arguments: Sequence[str] | None = None) -> Path:
 
     # DDPG. The penalty keeps actions out of the flat ends of the tanh, where nothing is learned.
     actor, critic = mpfa.make_actor(size, 2, width=64), mpfa.make_critic(size, 2, width=64)
-    loss = mpfa.make_ddpg_loss(actor, critic, reward_scale=0.1, saturation_penalty=1.0)
+    loss = mpfa.make_ddpg_loss(
+        actor, critic, reward_scale=0.1, saturation_penalty=1.0, saturation_limit=1.5
+    )
     learner = mpfa.DDPGLearner(loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005)
 
-    # The first robot acts without noise, the last with all of it, and the others in between: what
-    # the policy does by itself, driving in circles included, is in the data from the start.
+    falling = max(int(0.4 * options.actions), 1)
     noise = AdditiveGaussianModule(
-        env.action_spec,
-        sigma_init=1.0,
-        sigma_end=0.2,
-        annealing_num_steps=max(int(0.4 * options.actions), 1),
-        std=torch.linspace(0.0, 1.0, ROBOTS).unsqueeze(-1).tolist(),
+        env.action_spec, sigma_init=1.0, sigma_end=0.2, annealing_num_steps=falling
     )
     collector = Collector(
         env,
