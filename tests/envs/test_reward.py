@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from mpfa_envs import (
+    WORLDS,
     NavigationEnv,
     RewardTerms,
     StepOutcome,
     VectorNavigationEnv,
     navigation_reward,
 )
+from mpfa_envs.paths.distance import DistanceField, FreeGrid
 
 
 def outcome(before: float, after: float, *, success: bool = False, collision: bool = False):
@@ -86,3 +88,19 @@ def test_without_progress_an_approach_is_not_rewarded(step) -> None:
     reward = partial(navigation_reward, goal_reward=20.0, progress_scale=3.0)
     assert step(reward=reward) != 0.0
     assert step(reward=reward, progress="none") == 0.0
+
+
+def test_progress_along_the_shortest_path_is_the_difference_of_its_lengths() -> None:
+    options = {"physics": "kinematic", "progress_scale": 2.0, "detour_chance": 1.0}
+    env = VectorNavigationEnv(3, world="D", progress="shortest_path", **options)
+    env.reset(seed=0)
+    grid = FreeGrid(WORLDS["D"], distance=env.config.collision_distance)
+    fields = [DistanceField(grid, task.goal) for task in env.tasks if task is not None]
+    before = [field.at(*pose[:2]) for field, pose in zip(fields, env.poses, strict=True)]
+    for _ in range(3):
+        _, rewards, *ended, _ = env.step(np.full((3, 2), 0.5))
+        assert not np.any(ended)
+        after = [field.at(*pose[:2]) for field, pose in zip(fields, env.poses, strict=True)]
+        np.testing.assert_allclose(rewards, 2.0 * np.subtract(before, after), atol=1e-9)
+        before = after
+    env.close()
