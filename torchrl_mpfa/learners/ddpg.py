@@ -20,7 +20,7 @@ class DDPGLearner(ActorCriticLearner):
 
     Raises:
         TypeError: If the loss is another learner's.
-        ValueError: If an argument is out of its range,.
+        ValueError: If an argument is out of its range.
 
     Examples:
         >>> from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss

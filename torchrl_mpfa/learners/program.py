@@ -104,7 +104,7 @@ class CompiledGradients:
         """What a trace takes for given in a loss: its options, and how it makes targets."""
         plain = (bool, int, float, str, tuple)
         values = [value for value in vars(self._loss).values() if isinstance(value, plain)]
-        return id(self._loss.value_estimator), *values
+        return self._loss.value_estimator, *values
 
     def _make(self, entries: Entries, trains: Trains, loss_function: str | None) -> Program:
         loss = self._loss

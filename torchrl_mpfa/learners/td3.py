@@ -23,7 +23,7 @@ class TD3Learner(ActorCriticLearner):
 
     Raises:
         TypeError: If the loss is another learner's.
-        ValueError: If an argument is out of its range,.
+        ValueError: If an argument is out of its range.
 
     Examples:
         >>> from torchrl_mpfa import make_actor, make_critic, make_td3_loss
