@@ -60,17 +60,7 @@ class Learner(Protocol):
 
 
 class OptimizedLearner:
-    """A learner with a loss, one optimizer, target networks, and rates that can be lowered.
-
-    Args:
-        loss: The loss with its networks in it.
-        groups: Parameters with their learning rates and decays.
-        optimizer: ``"adam"`` or ``"radam"``.
-        tau: Share of the networks in the target networks' step.
-
-    Raises:
-        ValueError: If the optimizer is unknown.
-    """
+    """A learner with a loss, one optimizer, target networks, and rates that can be lowered."""
 
     def __init__(
         self, loss: Any, groups: list[dict[str, Any]], optimizer: OptimizerName, tau: float

@@ -27,11 +27,7 @@ _ONE_NETWORK = (
 
 
 def _whole_batch(draw: SampledBatch | TensorDictBase, name: str) -> TensorDictBase:
-    """The batch of a draw that actor and critic share.
-
-    Raises:
-        ValueError: If the draw is for one of them.
-    """
+    """The sampled batch, which must be for actor and critic alike."""
     if not isinstance(draw, SampledBatch):
         return draw
     if draw.trains != "both" or draw.loss_function is not None:

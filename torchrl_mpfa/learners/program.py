@@ -40,15 +40,7 @@ class Program(NamedTuple):
 
 
 class CompiledGradients:
-    """Differentiates the losses of an update by a program, one for each form of a batch.
-
-    Args:
-        loss: The loss; its networks must not move to another device later.
-        compile: Arguments of ``torch.compile``.
-
-    Raises:
-        PermissionError: If the folder of the user's programs belongs to another one.
-    """
+    """Differentiates the losses of an update by a program, one for each form of a batch."""
 
     def __init__(self, loss: Any, compile: dict[str, Any]) -> None:
         _keep_programs()
@@ -65,20 +57,7 @@ class CompiledGradients:
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
-        """Set the gradients and write the signals, as the losses and a backward pass do.
-
-        Args:
-            batch: Transitions, batch size ``[B]``.
-            trains: Whose losses are differentiated.
-            loss_function: Distance of the critics' loss; None: the loss's own.
-
-        Returns:
-            Detached losses and other values for the log.
-
-        Raises:
-            KeyError: If the batch lacks an entry.
-            ValueError: If the losses cannot be one program.
-        """
+        """Set gradients and write signals as losses and a backward pass do; values for the log."""
         entries = self._entries(batch)
         form = trains, loss_function, self._options(), *map(_form, entries.items())
         program = self._programs.get(form)
@@ -154,10 +133,8 @@ class CompiledGradients:
 
 
 def _keep_programs() -> None:
-    """Have PyTorch keep programs in a folder of the user, unless it was told where.
-
-    Its own default is a temporary folder, where others may have put something: a program is code.
-    """
+    """Have PyTorch keep programs in a folder of the user, unless it was told where."""
+    # Its own default is a temporary folder, where others may put something: a program is code.
     if "TORCHINDUCTOR_CACHE_DIR" in os.environ:
         return
     kept = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -181,11 +158,7 @@ def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
 
 
 def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[str]:
-    """Have a trace take tensors of a loss as inputs, where it holds them or views of them.
-
-    Returns:
-        Their names in the order of the inputs, which follow those that are there.
-    """
+    """Have a trace take tensors of a loss as its last inputs, and give their names."""
     graph, inputs = trace.graph, dict[str, fx.Node]()
     of_storage = {value.untyped_storage().data_ptr(): name for name, value in state.items()}
     last = graph.find_nodes(op="placeholder")[-1]
