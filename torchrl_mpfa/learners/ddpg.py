@@ -9,14 +9,19 @@ from torchrl_mpfa.losses import SignalDDPGLoss
 class DDPGLearner(ActorCriticLearner):
     r"""DDPG with target networks, Eqs. (4)-(7), and the actor's sampled policy gradient.
 
-    Options: see :class:`~torchrl_mpfa.learners.ActorCriticLearner`.
+    More of each option: :class:`~torchrl_mpfa.learners.ActorCriticLearner`.
 
     Args:
         loss: A :class:`~torchrl_mpfa.SignalDDPGLoss` with both networks in it.
-        compile: Whether an update is one compiled program, or the arguments of ``torch.compile``.
+        actor_lr: Learning rate of the actor, Table 1.
+        critic_lr: Learning rate of the critic, Table 1.
+        critic_weight_decay: L2 decay of the critic's weights.
+        tau: Share of the networks in the target networks' step, Table 1.
+        optimizer: ``"adam"`` or ``"radam"``.
         policy_delay: Updates of the critic for one of the actor and of the targets. Eqs. (4)-(7)
             have 1; 2 is TD3's (Fujimoto et al. 2018), and steadies a single critic.
-        **kwargs: ``actor_lr``, ``critic_lr``, ``critic_weight_decay``, ``tau``, ``optimizer``.
+        compile: Whether the losses are one compiled program, or the arguments of
+            ``torch.compile``.
 
     Raises:
         TypeError: If the loss is another learner's.
