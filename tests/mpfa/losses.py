@@ -1,5 +1,7 @@
 """Small networks, batches and losses that the tests of loss and learner share."""
 
+from copy import deepcopy
+
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -7,6 +9,9 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import (
+    DDPGLearner,
+    SACLearner,
+    TD3Learner,
     make_actor,
     make_critic,
     make_ddpg_loss,
@@ -22,14 +27,19 @@ BOUNDS = (-1.0, 1.0)
 KINDS = ["ddpg", "td3", "sac"]
 CRITICS_LOSS = {"ddpg": "loss_value", "td3": "loss_qvalue", "sac": "loss_qvalue"}
 """TorchRL's name of the critics' loss."""
+LEARNERS = {"ddpg": DDPGLearner, "td3": TD3Learner, "sac": SACLearner}
+UNTRACED = {"compile": {"disable": True}}
+"""The function that torch.compile would make one program of, which takes seconds."""
+TRACED = {"compile": {"backend": "eager"}}
+"""Python stands in for the C++ compiler: what is traced is the same."""
 
 
-def make_networks(seed=0, *, stochastic=False, **kwargs):
+def make_networks(seed=0, *, stochastic=False, size=5, **kwargs):
     """An actor and a critic that start far from zero, so that gradients are not tiny."""
     torch.manual_seed(seed)
     arguments = {"width": 16, "final_init": 0.5, **kwargs}
     make = make_stochastic_actor if stochastic else make_actor
-    return make(5, 2, **arguments), make_critic(5, 2, **arguments)
+    return make(size, 2, **arguments), make_critic(size, 2, **arguments)
 
 
 def make_loss(seed=0, **kwargs):
@@ -62,6 +72,23 @@ def make_of(kind, *, networks=None, **options):
             if name.startswith("target_"):
                 value.mul_(0.7)
     return loss
+
+
+def make_learner(kind="ddpg", seed=0, *, of_loss=None, **options):
+    """A learner of any kind whose targets differ from its networks."""
+    networks = make_networks(seed, stochastic=kind == "sac")
+    loss = make_of(kind, **{"networks": networks, **(of_loss or {})})
+    return LEARNERS[kind](loss, **{"actor_lr": 1e-3, "critic_lr": 1e-3, **options})
+
+
+def critics_of(loss, params):
+    """Each of the critics as a function of observation and action."""
+    found = []
+    for index in range(2):
+        critic = deepcopy(loss.qvalue_network)
+        params[index].detach().to_module(critic)
+        found.append(critic.module)
+    return found
 
 
 def evaluate(loss, batch, seed=1):

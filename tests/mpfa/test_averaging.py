@@ -5,33 +5,26 @@ import copy
 import pytest
 import torch
 
-from tests.mpfa.losses import BOUNDS, GAMMA, make_batch, make_networks
-from torchrl_mpfa import DDPGLearner, TD3Learner, make_ddpg_loss, make_td3_loss
+from tests.mpfa import losses
+from tests.mpfa.losses import GAMMA, make_batch
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
-MAKE = {
-    "ddpg": (make_ddpg_loss, DDPGLearner, "target_value_network_params"),
-    "td3": (make_td3_loss, TD3Learner, "target_qvalue_network_params"),
-}
+KINDS = ["ddpg", "td3"]
 
 
-def make_learner(name, average, seed=0, **kwargs):
-    make, learner, _ = MAKE[name]
-    more = {"bounds": BOUNDS} if name == "td3" else {}
-    loss = make(*make_networks(seed), gamma=GAMMA, target_average=average, **more)
-    return learner(loss, critic_lr=1e-2, actor_lr=1e-2, tau=0.5, **kwargs)
+def make_learner(kind, average, seed=0):
+    rates = {"actor_lr": 1e-2, "critic_lr": 1e-2, "tau": 0.5}
+    return losses.make_learner(kind, seed, of_loss={"target_average": average}, **rates)
 
 
 def target_of(learner, batch, seed=7):
     torch.manual_seed(seed)  # TD3 has noise in its targets.
-    update = {"ddpg": "loss_value", "td3": "value_loss"}
-    kind = "ddpg" if isinstance(learner, DDPGLearner) else "td3"
     with torch.no_grad():
-        return getattr(learner.loss, update[kind])(batch)[1]["target_value"]
+        return learner.loss.losses(batch, trains="critic")[1]["target_value"]
 
 
-@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("name", KINDS)
 def test_with_one_critic_every_step_is_the_same_as_without_averaging(name):
     averaged, plain = make_learner(name, 1), make_learner(name, 1)
     plain.end_episode = lambda: None
@@ -46,7 +39,7 @@ def test_with_one_critic_every_step_is_the_same_as_without_averaging(name):
         assert torch.equal(mine, other)
 
 
-@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("name", KINDS)
 def test_the_target_is_the_mean_over_the_present_and_the_earlier_critics(name):
     learner, batch = make_learner(name, 3), make_batch(seed=20)
     states = []
@@ -88,7 +81,7 @@ def next_values(name, learner, batch):
         return torch.stack([found["state_action_value"].squeeze(-1) for found in each])
 
 
-@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("name", KINDS)
 def test_averaged_targets_go_on_from_a_state_that_is_loaded(name):
     first, second = make_learner(name, 3), make_learner(name, 3, seed=1)
     for seed in range(4):
@@ -97,14 +90,3 @@ def test_averaged_targets_go_on_from_a_state_that_is_loaded(name):
     second.load_state_dict(first.state_dict())
     batch = make_batch(seed=30)
     assert torch.equal(target_of(first, batch.clone()), target_of(second, batch.clone()))
-
-
-@pytest.mark.slow
-def test_a_traced_learner_averages_as_well():
-    plain, traced = make_learner("ddpg", 3), make_learner("ddpg", 3, compile={"backend": "eager"})
-    for seed in range(4):
-        one, other = make_batch(seed=seed), make_batch(seed=seed)
-        for learner, batch in ((plain, one), (traced, other)):
-            learner.update(batch)
-            learner.end_episode()
-        torch.testing.assert_close(other["signals"].to_dict(), one["signals"].to_dict())

@@ -6,14 +6,9 @@ import pytest
 import torch
 from torchrl.objectives import SoftUpdate
 
-from tests.mpfa.losses import GAMMA, make_batch, make_loss, make_networks
-from torchrl_mpfa import DDPGLearner, Learner, make_ddpg_loss
+from tests.mpfa.losses import make_batch, make_learner, make_loss
+from torchrl_mpfa import Learner
 from torchrl_mpfa.learners import MultiTensorSoftUpdate
-
-
-def make_learner(seed=0, **kwargs):
-    arguments = {"actor_lr": 1e-3, "critic_lr": 1e-3, **kwargs}
-    return DDPGLearner(make_ddpg_loss(*make_networks(seed), gamma=GAMMA), **arguments)
 
 
 def parameters(loss):
@@ -113,8 +108,9 @@ def test_an_update_writes_the_signals_and_gives_detached_values():
     assert batch["signals"].batch_size == (6,)
 
 
-def test_training_lowers_the_error_of_the_critic_on_a_fixed_batch():
-    learner = make_learner(critic_weight_decay=0.0, tau=0.001)
+@pytest.mark.parametrize("kind", ["ddpg", "td3"])
+def test_training_lowers_the_error_of_the_critic_on_a_fixed_batch(kind):
+    learner = make_learner(kind, critic_weight_decay=0.0, tau=0.001)
     first = learner.update(make_batch())["loss_value"]
     for _ in range(200):
         last = learner.update(make_batch())["loss_value"]
@@ -134,7 +130,7 @@ def test_the_policy_acts_with_the_trained_parameters():
 
 
 def test_a_restored_learner_goes_on_bit_for_bit():
-    first, second = make_learner(0), make_learner(1)
+    first, second = make_learner(), make_learner(seed=1)
     for seed in range(5):
         first.update(make_batch(seed=seed))
     file = io.BytesIO()
@@ -153,21 +149,6 @@ def test_a_restored_learner_goes_on_bit_for_bit():
         observed = make_batch().select("observation")
         actions = [each.policy(observed.copy())["action"] for each in (first, second)]
     assert actions[0].equal(actions[1])
-
-
-@pytest.mark.parametrize(
-    ("argument", "value"),
-    [
-        ("actor_lr", 0.0),
-        ("critic_lr", -1.0),
-        ("critic_weight_decay", -0.1),
-        ("tau", 0.0),
-        ("tau", 1.5),
-    ],
-)
-def test_arguments_out_of_range_are_refused(argument, value):
-    with pytest.raises(ValueError, match=f"{argument} must .*got {value}"):
-        make_learner(**{argument: value})
 
 
 def test_the_learner_is_what_a_training_loop_asks_for():

@@ -8,11 +8,11 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from tests.mpfa import sac_networks
 from tests.mpfa.losses import (
     CRITICS_LOSS,
     GAMMA,
     KINDS,
+    critics_of,
     evaluate,
     make_batch,
     make_loss,
@@ -67,7 +67,7 @@ def test_of_several_critics_the_larger_error_and_the_first_slope_count(kind, def
     torch.testing.assert_close(batch["signals", "td_error"], errors.amax(0))
     assert not errors[0].equal(errors[1])
     torch.testing.assert_close(batch["signals", "value"], log["pred_value"][0] / 0.1)
-    first = sac_networks.critics_of(loss, loss.qvalue_network_params)[0]
+    first = critics_of(loss, loss.qvalue_network_params)[0]
     for row, observation in enumerate(batch["observation"]):
         action = batch["action"][row].detach().clone().requires_grad_(True)
         (slope,) = torch.autograd.grad(first(observation, action).sum(), action)

@@ -5,34 +5,19 @@ from copy import deepcopy
 import pytest
 import torch
 
-from tests.mpfa import sac_networks
-from tests.mpfa.losses import BOUNDS, make_batch, make_networks
+from tests.mpfa import losses
+from tests.mpfa.losses import UNTRACED, make_batch
 from tests.mpfa.transitions import same
-from torchrl_mpfa import (
-    DDPGLearner,
-    SACLearner,
-    TD3Learner,
-    make_ddpg_loss,
-    make_sac_loss,
-    make_td3_loss,
-)
 from torchrl_mpfa.selection import SampledBatch
 
-# The function that torch.compile makes one program of, which it is not asked to: it takes seconds.
-PURE = {"compile": {"disable": True}}
 RADAM = {"optimizer": "radam"}
-LEARNERS = [("ddpg", {}), ("td3", {}), ("sac", {}), ("ddpg", PURE), ("td3", PURE)]
+LEARNERS = [("ddpg", {}), ("td3", {}), ("sac", {}), ("ddpg", UNTRACED), ("td3", UNTRACED)]
 LEARNERS += [("ddpg", RADAM), ("sac", RADAM)]
 IDS = ["ddpg", "td3", "sac", "ddpg pure", "td3 pure", "ddpg radam", "sac radam"]
 
 
 def make_learner(name, seed=0, **options):
-    options = {"actor_lr": 1e-3, "critic_lr": 1e-3, "critic_weight_decay": 0.1, **options}
-    if name == "sac":
-        return SACLearner(make_sac_loss(*sac_networks.make_networks(seed)), **options)
-    if name == "td3":
-        return TD3Learner(make_td3_loss(*make_networks(seed), bounds=BOUNDS), **options)
-    return DDPGLearner(make_ddpg_loss(*make_networks(seed)), **options)
+    return losses.make_learner(name, seed, **{"critic_weight_decay": 0.1, **options})
 
 
 def parts(learner):
@@ -99,7 +84,7 @@ def test_an_update_of_the_actor_alone_leaves_the_critics_to_the_bit(name, option
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("ddpg", {}), ("td3", {}), ("ddpg", PURE), ("td3", PURE)], ids=str
+    ("name", "options"), [("ddpg", {}), ("td3", {}), ("ddpg", UNTRACED), ("td3", UNTRACED)], ids=str
 )
 def test_the_actor_moves_as_in_an_update_of_both(name, options):
     """All gradients of an update are taken at the same networks, so that its halves are alike."""
@@ -122,9 +107,10 @@ def test_a_stochastic_actor_moves_by_the_gradient_of_its_own_loss():
         torch.testing.assert_close(parameter.grad, gradient)
 
 
-@pytest.mark.parametrize("options", [{}, PURE], ids=["plain", "pure"])
-def test_a_delayed_actor_waits_for_its_training_step_whichever_draw_it_is_in(options):
-    learner = make_learner("td3", policy_delay=2, **options)
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+@pytest.mark.parametrize("options", [{}, UNTRACED], ids=["plain", "pure"])
+def test_a_delayed_actor_waits_for_its_training_step_whichever_batch_it_is_in(name, options):
+    learner = make_learner(name, policy_delay=2, **options)
     step = (("both", True), ("critic", False), ("actor", False))
     found = []
     for number in range(4):
@@ -141,7 +127,7 @@ def test_a_delayed_actor_waits_for_its_training_step_whichever_draw_it_is_in(opt
     assert found == [*waiting, both, critic_alone, actor_alone] * 2
 
 
-def test_an_actors_draw_that_begins_a_step_is_counted_even_if_nothing_is_due():
+def test_an_actors_batch_that_begins_a_step_counts_even_if_nothing_is_due():
     learner = make_learner("td3", policy_delay=2)
     assert learner.update(SampledBatch(make_batch(), trains="actor")) == {}
     assert "loss_actor" in learner.update(SampledBatch(make_batch(), trains="actor"))
@@ -150,47 +136,13 @@ def test_an_actors_draw_that_begins_a_step_is_counted_even_if_nothing_is_due():
 
 def train(learner, steps, begin=0):
     """Updates in the order of LA3P."""
-    logs = []
     for number in range(begin, begin + steps):
         torch.manual_seed(number)
         for place, (trains, distance) in enumerate(
             (("both", "pal"), ("critic", "smooth_l1"), ("actor", None))
         ):
             batch = make_batch(seed=3 * number + place)
-            logs.append(learner.update(SampledBatch(batch, trains, distance, new_step=place == 0)))
-    return logs
-
-
-# Python stands in for the C++ compiler: what is traced is the same.
-TRACED = {"compile": {"backend": "eager"}}
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [("ddpg", PURE), ("td3", PURE), pytest.param("td3", TRACED, marks=pytest.mark.slow)],
-    ids=str,
-)
-def test_as_one_function_a_learner_takes_the_same_steps(name, options):
-    plain, traced = make_learner(name), make_learner(name, **options)
-    for one, other in zip(train(plain, 6), train(traced, 6), strict=True):
-        losses = {key: value for key, value in one.items() if key.startswith("loss")}
-        assert losses.keys() == {key for key in other if key.startswith("loss")}
-        for key, value in losses.items():
-            torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-5)
-    expected = plain.loss.state_dict()
-    for key, value in traced.loss.state_dict().items():
-        torch.testing.assert_close(value, expected[key], rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ddpg", "td3"])
-def test_a_compiled_learner_takes_the_same_steps(name):
-    plain, compiled = make_learner(name), make_learner(name, compile=True)
-    train(plain, 4)
-    train(compiled, 4)
-    expected = plain.loss.state_dict()
-    for key, value in compiled.loss.state_dict().items():
-        torch.testing.assert_close(value, expected[key], rtol=1e-3, atol=1e-4)
+            learner.update(SampledBatch(batch, trains, distance, new_step=place == 0))
 
 
 @pytest.mark.parametrize(("name", "options"), LEARNERS, ids=IDS)

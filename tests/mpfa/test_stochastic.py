@@ -5,13 +5,12 @@ import torch
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 
-from tests.mpfa.losses import make_batch
-from tests.mpfa.sac_networks import make_networks
+from tests.mpfa.losses import make_batch, make_networks
 from torchrl_mpfa.networks import sample_tanh_normal
 
 
 def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
-    policy, _ = make_networks()
+    policy, _ = make_networks(stochastic=True)
     observed = make_batch().select("observation")
     found = policy.outputs(observed)
     assert found["action"].equal(found["preactivation"].tanh())
@@ -28,7 +27,11 @@ def test_the_policy_is_the_tanh_of_its_mean_unless_it_is_told_to_explore():
 
 
 def test_the_sizes_of_a_policy_can_be_read_from_its_weights():
-    weights = [value for value in make_networks()[0].state_dict().values() if value.ndim == 2]
+    weights = [
+        value
+        for value in make_networks(stochastic=True)[0].state_dict().values()
+        if value.ndim == 2
+    ]
     assert weights[0].shape[1] == 5
     assert weights[-1].shape[0] == 2
 
