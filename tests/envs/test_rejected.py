@@ -1,4 +1,4 @@
-"""Arguments that environments, robots, senses and policies reject: a row each."""
+"""Arguments and calls that environments, robots, senses and policies reject: a row each."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 
 from mpfa_envs import (
     ROBOTS,
+    ROOMS_TASK,
     WORLDS,
     DiscreteWheels,
     Lidar,
@@ -20,8 +21,10 @@ from mpfa_envs import (
     NavigationEnv,
     RandomMirror,
     RobotNoise,
+    Task,
     TaskConfig,
     VectorNavigationEnv,
+    Walker,
     World,
     make_navigation_env,
 )
@@ -228,3 +231,104 @@ def test_a_bad_argument_is_named_with_its_value(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         make(**arguments)
+
+
+TINY = World(name="tiny", size=(0.8, 0.8))
+FULL = replace(WORLDS["D"], name="full", walkers=(Walker(radius=2.4),))
+FAR = {"start": (99.0, 0.0, 0.0), "goal": (4.0, 4.0)}
+ONE_RESET: Rows = [
+    *(
+        ({"seed": seed}, f"seed must be an integer of at least 0, got {seed!r}")
+        for seed in (-1, 1.5, "1", True)
+    ),
+    ({"options": {"reset_mask": True}}, "got 'reset_mask'"),
+    ({"options": {"start": (0, 0, 0)}}, "options must have start and goal, or neither"),
+    ({"options": {"start": (0, 0), "goal": (3, 0)}}, r"start must be 3 finite .*got \(0, 0\)"),
+    ({"options": {"start": (0, 0, 0), "goal": (math.inf, 0)}}, "goal must be 2 finite numbers"),
+    ({"options": {"start": (0, 0, 0), "goal": "ab"}}, "goal must be 2 finite numbers, got 'ab'"),
+    ({"options": {"start": (4.8, 0, 0), "goal": (3, 0)}}, r"start must be farther .*\(4.8, 0.0\)"),
+    ({"options": {"start": (0, 0, 0), "goal": (0.4, 0)}}, r"goal must be farther .*\(0.4, 0.0\)"),
+    ({"options": {"start": (0, 0, 0), "goal": (7, 0)}}, r"goal must be within reach .*\(7.0, 0.0"),
+    *(
+        ({"seed": seed, "options": {"world": FULL}}, "'full' has no place for")
+        for seed in (None, 1)
+    ),
+]
+ROOMS_RESET: Rows = [
+    ({"seed": 1, "options": {"world": "A", "goal": (4.0, 4.0)}}, "start and goal, or neither"),
+    ({"seed": 1, "options": FAR}, "world must be given"),
+    ({"seed": 1, "options": {"world": "A", **FAR}}, "99"),
+    ({"seed": 1, "options": {"world": TINY}}, "world 'tiny' has no"),
+]
+MANY_RESET: Rows = [
+    ({"seed": -1}, "seed must be an integer of at least 0, got -1"),
+    ({"seed": [1]}, "seed must have 2 entries, got 1"),
+    ({"seed": [1, -1]}, "seed must be an integer of at least 0, got -1"),
+    ({"seed": np.array([1, 2])}, r"seed must be an integer of at least 0, got array\(\[1, 2\]\)"),
+    *(
+        ({"seed": 1, "options": options}, message)
+        for options, message in (
+            (["reset_mask"], r"options must be a dictionary or None, got \['reset_mask'\]"),
+            ({"task": []}, "options must have keys among .*got 'task'"),
+            ({"tasks": [None]}, "tasks must have 2 entries, got 1"),
+            ({"tasks": "ab"}, "tasks must be a sequence .*got 'ab'"),
+            ({"worlds": ["tets", None]}, "robot 0: world must be .*did you mean 'test'"),
+            ({"tasks": [None, Task((4.9, 0, 0), (0, 0))]}, "robot 1: start must be farther"),
+            ({"tasks": [None, ((0, 0, 0), (9, 0))]}, "robot 1: goal must be within reach"),
+            ({"reset_mask": np.zeros(2, dtype=np.bool_)}, "reset_mask must name at least one"),
+            ({"reset_mask": [True, False]}, "reset_mask must be a NumPy array of 2 bool"),
+            (
+                {"worlds": [World(name="hall", size=(90.0, 9.0)), None]},
+                "robot 0: world 'hall' .* 14",
+            ),
+            ({"worlds": [None, TINY]}, "world 'tiny' has no free start"),
+        )
+    ),
+]
+NEW_WORLD_RESET: Rows = [
+    ({"seed": seed, "options": {"worlds": [None, TINY]}}, "world 'tiny' has no")
+    for seed in (None, 5)
+]
+ONE_STEP: Rows = [
+    ({"action": [math.nan, 0.0]}, "actions must not hold NaN"),
+    ({"action": [0.0]}, r"action must have shape \(2,\), got \(1,\)"),
+]
+MANY_STEP: Rows = [
+    ({"actions": np.array([[0.0, math.nan], [0, 0]])}, r"not hold NaN, got some for robots \[0\]"),
+    ({"actions": np.zeros(2)}, r"actions must have shape \(2, 2\), got \(2,\)"),
+    *(
+        ({"actions": np.ones((2, 2)), "only": only}, "only must be a NumPy array of 2 bool")
+        for only in ([True, False], np.ones(3, dtype=np.bool_), np.ones(2))
+    ),
+]
+NEW_WORLDS = {"world": "rooms", "episodes_per_world": 2, "max_goal_distance": 20.0}
+CALLS: list[tuple[Callable[..., Any], str, Rows]] = [
+    (one, "reset", ONE_RESET),
+    (partial(one, **ROOMS_TASK), "reset", ROOMS_RESET),
+    (many, "reset", MANY_RESET),
+    (partial(many, **NEW_WORLDS), "reset", NEW_WORLD_RESET),
+    (one, "step", ONE_STEP),
+    (many, "step", MANY_STEP),
+]
+
+
+@pytest.mark.parametrize(
+    ("make", "method", "arguments", "message"),
+    [(make, method, *row) for make, method, rows in CALLS for row in rows],
+)
+def test_after_a_rejected_call_an_environment_goes_on_as_before(
+    make: Callable[..., Any], method: str, arguments: Mapping[str, Any], message: str
+) -> None:
+    env, twin = make(), make()
+    action = np.ones(env.action_space.shape)
+    for each in (env, twin):
+        each.reset(seed=0)
+        each.step(action)
+    with pytest.raises(ValueError, match=message):
+        getattr(env, method)(**arguments)
+    if isinstance(env, NavigationEnv):
+        assert env.np_random_seed == 0
+    for _ in range(2):
+        np.testing.assert_array_equal(env.step(action)[0], twin.step(action)[0])
+    for _ in range(3):
+        np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])

@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
 
-from mpfa_envs import ROOMS_TASK, NavigationEnv, VectorNavigationEnv, World, generate_world
+from mpfa_envs import ROOMS_TASK, NavigationEnv, VectorNavigationEnv, generate_world
 from mpfa_envs.generators import generator_tasks
 from mpfa_envs.sensing.observation import INFO_TYPES
 
@@ -82,31 +82,6 @@ def test_an_episode_can_be_fixed(env: NavigationEnv) -> None:
     env.reset()
     assert env.world != world
     assert env.task != task
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"reset_mask": True}, "got 'reset_mask'"),
-        ({"world": "A", "goal": (4.0, 4.0)}, "start and goal, or neither"),
-        ({"start": (0.0, 0.0, 0.0), "goal": (4.0, 4.0)}, "world must be given"),
-        ({"world": "A", "start": (99.0, 0.0, 0.0), "goal": (4.0, 4.0)}, "99"),
-        ({"world": World(name="tiny", size=(0.8, 0.8))}, "world 'tiny' has no"),
-    ],
-)
-def test_bad_options_are_rejected_and_the_episode_goes_on(
-    env: NavigationEnv, options: dict[str, object], message: str
-) -> None:
-    env.reset(seed=0)
-    before = env.world, env.task
-    with pytest.raises(ValueError, match=message):
-        env.reset(seed=1, options=options)
-    assert (env.world, env.task) == before
-    assert env.np_random_seed == 0
-    env.step(ACTIONS[0])
-    following, _ = env.reset()
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.reset()[0], following)
 
 
 @pytest.mark.filterwarnings("ignore")
