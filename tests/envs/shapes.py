@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from mpfa_envs import Box, Cylinder, Polygon, World
+from mpfa_envs.worlds.occupancy import OccupancyGrid
 
 
 def random_shapes(
@@ -46,6 +47,18 @@ def _polygon(rng: np.random.Generator) -> Polygon:
             (x + r * math.cos(a), y + r * math.sin(a)) for r, a in zip(radii, angles, strict=True)
         )
     )
+
+
+def cells(shape: tuple[int, int] = (40, 30), seed: int = 0) -> np.ndarray:
+    """Some occupied cells with free ones at the sides."""
+    occupied = np.random.default_rng(seed).random(shape) < 0.06
+    occupied[[0, 1, -1], :] = False
+    occupied[:, [0, 1, -1]] = False
+    return occupied
+
+
+GRID = OccupancyGrid(cells(), 0.2)
+SCATTERED = World(name="map", size=GRID.size, occupancy=GRID)
 
 
 def inside(x: float, y: float, polygon: Polygon) -> bool:

@@ -25,6 +25,7 @@ from mpfa_envs.paths.field_loops import path_lengths
 from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
+from tests.envs.shapes import GRID, SCATTERED, cells
 
 GOOD = {
     "image": "map.pgm",
@@ -46,25 +47,13 @@ def write_map(folder, shades, **changes):
     return folder / "map.yaml"
 
 
-def cells(shape=(40, 30), share=0.06, seed=0):
-    """Some occupied cells with free ones at the sides."""
-    occupied = np.random.default_rng(seed).random(shape) < share
-    occupied[[0, 1, -1], :] = False
-    occupied[:, [0, 1, -1]] = False
-    return occupied
-
-
 @pytest.fixture(scope="module")
 def scattered():
     """The same room twice: with the cells of a map, and with a box for each."""
-    grid = OccupancyGrid(cells(), 0.2)
-    (half_x, half_y), side = (half / 2 for half in grid.size), grid.resolution
-    corners = np.argwhere(grid.occupied) * side - (half_x, half_y)
+    half, side = np.array(GRID.size) / 2, GRID.resolution
+    corners = np.argwhere(GRID.occupied) * side - half
     boxes = tuple(Box(x, y, x + side, y + side) for x, y in corners.tolist())
-    return (
-        World(name="map", size=grid.size, occupancy=grid),
-        World(name="boxes", size=grid.size, boxes=boxes),
-    )
+    return SCATTERED, World(name="boxes", size=GRID.size, boxes=boxes)
 
 
 def places(world, count, seed=1):
@@ -105,27 +94,6 @@ def test_rays_along_the_edges_of_cells_meet_the_cell_ahead():
     np.testing.assert_allclose(lidar.cast(0.25, 0.25, math.pi / 2).min(), 2.25)
 
 
-def test_one_robot_and_many_behave_alike_in_a_map(scattered):
-    world = scattered[0]
-    env = NavigationEnv(world=world, physics="kinematic", progress="shortest_path", history=1)
-    many = VectorNavigationEnv(
-        3, world=[world, WORLDS["B"]], physics="kinematic", progress="shortest_path", history=1
-    )
-    seen, info = env.reset(seed=7)
-    all_seen, infos = many.reset(seed=[7, 8, 9])
-    rng = np.random.default_rng(0)
-    for _ in range(80):
-        np.testing.assert_allclose(all_seen[0], seen, atol=1e-6)
-        for key, value in info.items():
-            assert infos[key][0] == pytest.approx(value, abs=1e-9), key
-        actions = rng.uniform(-1.0, 1.0, (3, 2)).astype(np.float32)
-        seen, _, terminated, truncated, info = env.step(actions[0])
-        all_seen, _, _, _, infos = many.step(actions)
-        if terminated or truncated:
-            break
-    assert info["sim_time"] > 0.5
-
-
 def test_robots_share_a_map_and_unused_maps_go(scattered):
     world = scattered[0]
     other = World(name="other", size=(4.0, 4.0), occupancy=OccupancyGrid(cells((20, 20)), 0.2))
@@ -140,23 +108,6 @@ def test_robots_share_a_map_and_unused_maps_go(scattered):
     arrays = env._batch.worlds.arrays
     assert arrays.grid_of.tolist() == [-1, 0, -1]
     assert arrays.grids.shapes.tolist() == [[20, 20]]
-
-
-def test_many_robots_go_on_in_a_map_to_the_bit(scattered):
-    def make():
-        return VectorNavigationEnv(
-            2, world=scattered[0], physics="kinematic", progress="shortest_path"
-        )
-
-    env, other = make(), make()
-    env.reset(seed=3)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 2, 2))
-    for action in actions[:7]:
-        env.step(action)
-    other.load_state_dict(env.state_dict())
-    for action in actions[7:]:
-        for one, two in zip(env.step(action)[:4], other.step(action)[:4], strict=True):
-            np.testing.assert_array_equal(one, two)
 
 
 def test_a_map_that_is_written_is_read_as_it_was(scattered, tmp_path):

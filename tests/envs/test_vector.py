@@ -21,12 +21,13 @@ from mpfa_envs import (
     Task,
     VectorNavigationEnv,
     World,
+    generate_world,
     navigation_reward,
 )
 from mpfa_envs.sensing.observation import INFO_TYPES
 from tests.envs.busy import BUSY, POLITE
 from tests.envs.plain_robot import PlainRobot
-from tests.envs.shapes import random_shapes
+from tests.envs.shapes import SCATTERED, random_shapes
 
 NAMES = ["A", "B", "D", "test"]
 ALL = RobotNoise(range_noise=0.03, dropout=0.05, slip=0.1, latency=2, drift=0.05)
@@ -103,6 +104,8 @@ def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
         {"world": [BUSY] * 4, "lidar": {"noise": 0.02}, "memory": "map"},
         {"world": [BUSY] * 4, "progress": "shortest_path"},
         {"world": [POLITE] * 4},
+        {"world": [SCATTERED, "B", SCATTERED, "A"], "progress": "shortest_path", "history": 1},
+        {"world": [generate_world("halls", 2)] * 4, "progress": "shortest_path"},
         {"physics": "wheels"},
         {"physics": "wheels", "world": [BUSY] * 4},
     ],
@@ -179,11 +182,11 @@ def test_a_robot_drives_among_any_shapes_as_in_plain_python(arguments: dict) -> 
     assert ends
 
 
-@pytest.mark.parametrize("world", ["A", BUSY], ids=["A", "busy"])
+@pytest.mark.parametrize("world", ["A", BUSY, "mixed"], ids=["A", "busy", "mixed"])
 def test_a_robot_has_the_same_episodes_whatever_their_number(world: object) -> None:
     seen = []
     for robots in (1, 3, 16):
-        env, rng = make(robots, world=world), np.random.default_rng(0)
+        env, rng = make(robots, world=world, max_steps=60), np.random.default_rng(0)
         rows = [env.reset(seed=5)[0][0]]
         for _ in range(80):
             actions = np.tile(drive(rng, 1), (robots, 1))

@@ -11,7 +11,6 @@ from mpfa_envs import (
     GENERATORS,
     WORLDS,
     Box,
-    NavigationEnv,
     Task,
     VectorNavigationEnv,
     World,
@@ -33,11 +32,14 @@ def names(env: VectorNavigationEnv, resets: int) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("env_id", GENERATOR_IDS)
-def test_every_generator_has_an_id(env_id: str) -> None:
+def test_every_generator_has_an_id_for_one_robot_or_many(env_id: str) -> None:
+    assert len(GENERATOR_IDS) == len(GENERATORS)
     env = gymnasium.make_vec(env_id, num_envs=3, physics="kinematic")
     observations, _ = env.reset(seed=0)
     kind = env_id.split("-")[1].lower()
     assert kind in GENERATORS
+    single = gymnasium.make(env_id, physics="kinematic")
+    assert len({single.reset(seed=seed) and single.unwrapped.world.name for seed in (0, None)}) == 2
     assert len({world.name for world in env.worlds}) == 3
     for world in env.worlds:
         assert world == resolve_world(world.name)
@@ -45,18 +47,6 @@ def test_every_generator_has_an_id(env_id: str) -> None:
         assert env.observation_space.contains(observations)
         observations, *_ = env.step(np.full((3, 2), 0.4, dtype=np.float32))
     env.close()
-
-
-@pytest.mark.parametrize("env_id", GENERATOR_IDS)
-def test_one_robot_drives_in_the_worlds_of_a_generator(env_id: str) -> None:
-    env = gymnasium.make(env_id, physics="kinematic")
-    names = {env.reset(seed=seed) and env.unwrapped.world.name for seed in (0, None)}
-    assert len(names) == 2
-    env.close()
-
-
-def test_there_is_an_id_for_each_generator() -> None:
-    assert {env_id.split("-")[1].lower() for env_id in GENERATOR_IDS} == set(GENERATORS)
 
 
 def test_each_episode_is_in_a_new_world() -> None:
@@ -80,15 +70,6 @@ def test_a_world_can_be_kept_for_some_episodes() -> None:
     assert env.tasks[0] not in tasks
 
 
-def test_a_robot_has_the_same_worlds_whatever_their_number() -> None:
-    rows = []
-    for robots in (1, 5):
-        env = make(robots, "mixed")
-        env.reset(seed=7)
-        rows.append([(row[0], env.tasks[0]) for row in names(env, 4)])
-    assert rows[0] == rows[1]
-
-
 def test_validation_worlds_are_others_than_those_of_training() -> None:
     env = make(4, "mazes", split="validation", difficulty=0.3)
     env.reset(seed=0)
@@ -104,28 +85,6 @@ def test_every_task_can_be_solved_at_the_collision_distance(kind: str) -> None:
         field = DistanceField(FreeGrid(world, distance=env.config.collision_distance), task.goal)
         assert 1.9 <= field.at(*task.start[:2]) <= 6.1
         assert world.clearance(*task.start[:2]) > env.config.collision_distance
-
-
-def test_a_robot_drives_a_generated_world_as_alone() -> None:
-    env = make(3, "halls", progress="shortest_path")
-    env.reset(seed=2)
-    singles = [
-        NavigationEnv(world=world, physics="kinematic", progress="shortest_path")
-        for world in env.worlds
-    ]
-    for single, task in zip(singles, env.tasks, strict=True):
-        single.reset(options=task._asdict())
-    running = np.ones(3, dtype=np.bool_)
-    for step in range(60):
-        actions = np.random.default_rng(step).uniform(-0.2, 1.0, (3, 2))
-        observations, rewards, terminated, *_ = env.step(actions, only=running)
-        for index in np.flatnonzero(running):
-            seen, reward, over, *_ = singles[index].step(actions[index])
-            # The bounds of the observation differ, the observation does not.
-            np.testing.assert_allclose(observations[index], seen, atol=1e-9)
-            assert rewards[index] == pytest.approx(reward, abs=1e-9)
-            assert terminated[index] == over
-        running &= ~terminated
 
 
 def test_a_world_without_a_task_is_replaced_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
 from tests.envs.busy import BUSY, POLITE, STANDING
-from tests.envs.shapes import random_shapes
+from tests.envs.shapes import SCATTERED, random_shapes
 
 
 def actions_of(step: int, robots: int) -> np.ndarray:
@@ -59,6 +59,7 @@ CASES: list[dict[str, Any]] = [
     {"world": "rooms", "noise": ALL, "memory": "map", "physics": "wheels"},
     {"world": [BUSY, FEW, STANDING], "lidar": {"noise": 0.02}},
     {"world": [POLITE]},
+    {"world": [SCATTERED], "progress": "shortest_path"},
 ]
 
 
