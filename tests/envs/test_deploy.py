@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ from mpfa_envs import NavigationEnv, RobotModel
 from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.exported import card, exported
+from tests.envs.process import run
 
 Recorded = tuple[Scan, tuple[float, float, float], tuple[float, float]]
 
@@ -161,20 +160,13 @@ def test_it_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:
     file = exported(tmp_path)
     others = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "numba", "scipy", "onnx")
     code = f"""
-import sys
-for name in {(*others, "yaml", "PIL", "networkx")}:
-    sys.modules[name] = None  # As where it is not installed.
 from mpfa_envs.deploy import Pilot, Scan
 pilot = Pilot.load({str(file)!r})
 pilot.begin((3.0, 1.0))
 print(pilot.decide(Scan(-3.1, 0.01, [2.0] * 620), (0.0, 0.0, 0.0), (0.0, 0.0)))
 """
-    path = {"PYTHONPATH": str(Path(mpfa_envs.__file__).parents[1])}
-    result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        check=True, capture_output=True, text=True, env=path,
-    )  # fmt: skip
-    assert result.stdout.startswith("Command(left=0.")
+    found = run(code, without=(*others, "yaml", "PIL", "networkx"), PYTHONWARNINGS="error")
+    assert found.startswith("Command(left=0.")
 
 
 def test_a_decision_takes_a_few_milliseconds_at_most(tmp_path: Path) -> None:

@@ -211,6 +211,7 @@ IN_A = partial(SAMPLE, WORLDS["A"], distance=0.3)
             lambda: DistanceField(FreeGrid(CLOSET, distance=0.2), (0.0, 0.0)),
             "grid must have a free cell, and 'closet' has none",
         ),
+        (partial(PathPlanner, WORLDS["A"], radius=0), "radius must be positive, got 0"),
         (partial(SAMPLE, WORLDS["A"]), "distance must be given for a world, got None"),
         (
             lambda: SAMPLE(FreeGrid(WORLDS["A"], distance=0.3), distance=0.2),

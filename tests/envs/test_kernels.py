@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import mpfa_envs
 from mpfa_envs import ROBOTS, WORLDS, Box, Lidar, TaskConfig, World
 from mpfa_envs.compiled import njit
 from mpfa_envs.robots.drives import KinematicDrives
 from mpfa_envs.worlds.batch import WorldBatch
 from mpfa_envs.worlds.clearance_loops import clearance_at
 from tests.envs.plain_robot import drive_arc, scan
+from tests.envs.process import run
 from tests.envs.shapes import distance, random_shapes
 
 MIXES = [
@@ -125,7 +121,6 @@ def test_a_world_replaces_another_whatever_their_sizes() -> None:
 
 
 def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
-    root = Path(mpfa_envs.__file__).parents[1]
     code = (
         "import numba\n"
         "real = numba.njit\n"
@@ -137,11 +132,7 @@ def test_a_function_is_compiled_where_nothing_can_be_cached() -> None:
         "from mpfa_envs.compiled import njit\n"
         "print(njit(lambda x: 2.0 * x)(3.0))\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
-    )
-    assert result.stdout == "6.0\n"
+    assert run(code) == "6.0\n"
 
 
 def test_a_division_by_zero_is_infinite_as_in_numpy() -> None:

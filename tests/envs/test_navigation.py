@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -12,7 +10,6 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-import mpfa_envs
 from mpfa_envs import (
     OBSERVATION,
     PAPER_TASK,
@@ -26,6 +23,7 @@ from mpfa_envs import (
 )
 from mpfa_envs.sensing.observation import INFO_TYPES
 from tests.envs.paper import paper_env
+from tests.envs.process import run
 
 STRAIGHT = {"start": (0.0, 0.0, 0.0), "goal": (2.98, 0.0)}
 
@@ -63,8 +61,6 @@ def test_every_id_passes_the_checker_without_a_warning(env_id: str, physics: str
 
 def test_without_pybullet_kinematics_drives_and_wheels_say_what_they_need() -> None:
     code = """
-import sys
-sys.modules["pybullet"] = None  # As where it is not installed.
 from mpfa_envs import NavigationEnv, evaluate
 ahead = lambda seen: [1.0, 1.0]
 assert len(evaluate(ahead, "B", episodes=2, physics="kinematic")) == 2
@@ -74,17 +70,10 @@ for make in (NavigationEnv, lambda: evaluate(ahead, "B", episodes=2)):
     except ImportError as error:
         print(error)
 """
-    result = subprocess.run(
-        [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=_path()
-    )
-    lines = result.stdout.splitlines()
+    lines = run(code, without=["pybullet"]).splitlines()
     assert len(lines) == 2
     assert all("Python 3.11 and earlier" in line for line in lines)
     assert all("physics='kinematic'" in line for line in lines)
-
-
-def _path() -> dict[str, str]:
-    return {"PYTHONPATH": str(mpfa_envs.EXAMPLE_WORLD.parents[3])}
 
 
 def test_the_same_seed_gives_the_same_bits_after_other_episodes(physics: str) -> None:
@@ -103,15 +92,8 @@ def test_the_first_step_is_the_same_bits_after_a_reset(physics: str) -> None:
 
 
 def test_the_same_seed_gives_the_same_bits_in_another_process(physics: str) -> None:
-    code = "import sys; from tests.envs.test_navigation import rolled; print(rolled(sys.argv[1]))"
-    result = subprocess.run(
-        [sys.executable, "-c", code, physics],
-        check=True,
-        capture_output=True,
-        text=True,
-        env=_path(),
-    )
-    assert result.stdout.split()[-1] == rolled(physics)
+    code = "from tests.envs.test_navigation import rolled; print(rolled(sys.argv[1]))"
+    assert run(code, physics).split()[-1] == rolled(physics)
 
 
 def test_environments_side_by_side_do_not_know_each_other(physics: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.speed.convex import convex_parts
-from mpfa_envs import Box, Cylinder, Lidar, Polygon, World
+from mpfa_envs import Box, Cylinder, Polygon, World
 from tests.envs.shapes import distance, inside
 
 DENTED = Polygon(((-2.0, -1.0), (1.5, -1.5), (0.5, 0.0), (2.0, 1.0), (-1.0, 2.0), (-0.5, 0.5)))
@@ -75,16 +75,3 @@ def test_arrays_hold_the_numbers_of_all_obstacles() -> None:
     assert [part.shape for part in empty] == [(2,), (0, 4), (0, 3), (0, 4), (0,)]
     for part in (*world.arrays[:4], *empty[:4]):
         assert part.dtype == np.float64 and part.flags.c_contiguous
-
-
-def test_in_a_polygon_all_ranges_are_zero() -> None:
-    lidar = Lidar(polygon_world(DENTED, OVERLAPPING))
-    for place in ((-0.8, 0.0), (0.5, -2.0), (0.2, 0.2)):
-        np.testing.assert_array_equal(lidar.cast(*place, 0.7), 0.0)
-
-
-def test_a_ray_along_an_edge_has_a_finite_range() -> None:
-    world = polygon_world(Polygon(((1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 1.0))))
-    with np.errstate(all="raise", under="ignore"):
-        ranges = Lidar(world, sectors=1, reduction="single").scan(0.0, 0.0, 0.0)
-    assert ranges == pytest.approx(1.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -16,6 +14,7 @@ from gymnasium.utils.play import PlayableGame
 
 from mpfa_envs import NavigationEnv, VectorNavigationEnv
 from mpfa_envs.scene.window import Window
+from tests.envs.process import run
 
 pygame = pytest.importorskip("pygame")
 
@@ -133,12 +132,13 @@ def test_gymnasium_can_play_it_by_keyboard() -> None:
     env.close()
 
 
-def test_triton_can_be_imported_after_a_window_was_opened() -> None:
+def test_triton_can_be_imported_after_a_window_was_opened(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pytest.importorskip("triton")
-    code = (
+    # Where there is neither screen nor setting, SDL picks a driver that renders in software.
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    run(
         "import numpy as np; from mpfa_envs.scene.window import Window\n"
         "window = Window('test', fps=30); window.show(np.zeros((9, 9, 3), np.uint8)); import triton"
     )
-    # Where there is neither screen nor setting, SDL picks a driver that renders in software.
-    env = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}
-    subprocess.run([sys.executable, "-c", code], check=True, env=env, capture_output=True)

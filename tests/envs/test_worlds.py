@@ -1,10 +1,7 @@
 from __future__ import annotations
 
 import math
-import os
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -12,6 +9,7 @@ import pytest
 from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, Walker, World
 from mpfa_envs.paths.planner import planner_for
 from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
+from tests.envs.process import run
 from tests.envs.shapes import distance
 
 
@@ -228,21 +226,15 @@ def test_a_world_of_lists_equals_one_of_tuples() -> None:
 
 def test_equal_worlds_have_one_hash_across_processes() -> None:
     code = (
-        "import pickle, sys\n"
+        "import pickle\n"
         "from mpfa_envs import Walker, World\n"
         "world = World(name='x', walkers=(Walker(),))\n"
         "hash(world)\n"
-        "sys.stdout.buffer.write(pickle.dumps(world))"
+        "print(pickle.dumps(world).hex())"
     )
     # Of the seeds one at least is not this process's own.
     for seed in "12":
-        out = subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            check=True,
-            env={**os.environ, "PYTHONHASHSEED": seed},
-        ).stdout
-        world = pickle.loads(out)
+        world = pickle.loads(bytes.fromhex(run(code, PYTHONHASHSEED=seed)))
         assert {World(name="x", walkers=(Walker(),)): 1}.get(world) == 1
 
 
