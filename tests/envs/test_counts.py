@@ -70,16 +70,3 @@ def test_a_seed_may_be_as_large_as_any() -> None:
     assert env.reset(seed=2**60)[1] == env.reset(seed=2**60)[1]
     assert VectorNavigationEnv(1, physics="kinematic").reset(seed=2**200)
     assert evaluation_pairs("A", 1, seed=2**200)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: DynamicWindow(memory="x"), "memory must be one of .*got 'x'"),
-    ],
-)
-def test_parts_that_observations_lack_are_rejected_by_their_readers(
-    call: Callable[[], object], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()

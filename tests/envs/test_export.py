@@ -37,31 +37,22 @@ def test_it_chooses_what_the_policy_chooses(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, policy(observations()), rtol=0, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_it_drives_a_hundred_tasks_to_the_same_results(tmp_path: Path) -> None:
+@pytest.mark.parametrize("episodes", [5, pytest.param(100, marks=pytest.mark.slow)])
+def test_it_drives_to_the_same_results(tmp_path: Path, episodes: int) -> None:
     policy = load_policy(SHIPPED)
     file = export_policy(policy, tmp_path / "policy.onnx")
     want, found = (
-        evaluate(each, "test", episodes=100, physics="kinematic")
+        evaluate(each, "test", episodes=episodes, physics="kinematic")
         for each in (policy, load_policy(file))
     )
     assert [ending(each) for each in found] == [ending(each) for each in want]
     # An action in ten thousand differs in its last bit.
     assert [each.path_length for each in found] == pytest.approx([e.path_length for e in want])
+    assert any(result.success for result in found)
 
 
 def ending(result: EpisodeResult) -> tuple[bool, bool, bool, float]:
     return result.success, result.collision, result.timeout, result.time_s
-
-
-def test_it_drives_to_the_same_results(tmp_path: Path) -> None:
-    policy = load_policy(SHIPPED)
-    file = export_policy(policy, tmp_path / "policy.onnx")
-    want, found = (
-        evaluate(each, "test", episodes=5, physics="kinematic")
-        for each in (policy, load_policy(file))
-    )
-    assert found == want and any(result.success for result in found)
 
 
 def test_scaled_actions_and_choices_are_the_same_too(tmp_path: Path) -> None:
@@ -169,22 +160,18 @@ def test_weights_that_lie_in_another_file_are_rejected(
 
 def test_a_missing_or_damaged_file_is_told(tmp_path: Path) -> None:
     file = exported(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no policy at"):
+        load_policy(tmp_path / "other.onnx")
+    file.write_bytes(b"no network")
+    with pytest.raises(PolicyFileError, match="is the card of another file"):
+        load_policy(file)
     card = tmp_path / "policy.json"
-    kept = card.read_text()
     for damaged in ("{", "[" * 100_000):
         card.write_text(damaged)
         with pytest.raises(PolicyFileError, match="is no card of a policy"):
             load_policy(file)
     card.unlink()
     with pytest.raises(FileNotFoundError, match="there is no card of the policy at"):
-        load_policy(file)
-    with pytest.raises(FileNotFoundError, match="there is no policy at"):
-        load_policy(tmp_path / "other.onnx")
-    file.write_bytes(b"no network")
-    card.write_text(kept)
-    digest = "b0c8c5be68b6b63e1a4aa4b4bd1b2f8bb41d17ee8bb5e0a3c2c1d8d8a24e0b47"
-    change_card(file, sha256=digest)
-    with pytest.raises(PolicyFileError, match="is the card of another file"):
         load_policy(file)
 
 

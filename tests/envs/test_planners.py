@@ -313,6 +313,7 @@ def test_a_policy_is_a_driver_that_sees_the_observation_alone() -> None:
         (partial(AntColony, evaporation=1.5), r"evaporation must be in \[0, 1\], got 1\.5"),
         (partial(AntColony, seed=-1), "seed must be an integer of at least 0, got -1"),
         (partial(AntColony, time_limit=0.0), r"time_limit must be positive, got 0\.0"),
+        (partial(DynamicWindow, memory="x"), "memory must be one of .*got 'x'"),
         (partial(DynamicWindow, samples=1), "samples must be an integer of at least 2, got 1"),
         (partial(DynamicWindow, length=0.0), r"length must be positive, got 0\.0"),
         (partial(DynamicWindow, acceleration=-1.0), r"acceleration must be positive, got -1\.0"),

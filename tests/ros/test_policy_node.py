@@ -77,21 +77,23 @@ def feed(node: Any, world: World, time: float, frame: str = "odom") -> tuple[flo
     return world.sent[-1]
 
 
-def driving(module: Any, world: World, frame: str = "odom") -> Any:
-    """A node on its way."""
-    node = module.PolicyNode()
+def begin(node: Any, world: World, frame: str = "odom") -> None:
+    """Have a node drive to a goal."""
     node._on_odometry(odometry(10.0))
     node._on_goal(goal(frame))
     assert feed(node, world, 10.0) == DRIVES
+
+
+def driving(module: Any, world: World, frame: str = "odom") -> Any:
+    """A node on its path."""
+    node = module.PolicyNode()
+    begin(node, world, frame)
     return node
 
 
 def test_it_stops_the_robot_when_it_dies_of_an_exception(module: Any, world: World) -> None:
     def spin(node: Any) -> None:
-        node._on_odometry(odometry(10.0))
-        node._on_goal(goal("odom"))
-        node._on_scan(scan(10.0))
-        assert world.sent[-1] == DRIVES
+        begin(node, world)
         raise RuntimeError("a bad message")
 
     world.spin = spin
@@ -103,9 +105,7 @@ def test_it_stops_the_robot_when_it_dies_of_an_exception(module: Any, world: Wor
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_it_stops_the_robot_when_it_is_told_to_end(module: Any, world: World, name: str) -> None:
     def spin(node: Any) -> None:
-        node._on_odometry(odometry(10.0))
-        node._on_goal(goal("odom"))
-        assert feed(node, world, 10.0) == DRIVES
+        begin(node, world)
         signal.raise_signal(getattr(signal, name))
 
     world.spin = spin
