@@ -53,10 +53,3 @@ def test_a_held_action_cannot_pass_through_an_obstacle() -> None:
     *_, terminated, _, info = env.step([1.0, 1.0])
     assert terminated and info["collision"]
     assert info["min_clearance"] > -0.05
-
-
-def test_the_time_limit_counts_time_steps() -> None:
-    env = make_env(4, max_steps=10)
-    over = [env.step([-1.0, -1.0])[3] for _ in range(3)]
-    assert over == [False, False, True]
-    assert len(env.trail) == 11

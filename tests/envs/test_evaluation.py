@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,10 @@ def steer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def circle(observation: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.broadcast_to(np.array([-1.0, 1.0]), (*observation.shape[:-1], 2))
+
+
+def evaluated(policy: Any = steer, **arguments: Any) -> object:
+    return evaluate(policy, **{"world": "A", "physics": "kinematic", **arguments})
 
 
 def steering_policy(**env_arguments: object) -> Policy:
@@ -94,11 +100,6 @@ def test_outcomes_sum_to_one_and_times_count_successes_alone() -> None:
     assert sum(summary[k].value for k in ("success", "collision", "timeout")) == 1.0
     assert summary["time_s"].value == 10.0
     assert summary["spl"].value == pytest.approx(0.375)
-
-
-def test_no_results_are_rejected() -> None:
-    with pytest.raises(ValueError, match="results must hold at least one episode"):
-        summarize([])
 
 
 @pytest.mark.parametrize(
@@ -227,39 +228,48 @@ def test_walkers_and_noise_of_a_task_ignore_the_other_tasks() -> None:
     assert [found.path_length for found in some] == [found.path_length for found in alone[3:]]
 
 
-@pytest.mark.parametrize("name", ["bars", "bars:train", "bras:test"])
-def test_a_name_without_tasks_is_rejected(name: str) -> None:
-    with pytest.raises(ValueError, match=f"world must be .*got '{name}'"):
-        world_tasks(name)
-
-
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("call", "message"),
     [
-        ({"episodes": 0}, "episodes must be a positive integer, got 0"),
-        ({"envs_at_once": 1.5}, r"envs_at_once must be a positive integer, got 1\.5"),
-        ({"world": "tets"}, "world must be .*did you mean 'test'"),
-        ({"world": ["A", "tets"]}, "world must be .*did you mean 'test'"),
-        ({"physics": "magic"}, "physics must be one of .*got 'magic'"),
+        *(
+            (partial(world_tasks, name), f"world must be .*got '{name}'")
+            for name in ("bars", "bars:train", "bras:test")
+        ),
+        (partial(evaluated, episodes=0), "episodes must be a positive integer, got 0"),
+        (
+            partial(evaluated, envs_at_once=1.5),
+            "envs_at_once must be a positive integer, got 1.5",
+        ),
+        (partial(evaluated, world="tets"), "world must be .*did you mean 'test'"),
+        (partial(evaluated, world=["A", "tets"]), "world must be .*did you mean 'test'"),
+        (partial(evaluated, physics="magic"), "physics must be one of .*got 'magic'"),
+        # A policy of one observation is asked for two.
+        (
+            partial(evaluated, lambda _: np.zeros(2), episodes=2, envs_at_once=2),
+            r"shape \(2, 2\) for observations of shape \(2, 24\)",
+        ),
+        *(
+            (
+                partial(evaluated, lambda _, action=action: action, episodes=1),
+                r"policy must give an action of shape \(2,\) .*got array",
+            )
+            for action in (np.ones(1), np.ones((1, 2)), np.float64(1.0))
+        ),
+        *(
+            (
+                partial(run_tasks, steer, world_tasks("A", episodes=1), **{name: value}),
+                f"{name} must be left to the tasks",
+            )
+            for name, value in (("world", "B"), ("num_envs", 3), ("autoreset_mode", "next_step"))
+        ),
+        (partial(summarize, []), "results must hold at least one episode"),
     ],
 )
-def test_a_bad_argument_is_named_with_its_value(arguments: dict[str, object], message: str) -> None:
+def test_a_bad_argument_or_action_is_named_with_its_value(
+    call: Callable[[], object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
-        evaluate(steer, **{"physics": "kinematic", **arguments})
-
-
-def test_the_error_for_a_policy_of_one_observation_names_the_remedy() -> None:
-    def single(observation: NDArray[np.float32]) -> NDArray[np.float64]:
-        return np.zeros(2)
-
-    with pytest.raises(ValueError, match=r"shape \(2, 2\) for observations of shape \(2, 24\)"):
-        evaluate(single, "A", episodes=2, physics="kinematic", envs_at_once=2)
-
-
-@pytest.mark.parametrize("action", [np.ones(1), np.ones((1, 2)), np.float64(1.0)])
-def test_a_single_action_is_two_numbers(action: NDArray[np.float64]) -> None:
-    with pytest.raises(ValueError, match=r"policy must give an action of shape \(2,\) .*got array"):
-        evaluate(lambda _: action, "A", episodes=1, physics="kinematic")
+        call()
 
 
 def test_an_undrivable_task_is_named_before_any_is_driven() -> None:
@@ -274,12 +284,6 @@ def test_an_undrivable_task_is_named_before_any_is_driven() -> None:
     with pytest.raises(ValueError, match=r"task \d+, in world 'bars-test-\d+': (goal|start) must"):
         run_tasks(count, tasks, robot=wide, physics="kinematic")
     assert driven == 0
-
-
-def test_arguments_that_the_tasks_decide_are_rejected() -> None:
-    for name, value in (("world", "B"), ("num_envs", 3), ("autoreset_mode", "next_step")):
-        with pytest.raises(ValueError, match=f"{name} must be left to the tasks"):
-            run_tasks(steer, world_tasks("A", episodes=1), **{name: value})
 
 
 def test_no_tasks_have_no_results() -> None:

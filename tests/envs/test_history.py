@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mpfa_envs import Mirror, NavigationEnv, VectorNavigationEnv, make_navigation_env
+from mpfa_envs import Mirror, NavigationEnv, VectorNavigationEnv
 from mpfa_envs.sensing.observation import observation_slices
 
 NAMES = ["B", "D"]
@@ -57,9 +57,3 @@ def test_the_mirror_turns_each_scan_around() -> None:
         assert image[first : first + 18].equal(observation[first : first + 18].flip(0))
     assert image[18:24].equal(Mirror().observation(observation[:24])[18:24])
     assert Mirror(history=3).observation(image).equal(observation)
-
-
-def test_torchrl_has_room_for_the_earlier_scans() -> None:
-    env = make_navigation_env("B", num_envs=2, physics="kinematic", history=2, seed=0)
-    assert env.rollout(3)["observation"].shape == (2, 3, 24 + 2 * 18)
-    env.close()

@@ -10,7 +10,6 @@ from mpfa_envs import (
     WORLDS,
     Lidar,
     NavigationEnv,
-    NavigationTorchEnv,
     RobotNoise,
     Task,
     VectorNavigationEnv,
@@ -46,18 +45,6 @@ def test_without_noise_nothing_is_added(noise):
     assert env.config.noise == RobotNoise()
     assert env._batch.noise is None
     assert not env.lidar.is_noisy
-
-
-def test_only_a_state_of_other_noise_is_rejected():
-    env = VectorNavigationEnv(1, noise=ALL, **KINEMATIC)
-    quiet = VectorNavigationEnv(1, **KINEMATIC)
-    env.reset(seed=0)
-    quiet.reset(seed=0)
-    with pytest.raises(ValueError, match="noise = None"):
-        quiet.load_state_dict(env.state_dict())
-    state = quiet.state_dict()
-    del state["arguments"]["noise"]
-    quiet.load_state_dict(state)
 
 
 def test_late_actions_are_those_that_were_told_before():
@@ -144,14 +131,6 @@ def test_a_seed_has_its_noise():
     one, again, other = (drive(ALL, actions, seed=seed)[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, again)
     assert not np.array_equal(one, other)
-
-
-def test_torchrl_takes_noise_by_name():
-    env = NavigationTorchEnv(num_envs=2, noise={"latency": 1, "slip": 0.1}, **KINEMATIC)
-    assert env.env.config.noise == RobotNoise(latency=1, slip=0.1)
-    env.set_seed(0)
-    assert env.rollout(4)["next", "observation"].isfinite().all()
-    env.close()
 
 
 def test_twice_the_noise_is_twice_each():

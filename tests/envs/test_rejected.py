@@ -26,13 +26,17 @@ from mpfa_envs import (
     VectorNavigationEnv,
     Walker,
     World,
+    evaluate,
     make_navigation_env,
+    world_tasks,
 )
 from mpfa_envs.deploy import Pilot
+from mpfa_envs.generators import generator_tasks, split_worlds
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 from mpfa_envs.sensing.binning import Binning
-from tests.envs.exported import card
+from mpfa_envs.tasks.sampling import evaluation_pairs
+from tests.envs.exported import card, make_policy
 
 Rows = list[tuple[Mapping[str, Any], str]]
 
@@ -231,6 +235,65 @@ def test_a_bad_argument_is_named_with_its_value(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         make(**arguments)
+
+
+def of_a_policy(**env_arguments: Any) -> object:
+    """The evaluation of a policy whose file asks for these arguments."""
+    return evaluate(make_policy(**env_arguments), "A", episodes=1, physics="kinematic")
+
+
+def evaluated(**arguments: Any) -> object:
+    return evaluate(ahead, "A", **{"episodes": 1, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("make", "count"),
+    [
+        (many, "num_envs"),
+        (torchrl, "num_envs"),
+        (partial(torchrl, parallel=True), "num_envs"),
+        (evaluated, "episodes"),
+        (evaluated, "envs_at_once"),
+        (partial(world_tasks, "bars:test"), "episodes"),
+        (partial(evaluation_pairs, "A", seed=0), "n"),
+        (partial(split_worlds, "bars", "test"), "count"),
+        (partial(generator_tasks, "bars", "test"), "tasks"),
+        (one, "max_steps"),
+        (one, "action_repeat"),
+        (Mirror, "sectors"),
+        (RobotNoise, "latency"),
+        (partial(Lidar, WORLDS["A"]), "rays_per_sector"),
+        (of_a_policy, "history"),
+        (of_a_policy, "max_steps"),
+    ],
+)
+def test_a_count_beyond_bounds_is_rejected_at_once(make: Callable[..., object], count: str) -> None:
+    with pytest.raises(ValueError, match=rf"^{count} must be at most 1000*, got [0-9]+$"):
+        make(**{count: 2**31})
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "arguments"),
+    [
+        ("count", partial(generator_tasks, "bars", "test"), {"worlds": 2**31}),
+        (r"sectors \* rays_per_sector", partial(Lidar, WORLDS["A"]), {"sectors": 99_999}),
+        (r"sectors \* history", of_a_policy, {"history": 99_999}),
+        ("sectors", of_a_policy, {"lidar": {"sectors": 2**31}}),
+        ("latency", of_a_policy, {"noise": {"latency": 2**31}}),
+    ],
+)
+def test_counts_that_multiply_or_lie_within_are_bounded_too(
+    name: str, make: Callable[..., object], arguments: Mapping[str, Any]
+) -> None:
+    with pytest.raises(ValueError, match=rf"^{name} must be at most 1000*, got [0-9]+$"):
+        make(**arguments)
+
+
+def test_a_seed_may_be_as_large_as_any() -> None:
+    env = one()
+    assert env.reset(seed=2**60)[1] == env.reset(seed=2**60)[1]
+    assert many().reset(seed=2**200)
+    assert evaluation_pairs("A", 1, seed=2**200)
 
 
 TINY = World(name="tiny", size=(0.8, 0.8))

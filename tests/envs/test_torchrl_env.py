@@ -20,7 +20,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from mpfa_envs import NavigationEnv, NavigationTorchEnv, make_navigation_env
+from mpfa_envs import NavigationEnv, NavigationTorchEnv, RobotNoise, make_navigation_env
 from mpfa_envs.sensing.observation import INFO_TYPES
 from mpfa_envs.tasks.sampling import evaluation_pairs
 
@@ -197,12 +197,15 @@ def test_info_keys_choose_what_is_handed_on() -> None:
     assert "info" not in bare.reset()
 
 
-def test_the_specs_hold_in_the_worlds_of_a_generator() -> None:
-    env = make_navigation_env(
-        "mixed", num_envs=3, physics="kinematic", progress="shortest_path", max_steps=20, seed=0
-    )
+def test_the_specs_hold_in_generated_worlds_with_history_and_noise() -> None:
+    noise = {"latency": 1, "slip": 0.1}
+    task = {"progress": "shortest_path", "max_steps": 20, "history": 2, "noise": noise}
+    env = make_navigation_env("mixed", num_envs=3, physics="kinematic", seed=0, **task)
     check_env_specs(env)
+    assert env.env.config.noise == RobotNoise(**noise)
     rollout = env.rollout(30, break_when_any_done=False)
+    assert rollout["observation"].shape == (3, 30, 24 + 2 * 18)
+    assert rollout["observation"].isfinite().all()
     assert rollout["next", "done"].sum() >= 6
     assert len({world.name for world in env.env.worlds}) == 3
 

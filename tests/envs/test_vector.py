@@ -160,7 +160,7 @@ def test_a_robot_drives_among_any_shapes_as_in_plain_python(arguments: dict) -> 
         world = random_shapes(rng, boxes=3, cylinders=4, polygons=3)
         if world.clearance(0.0, 0.0) > 0.5 and world.clearance(3.0, 2.0) > 0.5:
             worlds.append(world)
-    env = make(6, world=worlds, **{**arguments, "detour_chance": 0.0, "max_steps": 90})
+    env = make(6, world=worlds, **{**arguments, "detour_chance": 0.0, "max_steps": 89})
     seen, _ = env.reset(seed=0)
     plain = [
         PlainRobot(world, task, env.config) for world, task in zip(worlds, env.tasks, strict=True)

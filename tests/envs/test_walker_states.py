@@ -52,12 +52,3 @@ def test_a_map_is_shown_no_walker_by_a_noisy_lidar_either() -> None:
         met += int(hits.sum())
     assert met > 300
     assert seen < 0.02 * met  # A thousandth is beyond three deviations.
-
-
-def test_a_bad_state_is_rejected_before_anything_changes() -> None:
-    batch = WalkerBatch(WorldBatch([HALL]), radius=0.18, time_step=0.1)
-    batch.begin(0, start_walkers(HALL, (15.0, 15.0), np.random.default_rng(0)))
-    before = batch.of(0)
-    with pytest.raises(ValueError, match="states of the state must be finite"):
-        batch.read(batch_with([np.nan, 0.0, 1.0, 0.0]), [HALL])
-    np.testing.assert_array_equal(batch.of(0), before)

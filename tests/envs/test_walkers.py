@@ -211,17 +211,18 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
 def test_a_state_of_other_walkers_is_rejected_and_changes_nothing() -> None:
     env = VectorNavigationEnv(1, world=BUSY, physics="kinematic")
     env.reset(seed=1)
-    before, state = env.walkers(0), env.state_dict()
-    targets = state["batch"]["walkers"]["targets"]
-    targets[targets > 0] = 3  # A round of three ends at 2.
+    state = env.state_dict()
     env.reset(seed=2)
-    before = env.walkers(0)
-    with pytest.raises(ValueError, match="targets of the state must be numbers"):
-        env.load_state_dict(state)
-    del state["batch"]["walkers"]["states"]
-    with pytest.raises(ValueError, match="states of the state must have rows for 6 walkers"):
-        env.load_state_dict(state)
-    np.testing.assert_array_equal(env.walkers(0), before)
+    before, walkers = env.walkers(0), state["batch"]["walkers"]
+    for name, bad, message in (
+        ("targets", np.where(walkers["targets"] > 0, 3, 0), "targets of the state must be numbers"),
+        ("states", np.full_like(walkers["states"], np.nan), "states of the state must be finite"),
+        ("states", None, "states of the state must have rows for 6 walkers"),
+    ):
+        state["batch"]["walkers"] = {**walkers, name: bad}
+        with pytest.raises(ValueError, match=message):
+            env.load_state_dict(state)
+        np.testing.assert_array_equal(env.walkers(0), before)
 
 
 def test_the_walkers_of_a_robot_that_waits_stand_still() -> None:

@@ -13,18 +13,6 @@ from tests.envs.process import run
 from tests.envs.shapes import distance
 
 
-def test_clearance_is_the_distance_to_the_nearest_face() -> None:
-    world = World(
-        name="two", boxes=(Box(1.0, 1.0, 2.0, 2.0),), cylinders=(Cylinder(-2.0, 0.0, 0.5),)
-    )
-    assert world.clearance(0.0, 1.5) == pytest.approx(1.0)
-    assert world.clearance(0.4, 0.2) == pytest.approx(1.0)
-    assert world.clearance(-1.0, 0.0) == pytest.approx(0.5)
-    assert world.clearance(4.9, -3.0) == pytest.approx(0.1)
-    assert world.clearance(1.5, 1.5) == 0.0
-    assert world.clearance(6.0, 0.0) == pytest.approx(-1.0)
-
-
 def around(count: int, turn: float = 1.0) -> tuple[tuple[float, float], ...]:
     """Corners on a circle, each turned from the one before [rad]."""
     return tuple((math.cos(i * turn), math.sin(i * turn)) for i in range(count))
