@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -95,23 +94,6 @@ def test_a_planner_has_the_tables_and_pictures_of_a_policy(
     assert f"\n{name}, physics: kinematic\n" in shown and "plan_ms" in shown
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "give either the path of a trained policy or --policy"),
-        (["runs/demo", "--policy", "dwa"], "give either the path of a trained policy or --policy"),
-        (["--policy", "astar", "--memory", "map"], "--memory map is for --policy dwa alone"),
-        (["--policy", "dwb"], "invalid choice: 'dwb'"),
-    ],
-)
-def test_a_command_line_names_a_policy_or_a_planner(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        evaluate.main(arguments)
-    assert message in capsys.readouterr().err
-
-
 def test_several_worlds_have_a_row_each_and_a_total(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,17 +160,6 @@ def test_an_evaluation_names_its_physics_and_another_physics_leaves_its_results(
     ]
 
 
-def test_a_folder_in_use_is_refused_in_one_sentence(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = run / "evaluation-A-kinematic"
-    with files.lock(folder), pytest.raises(SystemExit) as caught:
-        evaluate.main([str(run), "--worlds", "A", "--episodes", "1", "--no-pictures"])
-    assert caught.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"evaluate.py: another process is using {folder}")
-
-
 def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> None:
     words = ["bars:validation", "mazes:validation", "D"]
     summary = evaluate.main([str(run), "--worlds", *words, "--episodes", "20"])
@@ -247,36 +218,6 @@ def test_the_policy_that_comes_with_the_project_reaches_its_goals(
     summary = evaluate.main([str(SHIPPED), *arguments])
     assert summary["success"].iloc[0] == 1.0
     assert (tmp_path / "runs/evaluation-td3-mpfa_per/evaluation-A-kinematic/episodes.csv").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--worlds", "Q"], "got 'Q'"),
-        (["--worlds", "rooms:9-3"], "rooms:9-3 ends before it begins"),
-        (["--worlds", "A", "A"], "world 'A' is named twice"),
-        (["--episodes", "0"], "--episodes must be at least 1, got 0"),
-        (["--seed", "-1"], "--seed must be at least 0, got -1"),
-    ],
-)
-def test_a_wrong_command_line_is_refused(
-    run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        evaluate.main([str(run), *arguments])
-    assert message in capsys.readouterr().err
-
-
-def test_a_damaged_policy_is_refused_by_its_name(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    shutil.copy(SHIPPED, run / "policy.npz")
-    content = bytearray((run / "policy.npz").read_bytes())
-    content[len(content) // 2] ^= 1
-    (run / "policy.npz").write_bytes(content)
-    with pytest.raises(SystemExit):
-        evaluate.main([str(run)])
-    assert "policy.npz" in capsys.readouterr().err
 
 
 def test_worlds_and_their_label_agree() -> None:

@@ -53,19 +53,3 @@ def test_a_quantized_file_is_written_with_how_it_drives(tmp_path: Path) -> None:
     export.main([str(SHIPPED), "--output", str(file), "--episodes", "1", "--quantize"])
     assert json.loads((tmp_path / "small.json").read_text())["precision"] == "int8"
     assert load_policy(file).observation_size == 24
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["nothing.npz"], "there is no policy at nothing.npz"),
-        ([str(SHIPPED), "--output", "policy.pt"], "--output must end in .onnx, got policy.pt"),
-        ([str(SHIPPED), "--episodes", "-1"], "--episodes must be at least 0, got -1"),
-    ],
-)
-def test_a_wrong_command_line_is_refused(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        export.main(words)
-    assert message in capsys.readouterr().err

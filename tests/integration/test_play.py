@@ -99,14 +99,6 @@ def test_a_player_may_leave(capsys: pytest.CaptureFixture[str]) -> None:
     assert "you 0, policy 0" in capsys.readouterr().out
 
 
-def test_a_player_is_told_of_what_is_not_there(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        play.main([str(tmp_path / "none.npz")])
-    assert "there is no policy at" in capsys.readouterr().err
-
-
 def test_episodes_are_watched_to_their_ends() -> None:
     task = straight_task()
     ended = list(watch(constant(1.0, 1.0), [task] * 2, speed=100.0))

@@ -312,26 +312,6 @@ def test_a_signal_lets_the_run_that_is_under_way_end_and_begins_no_other(
     assert begun == ["Pendulum-v1-uniform-100"]
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (["--tasks", "Pendulum-v0"], "unknown task 'Pendulum-v0': did you mean 'Pendulum-v1'?"),
-        (["--methods", "perr"], "unknown method 'perr': did you mean 'per'?"),
-        (["--seeds", "-1"], "seed must be from 0 to 9999, got -1"),
-        (["--seeds", "1", "1"], "--seeds has 1 twice"),
-        (["--jobs", "0"], "--jobs must be at least 1, got 0"),
-        (["--actions", "0"], "actions must be an integer from 1 to 2147483647, got 0"),
-        (["--actions", "10"], "actions must be a multiple of 4, got 10"),
-    ],
-)
-def test_what_cannot_be_is_refused(
-    wrong: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        script.parse(["--tasks", "Pendulum-v1", *wrong])
-    assert message in capsys.readouterr().err
-
-
 def test_a_task_whose_engine_is_missing_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -49,11 +49,3 @@ def test_the_animation_of_the_readme_is_small_enough_for_a_page() -> None:
 def test_words_of_13_pixels_can_be_read_in_a_column_of_690(path: Path) -> None:
     with Image.open(path) as picture:
         assert 13 * min(690 / picture.width, 1) > 10.5
-
-
-def test_a_picture_of_a_critic_needs_a_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        pictures.main(["values", "--output", str(tmp_path)])
-    assert "values needs --run, the folder of a run" in capsys.readouterr().err

@@ -289,9 +289,6 @@ def test_runs_that_are_kept_are_not_made_again(
     assert set(rows.curves[["arm", "seed"]].itertuples(index=False, name=None)) == {
         (f"s/ddpg/{method}", seed) for method in ("per", "uniform") for seed in (100, 101)
     }
-    with pytest.raises(SystemExit):
-        study.main(["--kept", str(small / "three")])
-    assert "three: no rows of the study are there" in capsys.readouterr().err
 
 
 def test_the_parts_of_a_study_that_are_left_have_the_missing_runs_and_no_others() -> None:
@@ -348,19 +345,3 @@ def test_what_is_left_is_told_by_the_time_that_runs_took(small: Path) -> None:
     assert counts([*wanted, elsewhere]) == (0, 4)
     more = hours_left([*wanted, elsewhere], jobs=1)
     assert more is not None and 3 * 1030 < 3600 * more < 3 * 1030 + 300
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (["X"], "there is no table X; there are: C, D, E, A, B"),
-        (["--seeds", "0"], "--seeds must be at least 1, got 0"),
-        (["--jobs", "0"], "--jobs must be at least 1, got 0"),
-    ],
-)
-def test_what_there_is_not_is_refused(
-    wrong: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        study.main(wrong)
-    assert message in capsys.readouterr().err

@@ -95,12 +95,6 @@ def test_the_bars_of_a_figure_are_as_high_as_what_they_count(tmp_path: Path) -> 
         assert ratio == pytest.approx(counted[kind] / counted[KINDS[0]], rel=0.05)
 
 
-def test_an_unknown_method_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["prr"])
-    assert "unknown method 'prr': did you mean 'per'?" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_method_has_a_page_with_its_source_and_a_figure_unless_it_is_uniform(
     name: str,

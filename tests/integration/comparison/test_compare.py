@@ -344,14 +344,6 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(
     assert set(read_table(tmp_path / files.EPISODES)["method"]) == {"uniform"}
 
 
-def test_two_comparisons_do_not_work_in_one_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with files.lock(tmp_path):
-        assert compare.main(comparison(tmp_path)) == 2
-    assert f"another process is using {tmp_path}" in capsys.readouterr().err
-
-
 def test_defaults_of_a_comparison_give_way_to_its_command_line() -> None:
     assert with_defaults(["tracking=offline"]) == ["evaluation.every=5000", "tracking=offline"]
 
@@ -363,40 +355,3 @@ def test_an_arm_gives_way_to_nothing_and_keeps_what_is_in_brackets_together() ->
     assert arm.over(["robots=2", "learner.gamma=0.5"]) == ["robots=2", *arm.settings]
     group = parse_arm("a:curriculum=A")
     assert group.over(["curriculum.carry=false", "robots=2"]) == ["robots=2", "curriculum=A"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--methods", "pre"], "unknown method 'pre'"),
-        (["--learners", "ddgp"], "unknown learner 'ddgp'"),
-        (["--jobs", "0"], "--jobs must be at least 1, got 0"),
-        (["--seeds", "0", "0"], "--seeds has 0 twice"),
-        (["--methods", "per", "per"], "--methods has per twice"),
-        (["--worlds", "test", "test"], "world 'test' is named twice"),
-        (["--worlds", "tset"], "did you mean"),
-        (["--arm", "a:", "--arm", "a:robots=2"], "--arm has a twice"),
-        (["--arm", "robots=2"], "--arm robots=2: must be NAME:SETTING=VALUE"),
-        (["--arm", "a/b:robots=2"], "with a NAME of letters, digits"),
-        (["--arm", "a:robtos=2"], "unknown setting 'robtos': did you mean 'robots'?"),
-        (["--arm", "a:method.alpha=0.5,0.6"], "--arm a:method.alpha=0.5,0.6: '0.6' is not NAME="),
-        (["--arm", "a:seed=3"], "seed is what the comparison gives each run"),
-        (["--", "learner=td3"], "learner is what the comparison gives each run"),
-        (["--", "robtos=2"], "unknown setting 'robtos'"),
-        (["--physics", "magic"], "invalid choice: 'magic'"),
-    ],
-)
-def test_a_wrong_command_line_is_refused(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        compare.main(arguments)
-    assert message in capsys.readouterr().err
-
-
-def test_a_setting_that_cannot_be_is_refused_before_anything_is_trained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert compare.main([*comparison(tmp_path), "learner.gamma=2"]) == 2
-    assert "compare.py: learner.gamma must be in [0, 1]" in capsys.readouterr().err
-    assert not (tmp_path / "ddpg-mpfa_per-0").exists()

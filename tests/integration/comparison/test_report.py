@@ -143,25 +143,9 @@ def test_two_comparisons_of_one_name_have_the_runs_of_both(
     }
 
 
-def test_a_comparison_is_not_counted_twice(
-    comparison: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        report.main([str(comparison), f"{comparison}/../{comparison.name}"])
-    assert "is named twice: its runs count once" in capsys.readouterr().err
-
-
 def test_the_figures_may_go_elsewhere(comparison: Path, tmp_path: Path) -> None:
     assert report.main([str(comparison), "--output", str(tmp_path / "images")]) == 0
     assert (tmp_path / "images" / "evaluations.png").exists()
-
-
-def test_a_folder_without_rows_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        report.main([str(tmp_path)])
-    assert "no episodes.csv with rows" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("tables_alone")

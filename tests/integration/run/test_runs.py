@@ -282,24 +282,6 @@ def exit_status(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
     return caught.value.code
 
 
-def test_a_wrong_setting_is_one_line_and_exit_status_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_status(monkeypatch, f"run_dir={tmp_path / 'run'}", "learner.gamma=2") == 2
-    assert capsys.readouterr().err == "train.py: learner.gamma must be in [0, 1], got 2.0\n"
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("option", ["-m", "--multirun"])
-def test_a_sweep_has_no_run_dir(
-    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert exit_status(monkeypatch, option, "seed=0,1", "run_dir=mine") == 2
-    assert "the folder hydra.sweep.dir=FOLDER" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_run_of_a_sweep_has_one_folder_though_a_value_is_a_path() -> None:
     with initialize_config_module("training.settings", version_base="1.3"):
         words = ["seed=1", "tracking.group=a/b"]

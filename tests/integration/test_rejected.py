@@ -14,8 +14,10 @@ import pytest
 import compare
 import evaluate
 import export
+import play
 import report
 import train
+from training import files
 
 POLICY = str(Path(__file__).parents[2] / "examples/policies/td3-mpfa_per.npz")
 A_FILE = r"file cannot be a folder, as .*file is a file: name another one"
@@ -27,6 +29,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("x")
     (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and no more")
+    flipped = bytearray(Path(POLICY).read_bytes())
+    flipped[len(flipped) // 2] ^= 1
+    (tmp_path / "flipped.npz").write_bytes(flipped)
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "damaged.yaml").write_text("room: [1, 2\n")
     contents = {
@@ -63,6 +68,9 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (train.main, "run_dir=file", A_FILE),
         (train.main, "run_dir=file/run", r"file/run cannot be a folder, as .*file is a file"),
         (train.main, "run_dir=", "run_dir must not be empty, got ''"),
+        (train.main, "-m seed=0,1 run_dir=mine", "the folder hydra.sweep.dir=FOLDER"),
+        (train.main, "--multirun seed=0,1 run_dir=mine", "the folder hydra.sweep.dir=FOLDER"),
+        (train.main, "learner.gamma=2", r"^train.py: learner.gamma must be in \[0, 1\], got 2.0$"),
         (train.main, f"seed={2**62}", f"seed must be from 0 to 4294967295, got {2**62}"),
         (train.main, "tracking.project=", "tracking.project must not be empty, got ''"),
         (train.main, "tracking.group=", "tracking.group must be a word of at most 128 letters"),
@@ -77,30 +85,62 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
             r"curriculum.stages\[0\].world: damaged.yaml:2: is not YAML",
         ),
         (evaluate.main, "", "give either the path of a trained policy or --policy"),
+        (evaluate.main, f"{POLICY} --policy dwa", "give either the path of a trained policy or"),
+        (evaluate.main, "--policy astar --memory map", "--memory map is for --policy dwa alone"),
+        (evaluate.main, "--policy dwb", "invalid choice: 'dwb'"),
         (evaluate.main, "nowhere", "nowhere"),
         (evaluate.main, "rows", "rows"),
         (evaluate.main, "damaged.npz", "damaged.npz"),
+        (evaluate.main, "flipped.npz", "flipped.npz"),
         (evaluate.main, "other.npz", "other.npz"),
         (evaluate.main, f"{POLICY} --output file", A_FILE),
         (evaluate.main, f"{POLICY} --worlds damaged.yaml", "damaged.yaml:2: is not YAML"),
         (evaluate.main, f"{POLICY} --worlds rooms:5-2", "rooms:5-2 ends before it begins"),
         (evaluate.main, f"{POLICY} --worlds rooms:1-999999999", "at most 10000 worlds"),
+        (evaluate.main, f"{POLICY} --worlds Q", "got 'Q'"),
+        (evaluate.main, f"{POLICY} --worlds A A", "world 'A' is named twice"),
+        (evaluate.main, f"{POLICY} --episodes 0", "--episodes must be at least 1, got 0"),
+        (evaluate.main, f"{POLICY} --seed -1", "--seed must be at least 0, got -1"),
         (evaluate.main, f"{POLICY} --noise slop=1", "slop"),
         (compare.main, "--folder file", A_FILE),
-        (compare.main, "--methods pr", "did you mean 'per'"),
-        (compare.main, "--worlds nowhere", "nowhere"),
+        (compare.main, "--methods pr", "unknown method 'pr': did you mean 'per'"),
+        (compare.main, "--methods per per", "--methods has per twice"),
+        (compare.main, "--learners ddgp", "unknown learner 'ddgp'"),
+        (compare.main, "--jobs 0", "--jobs must be at least 1, got 0"),
+        (compare.main, "--seeds 0 0", "--seeds has 0 twice"),
+        (compare.main, "--worlds test test", "world 'test' is named twice"),
+        (compare.main, "--worlds tset", "did you mean"),
+        (compare.main, "--physics magic", "invalid choice: 'magic'"),
+        (compare.main, "--arm a: --arm a:robots=2", "--arm has a twice"),
+        (compare.main, "--arm robots=2", "--arm robots=2: must be NAME:SETTING=VALUE"),
+        (compare.main, "--arm a/b:robots=2", "with a NAME of letters, digits"),
+        (compare.main, "--arm a:robtos=2", r"unknown setting 'robtos': did you mean 'robots'\?"),
+        (compare.main, "--arm a:method.alpha=1,2", "--arm a:method.alpha=1,2: '2' is not NAME="),
+        (compare.main, "--arm a:seed=3", "seed is what the comparison gives each run"),
+        (compare.main, "-- learner=td3", "learner is what the comparison gives each run"),
+        (compare.main, "-- robtos=2", "unknown setting 'robtos'"),
+        (
+            compare.main,
+            "--folder study --methods uniform --seeds 0 -- learner.gamma=2",
+            r"^compare.py: learner.gamma must be in \[0, 1\]",
+        ),
         (
             compare.main,
             "--folder study --methods per --seeds 0",
             "settings.json is damaged: remove it, and the run is made anew",
         ),
         (report.main, "nowhere", "nowhere: no episodes.csv with rows, which compare.py writes"),
+        (report.main, "study", "study: no episodes.csv with rows, which compare.py writes"),
+        (report.main, "run study/../run", "is named twice: its runs count once"),
         (report.main, "rows", "episodes.csv is damaged, its rows cannot be read"),
         (report.main, "bytes", "episodes.csv is damaged, its rows cannot be read"),
         (report.main, "nothing", "episodes.csv is damaged, its rows cannot be read"),
-        (report.main, "run", "has no column learner: name the folder of a study"),
+        (report.main, "run", "has no column learner: name the folder of a comparison"),
         (report.main, "run --output file", A_FILE),
+        (play.main, "nothing.npz", "there is no policy at nothing.npz"),
+        (export.main, "nothing.npz", "there is no policy at nothing.npz"),
         (export.main, "damaged.npz", "damaged.npz"),
+        (export.main, f"{POLICY} --episodes -1", "--episodes must be at least 0, got -1"),
         (export.main, f"{POLICY} --output file/policy.onnx", f"--output: {A_FILE}"),
         (export.main, f"{POLICY} --output rows", "--output must end in .onnx, got rows"),
     ],
@@ -132,7 +172,7 @@ def test_a_wrong_command_line_is_one_sentence_and_status_2(
         (compare.main, "--physics wheels"),
     ],
 )
-def test_without_pybullet_simulated_wheels_are_refused_before_anything_has_begun(
+def test_without_pybullet_wheels_are_rejected_before_anything_has_begun(
     main: Callable[..., object],
     line: str,
     folder: Path,
@@ -147,6 +187,29 @@ def test_without_pybullet_simulated_wheels_are_refused_before_anything_has_begun
     said = capsys.readouterr().err.splitlines()[-1]
     assert "physics='wheels' needs PyBullet" in said, said
     assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("main", "line"),
+    [
+        (train.main, "run_dir=out"),
+        (evaluate.main, f"{POLICY} --output out"),
+        (compare.main, "--folder out"),
+    ],
+)
+def test_a_folder_in_use_is_rejected(
+    main: Callable[..., object],
+    line: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", [f"{main.__module__}.py", *line.split()])
+    with files.lock(folder / "out"):
+        assert status_of(main, line.split()) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert re.match(rf"{main.__module__}.py: another process is using .*out", said), said
+    assert [path.name for path in (folder / "out").iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize("script", ["train", "evaluate", "compare", "report"])

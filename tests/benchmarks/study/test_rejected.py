@@ -10,28 +10,43 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.study import cliffwalk, paper_report, report, run, sampling
+from benchmarks.study import cliffwalk, paper_report, pictures, report, run, sampling
 from benchmarks.study.gym import script as gym
 
 ROOT = Path(__file__).parents[3]
 A_FILE = r"file cannot be a folder, as .*file is a file: name another one"
+GYM = "--tasks Pendulum-v1"
 
 
 @pytest.mark.parametrize(
     ("main", "line", "message"),
     [
-        (run.main, "Z", "there is no table Z"),
+        (run.main, "Z", "there is no table Z; there are: C, D, E, A, B"),
+        (run.main, "--seeds 0", "--seeds must be at least 1, got 0"),
+        (run.main, "--jobs 0", "--jobs must be at least 1, got 0"),
+        (run.main, "--kept new", "new: no rows of the study are there, which --keep writes"),
         (run.main, "C --folder file", A_FILE),
         (run.main, "C --keep file", A_FILE),
         (report.main, "folder --output file", A_FILE),
         (report.main, "a b", "unrecognized arguments: b"),
         (paper_report.main, "folder --output file", A_FILE),
         (paper_report.main, "folder --seeds 0", "--seeds must be at least 1, got 0"),
+        (gym.main, "--tasks Pendulum-v0", r"'Pendulum-v0': did you mean 'Pendulum-v1'\?"),
+        (gym.main, f"{GYM} --methods perr", r"unknown method 'perr': did you mean 'per'\?"),
+        (gym.main, f"{GYM} --seeds -1", "seed must be from 0 to 9999, got -1"),
+        (gym.main, f"{GYM} --seeds 1 1", "--seeds has 1 twice"),
+        (gym.main, f"{GYM} --jobs 0", "--jobs must be at least 1, got 0"),
+        (gym.main, f"{GYM} --actions 0", "actions must be an integer from 1 to 2147483647, got 0"),
+        (gym.main, f"{GYM} --actions 10", "actions must be a multiple of 4, got 10"),
         (gym.main, "--actions 400", "actions must be at least .*, 1000, got 400"),
-        (cliffwalk.main, "--lengths 1", "--lengths"),
+        (cliffwalk.main, "--lengths 1", "--lengths: .*length"),
+        (cliffwalk.main, "--lengths a", "--lengths"),
+        (cliffwalk.main, "--seeds 0", "--seeds must be at least 1, got 0"),
+        (cliffwalk.main, "--eps -1", "--eps must be positive and finite, got -1"),
         (cliffwalk.main, "--eps inf", "--eps must be positive and finite, got inf"),
         (cliffwalk.main, "--output file", f"--output: {A_FILE}"),
-        (sampling.main, "pr", "did you mean 'per'"),
+        (pictures.main, "values --output new", "values needs --run, the folder of a run"),
+        (sampling.main, "pr", r"unknown method 'pr': did you mean 'per'\?"),
         (sampling.main, "per --output file", f"--output: {A_FILE}"),
     ],
 )
