@@ -192,17 +192,13 @@ def test_the_code_of_a_page_runs_in_its_order(page: str) -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("seed", range(1, 7))
-def test_pieces_on_the_page_on_sequences_are_of_one_trajectory_each(seed: int) -> None:
+def test_pieces_and_sums_on_the_page_on_sequences_are_of_one_trajectory(seed: int) -> None:
     torch.manual_seed(seed)
     names = run("howto/sequences.md", {"seed=0": f"seed={seed}"})
     for _ in range(10):
         pieces = names["slices"].sample().reshape(-1, 8)
         assert pieces["next", "observation"][:, :-1].equal(pieces["observation"][:, 1:])
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_steps_that_are_summed_on_the_page_on_sequences_are_of_one_trajectory() -> None:
-    stored = run("howto/sequences.md", {})["buffer"][:]
+    stored = names["buffer"][:]
     place = torch.arange(stored.shape[1]) % 20  # Of the twenty steps of a rollout.
     assert bool((place + stored["steps_to_next_obs"] <= 20).all())
 

@@ -133,34 +133,40 @@ def test_the_replay_parts_import_torch_and_torchrl_and_little_else():
     assert {name: more for name, more in found.items() if more} == {}
 
 
-def test_the_navigation_task_does_not_know_the_replay_parts():
-    assert not importers(TASKS, {"torchrl_mpfa"})
+MESSAGES = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_msgs", "tf2_ros"}
 
 
-def test_only_the_simulation_and_its_comparison_import_pybullet():
-    users = importers(EVERYTHING, {"pybullet", "pybullet_utils"})
-    assert {user for user in users if not user.startswith("tests/")} == {
-        "benchmarks/speed/bullet_world.py",
-        "envs/mpfa_envs/robots/simulation.py",
-    }
+@pytest.mark.parametrize(
+    ("packages", "files"),
+    [
+        (
+            {"pybullet", "pybullet_utils"},
+            {"benchmarks/speed/bullet_world.py", "envs/mpfa_envs/robots/simulation.py"},
+        ),
+        ({"wandb"}, {"examples/training/run/tracking.py"}),
+        (
+            {"rclpy", *MESSAGES},
+            {"envs/mpfa_envs/ros/policy_node.py", "envs/mpfa_envs/ros/robot_node.py"},
+        ),
+    ],
+)
+def test_an_optional_package_is_imported_by_few_files(packages, files):
+    users = importers(EVERYTHING, packages)
+    assert {user for user in users if not user.startswith("tests/")} == files
 
 
-def test_only_the_tracking_of_the_training_application_imports_wandb():
-    users = importers(EVERYTHING, {"wandb"})
-    assert {user for user in users if not user.startswith("tests/")} == {
-        "examples/training/run/tracking.py"
-    }
-
-
-def test_nothing_imports_the_benchmarks():
-    users = importers(EVERYTHING, {"benchmarks"})
-    assert {user.split("/")[0] for user in users} == {"benchmarks", "tests"}
-
-
-def test_the_benchmarks_import_no_script():
-    scripts = {path.stem for path in (ROOT / "examples").glob("*.py")}
-    users = importers(EVERYTHING, scripts)
-    assert {user.split("/")[0] for user in users} == {"examples", "tests"}
+@pytest.mark.parametrize(
+    ("modules", "folders"),
+    [
+        ({"torchrl_mpfa"}, {"torchrl_mpfa", "examples", "benchmarks", "tests"}),
+        ({path.stem for path in (ROOT / "examples").glob("*.py")}, {"examples", "tests"}),
+        ({"benchmarks"}, {"benchmarks", "tests"}),
+        # The source root of the navigation task is no package.
+        ({"envs"}, set()),
+    ],
+)
+def test_parts_are_imported_by_those_that_come_after_them(modules, folders):
+    assert {user.split("/")[0] for user in importers(EVERYTHING, modules)} == folders
 
 
 def test_the_training_application_s_folders_import_those_that_come_before_them():
@@ -176,15 +182,6 @@ def test_the_training_application_s_folders_import_those_that_come_before_them()
         modules = {node.module or "" for node in nodes_of(path) if isinstance(node, ast.ImportFrom)}
         found = {name.split(".")[1] for name in modules if name.startswith("training.")}
         assert found & set(allowed) <= allowed[place] | {place}, name_of(path)
-
-
-def test_only_the_nodes_import_rclpy():
-    messages = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_msgs", "tf2_ros"}
-    users = importers(EVERYTHING, {"rclpy", *messages})
-    assert {user for user in users if not user.startswith("tests/")} == {
-        "envs/mpfa_envs/ros/policy_node.py",
-        "envs/mpfa_envs/ros/robot_node.py",
-    }
 
 
 def test_no_file_puts_folders_on_the_path():
@@ -210,7 +207,3 @@ def test_no_package_file_asserts_what_a_user_gives():
 def test_no_file_is_named_after_nothing():
     nothing = {"utils", "util", "common", "helpers", "helper", "misc"}
     assert not [name_of(path) for path in EVERYTHING if path.stem in nothing]
-
-
-def test_the_source_root_of_the_tasks_is_not_imported_as_a_package():
-    assert not importers(EVERYTHING, {"envs"})

@@ -136,58 +136,41 @@ def test_tests_and_doctests_run_once_when_checks_are_asked_for(
     assert tests.split(" -m pytest ")[1].split() == both.split()
 
 
-@pytest.mark.parametrize("program", [SHIM_THAT_FAILS, TOO_OLD])
-def test_a_given_python_that_does_not_fit_is_refused_in_one_line(copy: Path, program: str) -> None:
-    add_program(copy / "bin" / "python3.11", PRETENDER)
-    add_program(copy / "python", program)
-    done = make(copy, "PYTHON=./python", "demo")
-    assert done.returncode != 0
-    line, *rest = done.stderr.splitlines()
-    assert "PYTHON=./python is not a Python 3.10 or later" in line
-    assert "make PYTHON=/path/to/python3.11 demo" in line
-    assert all("Error" in other for other in rest), done.stderr  # That make stops, no more.
-    assert pip_calls(copy) == []
-
-
-def test_without_a_python_that_fits_one_line_says_the_way_out(copy: Path) -> None:
-    for name, program in (("python3.11", SHIM_THAT_FAILS), ("python3", TOO_OLD)):
+@pytest.mark.parametrize(
+    ("programs", "words", "chosen", "said"),
+    [
+        # A shim that fails is passed over, and a later Python taken if there is no other.
+        ({"python3.11": SHIM_THAT_FAILS, "python3": PRETENDER}, ["bench"], "python3", ""),
+        ({"python3": LATER, "python": PRETENDER}, ["test"], "python", ""),
+        ({"python3": LATER}, ["test"], "python3",
+         "python3 is later than Python 3.11, so that there is no PyBullet"),
+        ({"python3": LATER}, ["PYTHON=python3", "test"], "python3", "no PyBullet"),
+        *(
+            ({"python3.11": PRETENDER, "given": given}, ["PYTHON=given", "demo"], None,
+             "PYTHON=given is not a Python 3.10 or later")
+            for given in (SHIM_THAT_FAILS, TOO_OLD)
+        ),
+        ({"python3.11": SHIM_THAT_FAILS, "python3": TOO_OLD}, ["test"], None,
+         "no Python 3.10 or later found"),
+    ],
+)  # fmt: skip
+def test_a_python_that_fits_is_chosen_or_one_line_says_the_way_out(
+    copy: Path, programs: dict[str, str], words: list[str], chosen: str | None, said: str
+) -> None:
+    for name, program in programs.items():
         add_program(copy / "bin" / name, program)
-    done = make(copy, "test")
-    assert done.returncode != 0
-    line, *rest = done.stderr.splitlines()
-    assert "no Python 3.10 or later found" in line
-    assert "make PYTHON=/path/to/python3.11 test" in line
-    assert all("Error" in other for other in rest), done.stderr
-
-
-def test_a_shim_that_fails_is_passed_over(copy: Path) -> None:
-    add_program(copy / "bin" / "python3.11", SHIM_THAT_FAILS)
-    add_program(copy / "bin" / "python3", PRETENDER)
-    done = make(copy, "bench")
-    assert done.returncode == 0, done.stderr
-    assert "making .venv with python3\n" in done.stdout
-
-
-def test_a_later_python_is_taken_if_there_is_no_other_and_its_lack_is_told(copy: Path) -> None:
-    add_program(copy / "bin" / "python3", LATER)
-    done = make(copy, "test")
-    assert done.returncode == 0, done.stderr
-    assert "making .venv with python3\n" in done.stdout
-    (line,) = done.stderr.splitlines()
-    assert "python3 is later than Python 3.11, so that there is no PyBullet" in line
-    shutil.rmtree(copy / ".venv")
-    done = make(copy, "PYTHON=python3", "test")
-    assert done.returncode == 0, done.stderr
-    assert "no PyBullet" in done.stderr
-
-
-def test_an_earlier_python_goes_before_a_later_one(copy: Path) -> None:
-    add_program(copy / "bin" / "python3", LATER)
-    add_program(copy / "bin" / "python", PRETENDER)
-    done = make(copy, "test")
-    assert done.returncode == 0, done.stderr
-    assert "making .venv with python\n" in done.stdout
-    assert "PyBullet" not in done.stderr
+    done = make(copy, *words)
+    line, *rest = done.stderr.splitlines() or [""]
+    assert said in line
+    if chosen:
+        assert done.returncode == 0, done.stderr
+        assert f"making .venv with {chosen}\n" in done.stdout
+        assert bool(line) == bool(said) and not rest
+    else:
+        assert done.returncode != 0
+        assert f"make PYTHON=/path/to/python3.11 {words[-1]}" in line
+        assert all("Error" in other for other in rest), done.stderr  # That make stops, no more.
+        assert pip_calls(copy) == []
 
 
 def test_the_install_happens_once_and_again_when_the_project_file_changed(copy: Path) -> None:
@@ -211,7 +194,7 @@ def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: P
     add_program(copy / "bin" / "python3.11", PRETENDER)
     other = LATER.replace("/somewhere 3.11", "/somewhere 3.12")
     add_program(copy / "bin" / "python3.12", other)
-    for program, calls, anew in (
+    for program, calls, again in (
         ("python3.12", 1, True),
         ("python3.12", 1, False),
         ("python3.11", 2, True),
@@ -220,10 +203,10 @@ def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: P
         done = make(copy, f"PYTHON={program}", "test")
         assert done.returncode == 0, done.stderr
         assert len(pip_calls(copy)) == calls
-        assert (f"making .venv with {program}\n" in done.stdout) == anew
-    refused = make(copy, "PYTHON=/nonexistent", "test")
-    assert refused.returncode != 0
-    assert "PYTHON=/nonexistent is not a Python" in refused.stderr
+        assert (f"making .venv with {program}\n" in done.stdout) == again
+    rejected = make(copy, "PYTHON=/nonexistent", "test")
+    assert rejected.returncode != 0
+    assert "PYTHON=/nonexistent is not a Python" in rejected.stderr
 
 
 @pytest.mark.parametrize(

@@ -47,13 +47,6 @@ def test_its_make_targets_exist() -> None:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
-def test_its_files_exist() -> None:
-    links = re.findall(r"\]\(([^)#]+)\)", README)
-    scripts = re.findall(r"examples/\w+\.py", README)
-    for path in [*(link for link in links if "://" not in link), *scripts]:
-        assert (ROOT / path).exists(), path
-
-
 def test_no_line_is_longer_than_a_page_is_wide() -> None:
     assert [line for line in README.splitlines() if len(line) > 120] == []
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from hydra.core.config_store import ConfigStore
 
 from training.records import write_table
+from training.settings.train import register
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -18,7 +20,15 @@ def one_store() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         # What is loaded from the store is a copy in any case.
         patch.setattr(ConfigStore, "__deepcopy__", lambda store, _: store, raising=False)
+        register()
         yield
+
+
+@pytest.fixture(autouse=True)
+def denormal_numbers() -> Iterator[None]:
+    """Keep denormal numbers, which scripts treat as zero, for the tests that come after."""
+    yield
+    torch.set_flush_denormal(False)
 
 
 @pytest.fixture

@@ -25,7 +25,6 @@ import torchrl_trainer
 from benchmarks.speed import environment, scaling, worlds
 from benchmarks.study.__main__ import COMMANDS
 from training.settings.command_line import parse_overrides
-from training.settings.train import register
 from training.worlds import parse_worlds
 
 ROOT = Path(__file__).parents[2]
@@ -121,7 +120,6 @@ def test_every_command_on_the_pages_is_understood(
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parsed)
     monkeypatch.setattr(sys, "argv", [])
-    register()
     found = commands()
     assert len(found) > 100
     wrong = {}

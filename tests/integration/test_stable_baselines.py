@@ -44,7 +44,7 @@ def test_the_last_observation_of_an_episode_is_told_and_a_timeout_is_one() -> No
     robots.close()
 
 
-def test_another_mode_is_refused() -> None:
+def test_another_mode_raises() -> None:
     with pytest.raises(ValueError, match=r"env must have AutoresetMode\.SAME_STEP, got"):
         stable_baselines.Robots(VectorNavigationEnv(1, physics="kinematic"))
 

@@ -167,7 +167,7 @@ def test_the_guard_of_the_configuration_names_a_silent_stepper() -> None:
         trainer.train()
 
 
-def test_a_storage_without_signals_is_refused_by_name() -> None:
+def test_a_storage_without_signals_is_rejected_by_name() -> None:
     with pytest.raises(Exception, match=r"storage must keep signals.*got LazyTensorStorage"):
         tiny("storage=lazy_tensor")
 

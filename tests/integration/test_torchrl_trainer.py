@@ -198,7 +198,7 @@ def test_the_values_for_the_log_keep_no_graph() -> None:
     assert not any(value.requires_grad for value in seen[0].values())
 
 
-def test_a_stepper_that_cannot_be_wrapped_is_refused() -> None:
+def test_a_stepper_that_cannot_be_wrapped_raises() -> None:
     with pytest.raises(TypeError, match="stepper must be an OptimizationStepper, got str"):
         PriorityStepper("step")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="must not update priorities itself, got PriorityStepper"):
@@ -207,7 +207,7 @@ def test_a_stepper_that_cannot_be_wrapped_is_refused() -> None:
         PriorityStepper(Forgetful())
 
 
-def test_a_step_without_a_replay_buffer_is_refused_before_it_is_taken() -> None:
+def test_a_step_without_a_replay_buffer_raises_before_it_is_taken() -> None:
     with pytest.raises(ValueError, match="replay_buffer of the trainer must not be None"):
         PriorityStepper().step(SimpleNamespace(loss_module=None), None)
 

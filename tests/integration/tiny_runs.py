@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
+import torch
+
+from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.settings.train import (
     GROUPS,
@@ -56,13 +61,62 @@ def tiny(
     return settings
 
 
+def blocky(block: int, method: str = "rud") -> TrainSettings:
+    """Three robots, whose updates come in blocks after so many actions."""
+    settings = tiny(method, [Stage("A", actions=120)], robots=3, updates=2)
+    settings.method.batch_size, settings.method.update_block = 16, block
+    return settings
+
+
+def weights_of(policy: torch.nn.Module) -> torch.Tensor:
+    return torch.cat([each.detach().reshape(-1).clone() for each in policy.parameters()])
+
+
 def rows(run: TrainingRun) -> list[dict[str, object]]:
     return [{k: v for k, v in asdict(r).items() if k != "seconds"} for r in run.records]
 
 
-def train(folder: Path, settings: TrainSettings) -> TrainingRun:
+def train(
+    folder: Path,
+    settings: TrainSettings,
+    look: Callable[[TrainingRun], object] = lambda run: None,
+    *,
+    state: dict[str, Any] | None = None,
+) -> TrainingRun:
+    """Train to the end, or until ``look`` stops it after an iteration."""
     folder.mkdir(parents=True, exist_ok=True)
-    run = TrainingRun(settings, folder)
-    run.train()
+    run = TrainingRun(settings, folder, state)
+    run.train(lambda: look(run))
     run.close()
     return run
+
+
+def stop_after(actions: int, folder: Path, settings: TrainSettings) -> TrainingRun:
+    run = train(folder, settings, lambda run: run.actions >= actions and run.stop.ask())
+    assert actions <= run.actions < actions + settings.robots
+    assert not run.schedule.finished
+    return run
+
+
+def go_on(folder: Path, settings: TrainSettings) -> TrainingRun:
+    """Train on from the checkpoint of a folder, to the end."""
+    run = train(folder, settings, state=read_checkpoint(folder))
+    assert run.schedule.finished
+    return run
+
+
+def assert_same_run(resumed: TrainingRun, whole: TrainingRun) -> None:
+    """Assert the same episodes, networks, random numbers, priorities and signals, bit by bit."""
+    assert rows(resumed) == rows(whole)
+    assert resumed.actions == whole.actions
+    networks = [run.learner.state_dict()["loss"] for run in (resumed, whole)]
+    assert networks[0].keys() == networks[1].keys()
+    assert all(networks[0][name].equal(networks[1][name]) for name in networks[0])
+    mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()
+    assert torch.equal(mine["_rng"][0], other["_rng"][0])
+    if "_sum_tree" in other["_sampler"]:
+        assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
+    if "_signals" in other["_storage"]:
+        signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
+        # NaN marks what is not known yet.
+        torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)

@@ -320,7 +320,7 @@ def test_a_task_whose_engine_is_missing_says_what_to_install(
         task_of("Reacher-v5")
 
 
-def test_a_regime_that_never_learns_is_refused() -> None:
+def test_a_regime_that_never_learns_raises() -> None:
     with pytest.raises(ValueError, match="first_actions must be at least batch_size, 256, got 8"):
         Regime(first_actions=8)
 

@@ -10,7 +10,6 @@ from threading import Thread
 from typing import Any
 
 import pytest
-import torch
 
 import compare
 from tests.integration.comparison.test_compare import InThisProcess, assert_same_rows, comparison
@@ -64,7 +63,6 @@ def test_a_comparison_loses_a_machine_and_gives_the_rows_of_one_machine(
     arguments.remove(cluster.address)
     monkeypatch.setattr(execution, "Child", InThisProcess)
     assert compare.main(arguments) == 0
-    torch.set_flush_denormal(False)
     assert_same_rows(tmp_path / "ray", tmp_path / "serial")
     kept = json.loads((tmp_path / "ray" / files.SETTINGS).read_text())
     assert set(kept["runs"]) == {"ddpg-mpfa_per-0", "ddpg-uniform-0"}

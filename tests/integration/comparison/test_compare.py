@@ -8,11 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-import torch
 
 import compare
 import evaluate
@@ -26,7 +25,6 @@ from training.records import read_table
 from training.run import running
 from training.run.running import Refused, resume, start
 from training.settings.command_line import composed
-from training.settings.train import register
 
 EPISODES = "curriculum.stages=[{{world: A, episodes: {}}}]"
 
@@ -65,17 +63,15 @@ class InThisProcess:
 
 
 @pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(execution, "Child", InThisProcess)
     monkeypatch.setattr(execution, "_PAUSE", 0.0)
     # A picture of a run takes longer than the two episodes of one.
     monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
-    yield
-    torch.set_flush_denormal(False)
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_comparison_keeps_every_episode_and_refuses_other_settings(
+def test_a_comparison_keeps_every_episode_and_rejects_other_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare.main(comparison(tmp_path)) == 0
@@ -98,14 +94,14 @@ def test_a_comparison_keeps_every_episode_and_refuses_other_settings(
     assert checkpoint.stat().st_mtime_ns == before
     assert "2 runs, 2 of them done" in capsys.readouterr().out
 
-    # Other settings: refused by name, nothing touched.
+    # Other settings: rejected by name, nothing touched.
     other = [*comparison(tmp_path, methods=("mpfa_per",)), "method.alpha=0.9"]
     assert compare.main(other) == 2
     message = capsys.readouterr().err
     assert "ddpg-mpfa_per-0 was trained with method.alpha=0.6, asked for is 0.9" in message
     assert checkpoint.stat().st_mtime_ns == before
 
-    # Trained anew only if asked to; other pairs are driven without training.
+    # Trained again only if asked to; other pairs are driven without training.
     assert compare.main([*comparison(tmp_path, "--anew", methods=("mpfa_per",)), other[-1]]) == 0
     assert json.loads((checkpoint.parent / files.SETTINGS).read_text())["method"]["alpha"] == 0.9
     before = checkpoint.stat().st_mtime_ns
@@ -131,7 +127,6 @@ def test_a_comparison_keeps_every_episode_and_refuses_other_settings(
 def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
     setting: str, matters: bool, tmp_path: Path
 ) -> None:
-    register()
     job = Job("ddpg", "per", 0, tmp_path)
     job.path.mkdir()
     many = [*OVERRIDES, "robots=4", EPISODES.format(1)]

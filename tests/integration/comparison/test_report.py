@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,24 +35,35 @@ def test_the_tables_say_what_the_rows_say(
         assert picture.width == 840
 
 
+def tables_of(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame]) -> str:
+    """The tables of a comparison whose rows are changed before."""
+    write_table(change(pd.read_csv(folder / "episodes.csv")), folder / "episodes.csv")
+    assert report.main([str(folder)]) == 0
+    return (folder / "tables.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.usefixtures("tables_alone")
-def test_random_worlds_have_tables_of_their_own(comparison: Path) -> None:
-    rows = pd.read_csv(comparison / "episodes.csv")
-    rooms = rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))
-    write_table(pd.concat([rows, rooms]), comparison / "episodes.csv")
-    report.main([str(comparison)])
-    test, random = (comparison / "tables.md").read_text(encoding="utf-8").split("## rooms")
-    assert LINE in test
-    assert LINE in random
+def test_random_worlds_and_other_physics_have_tables_of_their_own(comparison: Path) -> None:
+    def in_rooms_too(rows: pd.DataFrame) -> pd.DataFrame:
+        return pd.concat([rows, rows.assign(world=["rooms-5", "rooms-3"] * (len(rows) // 2))])
+
+    test, random = tables_of(comparison, in_rooms_too).split("## rooms")
+    assert LINE in test and LINE in random
+
+    def on_wheels_too(rows: pd.DataFrame) -> pd.DataFrame:
+        rows = rows.query("world == 'test'")
+        return pd.concat([rows.assign(physics=each) for each in ("wheels", "kinematic")])
+
+    text = tables_of(comparison, on_wheels_too)
+    assert text.index("## test, wheels") < text.index("## test, kinematic")
+    assert text.count(LINE) == 2
 
 
+@pytest.mark.usefixtures("tables_alone")
 def test_the_arms_of_a_comparison_have_rows_of_their_own(comparison: Path) -> None:
-    rows = pd.read_csv(comparison / "episodes.csv")
-    write_table(rows.assign(arm=rows["method"].map({"per": "None"})), comparison / "episodes.csv")
     for seed in (0, 1):
         (comparison / f"ddpg-per-{seed}").rename(comparison / f"ddpg-per-None-{seed}")
-    report.main([str(comparison)])
-    text = (comparison / "tables.md").read_text(encoding="utf-8")
+    text = tables_of(comparison, lambda rows: rows.assign(arm=rows["method"].map({"per": "None"})))
     assert "| learner | method | arm | success | 95 % | of each run |" in text
     assert "| ddpg | mpfa_per |  | 87.5% |" in text
     assert "| ddpg | per | None | 0.0% |" in text
@@ -60,25 +72,9 @@ def test_the_arms_of_a_comparison_have_rows_of_their_own(comparison: Path) -> No
 
 
 @pytest.mark.usefixtures("tables_alone")
-def test_other_physics_have_tables_of_their_own(comparison: Path) -> None:
-    rows = pd.read_csv(comparison / "episodes.csv")
-    both = [rows.assign(physics=physics) for physics in ("wheels", "kinematic")]
-    write_table(pd.concat(both), comparison / "episodes.csv")
-    report.main([str(comparison)])
-    text = (comparison / "tables.md").read_text(encoding="utf-8")
-    assert text.index("## test, wheels") < text.index("## test, kinematic")
-    assert text.count(LINE) == 2
-
-
-@pytest.mark.usefixtures("tables_alone")
-def test_the_worlds_of_a_generator_and_those_of_barn_are_a_row_each_with_the_worst_run(
-    comparison: Path,
-) -> None:
-    rows = pd.read_csv(comparison / "episodes.csv")
+def test_generators_and_barn_have_a_row_each_with_the_worst_run(comparison: Path) -> None:
     names = ["bars-test-5", "bars-validation-5", "barn-3", "barn-4"]
-    write_table(rows.assign(world=[*names] * (len(rows) // 4)), comparison / "episodes.csv")
-    report.main([str(comparison)])
-    text = (comparison / "tables.md").read_text(encoding="utf-8")
+    text = tables_of(comparison, lambda rows: rows.assign(world=names * (len(rows) // 4)))
     assert "| mean of the runs (the worst one) | ddpg/mpfa_per | ddpg/per |" in text
     assert "| bars:test | 100.0% (0: 100.0%) | 0.0% (0: 0.0%) |" in text
     assert "| bars:validation | 100.0% (0: 100.0%) | 0.0% (0: 0.0%) |" in text
@@ -110,18 +106,6 @@ def test_the_time_to_a_rate_of_success_is_that_of_the_median_run(comparison: Pat
     assert "| ddpg | per | 90% | 2,000 |  | 0 of 2 |" in (comparison / "tables.md").read_text(
         "utf-8"
     )
-
-
-@pytest.mark.usefixtures("tables_alone")
-def test_two_comparisons_together_have_the_runs_of_both(
-    comparison: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    more = tmp_path / "more"
-    more.mkdir()
-    rows = pd.read_csv(comparison / "episodes.csv").query("method == 'per' and seed == 0")
-    write_table(rows, more / "episodes.csv")
-    report.main([str(comparison), str(more), "--output", str(tmp_path / "both")])
-    assert f"| ddpg | per | 0.0% | {NO} | 0.0%, 0.0%, 0.0% |" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("tables_alone")

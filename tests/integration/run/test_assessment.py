@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from mpfa_envs import load_policy
-from tests.integration.run.test_training import assert_same_run
-from tests.integration.tiny_runs import tiny, train
+from tests.integration.tiny_runs import assert_same_run, go_on, tiny, train, weights_of
 from training.records import read_table
 from training.run import loop
 from training.run.assessment import Assessment, AssessmentSettings
@@ -38,10 +37,6 @@ def assessed(
         episodes=5, early_episodes=2, early_share=0.4, best_factor=0.0, by=by
     )
     return settings
-
-
-def weights_of(policy: torch.nn.Module) -> torch.Tensor:
-    return torch.cat([each.detach().reshape(-1).clone() for each in policy.parameters()])
 
 
 class Watched:
@@ -204,15 +199,13 @@ def test_a_run_that_is_stopped_in_an_assessment_goes_on_alike(
 ) -> None:
     settings = assessed(stages=stages)
     whole = train(tmp_path / "whole", settings)
-    part = TrainingRun(settings, tmp_path)
-    part.train(lambda: part.actions >= 240 and taken(part) > 0 and part.stop.ask())
-    part.close()
+    part = train(
+        tmp_path, settings, lambda run: run.actions >= 240 and taken(run) > 0 and run.stop.ask()
+    )
     state = read_checkpoint(tmp_path)
     assert not state["assessment"]["over"]
     assert state["waiting"] > 0
-    resumed = TrainingRun(settings, tmp_path, state)
-    assert resumed.train()
-    resumed.close()
+    resumed = go_on(tmp_path, settings)
     assert_same_run(resumed, whole)
     assert resumed.assessments == whole.assessments
     assert len(whole.assessments) > len(part.assessments) > 0
@@ -273,6 +266,4 @@ def test_a_run_without_the_rule_has_no_table_of_it(tmp_path: Path) -> None:
     del state["assessment"], state["assessments"], state["settings"]["assessment"]
     settings = tiny()
     settings.curriculum.stages.append(Stage("A", 1))
-    resumed = TrainingRun(settings, tmp_path, state)
-    assert resumed.train()
-    resumed.close()
+    assert train(tmp_path, settings, state=state).schedule.finished

@@ -1,4 +1,4 @@
-"""Runs of DQN and Q learning by the training script: saving, resuming, driving, refusals."""
+"""Runs of DQN and Q learning by the training script: saving, driving, what is rejected."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ import torch
 
 from mpfa_envs import load_policy
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
-from tests.integration.tiny_runs import rows, tiny, train
+from tests.integration.tiny_runs import tiny, train
 from training.evaluating import drive
-from training.run.loop import TrainingRun
 from training.settings.checks import check_settings
-from training.settings.train import Stage
 
 LEARNERS = ["dqn", "q_learning"]
 
@@ -39,48 +37,31 @@ def test_a_run_learns_from_choices_and_saves_a_policy_that_drives_them(tmp_path,
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_a_run_goes_on_where_it_was_saved(tmp_path, learner):
-    settings = tiny(learner=learner, episodes=[Stage("A", 4)])
-    whole = train(tmp_path / "whole", settings)
-    first = TrainingRun(settings, tmp_path)
-    while first.schedule.episodes < 2:
-        first._iterate()
-    first.save()
-    first.close()
-    state = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    second = TrainingRun(settings, tmp_path, state)
-    second.train()
-    second.close()
-    assert rows(second) == rows(whole)
-    states = [run.learner.state_dict()["loss"] for run in (whole, second)]
-    assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
-
-
-@pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize(
     "method", ["hvper", "la3p", "ref_er", "averaged_ddpg", "pal", "ddpg_radam"]
 )
-def test_a_method_that_needs_an_actor_is_refused_in_one_sentence(method, learner):
+def test_a_method_that_needs_an_actor_is_rejected(method, learner):
     with pytest.raises(ValueError, match=rf"method={method} is not for learner={learner}"):
         check_settings(tiny(method, learner=learner))
 
 
-def test_a_loss_that_bends_is_refused_where_there_is_no_loss():
+@pytest.mark.parametrize(
+    ("learner", "setting", "value", "message"),
+    [
+        ("q_learning", "learner.reward_scale", 0.1, "learner.reward_scale must be 1 with .* 0.1"),
+        ("dqn", "method.signals", ["action_gradient"], "reward or td_error"),
+        ("dqn", "learner.compile", True, "learner.compile must be false with dqn"),
+    ],
+)
+def test_a_setting_that_these_learners_lack_is_rejected(learner, setting, value, message):
+    settings = tiny("per", learner=learner)
+    group, name = setting.split(".")
+    setattr(getattr(settings, group), name, value)
+    with pytest.raises(ValueError, match=message):
+        check_settings(settings)
+
+
+def test_the_loss_of_lap_is_for_dqn_and_for_no_table():
     check_settings(tiny("lap", learner="dqn"))
     with pytest.raises(ValueError, match="method=lap is not for learner=q_learning"):
         check_settings(tiny("lap", learner="q_learning"))
-    settings = tiny("per", learner="q_learning")
-    settings.learner.reward_scale = 0.1
-    with pytest.raises(ValueError, match=r"learner\.reward_scale must be 1 with q_learning.*0\.1"):
-        check_settings(settings)
-
-
-def test_the_action_gradient_alone_is_refused_and_so_is_a_program():
-    settings = tiny("per", learner="dqn")
-    settings.method.signals = ["action_gradient"]
-    with pytest.raises(ValueError, match="reward or td_error"):
-        check_settings(settings)
-    settings = tiny("per", learner="dqn")
-    settings.learner.compile = True
-    with pytest.raises(ValueError, match=r"learner\.compile must be false with dqn"):
-        check_settings(settings)

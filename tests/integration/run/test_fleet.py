@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.integration.tiny_runs import OVERRIDES, tiny
+from tests.integration.tiny_runs import OVERRIDES, tiny, train
 from training import files
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
@@ -37,28 +37,22 @@ def on_ray(actions: int) -> TrainSettings:
         ({"robots": 9}, "robots must be a multiple of ray.workers=2, got 9"),
         ({"ray": RaySettings(workers=-1)}, "ray.workers must be at least 0, got -1"),
         ({"ray": RaySettings(workers=2, steps=0)}, "ray.steps must be at least 1, got 0"),
+        # These methods need the buffer at hand.
+        *(
+            ({"method": tiny(name).method}, f"ray.workers must be 0 with method={name}, got 2")
+            for name in ("la3p", "ref_er", "reaper")
+        ),
     ],
 )
-def test_what_workers_cannot_do_is_refused(change: dict[str, Any], message: str) -> None:
+def test_what_workers_cannot_do_is_rejected(change: dict[str, Any], message: str) -> None:
     pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
     with pytest.raises(ValueError, match=message):
         check_settings(replace(on_ray(100), **change))
 
 
-@pytest.mark.parametrize("name", ["la3p", "ref_er", "reaper"])
-def test_a_method_that_needs_its_buffer_at_hand_is_refused(name: str) -> None:
-    pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
-    settings = on_ray(100)
-    settings.method = tiny(name).method
-    with pytest.raises(ValueError, match=f"ray.workers must be 0 with method={name}, got 2"):
-        check_settings(settings)
-
-
 def test_a_checkpoint_without_the_places_of_the_robots_begins_new_episodes(tmp_path: Path) -> None:
     settings = tiny(episodes=[Stage("A", actions=160)], robots=8, updates=2)
-    run = TrainingRun(settings, tmp_path)
-    assert run.train()
-    run.close()
+    run = train(tmp_path, settings)
     state = read_checkpoint(tmp_path)
     # As a run with two workers leaves it.
     state["robots"] = {**state["robots"], "environment": None}

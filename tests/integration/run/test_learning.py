@@ -59,28 +59,20 @@ MARGIN = 0.4
 WELL_TRAINED = 0.85
 
 
-@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
-def test_a_robot_of_any_method_finds_far_more_goals_than_one_that_did_not_train(
-    method: str, tmp_path: Path
-) -> None:
-    assert train(settings_of(method, "ddpg", 40), tmp_path) >= RANDOM + MARGIN
+LEAST = {
+    **{(method, "ddpg"): RANDOM + MARGIN for method in sorted(GROUPS["method"])},
+    **{(method, "ddpg"): WELL_TRAINED for method in ("mpfa_per", "per", "uniform")},
+    **{(method, "td3"): WELL_TRAINED for method in ("mpfa_per", "la3p")},
+    ("mpfa_per", "sac"): WELL_TRAINED,
+}
+"""Success after forty episodes: of any method far more than at random, of some most goals."""
 
 
-@pytest.mark.parametrize(
-    ("method", "learner"),
-    [
-        ("mpfa_per", "ddpg"),
-        ("per", "ddpg"),
-        ("uniform", "ddpg"),
-        ("mpfa_per", "td3"),
-        ("la3p", "td3"),
-        ("mpfa_per", "sac"),
-    ],
-)
-def test_a_robot_that_trained_for_forty_episodes_finds_most_goals(
+@pytest.mark.parametrize(("method", "learner"), LEAST)
+def test_a_robot_that_trained_for_forty_episodes_finds_its_goals(
     method: str, learner: str, tmp_path: Path
 ) -> None:
-    assert train(settings_of(method, learner, 40), tmp_path) >= WELL_TRAINED
+    assert train(settings_of(method, learner, 40), tmp_path) >= LEAST[method, learner]
 
 
 def test_a_robot_that_did_not_train_finds_few_goals(tmp_path: Path) -> None:

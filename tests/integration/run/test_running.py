@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,17 +22,10 @@ from training.run.loop import TrainingRun
 from training.run.running import Refused, prepare_process, start
 from training.settings.command_line import composed
 from training.settings.learners import LearnerSettings
-from training.settings.train import TrainSettings, register
-
-
-@pytest.fixture(autouse=True)
-def as_before() -> Iterator[None]:
-    yield
-    torch.set_flush_denormal(False)
+from training.settings.train import TrainSettings
 
 
 def begin(folder: Path) -> int:
-    register()
     (settings,) = composed([*OVERRIDES, "curriculum.stages=[{world: A, episodes: 3}]"])
     return start(settings, folder)
 
@@ -56,7 +48,6 @@ def test_no_program_is_compiled_to_see_which_instructions_the_compiler_knows() -
         for given, expected in ((None, True), (False, False)):
             options.vec_isa_ok = given
             prepare_process(TrainSettings(threads=1))
-            torch.set_flush_denormal(False)
             assert options.vec_isa_ok is expected
     finally:
         # By hand: monkeypatch would leave PyTorch without this option.
@@ -72,7 +63,6 @@ def test_a_cuda_toolkit_without_a_gpu_is_not_warned_of(
     monkeypatch.setenv("CUDA_HOME", str(tmp_path))
     monkeypatch.setattr(logger, "handle", lambda record: warned.append(record.getMessage()))
     prepare_process(TrainSettings(threads=1))
-    torch.set_flush_denormal(False)
     assert cpp_extension._find_cuda_home() == str(tmp_path)
     assert warned == []
 

@@ -9,16 +9,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-import torch
 from hydra import compose, initialize_config_module
 
 import train
 from tests.integration.tiny_runs import OVERRIDES
+from tests.integration.tiny_runs import train as train_tiny
 from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
@@ -29,22 +28,9 @@ from training.run.loop import TrainingRun
 from training.run.running import Refused, resume, start
 from training.settings.command_line import composed, parse_overrides
 from training.settings.resuming import changed
-from training.settings.train import LAST_SEED, register
+from training.settings.train import LAST_SEED
 
 STAGES = "curriculum.stages=[{{world: A, episodes: {}}}]"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def registered() -> None:
-    register()
-
-
-@pytest.fixture(autouse=True)
-def as_before() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    yield
-    torch.set_flush_denormal(False)
-    torch.set_num_threads(threads)
 
 
 def begin(folder: Path, *overrides: str, episodes: int = 3) -> int:
@@ -114,7 +100,7 @@ def test_the_last_seed_that_is_taken_can_be_trained_with(tmp_path: Path) -> None
     assert begin(tmp_path, f"seed={LAST_SEED}", episodes=1) == 0
 
 
-def test_a_second_run_in_the_same_folder_is_refused_while_the_first_is_at_work(
+def test_a_second_run_in_the_same_folder_is_rejected_while_the_first_is_at_work(
     tmp_path: Path,
 ) -> None:
     with lock(tmp_path):
@@ -143,7 +129,7 @@ def test_a_folder_with_a_run_is_not_written_over_unless_asked_to(tmp_path: Path)
     assert contents(tmp_path) == before
 
 
-def test_a_run_started_anew_and_killed_at_once_cannot_resume_the_old_one(
+def test_a_run_begun_again_and_killed_at_once_cannot_resume_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begin(tmp_path, "seed=1", episodes=2)
@@ -162,7 +148,7 @@ def test_a_run_started_anew_and_killed_at_once_cannot_resume_the_old_one(
     assert (tmp_path / files.PREVIOUS / CHECKPOINT).read_bytes() == old
 
 
-def test_a_setting_that_the_parts_refuse_leaves_the_old_run_in_its_place(tmp_path: Path) -> None:
+def test_a_setting_that_the_parts_reject_leaves_the_old_run_in_its_place(tmp_path: Path) -> None:
     begin(tmp_path, episodes=1)
     before = contents(tmp_path)
     with pytest.raises(Refused, match="layers must be at least 2"):
@@ -213,7 +199,7 @@ def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: s
         ("learner.width=abc", "learner.width"),
     ],
 )
-def test_what_a_run_cannot_change_on_its_way_is_refused_by_name(
+def test_what_a_run_cannot_change_on_its_way_is_rejected_by_name(
     override: str, message: str, two_episodes: Path
 ) -> None:
     before = contents(two_episodes)
@@ -224,7 +210,7 @@ def test_what_a_run_cannot_change_on_its_way_is_refused_by_name(
 
 
 @pytest.fixture(scope="module")
-def two_episodes(registered: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def two_episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     begin(folder, episodes=2)
     return folder
@@ -349,15 +335,13 @@ def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])
-    run = TrainingRun(settings, tmp_path)
 
-    def stop() -> None:
+    def stop(run: TrainingRun) -> None:
         if run.actions == 23:
             os.kill(os.getpid(), number)
 
-    assert run.train(stop) is False
+    run = train_tiny(tmp_path, settings, stop)
     assert (run.actions, run.stop.exit_status) == (23, 128 + number)
     assert read_checkpoint(tmp_path)["schedule"]["actions"] == 23
-    run.close()
     with pytest.raises(KeyboardInterrupt):
         run.stop.ask(number)

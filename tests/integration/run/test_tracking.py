@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.integration.tiny_runs import tiny
+from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run import tracking
-from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.run.showing import show_policy
 from training.run.tracking import Tracker
@@ -27,7 +26,6 @@ from training.settings.train import (
     Stage,
     TrackingSettings,
     TrainSettings,
-    register,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -103,29 +101,17 @@ def killed_and_resumed(
     folder: Path, settings: TrainSettings, *, saved: int, killed: int
 ) -> TrainingRun:
     """Save after so many actions, end after more, go on from the checkpoint."""
-    run = TrainingRun(settings, folder)
 
-    def look() -> None:
+    def look(run: TrainingRun) -> None:
         if run.actions == saved:
             run.save()
         if run.actions == killed:
+            run.close()
             raise Killed
 
     with pytest.raises(Killed):
-        run.train(look)
-    run.close()
-    again = TrainingRun(settings, folder, read_checkpoint(folder))
-    again.train()
-    again.close()
-    return again
-
-
-def whole(folder: Path, settings: TrainSettings) -> TrainingRun:
-    folder.mkdir()
-    run = TrainingRun(settings, folder)
-    run.train()
-    run.close()
-    return run
+        train(folder, settings, look)
+    return go_on(folder, settings)
 
 
 def csv_rows(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -159,10 +145,9 @@ def in_both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     settings.environment.max_steps = 25
     settings.tracking = TrackingSettings(csv=True, tensorboard=True, log_every=5)
     folder = tmp_path_factory.mktemp("logs")
-    (folder / "killed").mkdir()
     killed_and_resumed(folder / "killed", settings, saved=20, killed=32)
     settings.tracking.tensorboard = False
-    whole(folder / "whole", settings)
+    train(folder / "whole", settings)
     return folder / "killed", folder / "whole"
 
 
@@ -187,10 +172,9 @@ def test_wandb_has_no_row_of_a_run_that_was_killed_twice(tmp_path: Path, kept: K
     settings = tiny(episodes=[Stage("A", 4)])
     settings.environment.max_steps = 25
     settings.tracking = replace(OFFLINE, log_every=5, pictures_every=None)
-    (tmp_path / "killed").mkdir()
     run = killed_and_resumed(tmp_path / "killed", settings, saved=20, killed=32)
     killed, kept.rows = kept.rows, {}
-    whole(tmp_path / "whole", settings)
+    train(tmp_path / "whole", settings)
     axes = [[row["actions"] for row in rows.values()] for rows in (killed, kept.rows)]
     assert axes[0] == axes[1]
     # Steps of wandb count on where they were, in the place of beginning again.
@@ -236,7 +220,7 @@ def test_wandb_is_shown_what_the_policy_does_and_gets_it_with_its_card(
     settings = tiny(episodes=[Stage("A", 1)])
     settings.tracking = replace(OFFLINE)
     settings.evaluation = replace(settings.evaluation, world="validation", episodes=2)
-    run = whole(tmp_path / "run +1", settings)
+    run = train(tmp_path / "run +1", settings)
     (row,) = [row for row in kept.rows.values() if "policy/paths" in row]
     kinds = {name: type(row[f"policy/{name}"]).__name__ for name in ("paths", "values")}
     assert kinds == {"paths": "Image", "values": "Image"}
@@ -281,7 +265,7 @@ def test_pictures_are_shown_at_the_end_or_more_often_or_never(
     settings.environment.max_steps = 25
     settings.tracking = replace(OFFLINE, pictures_every=every)
     monkeypatch.setattr("training.run.loop.show_policy", show)
-    whole(tmp_path / "run", settings)
+    train(tmp_path / "run", settings)
     (end,) = {row["actions"] for row in kept.rows.values() if row.get("train/episode") == 1}
     assert shown == [*(range(20, end, 20) if every else ()), end]
 
@@ -303,7 +287,6 @@ def test_a_run_of_wandb_s_sweep_is_what_its_file_says(monkeypatch: pytest.Monkey
         words += [part] if macro is None else macros.get(macro, [macro])
     assert words[:3] == ["env", "interpreter", "program"]
     monkeypatch.setenv("WANDB_RUN_ID", "1a2b3c4d")
-    register()
     (settings,) = composed(words[3:])
     assert (settings.method.name, settings.updates, settings.seed) == ("uniform", 8, 1002)
     assert (settings.learner.actor_lr, settings.learner.tau) == (1e-4, 0.01)

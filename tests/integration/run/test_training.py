@@ -14,7 +14,15 @@ import torch
 from torchrl.data import RandomSampler
 
 from mpfa_envs import load_policy
-from tests.integration.tiny_runs import rows, tiny, train
+from tests.integration.tiny_runs import (
+    assert_same_run,
+    blocky,
+    go_on,
+    rows,
+    stop_after,
+    tiny,
+    train,
+)
 from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods import ALIASES, Method
 from torchrl_mpfa.saving import save_atomically
@@ -41,71 +49,33 @@ def test_evaluating_on_the_way_changes_nothing_in_the_training(tmp_path: Path) -
     assert not (tmp_path / "plain" / "evaluations.csv").exists()
 
 
-@pytest.mark.parametrize(
-    ("method", "learner"),
-    [
-        ("mpfa_per", "ddpg"),
-        ("mpfa_per", "td3"),
-        *((method, "ddpg") for method in ("averaged_ddpg", "cer", "ddpg_radam", "hvper")),
-        *((method, "ddpg") for method in ("klper", "mw", "rank_per")),
-        ("la3p", "td3"),
-        ("mpfa_per", "sac"),
-    ],
-)
-def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
-    tmp_path: Path, method: str, learner: str
-) -> None:
-    whole = train(tmp_path / "whole", tiny(method, learner=learner))
-    stop_after(31, tmp_path, tiny(method, learner=learner))
-    resumed = TrainingRun(tiny(method, learner=learner), tmp_path, read_checkpoint(tmp_path))
-    assert resumed.train()
-    resumed.close()
-    assert_same_run(resumed, whole)
-
-
-@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
-def test_many_robots_are_stopped_in_the_middle_of_their_episodes_and_go_on(
-    tmp_path: Path, physics: str
-) -> None:
+def of_robots(physics: str) -> TrainSettings:
     settings = tiny(episodes=[Stage("bars", actions=90)], robots=3, updates=2)
-    settings.environment.physics = physics
-    settings.environment.progress = "shortest_path"
+    settings.environment.physics, settings.environment.progress = physics, "shortest_path"
+    return settings
+
+
+RESUMED = {
+    **{f"{name}-ddpg": tiny(name) for name in ("mpfa_per", "averaged_ddpg", "cer", "ddpg_radam")},
+    **{f"{name}-ddpg": tiny(name) for name in ("hvper", "klper", "mw", "rank_per")},
+    **{f"mpfa_per-{name}": tiny(learner=name) for name in ("td3", "sac", "dqn", "q_learning")},
+    "la3p-td3": tiny("la3p", learner="td3"),
+    # In the middle of the episodes of three robots, and of a block of updates.
+    **{f"robots-{physics}": of_robots(physics) for physics in ("kinematic", "wheels")},
+    **{f"{name}-blocks": blocky(30, name) for name in ("rud", "reaper", "ref_er")},
+}
+
+
+@pytest.mark.parametrize("settings", RESUMED.values(), ids=RESUMED)
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
+    tmp_path: Path, settings: TrainSettings
+) -> None:
     whole = train(tmp_path / "whole", settings)
-    part = stop_after(45, tmp_path, settings)
-    assert all(record.total_steps <= 45 for record in part.records)
-    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
-    assert resumed.train()
-    resumed.close()
+    actions = 31 if settings.robots == 1 else 45
+    part = stop_after(actions, tmp_path, settings)
+    assert all(record.total_steps <= actions for record in part.records)
     assert len(whole.records) > len(part.records)
-    assert_same_run(resumed, whole)
-
-
-def stop_after(actions: int, folder: Path, settings: TrainSettings) -> TrainingRun:
-    folder.mkdir(exist_ok=True)
-    run = TrainingRun(settings, folder)
-    run.train(lambda: run.actions >= actions and run.stop.ask())
-    run.close()
-    assert actions <= run.actions < actions + settings.robots
-    return run
-
-
-def assert_same_run(resumed: TrainingRun, whole: TrainingRun) -> None:
-    assert rows(resumed) == rows(whole)
-    assert resumed.actions == whole.actions
-    for mine, other in zip(
-        resumed.learner.loss.state_dict().values(),
-        whole.learner.loss.state_dict().values(),
-        strict=True,
-    ):
-        assert torch.equal(mine, other)
-    mine, other = resumed.buffer.state_dict(), whole.buffer.state_dict()
-    assert torch.equal(mine["_rng"][0], other["_rng"][0])
-    if "_sum_tree" in other["_sampler"]:
-        assert torch.equal(mine["_sampler"]["_sum_tree"], other["_sampler"]["_sum_tree"])
-    if "_signals" in other["_storage"]:
-        signals = [state["_storage"]["_signals"]["rows"] for state in (mine, other)]
-        # NaN marks what is not known yet.
-        torch.testing.assert_close(*signals, rtol=0, atol=0, equal_nan=True)
+    assert_same_run(go_on(tmp_path, settings), whole)
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
@@ -116,27 +86,23 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Pat
     assert rows(first) != rows(train(tmp_path / "c", other))
 
 
+@pytest.mark.parametrize("learner", ["ddpg", "sac", "td3"])
 @pytest.mark.parametrize("method", sorted(GROUPS["method"]))
-def test_every_method_trains_and_uses_its_own_signals(tmp_path: Path, method: str) -> None:
-    settings = tiny(method)
+def test_every_method_trains_every_learner_by_its_own_signals(
+    tmp_path: Path, method: str, learner: str
+) -> None:
+    settings = tiny(method, [Stage("A", 4)], learner)
     run = train(tmp_path, settings)
     assert run.updates > 0
     assert all(math.isfinite(record.reward) for record in run.records)
+    weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
+    assert all(value.isfinite().all() for value in weights)
     if not settings.method.signals:
         assert isinstance(run.buffer.sampler, RandomSampler)
     else:
         assert isinstance(run.buffer.sampler, SignalSampler)
         assert sorted(run.buffer.sampler.weights) == sorted(settings.method.signals)
         assert run.buffer.sampler.beta == settings.method.beta_end
-
-
-@pytest.mark.parametrize("learner", ["sac", "td3"])
-@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
-def test_every_method_works_with_every_learner(tmp_path: Path, method: str, learner: str) -> None:
-    run = train(tmp_path, tiny(method, [Stage("A", 4)], learner))
-    weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
-    assert run.updates > 0
-    assert all(value.isfinite().all() for value in weights)
 
 
 def test_no_two_methods_have_the_same_settings() -> None:
@@ -162,7 +128,7 @@ def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
     assert run.buffer[:]["next", "reward"].abs().max() < 1e3
 
 
-def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Path) -> None:
+def test_a_curriculum_that_does_not_carry_begins_again_in_each_world(tmp_path: Path) -> None:
     settings = tiny()
     settings.curriculum.carry = False
     run = train(tmp_path, settings)
@@ -170,15 +136,9 @@ def test_a_curriculum_that_does_not_carry_starts_anew_in_each_world(tmp_path: Pa
     assert len(run.buffer) == min(of_second_world, settings.method.capacity)
     assert run.buffer.write_count == of_second_world
 
-    (tmp_path / "part").mkdir()
-    part = TrainingRun(settings, tmp_path / "part")
     # Stopped between the worlds.
-    part.train(lambda: part.schedule.stage == 1 and part.stop.ask())
-    part.close()
-    resumed = TrainingRun(settings, tmp_path / "part", read_checkpoint(tmp_path / "part"))
-    assert resumed.train()
-    resumed.close()
-    assert rows(resumed) == rows(run)
+    train(tmp_path / "part", settings, lambda run: run.schedule.stage == 1 and run.stop.ask())
+    assert rows(go_on(tmp_path / "part", settings)) == rows(run)
 
 
 def test_a_finished_run_begins_further_worlds_as_its_curriculum_says(tmp_path: Path) -> None:
@@ -207,11 +167,8 @@ def test_a_stage_begins_though_an_evaluation_failed_just_before_it(tmp_path: Pat
     with pytest.raises(RuntimeError, match="out of memory"):
         failing.train()
     failing.close()
-    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
-    assert resumed.train()
-    resumed.close()
     whole = train(tmp_path / "whole", settings)
-    assert rows(resumed) == rows(whole)
+    assert rows(go_on(tmp_path, settings)) == rows(whole)
 
 
 def test_the_episodes_that_another_stage_cuts_short_are_counted(tmp_path: Path) -> None:
@@ -282,7 +239,7 @@ def test_the_policy_file_acts_as_the_trained_policy(tmp_path: Path, learner: str
     assert policy.env_arguments["closeness_distance"] == pytest.approx(0.25)
 
 
-def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: Path) -> None:
+def test_a_checkpoint_of_another_version_or_a_damaged_one_is_rejected(tmp_path: Path) -> None:
     save_atomically({"format": 3}, tmp_path / CHECKPOINT)
     with pytest.raises(ValueError, match=r"format 3, this version reads 5"):
         read_checkpoint(tmp_path)
@@ -293,7 +250,7 @@ def test_a_checkpoint_of_another_version_or_a_damaged_one_is_refused(tmp_path: P
         read_checkpoint(tmp_path / "elsewhere")
 
 
-def test_an_update_that_is_refused_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
+def test_an_update_that_raises_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
     failing = TrainingRun(tiny(), tmp_path)
     update, count = failing.learner.update, 0
 
@@ -308,10 +265,8 @@ def test_an_update_that_is_refused_leaves_a_checkpoint_that_goes_on(tmp_path: Pa
     with pytest.raises(ValueError, match="not finite"):
         failing.train()
     failing.close()
-    resumed = TrainingRun(tiny(), tmp_path, read_checkpoint(tmp_path))
-    assert resumed.actions == failing.actions
-    assert resumed.train()
-    resumed.close()
+    assert read_checkpoint(tmp_path)["schedule"]["actions"] == failing.actions
+    go_on(tmp_path, tiny())
 
 
 def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
@@ -329,10 +284,7 @@ def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
         failing.train(fail)
     failing.close()
     assert read_checkpoint(tmp_path)["schedule"]["actions"] == 20
-    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
-    assert resumed.train()
-    resumed.close()
-    assert rows(resumed) == rows(train(tmp_path / "whole", tiny()))
+    assert rows(go_on(tmp_path, settings)) == rows(train(tmp_path / "whole", tiny()))
 
 
 def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for(
@@ -347,15 +299,15 @@ def test_the_policy_of_a_run_is_the_best_of_its_evaluations_if_that_is_asked_for
     settings = tiny()
     settings.evaluation.every, settings.evaluation.episodes = 10, 4
     settings.evaluation.choose = True
-    run = TrainingRun(settings, tmp_path)
     kept: list[dict[str, torch.Tensor]] = []
-    run.train(
-        lambda: (
+    run = train(
+        tmp_path,
+        settings,
+        lambda run: (
             len(run.evaluations) > len(kept)
             and kept.append({k: v.clone() for k, v in run.learner.policy.state_dict().items()})
-        )
+        ),
     )
-    run.close()
     scores = [(record.success, record.spl) for record in run.evaluations]
     best = max(range(len(scores)), key=lambda number: (scores[number], number))
     observation = np.random.default_rng(0).random((5, 24), dtype=np.float32)

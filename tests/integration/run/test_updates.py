@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.integration.tiny_runs import tiny, train
+from tests.integration.tiny_runs import go_on, stop_after, tiny, train
 from torchrl_mpfa.selection import SampledBatch
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
@@ -91,14 +91,12 @@ def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
 
 
 def test_the_error_is_the_mean_of_the_sizes_in_units_of_the_reward(tmp_path: Path) -> None:
-    run = TrainingRun(tiny(), tmp_path)
-    run.train(lambda: len(run.buffer) >= 25 and run.stop.ask())
+    run = train(tmp_path, tiny(), lambda run: len(run.buffer) >= 25 and run.stop.ask())
     log = UpdateLog(100, reward_scale=0.1)
     log.learns(torch.arange(4))
     squared = torch.tensor([0.04, 0.0, 0.01, 0.01])
     log.learned({"td_error": squared})
     log.add(25, episode=1, buffer=run.buffer)
-    run.close()
     assert log.rows[0]["td_error"] == pytest.approx((2 + 0 + 1 + 1) / 4)
 
 
@@ -114,23 +112,17 @@ def test_a_run_that_was_killed_and_goes_on_has_every_row_once(tmp_path: Path) ->
     part.train(lambda: part.actions >= 50 and part.stop.ask())
     part.close()
     assert of_run(tmp_path)["total_steps"].tolist() == list(range(3, 41, 3))
-    resumed = TrainingRun(settings, tmp_path, read_checkpoint(tmp_path))
-    resumed.train()
-    resumed.close()
+    go_on(tmp_path, settings)
     pd.testing.assert_frame_equal(of_run(tmp_path), of_run(tmp_path / "whole"))
 
 
 def test_a_run_goes_on_whose_checkpoint_is_older_than_the_rows(tmp_path: Path) -> None:
     settings = tiny()
     settings.environment.max_steps, settings.tracking.log_every = 25, 5
-    part = TrainingRun(settings, tmp_path)
-    part.train(lambda: part.actions >= 40 and part.stop.ask())
-    part.close()
+    stop_after(40, tmp_path, settings)
     state = read_checkpoint(tmp_path)
     del state["log"]
-    resumed = TrainingRun(settings, tmp_path, state)
-    resumed.train()
-    resumed.close()
+    train(tmp_path, settings, state=state)
     assert of_run(tmp_path)["total_steps"].iloc[0] == 45
 
 

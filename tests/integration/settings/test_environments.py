@@ -112,7 +112,7 @@ def test_the_settings_of_noise_are_those_of_the_environment() -> None:
     env.close()
 
 
-def test_noise_on_the_command_line_is_read_or_refused() -> None:
+def test_noise_on_the_command_line_is_read_or_rejected() -> None:
     assert read_noise("slip=0.1,latency=2") == RobotNoise(slip=0.1, latency=2)
     for words in ("slip=2", "slip", "latency=0.5", "wind=1"):
         with pytest.raises(ArgumentTypeError):

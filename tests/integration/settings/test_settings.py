@@ -17,12 +17,7 @@ from training.settings.checks import OF_A_METHOD, check_settings
 from training.settings.command_line import composed, parse_overrides
 from training.settings.resuming import changed
 from training.settings.rules import rules_of, settings_by_name
-from training.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings, register
-
-
-@pytest.fixture(scope="module", autouse=True)
-def registered() -> None:
-    register()
+from training.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings
 
 
 @pytest.fixture(autouse=True)
