@@ -324,7 +324,7 @@ def test_a_loss_that_depends_on_the_numbers_in_a_batch_cannot_be_a_program():
 
 def test_a_compiler_that_fails_is_not_taken_for_a_batch_that_does_not_fit():
     fail = fail_with(OSError("no compiler"))
-    learner = DDPGLearner(make_loss("ddpg"), compile={"backend": fail})
+    learner = make_learner(compile={"backend": fail})
     with pytest.raises(BackendCompilerFailed, match="no compiler"):
         learner.update(make_batch())
 

@@ -171,7 +171,6 @@ def weight_of(state, start="target_"):
         (["loss", "WEIGHT"], "text", "must be torch.float32 of shape .*, got 'text'"),
         (["loss", "WEIGHT"], torch.nan, "must be finite, got nan"),
     ],
-    ids=str,
 )
 def test_a_foreign_state_changes_nothing_and_is_named(name, path, value, words):
     learner, other = make_learner(name), make_learner(name, seed=1)

@@ -55,7 +55,6 @@ OF_ONE = [
 @pytest.mark.parametrize(
     ("kind", "options", "words"),
     [*[(kind, *row) for kind in KINDS for row in OF_ALL], *OF_ONE],
-    ids=lambda value: str(value)[:40],
 )
 def test_an_option_out_of_its_range_is_rejected_by_name(kind, options, words):
     with pytest.raises(ValueError, match=words):
