@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import NavigationEnv
+from tests.envs.paper import drive_to_end, full_speed
 
 STRAIGHT = {"start": (0.0, 0.0, 0.0), "goal": (2.98, 0.0)}
 
@@ -33,11 +34,8 @@ def test_a_held_action_equals_the_same_action_given_again(physics: str) -> None:
 def test_the_episode_ends_at_the_time_step_at_the_goal() -> None:
     ends = []
     for repeat in (1, 4):
-        env = make_env(repeat)
-        terminated, total = False, 0.0
-        while not terminated:
-            _, reward, terminated, truncated, info = env.step([1.0, 1.0])
-            total += reward
+        env = NavigationEnv(action_repeat=repeat, physics="kinematic")
+        total, _, truncated, info = drive_to_end(env, full_speed, goal=(2.98, 0.0))
         assert info["success"] and not truncated
         ends.append((info["sim_time"], info["x"], pytest.approx(total)))
     assert ends[0] == ends[1]

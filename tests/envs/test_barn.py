@@ -42,11 +42,3 @@ def test_a_world_is_found_by_its_name() -> None:
     assert info["distance"] == 10.0 and info["heading"] == pytest.approx(math.pi / 2)
     _, info = env.reset(seed=0)
     assert info["y"] < -2.5 and env.task is not None and env.task.goal[1] > 3.5
-
-
-@pytest.mark.parametrize("index", [-1, 20, True, 1.5])
-def test_an_unknown_index_of_a_world_is_rejected(index: object) -> None:
-    with pytest.raises(ValueError, match="index must be"):
-        barn_world(index)
-    with pytest.raises(ValueError, match="'barn-0' to 'barn-19'"):
-        resolve_world(f"barn-{index}")

@@ -6,6 +6,7 @@ import numpy as np
 
 from mpfa_envs import Box, NavigationEnv, VectorNavigationEnv, World
 from mpfa_envs.worlds.plain import world_to_plain
+from tests.envs.paper import drive_to_end, full_speed
 
 
 def test_a_seed_of_a_reset_seeds_the_robots_that_it_starts() -> None:
@@ -38,10 +39,7 @@ def test_a_goal_reached_in_the_last_step_is_no_timeout() -> None:
     ends = []
     for max_steps in (500, 31, 30):  # The goal is 1.52 m away, and a step is 0.05 m.
         env = NavigationEnv(physics="kinematic", max_steps=max_steps)
-        env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (2.02, 0.0)})
-        ended = truncated = False
-        while not (ended or truncated):
-            _, _, ended, truncated, info = env.step([1.0, 1.0])
+        *_, ended, truncated, info = drive_to_end(env, full_speed, goal=(2.02, 0.0))
         ends.append((ended, truncated, info["success"], info["timeout"]))
     assert ends == [(True, False, True, False)] * 2 + [(False, True, False, True)]
 

@@ -29,6 +29,7 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.planner import PathPlanner
 from mpfa_envs.paths.tasks import sample_task_on_grid
+from mpfa_envs.worlds.barn import barn_world
 from mpfa_envs.worlds.plain import walker_to_plain
 
 NAMES = list(GENERATORS)
@@ -171,6 +172,11 @@ OF_NO_WORLD = ("bars", "bars-", "bars--1", "bars-1.5", "bars-a", "bars-train-1",
         *(
             (partial(register_generator, name, pillars), f"lower-case letters a to z, got {name!r}")
             for name in ("", "Pillars", "two words", "pillars-7", "pillars2")
+        ),
+        *((partial(barn_world, index), "index must be") for index in (-1, 20, True, 1.5)),
+        *(
+            (partial(resolve_world, f"barn-{index}"), "'barn-0' to 'barn-19'")
+            for index in (-1, 20, True, 1.5)
         ),
         (partial(register_generator, "pillars", None), "generator must be callable, got None"),
     ],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mpfa_envs import Mirror, NavigationEnv, VectorNavigationEnv
+from mpfa_envs import Mirror, NavigationEnv
 from mpfa_envs.sensing.observation import observation_slices
 
 NAMES = ["B", "D"]
@@ -40,20 +40,13 @@ def test_the_earlier_scans_come_newest_first(memory: str) -> None:
         assert step > 3
 
 
-def test_the_earlier_scans_stay_while_waiting() -> None:
-    env = VectorNavigationEnv(2, world=["B", "D"], physics="kinematic", history=3)
-    env.reset(seed=0)
-    for step in range(10):
-        env.step(actions_of(step, 2))
-    before = env.observations
-    env.step(actions_of(10, 2), only=np.array([True, False]))
-    np.testing.assert_array_equal(env.observations[1], before[1])
-
-
-def test_the_mirror_turns_each_scan_around() -> None:
-    observation = torch.arange(PARTS["lidar_history"].stop, dtype=torch.float32)
-    image = Mirror(history=3).observation(observation)
-    for first in (0, *range(24, 24 + 3 * 18, 18)):
-        assert image[first : first + 18].equal(observation[first : first + 18].flip(0))
-    assert image[18:24].equal(Mirror().observation(observation[:24])[18:24])
-    assert Mirror(history=3).observation(image).equal(observation)
+@pytest.mark.parametrize("sectors", [8, 18])
+def test_the_mirror_turns_each_scan_around(sectors: int) -> None:
+    mirror, now = Mirror(sectors=sectors, history=3), sectors + 6
+    observation = torch.arange(now + 3.0 * sectors)
+    image = mirror.observation(observation)
+    for first in (0, *range(now, now + 3 * sectors, sectors)):
+        assert image[first : first + sectors].equal(observation[first : first + sectors].flip(0))
+    plain = Mirror(sectors=sectors).observation(observation[:now])
+    assert image[sectors:now].equal(plain[sectors:])
+    assert mirror.observation(image).equal(observation) and not image.equal(observation)

@@ -1,9 +1,13 @@
-"""Modules that an import brings with it, each in a new process."""
+"""Imports in new processes: modules that they bring with them, and packages that are missing."""
 
 from __future__ import annotations
 
+import subprocess
+from pathlib import Path
+
 import pytest
 
+from tests.envs.exported import SHIPPED
 from tests.envs.process import run
 
 HEAVY = ("numba", "pybullet", "scipy", "torch", "torchrl", "yaml")
@@ -24,3 +28,33 @@ def test_without_gymnasium_the_package_can_still_be_imported() -> None:
     code = "import mpfa_envs; print(mpfa_envs.Box)"
     found = run(code, without=["gymnasium"], PYTHONWARNINGS="error")
     assert found == "<class 'mpfa_envs.worlds.shapes.Box'>\n"
+
+
+@pytest.mark.parametrize(
+    ("without", "code", "message"),
+    [
+        (
+            "gymnasium",
+            "from mpfa_envs import make_navigation_env",
+            "mpfa_envs.make_navigation_env needs gymnasium: pip install 'torchrl-mpfa[envs]'",
+        ),
+        (
+            "onnxruntime",
+            "from mpfa_envs.deploy import Network; Network(b'', 1, 1)",
+            "an exported policy needs onnxruntime",
+        ),
+        (
+            "onnx",
+            f"from mpfa_envs import *;export_policy(load_policy({str(SHIPPED)!r}), 'policy.onnx')",
+            "pip install 'torchrl-mpfa[onnx]'",
+        ),
+    ],
+)
+def test_the_error_of_a_missing_package_names_its_extra(
+    without: str, code: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(subprocess.CalledProcessError) as caught:
+        run(code, without=[without])
+    assert message in caught.value.stderr.splitlines()[-1]
+    assert not list(tmp_path.iterdir())

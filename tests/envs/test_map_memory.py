@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.observation import observation_slices
+from tests.envs.paper import drive_to_end
 from tests.envs.shapes import random_shapes
 
 ROBOT = ROBOTS["turtlebot2"]
@@ -143,11 +145,7 @@ def test_the_path_leads_out_of_a_pocket() -> None:
     env = NavigationEnv(world=POCKET, physics="kinematic", memory="map", max_steps=1000)
     ends = {}
     for part in ("way_direction", "goal_direction"):
-        observation, info = env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
-        ended = False
-        while not ended:
-            observation, _, terminated, truncated, info = env.step(follow(observation, part))
-            ended = terminated or truncated
+        *_, info = drive_to_end(env, partial(follow, part=part), goal=(3.0, 0.0))
         ends[part] = info["success"]
     assert ends == {"way_direction": True, "goal_direction": False}
     env.close()

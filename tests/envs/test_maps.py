@@ -305,17 +305,19 @@ def test_paths_in_a_map_equal_those_among_its_boxes(scattered):
     assert field.at(*goal) < 0.1
 
 
-def test_wheels_drive_in_a_map_as_among_boxes(scattered):
-    pytest.importorskip("pybullet")
-    envs = [NavigationEnv(world=world) for world in scattered]
+def test_a_robot_drives_in_a_map_as_among_boxes(scattered, physics):
+    envs = [NavigationEnv(world=world, physics=physics) for world in scattered]
     task = envs[0].reset(seed=0) and envs[0].task
-    radius = ROBOTS["turtlebot2"].radius
-    assert scattered[1].clearance(*task.start[:2]) > radius
+    assert scattered[1].clearance(*task.start[:2]) > ROBOTS["turtlebot2"].radius
     envs[1].reset(options=task._asdict())
     for _ in range(10):
-        one, two = (env.step([0.6, 0.2]) for env in envs)
-        np.testing.assert_allclose(one[0], two[0], atol=1e-6)
-        if one[2]:
+        (seen, *ends, info), (expected, *expected_ends, other) = (
+            env.step([0.6, 0.2]) for env in envs
+        )
+        np.testing.assert_allclose(seen, expected, atol=1e-6)
+        assert ends == pytest.approx(expected_ends, abs=1e-6)
+        assert info == pytest.approx(other, abs=1e-6)
+        if any(ends[1:]):
             break
     for env in envs:
         env.close()

@@ -46,13 +46,6 @@ def test_the_mirror_shows_the_view_in_the_mirrored_world(physics: str) -> None:
     other.close()
 
 
-def test_an_image_of_an_image_is_the_original() -> None:
-    mirror, generator = Mirror(sectors=8), torch.Generator().manual_seed(0)
-    observation = torch.rand(5, 14, generator=generator)
-    assert mirror.observation(mirror.observation(observation)).equal(observation)
-    assert not mirror.observation(observation).equal(observation)
-
-
 def sample(chance: float, *, seed: int = 0) -> tuple[TensorDict, TensorDict]:
     """Rollout, and a batch sampled from a buffer with the transform."""
     env = make_navigation_env("C", physics="kinematic", seed=0)

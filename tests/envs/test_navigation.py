@@ -196,13 +196,13 @@ def test_actions_beyond_the_box_are_clipped() -> None:
 
 def test_a_step_outside_an_episode_asks_for_a_reset() -> None:
     env = paper_env(physics="kinematic", max_steps=1, render_mode="rgb_array")
-    with pytest.raises(ResetNeeded, match="reset"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before step\(\)"):
         env.step([0.0, 0.0])
-    with pytest.raises(ResetNeeded, match="reset"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before render\(\)"):
         env.render()
     env.reset(options=STRAIGHT)
     env.step([0.0, 0.0])
-    with pytest.raises(ResetNeeded, match="reset"):
+    with pytest.raises(ResetNeeded, match=r"call reset\(\) before step\(\)"):
         env.step([0.0, 0.0])
 
 

@@ -19,7 +19,7 @@ TRIANGLE = ((0.5, -0.5), (1.5, 0.0), (0.5, 0.5))
 
 
 def chosen(world: World, walker: tuple[float, float], robot: tuple[float, ...]) -> np.ndarray:
-    """The velocity that a walker chooses on its way to (3, 1.5), which it moves with now."""
+    """The velocity that a walker chooses towards (3, 1.5), which it moves with now."""
     speed = np.array([3.0, 1.5]) - walker
     states = np.array([[*walker, *(speed / np.hypot(*speed))]])
     room = OrcaRoom(world, radius=0.18, time_step=0.1)

@@ -179,7 +179,7 @@ def test_pursuit_keeps_its_side_for_a_point_behind() -> None:
     grid = FreeGrid(WORLDS["A"], distance=0.25)
     for side in (1.0, -1.0):
         pursuit = PurePursuit([(0.0, 0.0), (-3.0, side * 1e-3)], TURTLEBOT, grid)
-        # It overshoots the direction opposite to the point: still the same way round.
+        # It overshoots the direction opposite to the point: it still turns to the same side.
         for heading in (0.0, -side * 0.3, side * 0.3, -side * 0.1):
             left, right = pursuit.act(0.0, 0.0, heading)
             assert (right > left) == (side > 0)

@@ -13,6 +13,7 @@ from mpfa_envs.evaluation.runs import Driver
 from mpfa_envs.planners import DynamicWindow, WindowScore
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.sensing.observation import observation_slices
+from tests.envs.paper import drive_to_end
 
 TURTLEBOT = ROBOTS["turtlebot2"]
 PARTS = observation_slices()
@@ -177,18 +178,9 @@ def test_a_map_leads_it_out_of_a_pocket() -> None:
     pocket = World(name="pocket", boxes=walls)
     success = {}
     for memory in ("none", "map"):
-        window = DynamicWindow(memory=memory)
-        with NavigationEnv(
-            world=pocket,
-            physics="kinematic",
-            memory=memory,
-            collision_distance="contact",
-        ) as env:
-            seen, info = env.reset(options={"start": (0.0, 0.0, 0.0), "goal": (3.0, 0.0)})
-            ended = False
-            while not ended:
-                seen, _, terminated, truncated, info = env.step(window(seen))
-                ended = terminated or truncated
+        task = {"memory": memory, "collision_distance": "contact"}
+        with NavigationEnv(world=pocket, physics="kinematic", **task) as env:
+            *_, info = drive_to_end(env, DynamicWindow(memory=memory), goal=(3.0, 0.0))
         success[memory] = info["success"]
     assert success == {"none": False, "map": True}
 

@@ -143,7 +143,7 @@ def test_robots_that_share_a_server_part_slowly() -> None:
     for _ in range(15):  # Three seconds.
         ours.step(np.tile(actions, (5, 1)))
         theirs.step(actions)
-    # All 40 are in one place, and none was in another's way.
+    # All 40 are in one place, and none hindered another.
     gaps = ours.poses.reshape(5, 8, 3)[..., :2] - theirs.poses[:, :2]
     assert np.hypot(*gaps.T).max() < 0.05
     ours.close()

@@ -225,12 +225,15 @@ def test_a_state_of_other_walkers_is_rejected_and_changes_nothing() -> None:
         np.testing.assert_array_equal(env.walkers(0), before)
 
 
-def test_the_walkers_of_a_robot_that_waits_stand_still() -> None:
-    env = VectorNavigationEnv(2, world=BUSY, physics="kinematic")
+def test_a_robot_that_waits_keeps_its_scans_and_its_walkers() -> None:
+    env = VectorNavigationEnv(2, world=BUSY, physics="kinematic", history=3)
     env.reset(seed=0)
-    before = env.walkers(1)
+    for step in range(10):
+        env.step(np.full((2, 2), 0.1 * step))
+    before, seen = env.walkers(1), env.observations[1].copy()
     env.step(np.zeros((2, 2)), only=np.array([True, False]))
     np.testing.assert_array_equal(env.walkers(1), before)
+    np.testing.assert_array_equal(env.observations[1], seen)
 
 
 def plain_time(x: float, y: float, speed_x: float, speed_y: float, reach: float) -> float:

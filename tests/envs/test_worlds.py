@@ -9,6 +9,7 @@ import pytest
 from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, Walker, World
 from mpfa_envs.paths.planner import planner_for
 from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
+from tests.envs.paper import drive_to_end, full_speed
 from tests.envs.process import run
 from tests.envs.shapes import distance
 
@@ -190,12 +191,8 @@ def test_a_task_with_a_too_narrow_path_is_rejected() -> None:
 
 
 def test_a_goal_beside_a_wall_can_be_reached() -> None:
-    task = {"start": (0.0, 0.0, 0.0), "goal": (4.8, 0.0)}
     with NavigationEnv(physics="kinematic", collision_distance=0.35) as env:
-        env.reset(options=task)
-        while not (ended := env.step([1.0, 1.0]))[2]:
-            pass
-    assert ended[4]["success"]
+        assert drive_to_end(env, full_speed, goal=(4.8, 0.0))[-1]["success"]
 
 
 def test_a_world_of_lists_equals_one_of_tuples() -> None:

@@ -1,4 +1,4 @@
-"""Sensors, odometry and policies that fail on the way, as closed loops: the robot stops in time."""
+"""Sensors, odometry and policies that fail during a drive, as closed loops: the robot stops in time."""
 
 from __future__ import annotations
 
