@@ -22,7 +22,7 @@ from mpfa_envs import (
     World,
 )
 from mpfa_envs.sensing.observation import INFO_TYPES
-from tests.envs.paper import paper_env
+from tests.envs.paper import drive_to_end, full_speed, paper_env
 from tests.envs.process import run
 
 STRAIGHT = {"start": (0.0, 0.0, 0.0), "goal": (2.98, 0.0)}
@@ -241,3 +241,23 @@ def test_the_papers_task_has_wider_collisions_and_pays_more_progress() -> None:
         env.reset(seed=0, options=STRAIGHT)
     rewards = [env.step([1.0, 1.0])[1] for env in (study, paper)]
     assert rewards == pytest.approx([5.0 * 0.1, 15.0 * 0.1])
+
+
+def test_a_goal_reached_in_the_last_step_is_no_timeout() -> None:
+    ends = []
+    for max_steps in (500, 31, 30):  # The goal is 1.52 m away, and a step is 0.05 m.
+        env = NavigationEnv(physics="kinematic", max_steps=max_steps)
+        *_, ended, truncated, info = drive_to_end(env, full_speed, goal=(2.02, 0.0))
+        ends.append((ended, truncated, info["success"], info["timeout"]))
+    assert ends == [(True, False, True, False)] * 2 + [(False, True, False, True)]
+
+
+def test_a_robot_at_the_very_collision_distance_has_collided() -> None:
+    env = NavigationEnv(
+        physics="kinematic", time_step=0.125, action_repeat=1, collision_distance=0.25
+    )
+    # A step is 1/16 m: 12 of them are exact.
+    env.reset(options={"start": (4.0, 0.0, 0.0), "goal": (-4.0, 0.0)})
+    ended = [env.step([1.0, 1.0])[2] for _ in range(12)]
+    assert env.trail[-1] == (4.75, 0.0)
+    assert ended == [False] * 11 + [True]

@@ -282,3 +282,15 @@ def test_each_mask_of_the_infos_is_its_own() -> None:
     infos["_x"][:] = False
     assert infos["_success"].all() and not infos["_x"].any()
     env.close()
+
+
+def test_a_seed_of_a_reset_seeds_the_robots_that_it_starts() -> None:
+    env, twin = (VectorNavigationEnv(2, world="B", physics="kinematic") for _ in range(2))
+    first, second = np.array([True, False]), np.array([False, True])
+    env.reset(seed=0)
+    twin.reset(seed=0)
+    env.reset(seed=9, options={"reset_mask": first})
+    for each in (env, twin):
+        each.reset(options={"reset_mask": second})
+    assert env.tasks[1] == twin.tasks[1]
+    assert env.tasks[0] != twin.tasks[0]

@@ -1,4 +1,4 @@
-"""Sensors, odometry and policies that fail during a drive, as closed loops: the robot stops in time."""
+"""Sensors, odometry and policies that fail in a closed loop: the robot stops in time."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ class Loop:
         world: World = HALL,
         start: tuple[float, float, float] = (-2.0, 0.0, 0.0),
         goal: tuple[float, float] = (14.0, 0.0),
+        goal_radius: float = 0.5,
         pilot: dict[str, Any] | None = None,
         learned: Any = ROBOTS["turtlebot2"],
         max_range: float = 40.0,
@@ -47,7 +48,7 @@ class Loop:
         # Where it sees the ends of the hall, it sees something else from everywhere.
         self.robot = SimulatedRobot(world, robot=learned, physics="kinematic", max_range=max_range)
         self.robot.place(start)
-        made = Pilot(card(robot=learned), network, **(pilot or {}))
+        made = Pilot(card(robot=learned, goal_radius=goal_radius), network, **(pilot or {}))
         self.controller = Controller(made)
         self.controller.aim(goal)
         self.told: list[str] = []
@@ -98,8 +99,9 @@ def test_it_stops_for_what_is_too_near_for_its_sensor(
 ) -> None:
     # The stop distance ends 0.23 m from the center, where the sensor has long been blind.
     start = (-2.0, 0.0, 0.0) if world is POST else (13.0, 0.0, 0.0)
-    loop = Loop(world=world, start=start, goal=(14.9, 0.0), pilot={"silent": silent})
-    loop.controller.pilot.card = card(goal_radius=0.01)
+    loop = Loop(
+        world=world, start=start, goal=(14.9, 0.0), goal_radius=0.01, pilot={"silent": silent}
+    )
     loop.run(6.0, blind(0.45, tells))
     assert loop.stands and loop.robot.motion.x - start[0] > 1.2
     assert loop.controller.pilot.goal is not None
@@ -143,8 +145,7 @@ def test_a_scan_that_repeats_itself_stops_it_until_it_changes() -> None:
 
 
 def test_a_repeated_scan_counts_from_its_first_time_for_obstacles() -> None:
-    loop = Loop(start=(14.0, 0.0, 0.0), goal=(14.9, 0.0))
-    loop.controller.pilot.card = card(goal_radius=0.01)
+    loop = Loop(start=(14.0, 0.0, 0.0), goal=(14.9, 0.0), goal_radius=0.01)
     loop.run(0.8)
     frozen = loop.robot.scan()
     loop.run(3.0, lambda *_: frozen)
@@ -169,8 +170,7 @@ def test_equal_scans_of_free_space_do_not_stop_it() -> None:
 
 @pytest.mark.parametrize("behind", [1, 2])
 def test_odometry_that_lags_does_not_make_a_scan_repeat_itself(behind: int) -> None:
-    loop = Loop(start=(13.5, 0.0, 0.0), goal=(14.9, 0.0))
-    loop.controller.pilot.card = card(goal_radius=0.01)
+    loop = Loop(start=(13.5, 0.0, 0.0), goal=(14.9, 0.0), goal_radius=0.01)
     late: list[Any] = []
 
     def feels(motion: Any, _: float) -> tuple[Any, Any]:
