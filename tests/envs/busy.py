@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
+
+import pytest
 
 from mpfa_envs import Box, Cylinder, Polygon, Walker, World
 
@@ -34,3 +37,11 @@ POLITE = replace(
         Walker(radius=0.2),
     ),
 )
+
+
+def needs(arguments: dict[str, Any]) -> None:
+    """Skip a test whose arguments need a package that is not installed."""
+    if arguments.get("physics") == "wheels":
+        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    if POLITE in list(arguments["world"]):
+        pytest.importorskip("pyrvo", reason="an extra")

@@ -15,8 +15,13 @@ if find_spec("pybullet") is None:  # Python 3.12 and later
     ]
 
 
+@pytest.fixture
+def wheels() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+
+
 @pytest.fixture(params=["kinematic", "wheels"])
 def physics(request: pytest.FixtureRequest) -> str:
     if request.param == "wheels":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+        request.getfixturevalue("wheels")
     return request.param

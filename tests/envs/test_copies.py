@@ -31,9 +31,9 @@ def test_a_kinematic_copy_drives_the_same_episode_independently(
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
 
 
+@pytest.mark.usefixtures("wheels")
 @pytest.mark.parametrize("duplicate", COPIES, ids=["copy", "pickle"])
 def test_a_copy_on_wheels_is_rejected(duplicate: Callable) -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     for make in MAKERS:
         env = make(world="A", physics="wheels")
         with pytest.raises(TypeError, match=r"'wheels' cannot be copied .* state_dict\(\)"):

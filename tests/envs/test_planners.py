@@ -209,8 +209,8 @@ def test_the_followers_reach_the_goals_of_map_d(name: str) -> None:
     assert all(result.plan_s > 0.0 and result.decision_s > 0.0 for result in results)
 
 
+@pytest.mark.usefixtures("wheels")
 def test_the_follower_reaches_goals_on_wheels() -> None:
-    pytest.importorskip("pybullet")
     results = evaluate(make_planner("dijkstra"), "D", episodes=4, physics="wheels")
     assert sum(result.success for result in results) >= 3
 

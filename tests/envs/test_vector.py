@@ -25,7 +25,7 @@ from mpfa_envs import (
     navigation_reward,
 )
 from mpfa_envs.sensing.observation import INFO_TYPES
-from tests.envs.busy import BUSY, POLITE
+from tests.envs.busy import BUSY, POLITE, needs
 from tests.envs.plain_robot import PlainRobot
 from tests.envs.shapes import SCATTERED, random_shapes
 
@@ -36,14 +36,6 @@ MODES = [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP]
 
 def make(num_envs: int = 4, **kwargs: object) -> VectorNavigationEnv:
     return VectorNavigationEnv(num_envs, **{"world": NAMES, "physics": "kinematic"} | kwargs)
-
-
-def needs(arguments: dict) -> None:
-    """Skip a test whose arguments need a package that is not installed."""
-    if arguments.get("physics") == "wheels":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
-    if POLITE in arguments["world"]:
-        pytest.importorskip("pyrvo", reason="an extra")
 
 
 def drive(rng: np.random.Generator, robots: int) -> np.ndarray:
@@ -132,8 +124,8 @@ def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments:
     theirs.close()
 
 
+@pytest.mark.usefixtures("wheels")
 def test_robots_that_share_a_server_part_slowly() -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     ours, theirs = make(40, physics="wheels"), make(8, physics="wheels")
     tasks = [Task((0.0, -3.0, 0.3 * i), (0.0, 3.0)) for i in range(8)]
     ours.reset(seed=0, options={"worlds": ["A"] * 40, "tasks": tasks * 5})

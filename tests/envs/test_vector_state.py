@@ -25,7 +25,7 @@ from mpfa_envs import (
     navigation_reward,
 )
 from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
-from tests.envs.busy import BUSY, POLITE, STANDING
+from tests.envs.busy import BUSY, POLITE, STANDING, needs
 from tests.envs.shapes import SCATTERED, random_shapes
 
 
@@ -65,10 +65,7 @@ CASES: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_what_follows_is_the_same_to_the_bit(case: dict[str, Any]) -> None:
-    if case.get("physics") == "wheels":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
-    if case["world"] == [POLITE]:
-        pytest.importorskip("pyrvo", reason="an extra")
+    needs(case)
     case = {"physics": "kinematic"} | case
 
     def make() -> VectorNavigationEnv:
@@ -91,8 +88,8 @@ def test_what_follows_is_the_same_to_the_bit(case: dict[str, Any]) -> None:
     other.close()
 
 
+@pytest.mark.usefixtures("wheels")
 def test_wheels_are_restored_at_the_start_of_an_episode_too() -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     env, other = (VectorNavigationEnv(2, world="A", physics="wheels") for _ in range(2))
     env.reset(seed=1)
     drive(env, 0, 10)
@@ -232,8 +229,8 @@ def test_a_state_without_measurable_paths_is_rejected_before_any_change() -> Non
     assert (other.worlds, other.tasks) == (worlds, tasks)
 
 
+@pytest.mark.usefixtures("wheels")
 def test_wheels_stay_where_they_are_without_what_they_have_driven() -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     env = VectorNavigationEnv(2, world="B", physics="wheels")
     env.reset(seed=0)
     drive(env, 0, 3)
