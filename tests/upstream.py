@@ -93,16 +93,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def run_suite(checkout: Path, suite: str, kind: str) -> dict[str, str]:
-    """Run the tests of a suite with one kind of parts.
-
-    Args:
-        checkout: A checkout of TorchRL.
-        suite: A name in :data:`SUITES`.
-        kind: A name in :data:`KINDS`.
-
-    Returns:
-        ``"passed"``, ``"failed"`` or ``"skipped"`` by the name of the test.
-    """
+    """Whether each test of a suite passed, failed or was skipped with one kind of parts."""
     with tempfile.TemporaryDirectory() as folder:
         outcomes = Path(folder) / "outcomes"
         outcomes.touch()

@@ -20,6 +20,7 @@ from torchrl.data import LazyMemmapStorage, RandomSampler
 from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
+from tests.integration.test_torchrl_trainer import assert_learned
 from torchrl_config import main, register, train
 from torchrl_mpfa import (
     FixedFusion,
@@ -87,20 +88,9 @@ def tiny(*overrides: str) -> Trainer:
     return train(compose("torchrl_config", [*TINY, *overrides]))
 
 
-def assert_learned(trainer: Trainer, *names: str) -> None:
-    """The transitions that were replayed have these signals, and no others have."""
-    table = trainer.replay_buffer.storage.signal_table
-    rows = table.rows[: table.size]
-    known = rows[:, [table.column[name] for name in names]].isfinite().all(1)
-    replayed = rows[:, table.count_column] > 0
-    assert known.equal(replayed)
-    assert replayed.any()
-    assert trainer.replay_buffer.sampler.weights
-
-
 def test_the_composed_pipeline_updates_the_priorities_of_what_it_replays() -> None:
     trainer = tiny()
-    assert_learned(trainer, "td_error", "action_gradient")
+    assert_learned(trainer)
     assert trainer.optimization_stepper.priority_updates == 9
     buffer = trainer.replay_buffer
     assert type(buffer.sampler) is MPFASampler
@@ -143,7 +133,7 @@ def test_many_robots_in_the_worlds_of_a_generator_are_one_setting_away() -> None
     trainer = tiny("world=mixed", "env.base_env.num_envs=5")
     robots = trainer.replay_buffer[:]["collector", "traj_ids"][:20].unique()
     assert len(robots) >= 5
-    assert_learned(trainer, "td_error", "action_gradient")
+    assert_learned(trainer)
 
 
 def test_torchrls_own_networks_fit_the_loss() -> None:
@@ -156,7 +146,7 @@ def test_torchrls_own_networks_fit_the_loss() -> None:
         "mlp.num_cells=[16]",
         f"loss.value_network={critic}",
     )
-    assert_learned(trainer, "td_error", "action_gradient")
+    assert_learned(trainer)
 
 
 def test_the_guard_of_the_configuration_names_a_silent_stepper() -> None:
@@ -326,7 +316,7 @@ def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
     PriorityGuard().register(trainer)
     trainer.train()
     assert type(trainer.loss_module) is SignalTD3Loss
-    assert_learned(trainer, "td_error", "action_gradient")
+    assert_learned(trainer)
 
 
 def test_sac_in_torchrls_sac_trainer_updates_priorities() -> None:
@@ -339,7 +329,7 @@ def test_sac_in_torchrls_sac_trainer_updates_priorities() -> None:
     trainer.train()
     assert type(trainer.loss_module) is SignalSACLoss
     assert float(trainer.loss_module.alpha_init) == pytest.approx(0.2)
-    assert_learned(trainer, "td_error", "action_gradient")
+    assert_learned(trainer)
 
 
 def test_a_loss_without_networks_waits_for_them() -> None:

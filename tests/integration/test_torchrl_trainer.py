@@ -51,12 +51,20 @@ def tiny_trainer(seed: int = 0) -> DDPGTrainer:
     return make_trainer(TINY, seed=seed, progress_bar=False)
 
 
-def known_and_replayed(trainer: Trainer) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which slots have both learned signals, and which were in a batch."""
+def known_and_replayed(trainer: Trainer, *names: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which slots have these learned signals, and which were in a batch."""
     table = trainer.replay_buffer.storage.signal_table
     rows = table.rows[: table.size]
-    learned = [table.column[name] for name in ("td_error", "action_gradient")]
+    learned = [table.column[name] for name in names or ("td_error", "action_gradient")]
     return rows[:, learned].isfinite().all(1), rows[:, table.count_column] > 0
+
+
+def assert_learned(trainer: Trainer, *names: str) -> None:
+    """The transitions that were replayed have these signals, and no others have."""
+    known, replayed = known_and_replayed(trainer, *names)
+    assert known.equal(replayed)
+    assert replayed.any()
+    assert trainer.replay_buffer.sampler.weights
 
 
 def test_many_robots_in_the_worlds_of_a_generator_are_collected_flat() -> None:
@@ -68,9 +76,7 @@ def test_many_robots_in_the_worlds_of_a_generator_are_collected_flat() -> None:
     assert trainer.replay_buffer[:]["observation"].shape == (60, 24)
     robots = trainer.replay_buffer[:]["collector", "traj_ids"][:20].unique()
     assert len(robots) >= 5
-    known, replayed = known_and_replayed(trainer)
-    assert known.equal(replayed)
-    assert replayed.any()
+    assert_learned(trainer)
 
 
 class Forgetful(DefaultOptimizationStepper):
@@ -98,10 +104,7 @@ def test_without_a_stepper_the_trainers_own_hook_updates_them() -> None:
     trainer = tiny_trainer()
     PriorityGuard().register(trainer)
     trainer.train()
-    known, replayed = known_and_replayed(trainer)
-    assert known.equal(replayed)
-    assert replayed.any()
-    assert trainer.replay_buffer.sampler.weights
+    assert_learned(trainer)
 
 
 def test_two_trainings_of_one_seed_are_the_same_and_of_another_seed_are_not() -> None:

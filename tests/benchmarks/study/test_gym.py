@@ -42,6 +42,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:positive_above='mean'")
 
 PENDULUM = TASKS["Pendulum-v1"]
 TINY = Regime(actions=96, first_actions=16, batch_size=16, width=8, every=48, episodes=1, updates=1)
+BRIEF = replace(TINY, actions=48)
 
 
 def test_the_runs_know_nothing_of_navigation() -> None:
@@ -102,18 +103,14 @@ def test_a_run_has_an_evaluation_each_so_many_actions(method: str) -> None:
 
 def test_the_same_seed_gives_the_same_run_and_another_one_another() -> None:
     first, again, other = (
-        train(Settings("Pendulum-v1", "mpfa_per", seed, replace(TINY, actions=48)))
-        for seed in (3, 3, 4)
+        train(Settings("Pendulum-v1", "mpfa_per", seed, BRIEF)) for seed in (3, 3, 4)
     )
     assert first["return"].tolist() == again["return"].tolist() != other["return"].tolist()
 
 
-def rows_of(method: str, actions: int = 48, *, used: int = 0) -> tuple[TensorDict, int]:
-    """What a run of so many actions has stored, and the updates that it made.
-
-    So many random numbers more were used before it.
-    """
-    settings = Settings("Pendulum-v1", method, 3, replace(TINY, actions=actions))
+def rows_of(method: str, regime: Regime = BRIEF, *, used: int = 0) -> tuple[TensorDict, int]:
+    """Transitions and updates of a run, before which some random numbers more were used."""
+    settings = Settings("Pendulum-v1", method, 3, regime)
     torch.manual_seed(3)
     env = TransformedEnv(GymWrapper(make_env(PENDULUM)), InitTracker())
     env.set_seed(3)
@@ -145,7 +142,7 @@ def test_the_replay_is_made_for_the_task_and_its_exponent_reaches_its_end(
         return made[0][1]
 
     monkeypatch.setattr(training, "make_replay", make)
-    train(Settings("Pendulum-v1", "mpfa_per", 3, replace(TINY, actions=48)))
+    train(Settings("Pendulum-v1", "mpfa_per", 3, BRIEF))
     ((named, replay),) = made
     assert (named["positive_above"], named["capacity"]) == ("mean", 48)
     assert named["generator"].initial_seed() == 3
@@ -185,26 +182,13 @@ def test_the_time_of_evaluations_is_none_of_the_training(monkeypatch: pytest.Mon
 
 def test_noise_goes_on_from_one_block_of_actions_to_the_next() -> None:
     # Untrained actors choose about zero: what is left is noise, which loses 0.15 in a step.
-    settings = replace(TINY, actions=600, first_actions=600)
-    noise = rows_of_noise(settings)
+    rows, _ = rows_of("uniform", replace(TINY, actions=600, first_actions=600))
+    noise = rows["action"][:, 0].numpy()
     whole = np.corrcoef(noise[:-1], noise[1:])[0, 1]
     across = np.corrcoef(noise[3:-1:4], noise[4::4])[0, 1]
     assert whole == pytest.approx(0.85, abs=0.1)
     assert across == pytest.approx(whole, abs=0.1)
     assert np.abs(noise[-100:]).mean() < 0.5 * np.abs(noise[:100]).mean()
-
-
-def rows_of_noise(regime: Regime) -> np.ndarray:
-    settings = Settings("Pendulum-v1", "uniform", 3, regime)
-    env = TransformedEnv(GymWrapper(make_env(PENDULUM)), InitTracker())
-    env.set_seed(3)
-    learner = training.make_learner(settings, env)
-    replay = make_replay("uniform", capacity=2000, batch_size=16)
-    for actions in iterations(regime, env, learner, replay, seed=3):
-        if actions == regime.actions - regime.actions_at_once:
-            break
-    found: np.ndarray = replay.buffer[:]["action"][:, 0].numpy()
-    return found
 
 
 def test_an_evaluation_adds_the_rewards_of_each_episode_up_to_its_end() -> None:
