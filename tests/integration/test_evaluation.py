@@ -162,13 +162,13 @@ def test_an_evaluation_names_its_physics_and_another_physics_leaves_its_results(
 
 def test_generators_have_a_row_each_and_a_picture_of_nine_worlds(run: Path) -> None:
     words = ["bars:validation", "mazes:validation", "D"]
-    summary = evaluate.main([str(run), "--worlds", *words, "--episodes", "20"])
+    summary = evaluate.main([str(run), "--worlds", *words, "--episodes", "8"])
     assert list(summary["world"]) == ["bars-validation", "mazes-validation", "D", "total"]
     folder = run / f"evaluation-{worlds_label(words)}-kinematic"
     found = json.loads((folder / "evaluation.json").read_text())
     assert sorted(found["generators"]) == ["bars:validation", "mazes:validation"]
     assert sorted(found["worlds"]) == ["D"]
-    assert found["episodes"] == 60
+    assert found["episodes"] == 24
     for row in (found, found["generators"]["mazes:validation"], found["worlds"]["D"]):
         assert row["success"] + row["collision"] + row["timeout"] == pytest.approx(1.0)
         assert {"spl", "time_s"} <= set(row)
@@ -189,7 +189,7 @@ def test_two_splits_of_a_generator_are_apart_in_the_document(run: Path) -> None:
 def test_the_table_tells_of_walkers_where_there_are_any(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    how = ["--episodes", "2", "--no-pictures", "--output", str(run / "crowd")]
+    how = ["--episodes", "1", "--no-pictures", "--output", str(run / "crowd")]
     summary = evaluate.main([str(run), "--worlds", "crowd:validation", "A", *how])
     assert summary["intrusion_time"].notna().tolist() == [True, False, True]
     header = next(line for line in capsys.readouterr().out.splitlines() if "min_clearance" in line)
