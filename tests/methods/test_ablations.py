@@ -1,5 +1,7 @@
 """The paper's ablations, as the settings have them: which weights, which adjustments."""
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -22,69 +24,49 @@ def priorities_of(name):
     buffer = make_buffer(sampler, 8, 4, filled=0, signals=signals_of(method))
     buffer.extend(TensorDict({"next": {"reward": torch.tensor(REWARDS).unsqueeze(1)}}, [8]))
     set_signals(buffer, td_error=torch.tensor(ERRORS), action_gradient=torch.tensor(SLOPES))
-    return sampler.priorities(torch.arange(8)).tolist(), sampler
+    return sampler.priorities(torch.arange(8)).tolist()
 
 
-def entropies():
-    return oracles.entropy_of_reward(REWARDS), oracles.entropy_of_positive(REWARDS)
+def share_of_the_reward(others):
+    """Weight of the reward beside signals that have the entropy of positive training."""
+    of_reward, of_positive = (
+        oracles.entropy_of_reward(REWARDS),
+        oracles.entropy_of_positive(REWARDS),
+    )
+    return of_reward / (of_reward + others * of_positive)
 
 
-def test_reward_and_td_error_share_their_entropies():
-    of_reward, of_positive = entropies()
-    a = of_reward / (of_reward + of_positive)
-    found, _ = priorities_of("td_reward")
-    expected = [a * abs(r) + (1 - a) * d + 0.05 for r, d in zip(REWARDS, ERRORS, strict=True)]
-    assert found == pytest.approx(expected, rel=1e-5)
+def fused(of_reward, of_error, of_slope):
+    rows = zip(REWARDS, ERRORS, SLOPES, strict=True)
+    return [of_reward * abs(r) + of_error * d + of_slope * g + 0.05 for r, d, g in rows]
 
 
-def test_td_error_and_slope_have_the_same_weight_whatever_the_rewards():
-    found, _ = priorities_of("td_loss")
-    expected = [0.5 * d + 0.5 * g + 0.05 for d, g in zip(ERRORS, SLOPES, strict=True)]
-    assert found == pytest.approx(expected, rel=1e-5)
+def boosted(priorities):
+    pairs = zip(REWARDS, priorities, strict=True)
+    return [max(3.0 * p, 1.0) if reward > 0 else p for reward, p in pairs]
 
 
-def test_all_three_signals_have_the_weights_of_the_paper():
-    of_reward, of_positive = entropies()
-    a = of_reward / (of_reward + 2 * of_positive)
-    rest = (1 - a) / 2
-    found, _ = priorities_of("mpf_per")
-    expected = [
-        a * abs(r) + rest * d + rest * g + 0.05
-        for r, d, g in zip(REWARDS, ERRORS, SLOPES, strict=True)
-    ]
-    assert found == pytest.approx(expected, rel=1e-5)
-
-
-def raised(reward, priority):
-    return max(3.0 * priority, 1.0) if reward > 0 else priority
-
-
-def decayed(rewards, priorities):
+def decayed(priorities):
     mean = sum(priorities) / len(priorities)
     return [
-        p / (1 + 2.718281828459045 ** (-0.01 * j)) if r > 0 and p > mean else p
-        for j, (r, p) in enumerate(zip(rewards, priorities, strict=True), 1)
+        p / (1 + math.exp(-0.01 * j)) if r > 0 and p > mean else p
+        for j, (r, p) in enumerate(zip(REWARDS, priorities, strict=True), 1)
     ]
 
 
-def test_raise_is_per_with_positive_transitions_raised():
-    found, _ = priorities_of("raise")
-    expected = [raised(r, d + 0.05) for r, d in zip(REWARDS, ERRORS, strict=True)]
-    assert found == pytest.approx(expected, rel=1e-5)
+ONE, TWO = share_of_the_reward(1), share_of_the_reward(2)
+ALL = fused(TWO, (1 - TWO) / 2, (1 - TWO) / 2)
+ABLATIONS = {
+    "per": fused(0, 1, 0),
+    "td_reward": fused(ONE, 1 - ONE, 0),
+    "td_loss": fused(0, 0.5, 0.5),
+    "mpf_per": ALL,
+    "raise": boosted(fused(0, 1, 0)),
+    "decay": decayed(fused(0, 1, 0)),
+    "mpfa_per": decayed(boosted(ALL)),
+}
 
 
-def test_decay_is_per_with_positive_transitions_above_the_mean_decayed():
-    found, _ = priorities_of("decay")
-    assert found == pytest.approx(decayed(REWARDS, [d + 0.05 for d in ERRORS]), rel=1e-5)
-
-
-def test_mpfa_per_is_mpf_per_raised_and_then_decayed():
-    fused, _ = priorities_of("mpf_per")
-    found, _ = priorities_of("mpfa_per")
-    both = decayed(REWARDS, [raised(r, p) for r, p in zip(REWARDS, fused, strict=True)])
-    assert found == pytest.approx(both, rel=1e-5)
-
-
-def test_per_is_the_td_error_alone():
-    found, _ = priorities_of("per")
-    assert found == pytest.approx([d + 0.05 for d in ERRORS], rel=1e-5)
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_an_ablation_has_its_signals_and_adjustments_and_no_others(name):
+    assert priorities_of(name) == pytest.approx(ABLATIONS[name], rel=1e-5)

@@ -40,17 +40,6 @@ def test_a_buffer_that_is_emptied_has_no_newest_transition():
     assert buffer.sample()["index"].tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("way", ["state_dict", "folder"])
-def test_the_newest_transition_is_saved(tmp_path, way):
-    first, second = make_combined(9, 2, 6), make_combined(9, 2, 0)
-    if way == "state_dict":
-        second.load_state_dict(first.state_dict())
-    else:
-        first.dumps(tmp_path / "buffer")
-        second.loads(tmp_path / "buffer")
-    assert int(second.sample()["index"][0]) == 5
-
-
 def test_a_file_of_an_earlier_version_has_the_place_without_its_name(tmp_path):
     (tmp_path / "newest.json").write_text("[3]", encoding="utf-8")
     sampler = CERSampler()

@@ -64,14 +64,6 @@ def test_priorities_are_those_of_the_formula(fraction):
     assert found.tolist() == pytest.approx(expected, abs=1e-5)
 
 
-def test_at_first_the_value_does_not_count_and_later_it_does():
-    fusion = value_schedule()
-    names = [RELATIVE_VALUE.name, RELATIVE_ERROR.name]
-    assert fusion.weights(names, None, None).tolist() == [0.0, 1.0]
-    fusion.anneal(1.0)
-    assert fusion.weights(names, None, None).tolist() == [0.5, 0.5]
-
-
 def test_value_and_error_are_between_zero_and_one():
     for function in (relative_value, relative_error):
         for data in (torch.rand(9, generator=seeded(3)) * 100, torch.zeros(4), torch.ones(1)):

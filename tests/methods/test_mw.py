@@ -60,7 +60,7 @@ def test_a_pool_that_is_used_up_is_sampled_from_uniformly():
     assert torch.equal(buffer.sample()["priority_weight"], torch.ones(8))
 
 
-def test_a_transition_that_takes_the_place_of_a_spent_one_counts_anew():
+def test_a_transition_that_takes_the_place_of_a_spent_one_counts_again():
     buffer = make_capped(6, 4, 2, filled=6)
     for _ in range(20):
         train(buffer)

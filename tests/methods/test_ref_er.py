@@ -7,15 +7,13 @@ import torch
 
 from tests.methods.replays import make_buffer, make_transitions, seeded
 from tests.mpfa.test_updates import ACTION, OBSERVATION, make_learner, make_rows
+from tests.mpfa.transitions import restore
 from torchrl_mpfa import (
     make_actor,
     make_critic,
-    make_ddpg_loss,
     make_sac_loss,
     make_stochastic_actor,
-    make_td3_loss,
 )
-from torchrl_mpfa.learners.program import CompiledGradients
 from torchrl_mpfa.losses.functional import Trust, trusted_loss
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.methods.ref_er import ReFERSampler, ReFERSelection, importance_ratio, next_weight
@@ -209,28 +207,6 @@ def test_the_loss_of_the_actor_is_that_of_the_formula():
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
-@pytest.mark.parametrize("name", ["ddpg", "td3"])
-def test_the_compiled_update_has_the_gradients_of_the_losses(name):
-    torch.manual_seed(0)
-    make = {"ddpg": make_ddpg_loss, "td3": make_td3_loss}[name]
-    more = {"bounds": (-1.0, 1.0)} if name == "td3" else {}
-    loss = make(
-        make_actor(OBSERVATION, ACTION, width=8),
-        make_critic(OBSERVATION, ACTION, width=8),
-        signals=[],
-        **more,
-    )
-    rows = make_rows(20)
-    rows["policy_weight"], rows["behavior_weight"] = torch.rand(20), torch.rand(20)
-    expected, _ = loss._actors_part(rows)
-    found = CompiledGradients(loss, {"disable": True})(rows, "actor", None)
-    torch.testing.assert_close(found["loss_actor"], expected["loss_actor"].detach())
-    del rows["policy_weight"]
-    free, _ = loss._actors_part(rows)
-    assert not torch.isclose(free["loss_actor"], expected["loss_actor"])
-
-
-@pytest.mark.filterwarnings("ignore:No target network updater")
 def test_sac_is_held_and_set_free_as_well():
     torch.manual_seed(0)
     loss = make_sac_loss(
@@ -255,11 +231,7 @@ def test_sac_is_held_and_set_free_as_well():
 def test_the_weight_is_saved(way, tmp_path):
     first, second = (make_buffer(ReFERSampler(), 9, 2) for _ in range(2))
     first.sampler.policy_weight, first.sampler.batches = 0.25, 7
-    if way == "state":
-        second.load_state_dict(first.state_dict())
-    else:
-        first.dumps(tmp_path)
-        second.loads(tmp_path)
+    restore(second, first, tmp_path if way == "folder" else None)
     assert (second.sampler.policy_weight, second.sampler.batches) == (0.25, 7)
     for state in ({"_batches": 1}, {"_policy_weight": 1.5, "_batches": 1}):
         with pytest.raises(ValueError, match="'_policy_weight'"):

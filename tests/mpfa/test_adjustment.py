@@ -8,7 +8,7 @@ import torch
 from tests import oracles
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import Adjustment, PositiveBoost, PositiveDecay
-from torchrl_mpfa.adjustment import BatchFacts, boost_positive, decay_factor, decay_threshold
+from torchrl_mpfa.adjustment import BatchFacts, boost_positive, decay_factor
 
 
 def facts(rewards, counts=None):
@@ -51,29 +51,19 @@ def test_decay_factor_of_hand_numbers():
     assert found.tolist() == pytest.approx([0.5, 0.7310586, 0.8807971])
 
 
-def test_threshold_is_the_mean_of_the_batch():
-    assert float(decay_threshold(torch.tensor([1.0, 2.0, 6.0]))) == pytest.approx(3.0)
-
-
 def test_decay_of_a_hand_example_counts_places_from_one():
     # The mean is 3. The first and the third lie above it; the third is not positive.
     found = PositiveDecay(sharpness=1.0)(torch.tensor([5.0, 1.0, 4.0, 2.0]), facts([1, 1, -1, 1]))
     assert found.tolist() == pytest.approx([5.0 * 0.7310586, 1.0, 4.0, 2.0])
 
 
-@pytest.mark.parametrize("sharpness", [0.01, 0.3, 2.0])
+@pytest.mark.parametrize("sharpness", [0.01, 0.3, 2.0, 1e6])
 def test_decay_equals_the_oracle(sharpness):
     priority = torch.rand(64, generator=seeded(2)) * 5
     rewards = torch.randn(64, generator=seeded(3))
     expected = oracles.decayed(priority.tolist(), rewards.tolist(), sharpness)
     found = PositiveDecay(sharpness=sharpness)(priority, facts(rewards))
     assert found.tolist() == pytest.approx(expected, rel=1e-5)
-
-
-def test_a_large_sharpness_is_no_decay():
-    priority = torch.rand(32, generator=seeded(4))
-    found = PositiveDecay(sharpness=1e6)(priority, facts(torch.ones(32)))
-    torch.testing.assert_close(found, priority)
 
 
 @pytest.mark.parametrize("dtype", [torch.float, torch.double])
@@ -110,11 +100,6 @@ def test_positions_by_count_decay_by_how_often_a_transition_was_replayed():
     found = decay(torch.tensor([6.0, 6.0, 0.0]), facts([1, 1, 1], counts=[1.0, 5.0, 2.0]))
     expected = [6 / (1 + math.exp(-1)), 6 / (1 + math.exp(-5)), 0.0]
     assert found.tolist() == pytest.approx(expected)
-
-
-def test_what_decays_may_fall_below_the_threshold():
-    decayed = PositiveDecay(sharpness=0.01)(torch.tensor([4.0, 2.0]), facts([1.0, 1.0]))
-    assert float(decayed[0]) < 3.0
 
 
 @pytest.mark.parametrize("adjust", [PositiveBoost, PositiveDecay])

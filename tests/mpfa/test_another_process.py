@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
+from tests.mpfa.transitions import make_filled, train_rounds
 from torchrl_mpfa import SignalMemmapStorage
 
 CODE = """
@@ -25,8 +25,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def buffer(folder):
-    buffer = make_buffer(16, storage=SignalMemmapStorage(16, scratch_dir=folder))
-    buffer.extend(make_transitions(16))
+    buffer = make_filled(16, storage=SignalMemmapStorage(16, scratch_dir=folder))
     return buffer
 
 

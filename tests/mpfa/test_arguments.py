@@ -23,7 +23,9 @@ from torchrl_mpfa import (
     make_critic,
     make_sac_loss,
     make_stochastic_actor,
+    run_updates,
 )
+from torchrl_mpfa.cliffwalk import Cliffwalk
 from torchrl_mpfa.fusion import entropy_weights, positive_entropy, reward_entropy
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.samplers import TreeSampler
@@ -77,6 +79,10 @@ def actor(**given):
 def sac_loss(alpha_init):
     networks = make_stochastic_actor(3, 2, width=8), make_critic(3, 2, width=8)
     return make_sac_loss(*networks, alpha_init=alpha_init)
+
+
+def updates(count):
+    run_updates(buffer(batch_size=4), None, updates=count)
 
 
 def misspelt(name):
@@ -182,8 +188,9 @@ ROWS = [
         for value in (0.0, -1.0, NAN)
     ],
     (actor, {"final_init": "0"}, f"final_init {NO_NUMBER} '0'"),
-    (actor, {"final_init": -1.0}, f"final_init {NEGATIVE}"),
     (actor, {"width": 2**31}, f"width {NO_COUNT}"),
+    *[(Cliffwalk, {"length": length}, "length must be .* got") for length in (1, 21, 2.5, True)],
+    *[(updates, {"count": count}, f"updates {NO_COUNT} {count}") for count in (0, -1, 1.5, True)],
     (sac_loss, {"alpha_init": NAN}, f"alpha_init {NOT_POSITIVE} nan"),
 ]
 

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from tests.methods.replays import assert_shares, seeded, set_signals
 from tests.mpfa.test_updates import make_learner, make_rows
-from tests.mpfa.transitions import same
+from tests.mpfa.transitions import restore, same
 from torchrl_mpfa import (
     MixtureSampler,
     PositiveBoost,
@@ -216,13 +216,9 @@ def test_a_product_passes_the_checks_and_a_mixture_is_saved_and_loaded(
     check_sampler(lambda: SignalSampler(64, 0.6, 0.4, EPS, combination="product", signals=SIGNALS))
     rewards, errors = random_signals()
     first = make_plus("mixture", rewards, errors)
-    for way in ("state", "folder"):
+    for folder in (None, tmp_path / "buffer"):
         second = make_plus("mixture", rewards * 2, errors.flip(0))
-        if way == "state":
-            second.load_state_dict(first.state_dict())
-        else:
-            first.dumps(tmp_path / "buffer")
-            second.loads(tmp_path / "buffer")
+        restore(second, first, folder)
         assert same(first.sampler.state_dict(), second.sampler.state_dict())
         assert first.sample()["index"].equal(second.sample()["index"])
 

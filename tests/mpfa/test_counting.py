@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.methods.replays import make_buffer, make_transitions, seeded, set_signals
+from tests.mpfa.transitions import restore
 from torchrl_mpfa import PositiveBoost, SignalSampler
 from torchrl_mpfa.adjustment import adaptive_boost
 from torchrl_mpfa.methods import METHODS, make_replay
@@ -98,11 +99,7 @@ def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(name, setti
 
     first, second = make(0), make(1)
     learn(first, 3)  # Between two counts.
-    if way == "state":
-        second.buffer.load_state_dict(first.buffer.state_dict())
-    else:
-        first.buffer.dumps(tmp_path)
-        second.buffer.loads(tmp_path)
+    restore(second.buffer, first.buffer, tmp_path if way == "folder" else None)
     assert learn(first, 20).equal(learn(second, 20))
     states = [replay.buffer.sampler.state_dict() for replay in (first, second)]
     assert [str(state["_counted"]) for state in states] == [str(states[0]["_counted"])] * 2

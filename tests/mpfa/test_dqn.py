@@ -168,7 +168,7 @@ def test_a_learner_goes_on_from_its_state_as_if_nothing_had_been(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_a_learner_refuses_what_cannot_be_and_does_not_change(kind):
+def test_a_learner_rejects_what_cannot_be_and_does_not_change(kind):
     learner = learners()[kind]
     before = copy.deepcopy(learner.state_dict())
     spoiled = transitions()
@@ -262,7 +262,7 @@ def test_a_learner_learns_which_action_pays_with_mpfa_per_of_two_signals(kind):
     assert torch.equal(found["chosen_action_value"], found["action_value"].amax(-1, keepdim=True))
 
 
-def test_learners_refuse_what_is_anothers():
+def test_a_learner_rejects_the_loss_or_table_of_another():
     with pytest.raises(TypeError, match="SignalDQNLoss"):
         DQNLearner(network())
     with pytest.raises(TypeError, match="make_value_table"):

@@ -23,14 +23,6 @@ def update(buffer, index, values):
     buffer.update_tensordict_priority(batch)
 
 
-def test_an_empty_buffer_gives_one():
-    buffer = make_plain(8)
-    assert buffer.sampler.default_priority == 1.0
-    buffer.extend(make_transitions(3))
-    assert buffer.sampler.priorities()[:3].tolist() == [1.0] * 3
-    assert buffer.sampler.default_priority == 1.0
-
-
 def test_fresh_rows_do_not_hand_on_what_they_were_given():
     buffer = make_plain(8)
     buffer.extend(make_transitions(4))

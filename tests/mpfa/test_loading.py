@@ -10,6 +10,7 @@ from tests.mpfa.transitions import (
     MISSING,
     make_buffer,
     make_transitions,
+    rejected,
     same,
     snapshot,
     spoil,
@@ -187,10 +188,8 @@ def test_signals_that_cannot_be_are_rejected(pair, column, wrong):
     if column == buffer.storage.signal_table.reward_column and wrong == -1.0:
         return
     state["_storage"]["_signals"]["rows"][3, column] = wrong
-    before = snapshot(buffer)
-    with pytest.raises(ValueError, match=r"of the saved signals must be (finite|in )"):
+    with rejected(buffer, ValueError, r"of the saved signals must be (finite|in )"):
         buffer.load_state_dict(state)
-    assert same(before, snapshot(buffer))
 
 
 def test_an_empty_buffer_is_restored_and_filled():

@@ -77,33 +77,6 @@ def test_of_several_critics_the_larger_error_and_the_first_slope_count(kind, def
 SIGNALS = ["td_error", "action_gradient", "value"]
 
 
-def test_the_gradient_signal_equals_finite_differences():
-    actor, critic = make_networks()
-    plain = copy.deepcopy(critic).double().module
-    loss = make_ddpg_loss(actor, critic, gamma=GAMMA)
-    batch = make_batch()
-    loss(batch)
-    double, step = batch.select("observation", "action").double(), 1e-6
-    slopes = []
-    for axis in range(2):
-        shift = torch.zeros(2, dtype=torch.double)
-        shift[axis] = step
-        up = plain(double["observation"], double["action"] + shift)
-        down = plain(double["observation"], double["action"] - shift)
-        slopes.append((up - down).squeeze(1) / (2 * step))
-    expected = torch.stack(slopes, 1).norm(dim=1)
-    torch.testing.assert_close(batch[SIGNAL].double(), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_the_td_error_signal_is_absolute_and_not_squared():
-    loss, batch = make_loss(), make_batch()
-    losses = loss(batch)
-    delta = (losses["target_value"] - losses["pred_value"]).abs()
-    torch.testing.assert_close(batch["signals", "td_error"], delta)
-    torch.testing.assert_close(batch["td_error"], delta.square())
-    assert (batch["signals", "td_error"] >= 0).all()
-
-
 @pytest.mark.parametrize("options", [{}, {"signals": ["td_error"]}], ids=str)
 @pytest.mark.parametrize("kind", KINDS)
 def test_neither_signals_nor_deferring_change_the_gradients_of_parameters(kind, options):
@@ -141,13 +114,6 @@ def test_errors_stay_in_units_of_the_reward_when_the_loss_scales_it(kind):
     name = CRITICS_LOSS[kind]
     torch.testing.assert_close(losses[10.0]["target_value"], 10 * losses[1.0]["target_value"])
     torch.testing.assert_close(losses[10.0][name], 100 * losses[1.0][name])
-
-
-def test_the_gradient_signal_is_divided_by_the_reward_scale():
-    plain, scaled = make_batch(), make_batch()
-    make_loss()(plain)
-    make_loss(reward_scale=4.0)(scaled)
-    torch.testing.assert_close(scaled[SIGNAL] * 4.0, plain[SIGNAL])
 
 
 # What is deferred to the backward pass of the loss.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
+from tests.mpfa.transitions import make_filled, train_rounds
 from torchrl_mpfa import FixedFusion, Fusion, ScaledFusion, ScheduledFusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.storages.table import SignalTable
@@ -55,8 +55,7 @@ def test_a_scaled_fusion_passes_on_what_the_other_needs_to_know():
 
 def test_a_sampler_tells_its_fusion_how_much_of_the_training_is_done():
     fusion = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
-    buffer = make_buffer(24, 6, fusion=fusion)
-    buffer.extend(make_transitions(24))
+    buffer = make_filled(24, 6, fusion=fusion)
     for fraction, expected in ((0.0, 1.0), (1.0, 0.0)):
         buffer.sampler.anneal(fraction)
         train_rounds(buffer, 1)

@@ -1,4 +1,4 @@
-"""Actor and critic: shapes, options, the start near the middle of the tanh, and refusals."""
+"""Actor and critic: shapes, options, the start near the middle of the tanh, and rejections."""
 
 import math
 
@@ -109,7 +109,7 @@ SIZES = {
     make_value_network: {"observation_size": 3, "actions": 2, "width": 8, "layers": 2},
     make_value_table: {"cell_of": len, "cells": 3, "actions": 2},
 }
-REFUSALS = [
+REJECTIONS = [
     *[
         (make, {name: 0}, f"{name} must be an integer from 1 to 2147483647, got 0")
         for make, sizes in SIZES.items()
@@ -129,7 +129,7 @@ REFUSALS = [
 ]
 
 
-@pytest.mark.parametrize(("make", "options", "words"), REFUSALS)
+@pytest.mark.parametrize(("make", "options", "words"), REJECTIONS)
 def test_an_argument_that_no_network_can_have_is_rejected_by_name(make, options, words):
     make(**SIZES[make])
     with pytest.raises(ValueError, match=words):

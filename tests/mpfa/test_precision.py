@@ -40,16 +40,11 @@ def sampled(sampler, storage, samples):
     return torch.cat([sampler.sample(storage, samples // 10)[0] for _ in range(10)])
 
 
-def test_single_slots_have_their_frequencies_among_a_hundred_thousand():
-    sampler = TreeSampler(100_000, 1.0, 0.4, 0.0)
-    storage, probability = filled(sampler, 100_000, spread=0.3)
-    assert abs(score(sampled(sampler, storage, 2_000_000), probability)) < 4
-
-
-def test_single_slots_have_their_frequencies_among_a_million():
-    sampler = TreeSampler(1_000_000, 1.0, 0.4, 0.0)
-    storage, probability = filled(sampler, 1_000_000, spread=0.3)
-    assert abs(score(sampled(sampler, storage, 6_000_000), probability)) < 4
+@pytest.mark.parametrize(("slots", "samples"), [(100_000, 2_000_000), (1_000_000, 6_000_000)])
+def test_single_slots_of_many_have_their_frequencies(slots, samples):
+    sampler = TreeSampler(slots, 1.0, 0.4, 0.0)
+    storage, probability = filled(sampler, slots, spread=0.3)
+    assert abs(score(sampled(sampler, storage, samples), probability)) < 4
 
 
 @pytest.mark.slow

@@ -34,12 +34,6 @@ def test_action_gradient_priority_is_the_chosen_norm_of_each_row(order, expected
     assert found.tolist() == pytest.approx([expected, 0.0])
 
 
-def test_the_action_gradient_norm_does_not_change_when_axes_are_swapped():
-    gradient = torch.randn(50, 2, generator=seeded())
-    swapped = action_gradient_priority(gradient.flip(1))
-    torch.testing.assert_close(action_gradient_priority(gradient), swapped)
-
-
 def test_proportional_priority_adds_eps_once():
     found = proportional_priority(torch.tensor([-1.0, 0.0]), eps=0.05)
     assert found.tolist() == pytest.approx([1.05, 0.05])
@@ -60,19 +54,6 @@ def test_probabilities_equal_the_oracle(alpha):
     assert float(found.sum()) == pytest.approx(1.0, rel=1e-5)
 
 
-def test_alpha_zero_samples_uniformly():
-    found = sampling_probabilities(torch.tensor([0.1, 5.0, 100.0, 2.0]), alpha=0.0)
-    assert found.tolist() == [0.25] * 4
-
-
-def test_probabilities_do_not_change_with_the_scale_of_the_priorities():
-    priority = torch.rand(20, generator=seeded(2)) + 0.01
-    torch.testing.assert_close(
-        sampling_probabilities(priority * 50, alpha=0.7),
-        sampling_probabilities(priority, alpha=0.7),
-    )
-
-
 def test_importance_weights_of_a_hand_example():
     # N P is 1/2, 1 and 3/2; to the power of -1 that is 2, 1 and 2/3, over the largest, 2.
     found = importance_weights(torch.tensor([1 / 6, 2 / 6, 3 / 6]), beta=1.0)
@@ -87,11 +68,6 @@ def test_importance_weights_equal_the_oracle_and_do_not_depend_on_the_batch(beta
     found = importance_weights(probability[sampled], beta=beta, lowest=probability.min())
     expected = oracles.importance_weights(priority.tolist(), 0.6, beta, sampled.tolist())
     assert found.tolist() == pytest.approx(expected, rel=1e-4)
-
-
-def test_importance_weights_are_one_when_all_are_alike_or_beta_is_zero():
-    assert importance_weights(torch.full((3,), 0.2), beta=1.0).tolist() == [1.0] * 3
-    assert importance_weights(torch.tensor([0.1, 0.9]), beta=0.0).tolist() == [1.0] * 2
 
 
 def test_importance_weights_undo_the_bias_of_sampling_at_beta_one():

@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Compose, DoubleToFloat, RewardScaling
 
 from tests.mpfa.transitions import (
     make_buffer,
+    make_filled,
     make_transitions,
     same,
     seeded,
@@ -25,7 +26,6 @@ from torchrl_mpfa import (
     Signal,
     SignalMemmapStorage,
     SignalReplayBuffer,
-    SignalSampler,
     SignalTensorStorage,
 )
 from torchrl_mpfa.samplers import TreeSampler
@@ -36,8 +36,7 @@ def leaves(buffer):
 
 
 def test_rows_that_were_overwritten_since_they_were_sampled_are_dropped_and_counted():
-    buffer = make_buffer(8, 16)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8, 16)
     batch = write_signals(buffer.sample())
     overwritten = buffer.extend(make_transitions(3, first=8))
     fresh = leaves(buffer)[overwritten]
@@ -53,8 +52,7 @@ def test_rows_that_were_overwritten_since_they_were_sampled_are_dropped_and_coun
 
 
 def test_a_batch_whose_rows_are_all_gone_changes_nothing():
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     batch = write_signals(buffer.sample())
     buffer.extend(make_transitions(8, first=8))
     before = buffer.state_dict()
@@ -63,37 +61,29 @@ def test_a_batch_whose_rows_are_all_gone_changes_nothing():
     assert same(before, buffer.state_dict())
 
 
-def test_a_batch_from_before_the_buffer_was_emptied_is_stale():
+@pytest.mark.parametrize("filled", [0, 3, 8])
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_batch_from_before_the_buffer_was_emptied_is_stale(filled, times):
     # The count of writes must not start again, or the new rows would carry the old times.
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
-    batch = write_signals(buffer.sample())
-    buffer.empty()
-    buffer.extend(make_transitions(8))
-    buffer.update_tensordict_priority(batch)
-    assert buffer.stale_updates == 4
-
-
-@pytest.mark.parametrize("filled", [0, 3])
-def test_a_batch_of_slots_that_are_no_longer_filled_is_stale(filled):
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     batch = write_signals(buffer.sample())
     batch["index"], batch["written_at"] = torch.tensor([1, 4, 6, 7]), torch.tensor([1.0, 4, 6, 7])
-    buffer.empty()
+    for _ in range(times):
+        buffer.empty()
     if filled:
         buffer.extend(make_transitions(filled))
     before = snapshot(buffer)
     buffer.update_tensordict_priority(batch)
     assert buffer.stale_updates == 4
     assert same(before, snapshot(buffer))
+    if filled == 8:
+        return
     with pytest.raises(IndexError, match=rf"index must be in \[0, {filled}\), got 7"):
         buffer.update_tensordict_priority(batch.exclude("written_at"))
 
 
 def test_a_row_that_was_written_in_place_is_stale():
-    buffer = make_buffer(2, 2)
-    buffer.extend(make_transitions(2))
+    buffer = make_filled(2, 2)
     batch = write_signals(buffer.sample())
     buffer[torch.arange(2)] = make_transitions(2)
     buffer.update_tensordict_priority(batch)
@@ -101,8 +91,7 @@ def test_a_row_that_was_written_in_place_is_stale():
 
 
 def test_without_the_time_of_writing_every_row_is_taken():
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     batch = write_signals(buffer.sample()).exclude("written_at")
     buffer.extend(make_transitions(8, first=8))
     buffer.update_tensordict_priority(batch)
@@ -110,8 +99,7 @@ def test_without_the_time_of_writing_every_row_is_taken():
 
 
 def test_a_part_of_a_batch_may_be_updated_and_signals_may_be_columns():
-    buffer = make_buffer(8, 6)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8, 6)
     batch = write_signals(buffer.sample())[:3]
     batch["signals"] = TensorDict(
         {key: value.unsqueeze(1) for key, value in batch["signals"].items()}, [3]
@@ -124,8 +112,7 @@ def test_a_part_of_a_batch_may_be_updated_and_signals_may_be_columns():
 
 
 def test_an_update_of_nothing_is_nothing():
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     before = buffer.state_dict()
     buffer.update_tensordict_priority(write_signals(buffer.sample())[:0])
     del before["_rng"]
@@ -154,14 +141,6 @@ def test_signals_are_read_under_nested_and_renamed_keys():
     assert leaves(buffer).tolist() == pytest.approx([2.5**0.6, 4.0**0.6])
 
 
-def test_extending_returns_the_slots_and_adding_returns_one():
-    buffer = make_buffer(4)
-    assert buffer.extend(make_transitions(3)).tolist() == [0, 1, 2]
-    assert buffer.add(make_transitions(1)[0]) == 3
-    assert buffer.add(make_transitions(1)[0]) == 0
-    assert len(buffer) == 4
-
-
 def test_adding_one_by_one_equals_extending_at_once():
     one, many = make_buffer(8), make_buffer(8)
     data = make_transitions(11)
@@ -174,8 +153,7 @@ def test_adding_one_by_one_equals_extending_at_once():
 
 
 def test_a_batch_has_what_the_loss_and_the_update_need():
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     batch = buffer.sample()
     assert not batch.is_locked
     for key in ("index", "priority_weight", "written_at"):
@@ -187,57 +165,18 @@ def test_a_batch_has_what_the_loss_and_the_update_need():
         assert buffer.sample(3).batch_size == (3,)
 
 
-def test_changing_a_batch_does_not_change_the_buffer():
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
-    buffer.sample()["observation"].fill_(-1)
-    assert buffer[:]["observation"].min() == 0
-
-
 def test_batches_of_two_buffers_are_equal_if_their_seeds_are():
     sampled = []
     for seed in (1, 1, 2):
-        buffer = make_buffer(64, 16, seed=seed)
-        buffer.extend(make_transitions(64))
+        buffer = make_filled(64, 16, seed=seed)
         sampled.append(train_rounds(buffer, 5))
     assert sampled[0].equal(sampled[1])
     assert not sampled[0].equal(sampled[2])
 
 
-def test_without_a_generator_the_global_seed_rules():
-    sampled = []
-    for _ in range(2):
-        torch.manual_seed(11)
-        buffer = SignalReplayBuffer(
-            storage=SignalTensorStorage(64), sampler=MPFASampler(64), batch_size=16
-        )
-        buffer.extend(make_transitions(64))
-        sampled.append(train_rounds(buffer, 3))
-    assert sampled[0].equal(sampled[1])
-
-
-@pytest.mark.parametrize(
-    "sampler",
-    [
-        MPFASampler(32),
-        TreeSampler(32, 0.6, 0.4),
-        PrioritizedSampler(32, 0.6, 0.4),
-        RandomSampler(),
-        None,
-    ],
-    ids=lambda sampler: type(sampler).__name__,
-)
-def test_prefetching_is_rejected_as_one_seed_would_not_give_the_same_batches(sampler):
-    with pytest.raises(ValueError, match=r"prefetch must be 0, got 2: batches .* same batches"):
-        SignalReplayBuffer(
-            storage=SignalTensorStorage(32), sampler=sampler, batch_size=8, prefetch=2
-        )
-
-
 def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):
     # The writer would be at the third slot of a storage that holds none.
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     other, written, emptied = ThreadPoolExecutor(1), [], buffer.sampler._empty
 
     def empty():
@@ -325,8 +264,7 @@ def test_with_any_other_sampler_it_is_torchrls_buffer(make_sampler, make_storage
 
 
 def test_priorities_may_also_be_set_by_hand():
-    buffer = make_buffer(8)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8)
     buffer.update_priority(torch.arange(8), torch.arange(8.0))
     expected = [(p + 0.05) ** 0.6 for p in range(8)]
     assert leaves(buffer).tolist() == pytest.approx(expected)
@@ -362,18 +300,6 @@ def test_a_priority_is_stored_with_the_transition_where_no_signals_are_fused(mak
     assert batch[key].equal(data[key][batch["index"]])
     if hasattr(buffer.sampler, "_sum_tree"):
         assert leaves(buffer).tolist() == [1, 2, 3, 4, 5, 6]
-
-
-@pytest.mark.parametrize("key", [("next", "reward"), "novelty", ("novelty",)])
-def test_a_priority_key_that_would_take_a_signal_away_is_rejected(key):
-    signals = ["td_error", Signal("novelty", key="novelty", known_at="write")]
-    with pytest.raises(ValueError, match=r"priority_key must not be where a reward .*, got "):
-        SignalReplayBuffer(
-            storage=SignalTensorStorage(16, signals=signals),
-            sampler=SignalSampler(16, 0.6, 0.4, signals=signals),
-            batch_size=4,
-            priority_key=key,
-        )
 
 
 def test_the_paper_signal_of_the_reward_is_its_absolute_value():

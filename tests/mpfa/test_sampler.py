@@ -11,6 +11,7 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 from tests import oracles
 from tests.mpfa.transitions import (
     make_buffer,
+    make_filled,
     make_transitions,
     seeded,
     train_rounds,
@@ -133,14 +134,6 @@ def test_importance_weights_of_a_batch_equal_the_oracle():
     assert batch["priority_weight"].tolist() == pytest.approx(expected, rel=1e-4)
 
 
-def test_alpha_zero_samples_uniformly_whatever_the_signals_say():
-    buffer = make_buffer(16, 8, alpha=0.0)
-    buffer.extend(make_transitions(16))
-    train_rounds(buffer, 5)
-    assert leaves(buffer).tolist() == [1.0] * 16
-    assert buffer.sample()["priority_weight"].tolist() == [1.0] * 8
-
-
 def test_one_signal_is_torchrls_prioritized_replay():
     ours = SignalReplayBuffer(
         storage=SignalTensorStorage(32, signals=["td_error"]),
@@ -162,8 +155,7 @@ def test_one_signal_is_torchrls_prioritized_replay():
 
 
 def test_of_a_slot_that_appears_twice_in_a_batch_the_last_entry_counts():
-    buffer = make_buffer(8, adjustments=[], fusion=FixedFusion({"td_error": 1.0}), eps=0.0)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8, adjustments=[], fusion=FixedFusion({"td_error": 1.0}), eps=0.0)
     batch = set_batch(buffer, [3, 5, 3, 3])
     batch["signals"] = TensorDict(
         {"td_error": torch.tensor([9.0, 4, 8, 2]), "action_gradient": torch.zeros(4)}, [4]
@@ -186,8 +178,7 @@ def test_a_fresh_transition_gets_the_highest_priority_in_the_buffer_before_alpha
 
 
 def test_replays_are_counted_with_duplicates_and_start_again_with_a_new_transition():
-    buffer = make_buffer(4, 64)
-    buffer.extend(make_transitions(4))
+    buffer = make_filled(4, 64)
     index = buffer.sample()["index"]
     table = buffer.storage.signal_table
     counts = table.rows[:, table.count_column]
@@ -213,8 +204,7 @@ class CountingFusion:
 )
 def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten(refresh, expected):
     fusion = CountingFusion()
-    buffer = make_buffer(16, fusion=fusion, entropy_refresh=refresh)
-    buffer.extend(make_transitions(16))
+    buffer = make_filled(16, fusion=fusion, entropy_refresh=refresh)
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
     for number in range(5):
         buffer.add(make_transitions(1, first=16 + number)[0])
@@ -224,8 +214,7 @@ def test_entropies_are_counted_again_when_that_share_of_the_buffer_was_rewritten
 
 def test_a_refresh_of_zero_counts_at_every_update_even_if_nothing_was_written():
     fusion = CountingFusion()
-    buffer = make_buffer(16, fusion=fusion, entropy_refresh=0.0)
-    buffer.extend(make_transitions(16))
+    buffer = make_filled(16, fusion=fusion, entropy_refresh=0.0)
     train_rounds(buffer, 3)
     assert fusion.asked == 3
 
@@ -242,19 +231,6 @@ def test_weights_counted_over_the_batch_are_those_of_each_batch():
     assert buffer.sampler.weights == pytest.approx(
         {"td_error": 0.0, "action_gradient": 0.0, "reward": 1.0}
     )
-
-
-def test_weights_are_counted_over_the_whole_buffer_and_not_the_batch():
-    buffer = make_buffer(8)
-    rewards = [1.0, -1, -1, -1, -1, -1, -1, 3]
-    buffer.extend(make_transitions(8, rewards=rewards))
-    buffer.update_tensordict_priority(write_signals(set_batch(buffer, [0, 7])))
-    of_positive = oracles.entropy_of_positive(rewards)
-    a, beta, _ = oracles.fusion_weights(
-        oracles.entropy_of_reward(rewards), of_positive, of_positive
-    )
-    assert buffer.sampler.weights["reward"] == pytest.approx(a)
-    assert buffer.sampler.weights["td_error"] == pytest.approx(beta)
 
 
 def test_defaults_are_those_of_the_paper():

@@ -6,14 +6,13 @@ import os
 import pytest
 import torch
 
-from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
+from tests.mpfa.transitions import make_filled, make_transitions, train_rounds
 from torchrl_mpfa import SignalMemmapStorage
 
 
 @pytest.mark.parametrize("capacity", [100, 16, 3])
 def test_a_folder_in_use_is_rejected_and_the_user_of_it_goes_on(tmp_path, capacity):
-    buffer = make_buffer(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
-    buffer.extend(make_transitions(16))
+    buffer = make_filled(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
     before = buffer.storage.signal_table.rows.clone()
     with pytest.raises(FileExistsError, match=r"signals.memmap is in use by a living storage"):
         SignalMemmapStorage(capacity, scratch_dir=tmp_path, existsok=True)

@@ -7,6 +7,7 @@ import pytest
 from tests import oracles
 from tests.mpfa.transitions import (
     make_buffer,
+    make_filled,
     make_transitions,
     same,
     snapshot,
@@ -107,8 +108,7 @@ def test_statistics_grow_with_what_is_known():
 
 
 def test_a_fusion_without_entropies_has_none_in_the_statistics():
-    buffer = make_buffer(8, fusion=FixedFusion({"reward": 0.5, "td_error": 0.5}))
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8, fusion=FixedFusion({"reward": 0.5, "td_error": 0.5}))
     train_rounds(buffer, 1)
     stats = buffer.stats()
     assert not any(name.startswith("entropy/") for name in stats)

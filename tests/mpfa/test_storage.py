@@ -6,7 +6,14 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictMaxValueWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
-from tests.mpfa.transitions import make_buffer, make_transitions, same, seeded, write_signals
+from tests.mpfa.transitions import (
+    make_buffer,
+    make_filled,
+    make_transitions,
+    same,
+    seeded,
+    write_signals,
+)
 from torchrl_mpfa import Signal, SignalMemmapStorage, SignalTensorStorage
 
 KINDS = ["memory", "memmap", "memmap_scratch"]
@@ -59,8 +66,7 @@ def test_a_wrap_of_the_ring_resets_exactly_the_rows_it_writes(make_storage):
 
 def test_adding_one_transition_resets_its_slot(make_storage):
     storage = make_storage(2)
-    buffer = make_buffer(2, storage=storage)
-    buffer.extend(make_transitions(2))
+    buffer = make_filled(2, storage=storage)
     fill_signals(storage)
     assert buffer.add(make_transitions(1, rewards=[-4.0])[0]) == 0
     assert is_fresh(storage, [0])
@@ -130,8 +136,7 @@ def test_a_writer_that_keeps_the_best_keeps_signals_and_data_together():
 
 
 def test_nothing_of_the_signals_shows_in_a_batch(make_storage):
-    buffer = make_buffer(8, storage=make_storage(8))
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8, storage=make_storage(8))
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
     batch = buffer.sample()
     bookkeeping = {"index", "priority_weight", "written_at"}
@@ -190,8 +195,7 @@ def test_entries_that_are_no_tensors_come_back():
 
 def test_an_emptied_buffer_forgets_the_signals_and_can_be_filled_again(make_storage):
     storage = make_storage(8)
-    buffer = make_buffer(8, storage=storage)
-    buffer.extend(make_transitions(8))
+    buffer = make_filled(8, storage=storage)
     buffer.update_tensordict_priority(write_signals(buffer.sample()))
     buffer.empty()
     assert len(buffer) == storage.signal_table.size == 0
@@ -257,17 +261,6 @@ def test_torchrls_own_sampler_may_sample_the_storage():
     buffer = ReplayBuffer(storage=SignalTensorStorage(8), sampler=RandomSampler(), batch_size=4)
     buffer.extend(torch.arange(5.0))
     assert buffer.sample().shape == (4,)
-
-
-def test_a_batch_from_before_two_clearings_is_old(make_storage):
-    storage = make_storage(8)
-    buffer = make_buffer(8, storage=storage)
-    buffer.extend(make_transitions(8))
-    batch = write_signals(buffer.sample())
-    buffer.empty()
-    buffer.empty()
-    buffer.update_tensordict_priority(batch)
-    assert buffer.stale_updates == len(batch)
 
 
 def test_rows_that_are_written_out_of_order_count_as_in_torchrl():

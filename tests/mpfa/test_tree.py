@@ -10,7 +10,7 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.data.replay_buffers.scheduler import LinearScheduler
 
 from tests import oracles
-from tests.mpfa.transitions import make_transitions, same, seeded
+from tests.mpfa.transitions import make_transitions, rejected, same, seeded
 from torchrl_mpfa import MixtureSampler
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
@@ -124,41 +124,44 @@ def test_one_number_may_serve_for_all_slots_and_a_column_for_a_row():
     assert leaves(sampler, 4).tolist() == [3.0, 4.0, 5.0, 2.0]
 
 
-def test_of_a_slot_that_appears_twice_the_last_entry_counts():
-    sampler = TreeSampler(4, 1.0, 0.4, 0.0)
-    sampler.update_priority(torch.tensor([1, 1, 1]), torch.tensor([7.0, 9.0, 2.0]))
-    assert float(sampler._sum_tree[1]) == 2.0
-    assert float(sampler._min_tree[1]) == 2.0
+INTEGERS = "index must hold integers, got"
+OUTSIDE = r"index must be in \[0, 4\), got"
+WRONG = [
+    *(([0, 1], [1.0, v], f"priority .* not negative, got {v}") for v in (math.nan, math.inf, -0.5)),
+    *(([0, slot], [1.0, 2.0], f"{OUTSIDE} {slot}") for slot in (4, 7, -2)),
+    (torch.tensor([True, False, True]), 1.0, INTEGERS),
+    (np.array([True, False]), 1.0, INTEGERS),
+    (torch.tensor([0.0, 1.7]), 1.0, INTEGERS),
+    ([0.5], 1.0, INTEGERS),
+    ((torch.tensor([0.0]), torch.tensor([1.0])), 1.0, INTEGERS),
+    (torch.arange(3), torch.ones(2), "priority should be a number or an iterable"),
+    (torch.zeros(2, 2, dtype=torch.long), torch.ones(2), "index must have one dimension"),
+]
 
 
-@pytest.mark.parametrize("wrong", [math.nan, math.inf, -0.5])
-def test_a_priority_that_would_poison_the_tree_is_rejected_where_it_enters(wrong):
+@pytest.mark.parametrize(("index", "priority", "message"), WRONG)
+def test_a_slot_or_priority_that_cannot_be_is_rejected_and_changes_nothing(
+    index, priority, message
+):
     sampler = TreeSampler(4, 0.6, 0.4)
     filled(sampler, 4, 4)
     before = sampler.state_dict()
-    with pytest.raises(ValueError, match=f"priority must be finite and not negative, got {wrong}"):
-        sampler.update_priority(torch.tensor([0, 1]), torch.tensor([1.0, wrong]))
+    with pytest.raises((IndexError, RuntimeError, TypeError, ValueError), match=message):
+        sampler.update_priority(index, torch.as_tensor(priority))
+    if "index must" in message and "dimension" not in message:
+        with pytest.raises((IndexError, TypeError), match=message):
+            sampler.mark_update(index)
     assert same(before, sampler.state_dict())
 
 
-@pytest.mark.parametrize("slot", [4, 7, -2])
-def test_a_slot_outside_the_buffer_is_rejected(slot):
-    sampler = TreeSampler(4, 0.6, 0.4)
-    filled(sampler, 4, 4)
-    before = sampler.state_dict()
-    with pytest.raises(IndexError, match=rf"index must be in \[0, 4\), got {slot}"):
-        sampler.update_priority(torch.tensor([0, slot]), torch.tensor([1.0, 2.0]))
-    with pytest.raises(IndexError, match=rf"index must be in \[0, 4\), got {slot}"):
-        sampler.mark_update(torch.tensor([slot]))
-    assert same(before, sampler.state_dict())
-
-
-def test_priorities_that_do_not_fit_the_slots_are_rejected():
-    sampler = TreeSampler(4, 0.6, 0.4)
-    with pytest.raises(RuntimeError, match="priority should be a number or an iterable"):
-        sampler.update_priority(torch.arange(3), torch.ones(2))
-    with pytest.raises(RuntimeError, match="index must have one dimension"):
-        sampler.update_priority(torch.zeros(2, 2, dtype=torch.long), torch.ones(2))
+@pytest.mark.parametrize("alpha", [1.0, 2.0])
+def test_priorities_whose_sum_overflows_are_rejected(alpha):
+    sampler = TreeSampler(1000, alpha, 0.4)
+    sampler.mark_update(torch.arange(1000))
+    with rejected(sampler, ValueError, r"priority must not be so high that sums overflow, got"):
+        sampler.update_priority([3], torch.tensor([1e306], dtype=torch.double))
+    sampler.update_priority([3], torch.tensor([2e38]))  # Would overflow in single precision.
+    assert sampler.priorities(torch.tensor([3])).item() == pytest.approx(2e38)
 
 
 def test_an_empty_buffer_and_priorities_of_zero_cannot_be_sampled():
@@ -276,6 +279,21 @@ def test_the_highest_mass_that_there_is_does_not_leave_the_filled_slots(monkeypa
     highest = torch.full((3,), 1.0 - 2.0**-53, dtype=torch.double)
     monkeypatch.setattr(sampler, "_mass", lambda count: highest.clone())
     assert sampler.sample(storage, 3)[0].tolist() == [28] * 3
+
+
+@pytest.mark.parametrize("count", [3, 40_000])
+def test_of_a_slot_that_appears_twice_the_last_entry_counts(count):
+    sampler = TreeSampler(50, 1.0, 0.4, 0.0)
+    sampler.mark_update(torch.arange(50))
+    slots = torch.randint(50 if count > 50 else 1, (count,), generator=seeded(3))
+    priority = torch.rand(count, generator=seeded(4), dtype=torch.double) + 0.1
+    sampler.update_priority(slots, priority)
+    expected = [1.0] * 50
+    for slot, value in zip(slots.tolist(), priority.tolist(), strict=True):
+        expected[slot] = value
+    assert sampler.priorities().tolist() == expected
+    for tree in (sampler._sum_tree, sampler._min_tree):
+        assert torch.as_tensor(tree[torch.arange(50)]).tolist() == expected
 
 
 def test_without_an_exponent_the_highest_priority_is_the_highest_ever():

@@ -376,12 +376,6 @@ def test_a_batch_size_of_several_batches_is_not_warned_of(recwarn):
     assert not [each for each in recwarn if "batch_size" in str(each.message)]
 
 
-@pytest.mark.parametrize("updates", [0, -1, 1.5, True])
-def test_a_number_of_updates_that_is_no_count_is_rejected(updates):
-    with pytest.raises(ValueError, match=r"updates must be an integer from 1 to 2147483647, got"):
-        run_updates(make_buffer(), make_learner(), updates=updates)
-
-
 def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_rejected():
     learner = make_learner()
     storage = SignalTensorStorage(MANY)

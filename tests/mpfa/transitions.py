@@ -1,8 +1,10 @@
 """Transitions and buffers that the tests of the replay parts share."""
 
 import os
+from contextlib import contextmanager
 from copy import deepcopy
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -36,6 +38,13 @@ def make_buffer(capacity=16, batch_size=4, *, seed=0, storage=None, **kwargs):
         batch_size=batch_size,
         generator=seeded(seed),
     )
+
+
+def make_filled(capacity=16, batch_size=4, **kwargs):
+    """The same, full of transitions."""
+    buffer = make_buffer(capacity, batch_size, **kwargs)
+    buffer.extend(make_transitions(capacity))
+    return buffer
 
 
 def write_signals(batch, *, seed=0, generator=None):
@@ -82,6 +91,24 @@ def same(first, second):
 def snapshot(buffer):
     """A copy of the whole state of a buffer, generator included."""
     return deepcopy(buffer.state_dict())
+
+
+@contextmanager
+def rejected(part, error, match=None):
+    """A block that raises this error and leaves the state of the part as it was."""
+    before = snapshot(part)
+    with pytest.raises(error, match=match):
+        yield
+    assert same(before, snapshot(part))
+
+
+def restore(second, first, folder=None):
+    """Give a buffer the state of another one, through a folder if there is one."""
+    if folder is None:
+        second.load_state_dict(first.state_dict())
+    else:
+        first.dumps(folder)
+        second.loads(folder)
 
 
 MISSING = object()
