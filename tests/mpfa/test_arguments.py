@@ -91,12 +91,12 @@ def misspelt(name):
 
 ROWS = [
     (tree_sampler, {"max_capacity": 0}, f"max_capacity {NO_COUNT} 0"),
-    (tree_sampler, {"alpha": -1.0}, f"alpha {NEGATIVE}, got -1.0"),
+    (tree_sampler, {"alpha": -1.0}, "alpha must be greater or equal to 0 and finite, got -1.0"),
     (tree_sampler, {"beta": NAN}, f"beta {NEGATIVE}, got nan"),
     (tree_sampler, {"eps": INF}, f"eps {NEGATIVE}, got inf"),
     (mpfa_sampler, {"max_capacity": 2.5}, f"max_capacity {NO_COUNT} 2.5"),
     (mpfa_sampler, {"max_capacity": 10**30}, f"max_capacity {NO_COUNT} 1000"),
-    (mpfa_sampler, {"alpha": -0.1}, f"alpha {NEGATIVE}, got -0.1"),
+    (mpfa_sampler, {"alpha": -0.1}, "alpha must be greater or equal to 0 and finite, got -0.1"),
     (mpfa_sampler, {"entropy_refresh": -1.0}, f"entropy_refresh {NEGATIVE}, got -1.0"),
     (mpfa_sampler, {"signals": []}, FEW_SIGNALS),
     (mpfa_sampler, {"fusion": object()}, "fusion must have a method 'weights', got object"),

@@ -24,6 +24,7 @@ from torchrl_mpfa.samplers.states import SavedTrees
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 ORDERED = 2048
 """Rows up to which writing by index keeps their order."""
+_ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
 
 
 class TreeSampler(SavedTrees):
@@ -77,7 +78,8 @@ class TreeSampler(SavedTrees):
         stratified: bool = False,
     ) -> None:
         check_counts(max_capacity=max_capacity)
-        check(NOT_NEGATIVE, alpha=alpha, beta=beta, eps=eps)
+        check(_ALPHA, alpha=alpha)
+        check(NOT_NEGATIVE, beta=beta, eps=eps)
         if dtype not in (torch.float, torch.double):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.stratified = stratified
@@ -122,7 +124,7 @@ class TreeSampler(SavedTrees):
 
     @alpha.setter
     def alpha(self, value: float) -> None:
-        check(NOT_NEGATIVE, alpha=value)
+        check(_ALPHA, alpha=value)
         self._check_alpha(value)
         before, self._alpha = self._alpha, float(value)
         if value != before:
@@ -440,8 +442,7 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
 
 def last_of_each(slots: Tensor) -> Tensor | None:
     """Last position of each slot, shape ``[U]``; None if every slot appears once."""
-    # Of a slot that is written twice in one call the last must win, which writing by index leaves
-    # open for large batches.
+    # A slot that is written twice keeps its last value; index writes of many rows leave it open.
     unique, inverse = slots.unique(return_inverse=True)
     if len(unique) == len(slots):
         return None
