@@ -32,9 +32,10 @@ def test_an_old_name_warns_and_is_the_new_one(old, new):
 
 def test_every_old_name_is_on_the_page():
     from mpfa_envs import _RENAMED
-    from torchrl_mpfa.renamed import OF_CLIFFWALK, OF_METHODS, OF_SELECTION, TOP
+    from torchrl_mpfa.renamed import OF_CLIFFWALK, OF_LEARNERS, OF_METHODS, OF_SELECTION, TOP
 
-    assert len(ROWS) == len(_RENAMED) + len(OF_METHODS) + len(OF_SELECTION) + len(TOP)
+    tables = (_RENAMED, OF_LEARNERS, OF_METHODS, OF_SELECTION, TOP)
+    assert len(ROWS) == sum(map(len, tables))
     assert len(GONE) == len(OF_CLIFFWALK)
 
 

@@ -56,6 +56,11 @@ OF_METHODS: Final[dict[str, str]] = {
     "value_schedule": "torchrl_mpfa.methods.hvper.value_schedule",
 }
 """Names that were in :mod:`torchrl_mpfa.methods`, and where they are."""
+OF_LEARNERS: Final[dict[str, str]] = {
+    "CompilableLearner": "torchrl_mpfa.learners.ActorCriticLearner",
+    "QLearner": "torchrl_mpfa.learners.TabularQLearner",
+}
+"""Names that were in :mod:`torchrl_mpfa.learners`, and where they are."""
 OF_CLIFFWALK: Final[dict[str, str]] = {
     "batch_size_of": "benchmarks.study.cliffwalk.batch_size_of",
     "oracle_updates": "benchmarks.study.cliffwalk.oracle_updates",

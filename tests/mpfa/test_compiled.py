@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch._dynamo.exc import BackendCompilerFailed
+from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torchrl.objectives import ValueEstimators
 
 from tests.mpfa.losses import (
@@ -20,7 +22,7 @@ from tests.mpfa.losses import (
     parameter_gradients,
     without_shortcut,
 )
-from torchrl_mpfa import DDPGLearner, SignalDDPGLoss
+from torchrl_mpfa import DDPGLearner, SignalDDPGLoss, make_ddpg_loss
 from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.selection import SampledBatch
 
@@ -330,19 +332,90 @@ def test_a_compiler_that_fails_is_not_taken_for_a_batch_that_does_not_fit():
 
 
 def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, monkeypatch):
+    # TorchRL has PyTorch name its own folder in the environment, which is not a user's choice.
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "anything")
-    make_pair("ddpg")
-    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "anything"
-    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
     make_pair("ddpg")
     folder = Path(os.environ["TORCHINDUCTOR_CACHE_DIR"])
     assert folder.is_relative_to(tmp_path)
     assert folder.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "anything")
+    make_pair("ddpg")
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "anything"
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
     monkeypatch.setattr(Path, "chmod", fail_with(PermissionError("not yours")))
     with pytest.raises(PermissionError, match="must be a folder of your own: set XDG_CACHE_HOME"):
         make_pair("ddpg")
+
+
+def test_where_the_user_has_no_folder_programs_stay_where_pytorch_has_them(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
+    make_pair("ddpg")
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == default_cache_dir()
+
+
+def change_reward(loss):
+    loss.set_keys(reward="other_reward")
+
+
+def change_gamma(loss):
+    loss.value_estimator.gamma = torch.tensor(0.5)
+
+
+@pytest.mark.parametrize("change", [change_reward, change_gamma])
+def test_a_program_is_made_again_for_a_loss_that_is_changed(change):
+    learners = make_pair("ddpg")
+    for seed in range(4):
+        if seed == 2:
+            for learner in learners:
+                change(learner.loss)
+        for learner in learners:
+            batch = make_batch(seed=seed, weighted=True)
+            batch["next", "other_reward"] = 5.0 * batch["next", "reward"] + 1.0
+            torch.manual_seed(seed)
+            learner.update(batch)
+    assert_alike(*learners)
+
+
+def test_a_program_is_made_again_for_another_precision():
+    learners = make_pair("ddpg")
+    for seed in range(4):
+        with torch.autocast("cpu", torch.bfloat16, enabled=seed < 2):
+            update_both(learners, seed)
+    assert_alike(*learners, rtol=1e-3, atol=1e-4)
+
+
+def test_running_statistics_count_each_batch_once():
+    counts = []
+    for compile in (False, UNTRACED):
+        actor, critic = make_networks()
+        critic.module.first.insert(1, torch.nn.BatchNorm1d(16))
+        learner = DDPGLearner(make_ddpg_loss(actor, critic), compile=compile)
+        for seed in range(3):
+            learner.update(make_batch(seed=seed))
+        found = learner.loss.state_dict()
+        counts.append([int(v) for k, v in found.items() if k.endswith("num_batches_tracked")])
+    assert counts[0] == counts[1]
+    assert max(counts[0]) > 0
+
+
+def test_a_batch_without_entries_is_rejected_as_in_eager():
+    for learner in make_pair("ddpg"):
+        with pytest.raises(KeyError):
+            learner.update(TensorDict({}, [8]))
+
+
+def test_slices_of_other_tensors_need_no_program_of_their_own():
+    plain, traced = make_pair("ddpg")
+    for step in range(1, 12):
+        for learner in (plain, traced):
+            batch = make_batch(seed=step)
+            wide = batch["observation"].repeat_interleave(step, -1)
+            batch["observation"] = wide[:, ::step]
+            learner.update(batch)
+    assert_alike(plain, traced)
 
 
 @pytest.mark.slow

@@ -148,7 +148,7 @@ def weight_of(state, start="target_"):
         (
             ["optimizer", "state", 0, "step"],
             torch.tensor(-5.0),
-            "'step' of the saved moments .* must be finite and not negative, got -5.0",
+            "'step' of the saved moments .* finite and not negative, got tensor.-5",
         ),
         (
             ["optimizer", "param_groups", 0, "lr"],

@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, fx
+from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from torchrl_mpfa.selection import Trains
@@ -62,7 +63,8 @@ class CompiledGradients:
         form = trains, loss_function, self._options(), *map(_form, entries.items())
         program = self._programs.get(form)
         if program is None:
-            program = self._programs[form] = self._make(entries, trains, loss_function)
+            made = self._make(entries, batch.batch_size[:1], trains, loss_function)
+            program = self._programs[form] = made
         with torch.no_grad():
             found = iter(program.call(*entries.values(), *program.state))
         for parameter in program.moved:
@@ -77,15 +79,27 @@ class CompiledGradients:
         written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
         written.add(keys.value_signal)
         found = batch.items(True, True)
-        return {k: v for k, v in found if isinstance(v, Tensor) and k not in written}
+        # A program is for one layout, which a slice of another tensor has not.
+        return {k: v.contiguous() for k, v in found if isinstance(v, Tensor) and k not in written}
 
     def _options(self) -> tuple[Any, ...]:
-        """What a trace takes for given in a loss: its options, and how it makes targets."""
-        plain = (bool, int, float, str, tuple)
-        values = [value for value in vars(self._loss).values() if isinstance(value, plain)]
-        return self._loss.value_estimator, *values
+        """What a trace takes for given: options, keys, how targets are made, and precision."""
+        estimator = self._loss.value_estimator
+        keys = self._loss.tensor_keys, estimator.tensor_keys
+        held = [v for each in (self._loss, estimator, *keys) for v in vars(each).values()]
+        plain = [value for value in held if isinstance(value, (bool, int, float, str, tuple))]
+        tensors = [id(value) for value in estimator.buffers()]
+        device = next(self._loss.parameters()).device.type
+        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
+        return estimator, autocast, *tensors, *plain
 
-    def _make(self, entries: Entries, trains: Trains, loss_function: str | None) -> Program:
+    def _make(
+        self,
+        entries: Entries,
+        batch_size: torch.Size,
+        trains: Trains,
+        loss_function: str | None,
+    ) -> Program:
         loss = self._loss
         # Views of parameters that lie elsewhere now are taken again, and before a trace, which
         # cannot hold that modules are copied.
@@ -93,7 +107,6 @@ class CompiledGradients:
         loss._networks()
         state = {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
         parameters = [value for value in state.values() if value.requires_grad]
-        batch_size = next(iter(entries.values())).shape[:1]
         moved: list[Tensor] = []
         written: Entries = {}
         log: dict[str, Tensor] = {}
@@ -115,6 +128,7 @@ class CompiledGradients:
         # Recorded with real numbers, as a loss may make tensors that it keeps; but with none of the
         # random numbers that the update will have.
         devices = {value.device for value in entries.values() if value.is_cuda}
+        buffers = [(value, value.clone()) for value in loss.buffers()]
         try:
             with torch.random.fork_rng(devices):
                 graph_module = make_fx(differentiate)(*entries.values())
@@ -125,6 +139,10 @@ class CompiledGradients:
                 "compile needs a loss whose operations do not depend on the numbers in a batch, "
                 f"got a {type(loss).__name__} where they do: {error}"
             ) from error
+        finally:
+            # Layers with running statistics have counted the batch of the trace.
+            for value, before in buffers:
+                value.copy_(before)
         names = _take_state(graph_module, state)
         # Another one, without what the first one held.
         program = torch.compile(fx.GraphModule(graph_module, graph_module.graph), **self._arguments)
@@ -135,17 +153,21 @@ class CompiledGradients:
 def _keep_programs() -> None:
     """Have PyTorch keep programs in a folder of the user, unless it was told where."""
     # Its own default is a temporary folder, where others may put something: a program is code.
-    if "TORCHINDUCTOR_CACHE_DIR" in os.environ:
+    # PyTorch writes that default into the environment itself.
+    if os.environ.get("TORCHINDUCTOR_CACHE_DIR") not in (None, default_cache_dir()):
         return
-    kept = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    kept = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     # Processors of several kinds may share the folder.
     able = sorted(name for name, has in torch.cpu.get_capabilities().items() if has is True)
     processor = hashlib.sha256(repr(able).encode()).hexdigest()[:16]
     folder = Path(kept, "torchrl_mpfa", "programs", processor)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # There is no home to write to: the temporary folder is what is left.
+        return
+    try:
         folder.chmod(0o700)
-    except PermissionError as error:
+    except OSError as error:
         raise PermissionError(
             f"{folder} must be a folder of your own: set XDG_CACHE_HOME or TORCHINDUCTOR_CACHE_DIR"
         ) from error

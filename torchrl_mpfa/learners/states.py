@@ -101,11 +101,17 @@ def check_state(state: Any, own: Mapping[str, Any], optimizer: torch.optim.Optim
     for place, moments in state["optimizer"]["state"].items():
         mean = _alike("exp_avg", parameters[place])
         square = replace(mean, name="exp_avg_sq", holds=_not_negative, wanted=_NOT_NEGATIVE)
-        step = replace(square, name="step", dtype=torch.float32, shape=())
+        # PyTorch keeps it in the default type of the process that began.
+        step = Entry("step", _is_step, "a tensor of one number, finite and not negative")
         _check(f"moments of parameter {place}", moments, [step, mean, square])
 
 
 _NOT_NEGATIVE = "finite and not negative"
+
+
+def _is_step(found: Any) -> bool:
+    single = isinstance(found, Tensor) and found.ndim == 0 and found.is_floating_point()
+    return single and bool(_not_negative(found))
 
 
 def _not_negative(found: Tensor) -> Tensor:
