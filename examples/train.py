@@ -27,6 +27,14 @@ from training.finished import after_the_end, is_finished
 def main() -> None:
     """Check the command line, then train."""
     arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        from training.settings.help import help_text
+
+        try:
+            print(help_text(__doc__ or "", arguments))
+        except ValueError as error:
+            raise SystemExit(f"train.py: {error}") from error
+        return
     only, _, folder = "".join(arguments).partition("resume=")
     if len(arguments) == 1 and not only and is_finished(Path(folder)):
         print(after_the_end(Path(folder)))

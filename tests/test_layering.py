@@ -143,7 +143,7 @@ MESSAGES = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_ms
             {"pybullet", "pybullet_utils"},
             {"benchmarks/speed/bullet_world.py", "envs/mpfa_envs/robots/simulation.py"},
         ),
-        ({"wandb"}, {"examples/training/run/tracking.py"}),
+        ({"wandb"}, {"examples/training/run/wandb_log.py"}),
         (
             {"rclpy", *MESSAGES},
             {"envs/mpfa_envs/ros/policy_node.py", "envs/mpfa_envs/ros/robot_node.py"},

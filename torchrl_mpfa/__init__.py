@@ -1,80 +1,74 @@
 """Replay whose priority is fused from several signals, as TorchRL parts."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torchrl_mpfa.adjustment import Adjustment, PositiveBoost, PositiveDecay
-from torchrl_mpfa.fusion import EntropyFusion, FixedFusion, Fusion
-from torchrl_mpfa.history import ReplayHistory
-from torchrl_mpfa.learners import (
-    DDPGLearner,
-    DQNLearner,
-    Learner,
-    SACLearner,
-    TabularQLearner,
-    TD3Learner,
-)
-from torchrl_mpfa.losses import (
-    SignalDDPGLoss,
-    SignalDQNLoss,
-    SignalSACLoss,
-    SignalTD3Loss,
-    make_ddpg_loss,
-    make_sac_loss,
-    make_td3_loss,
-)
-from torchrl_mpfa.moving_fusion import ScaledFusion, ScheduledFusion
-from torchrl_mpfa.networks import make_actor, make_critic, make_stochastic_actor, make_value_network
 from torchrl_mpfa.renamed import TOP, find
-from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.samplers import MixtureSampler, MPFASampler, SignalSampler
-from torchrl_mpfa.signals import ACTION_GRADIENT, MPFA_SIGNALS, REWARD, TD_ERROR, Signal
-from torchrl_mpfa.storages import SignalMemmapStorage, SignalTensorStorage
-from torchrl_mpfa.updates import run_updates
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.adjustment import Adjustment as Adjustment
+    from torchrl_mpfa.adjustment import PositiveBoost as PositiveBoost
+    from torchrl_mpfa.adjustment import PositiveDecay as PositiveDecay
+    from torchrl_mpfa.fusion import EntropyFusion as EntropyFusion
+    from torchrl_mpfa.fusion import FixedFusion as FixedFusion
+    from torchrl_mpfa.fusion import Fusion as Fusion
+    from torchrl_mpfa.history import ReplayHistory as ReplayHistory
+    from torchrl_mpfa.learners import DDPGLearner as DDPGLearner
+    from torchrl_mpfa.learners import DQNLearner as DQNLearner
+    from torchrl_mpfa.learners import Learner as Learner
+    from torchrl_mpfa.learners import SACLearner as SACLearner
+    from torchrl_mpfa.learners import TabularQLearner as TabularQLearner
+    from torchrl_mpfa.learners import TD3Learner as TD3Learner
+    from torchrl_mpfa.losses import SignalDDPGLoss as SignalDDPGLoss
+    from torchrl_mpfa.losses import SignalDQNLoss as SignalDQNLoss
+    from torchrl_mpfa.losses import SignalSACLoss as SignalSACLoss
+    from torchrl_mpfa.losses import SignalTD3Loss as SignalTD3Loss
+    from torchrl_mpfa.losses import make_ddpg_loss as make_ddpg_loss
+    from torchrl_mpfa.losses import make_sac_loss as make_sac_loss
+    from torchrl_mpfa.losses import make_td3_loss as make_td3_loss
+    from torchrl_mpfa.moving_fusion import ScaledFusion as ScaledFusion
+    from torchrl_mpfa.moving_fusion import ScheduledFusion as ScheduledFusion
+    from torchrl_mpfa.networks import make_actor as make_actor
+    from torchrl_mpfa.networks import make_critic as make_critic
+    from torchrl_mpfa.networks import make_stochastic_actor as make_stochastic_actor
+    from torchrl_mpfa.networks import make_value_network as make_value_network
+    from torchrl_mpfa.replay import SignalReplayBuffer as SignalReplayBuffer
+    from torchrl_mpfa.samplers import MixtureSampler as MixtureSampler
+    from torchrl_mpfa.samplers import MPFASampler as MPFASampler
+    from torchrl_mpfa.samplers import SignalSampler as SignalSampler
+    from torchrl_mpfa.signals import ACTION_GRADIENT as ACTION_GRADIENT
+    from torchrl_mpfa.signals import MPFA_SIGNALS as MPFA_SIGNALS
+    from torchrl_mpfa.signals import REWARD as REWARD
+    from torchrl_mpfa.signals import TD_ERROR as TD_ERROR
+    from torchrl_mpfa.signals import Signal as Signal
+    from torchrl_mpfa.storages import SignalMemmapStorage as SignalMemmapStorage
+    from torchrl_mpfa.storages import SignalTensorStorage as SignalTensorStorage
+    from torchrl_mpfa.updates import run_updates as run_updates
 
 __version__ = "0.2.0"
 
-__all__ = [
-    "ACTION_GRADIENT",
-    "MPFA_SIGNALS",
-    "REWARD",
-    "TD_ERROR",
-    "Adjustment",
-    "DDPGLearner",
-    "DQNLearner",
-    "EntropyFusion",
-    "FixedFusion",
-    "Fusion",
-    "Learner",
-    "MPFASampler",
-    "MixtureSampler",
-    "PositiveBoost",
-    "PositiveDecay",
-    "ReplayHistory",
-    "SACLearner",
-    "ScaledFusion",
-    "ScheduledFusion",
-    "Signal",
-    "SignalDDPGLoss",
-    "SignalDQNLoss",
-    "SignalMemmapStorage",
-    "SignalReplayBuffer",
-    "SignalSACLoss",
-    "SignalSampler",
-    "SignalTD3Loss",
-    "SignalTensorStorage",
-    "TD3Learner",
-    "TabularQLearner",
-    "make_actor",
-    "make_critic",
-    "make_ddpg_loss",
-    "make_sac_loss",
-    "make_stochastic_actor",
-    "make_td3_loss",
-    "make_value_network",
-    "run_updates",
-]
+_NAMES = {
+    "adjustment": "Adjustment PositiveBoost PositiveDecay",
+    "fusion": "EntropyFusion FixedFusion Fusion",
+    "history": "ReplayHistory",
+    "learners": "DDPGLearner DQNLearner Learner SACLearner TabularQLearner TD3Learner",
+    "losses": (
+        "SignalDDPGLoss SignalDQNLoss SignalSACLoss SignalTD3Loss make_ddpg_loss make_sac_loss "
+        "make_td3_loss"
+    ),
+    "moving_fusion": "ScaledFusion ScheduledFusion",
+    "networks": "make_actor make_critic make_stochastic_actor make_value_network",
+    "replay": "SignalReplayBuffer",
+    "samplers": "MixtureSampler MPFASampler SignalSampler",
+    "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",
+    "storages": "SignalMemmapStorage SignalTensorStorage",
+    "updates": "run_updates",
+}
+"""Public names by module. A module is imported when a name of it is first used, as TorchRL's
+buffers take half a second, which whoever asks for help need not wait."""
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))
 
 
 def __getattr__(name: str) -> Any:
-    """Old names, which warn."""
-    return find(__name__, name, TOP)
+    """Import a name when it is first used; old names warn."""
+    return find(__name__, name, TOP, _MODULE_OF)

@@ -1,8 +1,9 @@
-"""Old names, which stay for one version and warn."""
+"""Names that a package finds when they are used: lazily imported ones, and old ones, which warn."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, Final
 
@@ -68,12 +69,16 @@ OF_CLIFFWALK: Final[dict[str, str]] = {
 """Names that were in :mod:`torchrl_mpfa.cliffwalk`, and are not in the package any more."""
 
 
-def find(package: str, name: str, renamed: dict[str, str]) -> Any:
-    """The new object of an old name of a package.
+def find(
+    package: str, name: str, renamed: Mapping[str, str], module_of: Mapping[str, str] | None = None
+) -> Any:
+    """What a package has by a name, from one of its modules; old names stay for one version.
 
     Raises:
         AttributeError: If there is no such name, or it is not in the package any more.
     """
+    if module_of and name in module_of:
+        return getattr(import_module(f"{package}.{module_of[name]}"), name)
     if name not in renamed:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
     module, _, new = renamed[name].rpartition(".")

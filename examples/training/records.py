@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from torchrl_mpfa.saving import write_text_atomically
+
+# Imported where a table is made: it takes half a second, which a run's start need not wait.
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass
@@ -86,6 +88,8 @@ def last_best(records: Sequence[EvaluationRecord]) -> EvaluationRecord:
 
 def as_table(rows: Sequence[Any], kind: type[Any]) -> pd.DataFrame:
     """Rows of one kind as a table."""
+    import pandas as pd
+
     columns = [entry.name for entry in fields(kind)]
     return pd.DataFrame([asdict(row) for row in rows], columns=columns)
 
@@ -97,6 +101,8 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table; one without rows if there is no such file."""
+    import pandas as pd
+
     if not path.exists():
         return pd.DataFrame()
     # An arm may be called 3 or None: only an empty cell has no value.

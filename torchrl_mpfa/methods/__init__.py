@@ -3,32 +3,31 @@
 What is a choice of other parts has no file: it is a few lines of configuration.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torchrl_mpfa.methods.assembly import Replay, loss_options, make_replay
-from torchrl_mpfa.methods.catalogue import ALIASES, METHODS, Method
-from torchrl_mpfa.methods.remote import (
-    MethodReplayBuffer,
-    RaySignalReplayBuffer,
-    can_be_remote,
-    make_ray_replay,
-)
 from torchrl_mpfa.renamed import OF_METHODS, find
 
-__all__ = [
-    "ALIASES",
-    "METHODS",
-    "Method",
-    "MethodReplayBuffer",
-    "RaySignalReplayBuffer",
-    "Replay",
-    "can_be_remote",
-    "loss_options",
-    "make_ray_replay",
-    "make_replay",
-]
+if TYPE_CHECKING:
+    from torchrl_mpfa.methods.assembly import Replay as Replay
+    from torchrl_mpfa.methods.assembly import loss_options as loss_options
+    from torchrl_mpfa.methods.assembly import make_replay as make_replay
+    from torchrl_mpfa.methods.catalogue import ALIASES as ALIASES
+    from torchrl_mpfa.methods.catalogue import METHODS as METHODS
+    from torchrl_mpfa.methods.catalogue import Method as Method
+    from torchrl_mpfa.methods.remote import MethodReplayBuffer as MethodReplayBuffer
+    from torchrl_mpfa.methods.remote import RaySignalReplayBuffer as RaySignalReplayBuffer
+    from torchrl_mpfa.methods.remote import can_be_remote as can_be_remote
+    from torchrl_mpfa.methods.remote import make_ray_replay as make_ray_replay
+
+_NAMES = {
+    "assembly": "Replay loss_options make_replay",
+    "catalogue": "ALIASES METHODS Method",
+    "remote": "MethodReplayBuffer RaySignalReplayBuffer can_be_remote make_ray_replay",
+}
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))
 
 
 def __getattr__(name: str) -> Any:
-    """Old names, which warn."""
-    return find(__name__, name, OF_METHODS)
+    """Import a name when it is first used; old names warn."""
+    return find(__name__, name, OF_METHODS, _MODULE_OF)

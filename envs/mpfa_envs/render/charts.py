@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.scene.colors import LINES, VIRIDIS
@@ -120,6 +119,9 @@ def draw_seeds(
 
 def seed_band(curves: Sequence[Curve]) -> tuple[Array, Array, Array, Array]:
     """Steps that all runs have, their mean and the ends of its 95 % interval, ``[T]``."""
+    # Takes half a second to import, which whoever makes no chart need not wait.
+    from scipy import stats
+
     checked = [_checked(curve) for curve in curves]
     first = max(steps[0] for steps, _ in checked)
     last = min(steps[-1] for steps, _ in checked)

@@ -16,10 +16,8 @@ import torch._inductor.config as inductor
 from hydra.core.override_parser.types import Override
 from torch._dynamo.exc import BackendCompilerFailed
 
-from mpfa_envs.render import plot_histograms
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
-from training.figures import plot_learning_curve
 from training.finished import after_the_end, is_finished
 from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
@@ -160,6 +158,10 @@ def _train(training: TrainingRun) -> int:
         finished = False
     finally:
         training.close()
+    # Charts are made of tables and by matplotlib, which take a second to import.
+    from mpfa_envs.render.charts import plot_histograms
+    from training.figures import plot_learning_curve
+
     curve = folder / files.CURVE
     if training.records:
         plot_learning_curve(as_table(training.records, EpisodeRecord), curve)

@@ -1,23 +1,15 @@
-"""What a run logs, and to wandb: offline by default, online or off by one setting.
-
-All of wandb is here; TorchRL's loggers that may be beside it are in ``loggers.py``.
-"""
+"""What a run logs: to wandb, in ``wandb_log.py``, and by TorchRL's loggers, in ``loggers.py``."""
 
 from __future__ import annotations
 
 import os
-import re
 import secrets
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import pandas as pd
 import torch
-import wandb
 from tensordict import TensorDictBase
 
 from torchrl_mpfa import SignalReplayBuffer
@@ -25,8 +17,8 @@ from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
 from training.run.loggers import CSVLog, Log, TensorboardLog
 from training.settings.train import TrackingSettings, TrainSettings
 
-AXIS = "actions"
-"""What every entry is plotted over: actions of all robots so far."""
+if TYPE_CHECKING:
+    from training.run.wandb_log import WandbLog
 
 
 class Tracker:
@@ -48,8 +40,13 @@ class Tracker:
         self._logs: list[Log] = []
         self.upload = upload_command(wanted, folder, self.run_id)
         """What uploads the run to wandb, if it is kept offline."""
+        self._wandb: WandbLog | None = None
         if wanted.mode != "off":
-            self._logs.append(WandbLog(settings, folder, run_id=self.run_id))
+            # Imports wandb, which takes a second.
+            from training.run.wandb_log import WandbLog
+
+            self._wandb = WandbLog(settings, folder, run_id=self.run_id)
+            self._logs.append(self._wandb)
         if wanted.csv:
             self._logs.append(CSVLog(folder, actions=actions))
         if wanted.tensorboard:
@@ -112,9 +109,8 @@ class Tracker:
     ) -> None:
         """Log pictures and tables of what a policy does, and to wandb the policy."""
         self._log(entries, actions)
-        for log in self._logs:
-            if isinstance(log, WandbLog):
-                log.keep(file, card)
+        if self._wandb is not None:
+            self._wandb.keep(file, card)
 
     def _log(self, entries: Mapping[str, Any], actions: int) -> None:
         for log in self._logs:
@@ -129,87 +125,6 @@ class Tracker:
         """Finish the logs."""
         for log in self._logs:
             log.close()
-
-
-class WandbLog:
-    """A run of wandb, the same one however often it goes on.
-
-    What a run does again after a checkpoint is logged once: how far it was logged is in a file,
-    since wandb does not tell it of an offline run.
-
-    Args:
-        settings: Of the run, its configuration.
-        folder: Of the run, where wandb keeps it.
-        run_id: Of the run.
-    """
-
-    def __init__(self, settings: TrainSettings, folder: Path, *, run_id: str) -> None:
-        os.environ.setdefault("WANDB_SILENT", "true")
-        parts = [settings.curriculum.name or "", settings.method.name, settings.learner.name]
-        try:
-            self._run: Any = wandb.init(
-                project=settings.tracking.project,
-                id=run_id,
-                resume="allow",
-                name=folder.name,
-                group=settings.tracking.group or "-".join(parts)[:128],
-                job_type="train",
-                tags=[part[:64] for part in (*parts, settings.regime)],
-                mode=settings.tracking.mode,  # type: ignore[arg-type]
-                dir=folder,
-                config=asdict(settings),
-                allow_val_change=True,
-            )
-        except wandb.Error as error:
-            raise ValueError(
-                f"tracking.mode={settings.tracking.mode}: wandb says {str(error).rstrip('.')}; "
-                "tracking=wandb keeps the run on this machine"
-            ) from error
-        # wandb's own step takes one value of a key, and several episodes may end at one action.
-        self._run.define_metric("*", step_metric=AXIS)
-        self._path = folder / "wandb" / f"logged-{run_id}.txt"
-        self._path.parent.mkdir(exist_ok=True)
-        self._path.touch()
-        words = self._path.read_text().split() or (self._run.step, -1)
-        self._entries, self._before = map(int, words)
-        self._actions = self._before
-
-    def log(self, entries: Mapping[str, Any], actions: int) -> None:
-        """Log entries, unless that was done before the run was stopped."""
-        if actions <= self._before:
-            return
-        shown = {name: _as_wandb(value) for name, value in entries.items()}
-        self._run.log({**shown, AXIS: actions}, step=self._entries, commit=True)
-        self._entries, self._actions = self._entries + 1, max(self._actions, actions)
-        # Not emptied first: the new numbers are as long as the old ones, or longer.
-        with self._path.open("r+") as file:
-            file.write(f"{self._entries} {self._actions}")
-
-    def keep(self, file: Path, card: Mapping[str, Any]) -> None:
-        """Keep a policy as an artifact, whose versions are those of runs with the same name."""
-        name = re.sub(r"[^\w.-]", "-", f"policy-{file.parent.name}")[:128]
-        artifact = wandb.Artifact(name, type="policy", metadata=dict(card))
-        artifact.add_file(str(file))
-        self._run.log_artifact(artifact)
-
-    def flush(self) -> None:
-        """Do nothing: wandb has a process of its own, which outlives this one."""
-
-    def close(self) -> None:
-        """Finish the run."""
-        self._run.finish()
-
-
-def _as_wandb(value: Any) -> Any:
-    if isinstance(value, torch.Tensor):
-        return wandb.Histogram(np.asarray(value))
-    if isinstance(value, np.ndarray):
-        return wandb.Image(value)
-    if isinstance(value, pd.DataFrame):
-        return wandb.Table(dataframe=value)
-    if isinstance(value, Path):
-        return wandb.Video(str(value), format="gif")
-    return value
 
 
 def upload_command(wanted: TrackingSettings, folder: Path, run_id: str) -> str | None:

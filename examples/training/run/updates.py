@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 import torch
 from torch import Tensor
 
 from torchrl_mpfa import ReplayHistory, SignalReplayBuffer
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _NEVER = -1
 COLUMNS = (
@@ -113,6 +115,8 @@ class UpdateLog:
 
     def table(self) -> pd.DataFrame:
         """The rows as a table, the columns of all methods first."""
+        import pandas as pd
+
         found = pd.DataFrame(self.rows)
         own = sorted(set(found.columns) - set(COLUMNS))
         return found.reindex(columns=[*COLUMNS, *own])

@@ -18,7 +18,6 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from mpfa_envs import GENERATORS
 from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, Rule
 from torchrl_mpfa.methods import METHODS, Method
 from training.settings.environment import EnvironmentSettings
@@ -359,6 +358,9 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     curriculum = settings.curriculum
     curriculum.name = curriculum.name or curriculum_name(curriculum.stages)
     if settings.evaluation.world == SAME and curriculum.stages:
+        # Generators take a second to import, and are none of what a setting is.
+        from mpfa_envs import GENERATORS
+
         last = curriculum.stages[-1].world
         settings.evaluation.world = f"{last}:validation" if last in GENERATORS else last
     return settings

@@ -13,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import wandb
 from hydra import compose, initialize_config_module
 
 import train
@@ -22,7 +23,7 @@ from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.records import read_table
-from training.run import loop, tracking
+from training.run import loop
 from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.run.running import Refused, resume, start
@@ -220,13 +221,13 @@ def test_one_wandb_run_stays_one_through_resuming(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[dict[str, object]] = []
-    init = tracking.wandb.init
+    init = wandb.init
 
     def remember(**arguments: object) -> object:
         started.append(arguments)
         return init(**{**arguments, "mode": "disabled"})
 
-    monkeypatch.setattr(tracking.wandb, "init", remember)
+    monkeypatch.setattr(wandb, "init", remember)
     begin(tmp_path, "tracking=offline", "tracking.pictures_every=null", episodes=1)
     go_on(tmp_path, STAGES.format(2))
     go_on(tmp_path, STAGES.format(3))

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import wandb
 import yaml
 
 from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord
-from training.run import tracking
 from training.run.loop import TrainingRun
 from training.run.showing import show_policy
 from training.run.tracking import Tracker
@@ -60,7 +60,7 @@ class Kept:
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> Kept:
     run = Kept()
-    monkeypatch.setattr(tracking.wandb, "init", lambda **_: run)
+    monkeypatch.setattr(wandb, "init", lambda **_: run)
     return run
 
 
