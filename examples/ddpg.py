@@ -87,11 +87,12 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     noise = AdditiveGaussianModule(
         env.action_spec, sigma_init=1.0, sigma_end=0.2, annealing_num_steps=falling
     )
+    frames = ROBOTS * STEPS
     collector = Collector(
         env,
         TensorDictSequential(actor, noise),
-        frames_per_batch=ROBOTS * STEPS,
-        total_frames=options.actions,
+        frames_per_batch=frames,
+        total_frames=-(-options.actions // frames) * frames,  # Whole batches.
         auto_register_policy_transforms=True,
     )
 

@@ -133,8 +133,10 @@ def prepare_process(settings: TrainSettings) -> None:
     # Weights that no gradient reaches decay until they are denormal numbers; after some five
     # thousand updates a CPU takes twice as long for each because of them.
     torch.set_flush_denormal(True)
-    # By default a pool of processes would wait for programs to compile, of which there are two.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
+    # Threads, each of which waits for a C++ compiler; the processes that would wait beside them for
+    # programs of a GPU have nothing to do.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", str(min(4, os.cpu_count() or 1)))
+    os.environ.setdefault("TORCH_WARM_POOL", "0")
     # Nor need it compile a program for each set of vector instructions that the processor has, a
     # quarter of the time: a compiler that takes PyTorch's C++20 knows them.
     if inductor.cpp.vec_isa_ok is None:
