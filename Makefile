@@ -8,7 +8,6 @@
 #                                  build, or 'torch==2.15.* --index-url URL-OF-CPU-BUILDS';
 #                                  others than the last ones install again
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
-#   COMPILE=false                  demo, train: no compiled updates; default: true if a C++ compiler and Python.h are found
 #   REGIME=paper                   train: the paper's task and numbers; default: rooms
 #   DEMO_ACTIONS=40000             length of demo's training, in actions
 #   EPISODES=100                   evaluation episodes of demo in the worlds of each generator
@@ -26,9 +25,6 @@ ARGS ?=
 REGIME ?= rooms
 DEMO_ACTIONS ?= 40000
 EPISODES ?= 100
-# Compiled updates need a C++ compiler and the headers of Python; other learners have none.
-COMPILE ?= $(if $(filter learner=sac learner=dqn learner=q_learning,$(ARGS)),false,$(if $(COMPILES),true,false))
-COMPILES = $(shell command -v "$${CXX:-g++}" >/dev/null 2>&1 && $(BIN)/python -c "$(HEADERS)" 2>/dev/null && echo yes)
 SLOW ?=
 WORKERS ?= 2
 
@@ -48,7 +44,6 @@ CANDIDATES := python3.11 python3.10 python3 python python3.13 python3.12
 FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))
 LATER := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 12))
 HOME_OF := import sys; print(sys.base_prefix, sys.version_info[:2])
-HEADERS := import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_path('include') + '/Python.h'))
 WAY_OUT := install Python 3.11 and run: make PYTHON=/path/to/python3.11 $(or $(MAKECMDGOALS),test)
 NO_WHEELS := is later than Python 3.11, so that there is no PyBullet and no simulated wheels; demo and train use physics=kinematic
 # Arguments of the scripts on such a Python, evaluated when they are called: there may be no .venv before.
@@ -59,18 +54,18 @@ help: ## Print this list
 	@echo "usage: make TARGET"
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/\1|\2/p' Makefile | \
 	  while IFS='|' read -r target text; do printf '  %-12s %s\n' "$$target" "$$text"; done
-	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, COMPILE, REGIME, DEMO_ACTIONS, EPISODES, SLOW, WORKERS; see the top of the Makefile"
+	@echo "variables: PYTHON, TORCH_INSTALL_ARGS, ARGS, REGIME, DEMO_ACTIONS, EPISODES, SLOW, WORKERS; see the top of the Makefile"
 
 demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unseen rooms
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
-	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true learner.compile=$(COMPILE) 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
+	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
 	@echo "== driving through test worlds of every generator"
 	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED)
 	@cd runs/demo/evaluation-all-$(EVALUATED) && cp evaluation.json trajectories.png episode.gif ..
 	@echo "written: runs/demo/evaluation.json, trajectories.png, episode.gif"
 
 train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
-	$(BIN)/python examples/train.py regime=$(REGIME) learner.compile=$(COMPILE) $(PHYSICS) $(ARGS)
+	$(BIN)/python examples/train.py regime=$(REGIME) $(PHYSICS) $(ARGS)
 
 paper: $(STAMP) ## Make the paper's figures and tables from runs/paper, and name missing runs
 	$(BIN)/python -m benchmarks.study paper runs/paper $(ARGS)

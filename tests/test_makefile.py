@@ -98,11 +98,8 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             ["[{world: mixed, actions: 900}]", "--worlds all --episodes 2"],
         ),
         (
-            ["train", "COMPILE=false", "ARGS=method=per seed=1"],
-            [
-                "python examples/train.py regime=rooms learner.compile=false",
-                "method=per seed=1",
-            ],
+            ["train", "ARGS=method=per seed=1"],
+            ["python examples/train.py regime=rooms", "method=per seed=1"],
         ),
         (["test"], ["python -m pytest"]),
         (["test", "WORKERS=0", "SLOW=1"], ["python -m pytest -n 0", "-m 'slow or not slow'"]),
@@ -207,29 +204,6 @@ def test_another_python_of_the_same_prefix_has_an_environment_of_its_own(copy: P
     rejected = make(copy, "PYTHON=/nonexistent", "test")
     assert rejected.returncode != 0
     assert "PYTHON=/nonexistent is not a Python" in rejected.stderr
-
-
-@pytest.mark.parametrize(
-    ("compiler", "headers", "argument", "compiled"),
-    [
-        (True, True, "method=per", "true"),
-        (False, True, "method=per", "false"),
-        (True, False, "method=per", "false"),
-        (True, True, "learner=td3", "true"),
-        (True, True, "learner=sac", "false"),
-    ],
-)
-def test_updates_are_compiled_where_they_can_be(
-    installed: Path, compiler: bool, headers: bool, argument: str, compiled: str
-) -> None:
-    if compiler:
-        add_program(installed / "bin" / "g++", "#!/bin/sh\n")
-    if not headers:
-        without = PRETENDER.replace("esac", "  *Python.h*) exit 1 ;;\nesac")
-        add_program(installed / ".venv" / "bin" / "python", without)
-        (installed / ".venv" / ".installed").touch()
-    done = make(installed, "-n", "train", f"ARGS={argument}")
-    assert f"learner.compile={compiled} " in done.stdout
 
 
 def test_an_install_that_failed_is_made_again(copy: Path) -> None:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import copy
 import importlib.util
-import os
-import shutil
 import time
 from collections.abc import Callable
 from typing import Any
@@ -43,6 +41,7 @@ from torchrl_mpfa import (
     make_critic,
     make_ddpg_loss,
 )
+from training.run.compiling import has_compiler
 
 WIDTH = 256
 CAPACITY = 100_000
@@ -313,8 +312,3 @@ def _variants(name: str, make: Callable[..., Call], *, quick: bool) -> dict[str,
         report_progress(f"{name}: not compiled, there is no C++ compiler")
         return {name: make()}
     return {name: make(compile=True), f"{name}_eager": make()}
-
-
-def has_compiler() -> bool:
-    """Whether there is a C++ compiler, without which nothing can be compiled."""
-    return shutil.which(os.environ.get("CXX", "g++")) is not None

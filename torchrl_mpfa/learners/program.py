@@ -147,7 +147,7 @@ class CompiledGradients:
 
 
 def _compiled(
-    graph_module: fx.GraphModule, inputs: list[Tensor], arguments: dict[str, Any]
+    graph_module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any]
 ) -> Callable[..., Any]:
     """The program of a trace, by Inductor itself unless ``torch.compile`` has another backend."""
     if arguments.keys() - {"options"}:

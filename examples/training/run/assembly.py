@@ -48,6 +48,7 @@ def make_learner(
     action_size: int,
     *,
     device: str = "cpu",
+    compile: bool = False,
 ) -> Learner:
     """Networks, loss and optimizers; the loss writes those signals that the method asks for."""
     if settings.algorithm == "q_learning":
@@ -77,6 +78,7 @@ def make_learner(
         "critic_weight_decay": settings.critic_weight_decay,
         "tau": settings.tau,
         "optimizer": method.optimizer,
+        "compile": compile,
     }
     make_one = ALGORITHMS[settings.algorithm]
     return make_one(settings, actor.to(device), critic.to(device), of_loss, of_learner)
@@ -90,8 +92,7 @@ def _ddpg(
     of_learner: Options,
 ) -> Learner:
     loss = make_ddpg_loss(actor, critic, **_smoothing(settings), **of_loss)
-    delay = settings.policy_delay
-    return DDPGLearner(loss, policy_delay=delay, compile=settings.compile, **of_learner)
+    return DDPGLearner(loss, policy_delay=settings.policy_delay, **of_learner)
 
 
 def _td3(
@@ -102,8 +103,7 @@ def _td3(
     of_learner: Options,
 ) -> Learner:
     loss = make_td3_loss(actor, critic, **_smoothing(settings), **of_loss)
-    delay = settings.policy_delay
-    return TD3Learner(loss, policy_delay=delay, compile=settings.compile, **of_learner)
+    return TD3Learner(loss, policy_delay=settings.policy_delay, **of_learner)
 
 
 def _smoothing(settings: LearnerSettings) -> Options:
@@ -123,8 +123,7 @@ def _sac(
     of_learner: Options,
 ) -> Learner:
     loss = make_sac_loss(actor, critic, alpha_init=settings.alpha_init, **of_loss)
-    alpha_lr, compile = settings.alpha_lr, settings.compile
-    return SACLearner(loss, alpha_lr=alpha_lr, compile=compile, **of_learner)
+    return SACLearner(loss, alpha_lr=settings.alpha_lr, **of_learner)
 
 
 ALGORITHMS: dict[str, Callable[..., Learner]] = {"ddpg": _ddpg, "td3": _td3, "sac": _sac}

@@ -33,6 +33,7 @@ from training.records import (
 from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
 from training.run.assessment import Assessment
 from training.run.checkpoints import FORMAT, random_state, set_random_state
+from training.run.compiling import is_compiled
 from training.run.evaluations import evaluate_policy, exported_policy
 from training.run.exploration import make_explorer
 from training.run.schedule import Schedule
@@ -105,8 +106,10 @@ class TrainingRun:
         settings, spec = self.settings, self._action_spec
         sizes = self._observation_size, spec.shape[-1]
         method, device = method_of(settings), settings.device
-        self.learner = make_learner(settings.learner, method, *sizes, device=device)
-        self._to_compile = settings.learner.compile
+        self._to_compile = is_compiled(settings)
+        self.learner = make_learner(
+            settings.learner, method, *sizes, device=device, compile=self._to_compile
+        )
         self.curiosity = make_curiosity(method, *sizes, device=device)
         self.explorer = make_explorer(self.learner.policy, settings.exploration, spec)
         replay = self.robots.make_replay(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -12,7 +11,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
-import torch._inductor.config as inductor
 from hydra.core.override_parser.types import Override
 from torch._dynamo.exc import BackendCompilerFailed
 
@@ -22,6 +20,7 @@ from training.finished import after_the_end, is_finished
 from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
 from training.run.checkpoints import read_checkpoint
+from training.run.compiling import prepare_compiler
 from training.run.loop import TrainingRun
 from training.settings.checks import check_settings
 from training.settings.resuming import changed, check_lawful, check_single
@@ -133,14 +132,7 @@ def prepare_process(settings: TrainSettings) -> None:
     # Weights that no gradient reaches decay until they are denormal numbers; after some five
     # thousand updates a CPU takes twice as long for each because of them.
     torch.set_flush_denormal(True)
-    # Threads, each of which waits for a C++ compiler; the processes that would wait beside them for
-    # programs of a GPU have nothing to do.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", str(min(4, os.cpu_count() or 1)))
-    os.environ.setdefault("TORCH_WARM_POOL", "0")
-    # Nor need it compile a program for each set of vector instructions that the processor has, a
-    # quarter of the time: a compiler that takes PyTorch's C++20 knows them.
-    if inductor.cpp.vec_isa_ok is None:
-        inductor.cpp.vec_isa_ok = True
+    prepare_compiler()
     # TorchRL announces each storage in the middle of the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     # The compiler of programs for a CPU warns that a CUDA toolkit is there and no GPU.

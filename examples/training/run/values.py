@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ def load_learner(folder: Path, policy: Policy) -> tuple[Learner, TrainSettings]:
     """
     state = read_checkpoint(folder)
     settings = as_settings(state["settings"])
-    settings.learner, settings.device = replace(settings.learner, compile=False), "cpu"
+    settings.device = "cpu"
     sizes = policy.observation_size, policy.action_size
     learner = make_learner(settings.learner, method_of(settings), *sizes)
     learner.load_state_dict(state["learner"])

@@ -79,7 +79,7 @@ def check_settings(settings: TrainSettings) -> None:
         _check_one_rule(settings)
     _check_ray(settings)
     if is_discrete(settings.learner):
-        if settings.learner.compile:
+        if settings.learner.compile is True:
             name = settings.learner.algorithm
             raise ValueError(f"learner.compile must be false with {name}, got True")
         _check_values_alone(settings)

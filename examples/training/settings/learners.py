@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE
+from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule
 from training.settings.rules import NAME, at_least, choice, setting, up_to
+
+_COMPILE: Rule = (lambda value: value in ("auto", True, False), "auto, true or false")
 
 
 @dataclass
@@ -49,9 +51,10 @@ class LearnerSettings:
     """Factor of the penalty on actions deep in the tanh's flat ends, where no gradient is."""
     saturation_limit: float = setting(1.5, NOT_NEGATIVE)
     """Preactivations beyond this are penalized; tanh(1.5) = 0.905."""
-    compile: bool = False
-    """Make one program of an update with ``torch.compile``, which halves the time of a run. Needs a
-    C++ compiler, and half a minute at the start, a few seconds the next time."""
+    compile: bool | str = setting("auto", _COMPILE)
+    """Make one program of an update, which halves its time: ``true``, ``false``, or ``auto``, from
+    10,000 updates on (an episode counts as 100 actions). It needs a C++ compiler and the headers of
+    Python, and twenty seconds at the start, or a few once such a program was made."""
     policy_delay: int = setting(1, at_least(1))
     """DDPG and TD3: updates of the critics for one of the actor and the targets."""
     policy_noise: float = setting(0.0, NOT_NEGATIVE)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from training.run.assembly import make_learner
 from training.run.loop import TrainingRun
 from training.run.running import Refused, prepare_process, start
 from training.settings.command_line import composed
-from training.settings.learners import LearnerSettings
 from training.settings.train import TrainSettings
 
 
@@ -70,8 +68,8 @@ def test_a_cuda_toolkit_without_a_gpu_is_not_warned_of(
 def test_a_run_says_once_that_it_compiles_its_update(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def eager(settings: LearnerSettings, *arguments: Any, **options: Any) -> Learner:
-        return make_learner(replace(settings, compile=False), *arguments, **options)
+    def eager(*arguments: Any, **options: Any) -> Learner:
+        return make_learner(*arguments, **{**options, "compile": False})
 
     monkeypatch.setattr(loop, "make_learner", eager)
     settings = tiny()

@@ -1,0 +1,56 @@
+"""Whether a run makes one program of its update, and with what."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sysconfig
+from pathlib import Path
+
+import torch._inductor.config as inductor
+from tqdm import tqdm
+
+from training.settings.learners import is_discrete
+from training.settings.train import TrainSettings
+
+_MANY_UPDATES = 10_000
+"""From here on a program saves more than it takes to make one."""
+_EPISODE = 100
+"""Actions that an episode is counted as, of a run whose stages count episodes."""
+
+
+def is_compiled(settings: TrainSettings) -> bool:
+    """Whether the update is compiled: as asked for, or by the length of the run and nothing else.
+
+    So a seed gives the same bits whatever was compiled before.
+    """
+    wanted = settings.learner.compile
+    if wanted != "auto":
+        return bool(wanted)
+    stages = settings.curriculum.stages
+    actions = sum(stage.actions + _EPISODE * stage.episodes for stage in stages)
+    long = actions // settings.robots * settings.updates >= _MANY_UPDATES
+    if not long or is_discrete(settings.learner):
+        return False
+    if not has_compiler():
+        tqdm.write("updates take twice as long: there is no C++ compiler, or no headers of Python")
+        return False
+    return True
+
+
+def has_compiler() -> bool:
+    """Whether there is a C++ compiler and the headers of Python, without which none compiles."""
+    headers = Path(sysconfig.get_path("include"), "Python.h")
+    return headers.exists() and shutil.which(os.environ.get("CXX", "g++")) is not None
+
+
+def prepare_compiler() -> None:
+    """Have PyTorch compile as fits a few small programs for a CPU."""
+    # Threads, each of which waits for a C++ compiler; the processes that would wait beside them for
+    # programs of a GPU have nothing to do.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", str(min(4, os.cpu_count() or 1)))
+    os.environ.setdefault("TORCH_WARM_POOL", "0")
+    # It need not compile a program for each set of vector instructions that the processor has, a
+    # quarter of the time: a compiler that takes PyTorch's C++20 knows them.
+    if inductor.cpp.vec_isa_ok is None:
+        inductor.cpp.vec_isa_ok = True
