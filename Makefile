@@ -10,7 +10,7 @@
 #   ARGS='method=per seed=1'       settings for demo and train, options for test and bench
 #   REGIME=paper                   train: the paper's task and numbers; default: rooms
 #   DEMO_ACTIONS=40000             length of demo's training, in actions
-#   EPISODES=100                   evaluation episodes of demo in the worlds of each generator
+#   EPISODES=50                    evaluation episodes of demo in the worlds of each generator
 #   SLOW=1                         test: include the slow tests
 #   WORKERS=4                      test: number of processes, 2 by default; 0: one, with live output
 
@@ -24,7 +24,7 @@ TORCH_INSTALL_ARGS ?=
 ARGS ?=
 REGIME ?= rooms
 DEMO_ACTIONS ?= 40000
-EPISODES ?= 100
+EPISODES ?= 50
 SLOW ?=
 WORKERS ?= 2
 
@@ -58,7 +58,7 @@ help: ## Print this list
 
 demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unseen rooms
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
-	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
+	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true tracking=off 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
 	@echo "== driving through test worlds of every generator"
 	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED)
 	@cd runs/demo/evaluation-all-$(EVALUATED) && cp evaluation.json trajectories.png episode.gif ..

@@ -88,7 +88,7 @@ def test_make_alone_lists_the_targets(copy: Path) -> None:
             [
                 "python examples/train.py run_dir=runs/demo overwrite=true",
                 "[{world: mixed, actions: 40000}]",
-                "python examples/evaluate.py runs/demo --worlds all --episodes 100",
+                "python examples/evaluate.py runs/demo --worlds all --episodes 50",
                 "cd runs/demo/evaluation-all-",
                 "cp evaluation.json trajectories.png episode.gif ..",
             ],
