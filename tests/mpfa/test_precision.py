@@ -47,6 +47,14 @@ def test_single_slots_of_many_have_their_frequencies(slots, samples):
     assert abs(score(sampled(sampler, storage, samples), probability)) < 4
 
 
+def test_the_weight_of_a_batch_of_one_is_in_double_precision():
+    sampler = TreeSampler(100, 0.6, 0.4, dtype=torch.double)
+    storage, _ = filled(sampler, 100)
+    slots, info = sampler.sample(storage, 1)
+    expected = sampler.batch_weights(100)[slots]
+    torch.testing.assert_close(info["priority_weight"], expected, rtol=1e-14, atol=0.0)
+
+
 @pytest.mark.slow
 def test_in_single_precision_they_have_not():
     """A mass of 24 bits names each of a million slots by some seventeen values."""

@@ -18,6 +18,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.slots import set_leaves
 from torchrl_mpfa.saved import wrong
 from torchrl_mpfa.selection import SampledBatch
 
@@ -60,7 +61,7 @@ class LA3PSampler(SignalSampler):
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         super()._write_leaves(slots, leaf)
-        self._inverse_tree[slots] = 1.0 / leaf
+        set_leaves(slots, 1.0 / leaf, self._inverse_tree)
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
         highest = super()._checked(priority, name)
@@ -114,7 +115,7 @@ class LA3PSampler(SignalSampler):
         super().load_state_dict(state_dict)
         slots = self._priorities.isfinite().nonzero().squeeze(1)
         if len(slots):
-            self._inverse_tree[slots] = 1.0 / state_dict["_sum_tree"][slots]
+            set_leaves(slots, 1.0 / state_dict["_sum_tree"][slots], self._inverse_tree)
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
         """Reject a state that does not fit, before anything changes."""

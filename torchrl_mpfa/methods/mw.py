@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.slots import set_leaves
 from torchrl_mpfa.saved import Entry
 
 _NO_LEAF = float("inf")
@@ -73,9 +74,10 @@ class MWSampler(SignalSampler):
         super()._write_leaves(slots, leaf)
         spent = slots[self._spent[slots]]
         if len(spent):
-            self._sum_tree[spent] = torch.zeros(len(spent), dtype=torch.double)
+            set_leaves(spent, torch.zeros(len(spent), dtype=torch.double), self._sum_tree)
             # The lowest share of those that can be sampled is what weights are relative to.
-            self._min_tree[spent] = torch.full((len(spent),), _NO_LEAF, dtype=torch.double)
+            none = torch.full((len(spent),), _NO_LEAF, dtype=torch.double)
+            set_leaves(spent, none, self._min_tree)
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         left = size - int(self._spent[:size].sum())

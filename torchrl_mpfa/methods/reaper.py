@@ -25,7 +25,7 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.checks import POSITIVE, check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.tree import as_slots
+from torchrl_mpfa.samplers.slots import as_slots
 from torchrl_mpfa.signals import TD_ERROR, Signal
 from torchrl_mpfa.storages.table import SignalTable
 

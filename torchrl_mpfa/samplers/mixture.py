@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_mpfa.moving_fusion import ScaledFusion
 from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.slots import leaves_of
 from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.saved import Entry
 
@@ -133,7 +134,7 @@ class MixtureSampler(SignalSampler):
         """Probability of slots, shape ``[B]``."""
         probability = torch.zeros(len(index), dtype=torch.double)
         for share, name, total in zip(shares.tolist(), self._names, totals, strict=True):
-            leaf = torch.as_tensor(self._parts[name]._sum_tree[index]).reshape(-1)
+            leaf = leaves_of(self._parts[name]._sum_tree, index)
             probability += leaf * (share / total)
         return probability
 

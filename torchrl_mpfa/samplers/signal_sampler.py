@@ -16,13 +16,8 @@ from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_finite
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
-from torchrl_mpfa.samplers.tree import (
-    ORDERED,
-    TreeSampler,
-    as_slots,
-    in_dimensions_of,
-    last_of_each,
-)
+from torchrl_mpfa.samplers.slots import ORDERED, as_slots, in_dimensions_of, last_of_each
+from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.saved import Entry, count, exactly, finite, number
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import RandomSampler
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from torchrl_mpfa.samplers.slots import leaves_of, set_leaves
 from torchrl_mpfa.saved import Entry, check_entries, exactly, number, wrong
 from torchrl_mpfa.saving import load_safely, save_atomically
 
@@ -38,9 +39,9 @@ class SavedTrees(PrioritizedSampler):
             "_kind": self.KIND,
             "_max_capacity": self._max_capacity,
             **{name: _copy(getattr(self, name)) for name in self.SAVED},
-            "_learned": torch.as_tensor(self._max_tree[slots]).reshape(-1) <= 0,
-            "_sum_tree": torch.as_tensor(self._sum_tree[slots]).reshape(-1).clone(),
-            "_min_tree": torch.as_tensor(self._min_tree[slots]).reshape(-1).clone(),
+            "_learned": leaves_of(self._max_tree, slots) <= 0,
+            "_sum_tree": leaves_of(self._sum_tree, slots),
+            "_min_tree": leaves_of(self._min_tree, slots),
         }
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
@@ -97,10 +98,10 @@ class SavedTrees(PrioritizedSampler):
         slots = self._priorities.isfinite().nonzero().squeeze(1)
         if len(slots):
             for name in ("_sum_tree", "_min_tree"):
-                getattr(self, name)[slots] = state_dict[name][slots]
+                set_leaves(slots, state_dict[name][slots], getattr(self, name))
         learned = (state_dict["_learned"] & self._priorities.isfinite()).nonzero().squeeze(1)
         if len(learned):
-            self._max_tree[learned] = -self._priorities[learned]
+            set_leaves(learned, -self._priorities[learned], self._max_tree)
 
     def dumps(self, path: str | Path) -> None:
         """Save in a folder: everything in one file, and beside it what a person can read."""

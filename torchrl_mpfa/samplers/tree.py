@@ -19,11 +19,17 @@ from torchrl_mpfa.checks import (
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
+from torchrl_mpfa.samplers.slots import (
+    ORDERED,
+    as_slots,
+    in_dimensions_of,
+    last_of_each,
+    leaves_of,
+    set_leaves,
+)
 from torchrl_mpfa.samplers.states import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
-ORDERED = 2048
-"""Rows up to which writing by index keeps their order."""
 _ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
 
 
@@ -165,7 +171,7 @@ class TreeSampler(SavedTrees):
             return None, None
         if not self._max_priority_within_buffer or self._alpha == 0:
             return max(highest - self._eps, 0.0), self._highest_slot
-        leaves = torch.as_tensor(self._max_tree[torch.arange(self._max_capacity)]).reshape(-1)
+        leaves = leaves_of(self._max_tree, torch.arange(self._max_capacity))
         return max(highest - self._eps, 0.0), int(leaves.argmin())
 
     @_max_priority.setter
@@ -250,8 +256,7 @@ class TreeSampler(SavedTrees):
                 f"of {lowest}: raise eps, or give the buffer its sampler before its data"
             )
         index = self._proportional(self._sum_tree, size, batch_size)
-        # Of one slot the tree gives a bare number, of several a tensor.
-        leaf = torch.as_tensor(self._sum_tree[index]).reshape(-1)
+        leaf = leaves_of(self._sum_tree, index)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
 
     def batch_weights(self, size: int) -> Tensor:
@@ -269,7 +274,7 @@ class TreeSampler(SavedTrees):
             >>> sampler.batch_weights(2).tolist()
             [1.0, 0.5]
         """
-        leaf = torch.as_tensor(self._sum_tree[torch.arange(size)]).reshape(-1)
+        leaf = leaves_of(self._sum_tree, torch.arange(size))
         weight = importance_weights(leaf, beta=self._beta, lowest=self._min_tree.query(0, size))
         return torch.where(leaf > 0, weight, torch.nan)
 
@@ -357,7 +362,7 @@ class TreeSampler(SavedTrees):
         TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
         transitions that they find in a storage, and for batches without a priority.
         """
-        fresh = torch.as_tensor(self._max_tree[slots]).reshape(-1) > 0
+        fresh = leaves_of(self._max_tree, slots) > 0
         return fresh & (value.float() == torch.tensor(self.default_priority).float())
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
@@ -380,13 +385,13 @@ class TreeSampler(SavedTrees):
         if len(slots) > ORDERED and (last := last_of_each(slots)) is not None:
             slots, priority = slots[last], priority[last]
         self._priorities.index_copy_(0, slots, priority)
-        self._max_tree[slots] = -priority if learned else torch.full_like(priority, math.inf)
+        given = -priority if learned else torch.full_like(priority, math.inf)
+        set_leaves(slots, given, self._max_tree)
         self._write_leaves(slots, self._leaf(priority))
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         """Write leaves, to which slots are sampled in proportion, shape ``[B]``."""
-        self._sum_tree[slots] = leaf
-        self._min_tree[slots] = leaf
+        set_leaves(slots, leaf, self._sum_tree, self._min_tree)
 
     def _leaf(self, priority: Tensor) -> Tensor:
         """Leaves of slots, their priorities to the power of alpha, shape ``[B]``."""
@@ -397,54 +402,3 @@ class TreeSampler(SavedTrees):
         slots = self._priorities.isfinite().nonzero().squeeze(1)
         if len(slots):
             self._write_leaves(slots, self._leaf(self._priorities[slots]))
-
-
-def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
-    """Slots as TorchRL's sampler gives them: a tuple of places for several dimensions."""
-    if getattr(storage, "ndim", 1) == 1:
-        return slots
-    return torch.unravel_index(slots, storage.shape)
-
-
-def as_slots(index: Any, storage: Any = None) -> Tensor:
-    """Slots ``[B]`` along the flattened storage, from slots or places ``[B, D]`` or a tuple."""
-    if isinstance(index, tuple):
-        index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
-    slots = torch.as_tensor(index, device="cpu")
-    if slots.numel() == 0:
-        return slots.new_empty(0, dtype=torch.long)
-    # A mask would be read as slots 0 and 1.
-    if slots.dtype is torch.bool or slots.is_floating_point() or slots.is_complex():
-        raise TypeError(f"index must hold integers, got {slots.dtype}")
-    slots = slots.long()
-    if slots.ndim <= 1:
-        return slots.reshape(-1)
-    # Not the filled part of it: a batch may be from before the storage was emptied.
-    shape = getattr(storage, "_total_shape", None)
-    if shape is None or len(shape) < 2 or len(shape) != slots.shape[-1]:
-        raise RuntimeError(
-            f"index must have one dimension, or one place for each dimension of a storage, got "
-            f"shape {[*slots.shape]} for a storage of shape {None if shape is None else [*shape]}"
-        )
-    places = slots.reshape(-1, len(shape))
-    # TorchRL's writers mark with -1 what was not stored.
-    skipped = (places == -1).all(-1)
-    wrong = ((places < 0) | (places >= torch.tensor(shape))).any(-1) & ~skipped
-    if bool(wrong.any()):
-        raise IndexError(
-            f"index must be within the storage's shape {[*shape]}, got {places[wrong][0].tolist()}"
-        )
-    slots = places[:, 0]
-    for dimension in range(1, len(shape)):
-        slots = slots * shape[dimension] + places[:, dimension]
-    return torch.where(skipped, -1, slots)
-
-
-def last_of_each(slots: Tensor) -> Tensor | None:
-    """Last position of each slot, shape ``[U]``; None if every slot appears once."""
-    # A slot that is written twice keeps its last value; index writes of many rows leave it open.
-    unique, inverse = slots.unique(return_inverse=True)
-    if len(unique) == len(slots):
-        return None
-    positions = torch.arange(len(slots))
-    return torch.zeros_like(unique).scatter_reduce_(0, inverse, positions, "amax")
