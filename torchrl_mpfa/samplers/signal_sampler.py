@@ -16,12 +16,12 @@ from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_finite
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
-from torchrl_mpfa.samplers.slots import ORDERED, as_slots, in_dimensions_of, last_of_each
+from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.saved import Entry, count, exactly, finite, number
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
-from torchrl_mpfa.storages.table import SignalTable, signal_table_of
+from torchrl_mpfa.storages.table import SignalTable, by_batch, signal_table_of
 
 _USE = "Use SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
@@ -245,7 +245,7 @@ class SignalSampler(TreeSampler):
         if slots.numel() == 0:
             return stale
         weighing, adjusted = self._weighing, []
-        for one, of_one in zip(slots.split(sizes), rows.split(sizes), strict=True):
+        for one, of_one in by_batch(sizes, slots, rows):
             if len(one):
                 weighing = self._weigh(table, one, weighing)  # Eqs. (15)-(20).
                 adjusted.append(self._fused(table, of_one, one, weighing))  # Eqs. (21)-(24).
@@ -254,8 +254,8 @@ class SignalSampler(TreeSampler):
 
         # Nothing has changed so far, so that a call that raises leaves everything as it was.
         self._weighing = weighing
-        if len(slots) > ORDERED and (last := last_of_each(slots)) is not None:
-            slots, rows, priority = slots[last], rows[last], priority[last]
+        if (last := last_of_each(slots)) is not None:
+            slots, rows, priority = (each.index_select(0, last) for each in (slots, rows, priority))
             highest = bounds(priority)[1]
         table.rows.index_copy_(0, slots, rows)
         self._set(slots, priority, highest)  # Eq. (8).

@@ -20,7 +20,6 @@ from torchrl_mpfa.checks import (
 )
 from torchrl_mpfa.priorities import importance_weights
 from torchrl_mpfa.samplers.slots import (
-    ORDERED,
     as_slots,
     in_dimensions_of,
     last_of_each,
@@ -347,9 +346,10 @@ class TreeSampler(SavedTrees):
             return
         value = value if len(kept) == len(slots) else value[slots >= 0]
         check_finite("priority", value)
-        inherited = self._inherited(kept, value)
-        value = value + self._eps
-        highest = self._checked(value)
+        highest = self._checked(value + self._eps)
+        if (last := last_of_each(kept)) is not None:
+            kept, value = kept[last], value[last]
+        inherited, value = self._inherited(kept, value), value + self._eps
         if bool(inherited.any()):
             self._write(kept[inherited], value[inherited], learned=False)
             kept, value = kept[~inherited], value[~inherited]
@@ -381,9 +381,7 @@ class TreeSampler(SavedTrees):
             self._highest, self._highest_slot = highest, int(slots[priority.argmax()])
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
-        """Write priorities, eps included, to the trees."""
-        if len(slots) > ORDERED and (last := last_of_each(slots)) is not None:
-            slots, priority = slots[last], priority[last]
+        """Write priorities, eps included, to the trees; slots as by :func:`last_of_each`."""
         self._priorities.index_copy_(0, slots, priority)
         given = -priority if learned else torch.full_like(priority, math.inf)
         set_leaves(slots, given, self._max_tree)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,6 @@ class SignalTable:
             self.rows = torch.from_numpy(_map(file, (capacity, width), existsok=existsok))
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
-        self._one = torch.ones((), dtype=torch.double)
         self.clock = [0]
         self.size = self.cleared = 0
         self.clear()
@@ -152,7 +151,7 @@ class SignalTable:
             if priority_of is None:
                 column.copy_(value)
                 continue
-            for one, into in zip(value.split(sizes), column.split(sizes), strict=True):
+            for one, into in by_batch(sizes, value, column):
                 if len(one):
                     into.copy_(priority_of(one))
 
@@ -190,9 +189,11 @@ class SignalTable:
                 "written_at must have one number per transition, got shape "
                 f"{[*written_at.shape]} for {len(rows)} slots"
             )
-        live = rows.select(1, self.time_column) == written_at.reshape(-1).to(rows.device)
-        if live.all():
+        now = rows.select(1, self.time_column)
+        before = written_at.reshape(-1).to(now.device, now.dtype)
+        if torch.equal(now, before):
             return rows, slots, None, sizes
+        live = now == before
         return rows[live], slots[live], live, live.reshape(batches, -1).sum(1).tolist()
 
     def missing(self, rows: Tensor) -> str | None:
@@ -232,16 +233,15 @@ class SignalTable:
 
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
-        counts = self.rows[:, self.count_column]
-        counts.index_add_(0, index, self._one.expand(index.shape))
+        np.add.at(self.rows.numpy()[:, self.count_column], index.numpy(), 1.0)
 
     def written_at(self, index: Tensor) -> Tensor:
         """Time of writing of each slot, as a count of writes, shape ``[B]``."""
-        return self.rows[:, self.time_column].index_select(0, index)
+        return self.rows.select(1, self.time_column).index_select(0, index)
 
     def replay_counts(self, index: Tensor) -> Tensor:
         """Replays of each slot, shape ``[B]``."""
-        return self.rows[:, self.count_column].index_select(0, index)
+        return self.rows.select(1, self.count_column).index_select(0, index)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that restores the table; tensors and plain values only."""
@@ -298,6 +298,13 @@ class SignalTable:
         self.clear()
         self.size, self.writes = state["size"], state["writes"]
         self.rows[: self.size] = state["rows"]
+
+
+def by_batch(sizes: Sequence[int], *columns: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """The part of each column that belongs to a batch, for one batch after the other."""
+    if len(sizes) == 1:
+        return [columns]
+    return zip(*(column.split(list(sizes)) for column in columns), strict=True)
 
 
 def signal_table_of(storage: object, signals: Sequence[Signal], capacity: int) -> SignalTable:
