@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
+from contextlib import contextmanager
 from types import FrameType
 
 from tqdm import tqdm
@@ -56,15 +54,3 @@ class Stop:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def end_with(parent: Connection) -> None:
-    """End by SIGTERM when the process that holds the other end of a pipe is gone, however."""
-
-    def wait() -> None:
-        # Nothing is ever written: this returns once the other end is closed.
-        with suppress(OSError):
-            parent.poll(None)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=wait, daemon=True, name="lifeline").start()

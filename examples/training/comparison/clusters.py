@@ -1,25 +1,27 @@
-"""The commands of a comparison on the machines of a Ray cluster, each as a task of one core."""
+"""The workers of a comparison on the machines of a Ray cluster, each an actor of one core."""
 
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import ray
 from ray import exceptions
 
 from training import files
-from training.comparison.processes import Child, Lost
+from training.comparison.workers import LocalWorker, Lost
 
 _PAUSE = 0.3
-"""Between two looks at a command [s]."""
+"""Between two looks at a script [s]."""
 _PATIENCE = 150.0
 """How long a folder may stay locked after its machine is gone [s]. NFS lets go after 90."""
+
 _GONE = (
+    exceptions.RayActorError,
     exceptions.NodeDiedError,
     exceptions.WorkerCrashedError,
     exceptions.LocalRayletDiedError,
@@ -27,43 +29,93 @@ _GONE = (
 )
 
 
-class RemoteChild:
-    """A command on whichever machine of the cluster has a core to spare.
+class RemoteWorker:
+    """A worker on whichever machine of the cluster has a core to spare.
 
-    It is what :class:`~training.comparison.processes.Child` is on this machine. All machines must
-    find programs and folders where this one has them.
-
-    Args:
-        command: Program and arguments.
-        log: The file that its output is appended to.
+    It is what :class:`~training.comparison.workers.LocalWorker` is on this machine. All machines
+    must find programs and folders where this one has them.
     """
 
-    def __init__(self, command: Sequence[str], log: Path) -> None:
+    def __init__(self) -> None:
+        self._actor: Any = None
+        self._begun: Any = None
+        self._task: Any = None
+        self._stopped: Any = None
+        self._log = Path()
+
+    def ready(self) -> bool:
+        """Whether a machine has a core for it; that is asked for from the first call on."""
+        if self._actor is None:
+            # Two calls at a time: a script, and what asks it to stop.
+            options = {"num_cpus": 1, "max_concurrency": 2, "scheduling_strategy": "SPREAD"}
+            self._actor = ray.remote(**options)(_Host).remote()
+            self._begun = self._actor.begun.remote()
+        return bool(ray.wait([self._begun], timeout=0)[0])
+
+    def start(self, command: Sequence[str], log: Path) -> None:
+        """Begin a script; its output is appended to a file."""
         self._log = log
-        options = {"num_cpus": 1, "max_retries": 0, "scheduling_strategy": "SPREAD"}
-        self._task = ray.remote(**options)(_run).remote(list(command), log, Path.cwd())
+        self._task = self._actor.run.remote(list(command), log, Path.cwd())
 
     def ended(self) -> int | None:
-        """Exit status, or None while it runs or waits for a core."""
+        """Exit status of the script, None while it runs; raise :class:`Lost` if it was lost."""
         done, _ = ray.wait([self._task], timeout=0)
-        return self.wait() if done else None
-
-    def stop(self, number: int = signal.SIGTERM) -> None:
-        """Send it SIGTERM, or take it out of the queue."""
-        ray.cancel(self._task)
-
-    def wait(self) -> int:
-        """Wait for its end and give the exit status."""
+        if not done:
+            return None
         try:
             return int(ray.get(self._task))
-        except exceptions.TaskCancelledError:
-            return 128 + signal.SIGTERM
-        except _GONE as error:
-            raise Lost(str(error).splitlines()[0]) from error
+        except (Lost, *_GONE) as error:
+            self.stop()
+            self.wait()
+            raise Lost(str(error).strip().splitlines()[-1]) from error
         except exceptions.RayTaskError as error:
             with self._log.open("a", encoding="utf-8") as log:
                 log.write(f"{error}\n")
             return 1
+
+    def stop(self) -> None:
+        """Ask the script to save and end, or the cluster no longer for a core."""
+        if self._actor is not None and self.ready():
+            self._stopped = self._actor.stop.remote()
+
+    def wait(self) -> None:
+        """Wait until it has, and give the core back."""
+        if self._stopped is not None:
+            with suppress(exceptions.RayError):
+                ray.get(self._stopped)
+        if self._actor is not None:
+            ray.kill(self._actor)
+        self._actor = self._stopped = None
+
+
+class _Host:
+    """What a machine runs for a worker: the process of one, which scripts have to themselves."""
+
+    def __init__(self) -> None:
+        self._worker = LocalWorker()
+
+    def begun(self) -> None:
+        """Return once there is a core."""
+
+    def run(self, command: list[str], log: Path, folder: Path) -> int:
+        """Run a script where the comparison would have run it; its exit status."""
+        os.chdir(folder)
+        if not log.parent.is_dir():
+            raise FileNotFoundError(
+                f"{os.uname().nodename} does not have {log.parent.resolve()}: the machines of the "
+                "cluster must share the comparison's folder"
+            )
+        # The run may have been begun on a machine that is gone, or takes its time to be.
+        files.wait_until_free(log.parent, _PATIENCE)
+        self._worker.start(command, log)
+        while (status := self._worker.ended()) is None:
+            time.sleep(_PAUSE)
+        return status
+
+    def stop(self) -> None:
+        """Have the script save and end."""
+        self._worker.stop()
+        self._worker.wait()
 
 
 @contextmanager
@@ -82,23 +134,3 @@ def connected(address: str | None) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
-
-
-def _run(command: list[str], log: Path, folder: Path) -> int:
-    """Run a command where the comparison would have run it; cancelling it stops it by SIGTERM."""
-    os.chdir(folder)
-    if not log.parent.is_dir():
-        raise FileNotFoundError(
-            f"{os.uname().nodename} does not have {log.parent.resolve()}: the machines of the "
-            "cluster must share the comparison's folder"
-        )
-    # The run may have been begun on a machine that is gone, or takes its time to be.
-    files.wait_until_free(log.parent, _PATIENCE)
-    child = Child(command, log)
-    try:
-        while (status := child.ended()) is None:
-            time.sleep(_PAUSE)
-    except KeyboardInterrupt:
-        child.stop()
-        return child.wait()
-    return status

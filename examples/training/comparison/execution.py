@@ -1,28 +1,25 @@
-"""The runs of a comparison: trained, then evaluated, and begun again where one is lost."""
+"""The runs of a comparison: trained, then evaluated, and gone on with where one is lost."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from tqdm import tqdm
 
 from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job, collect, other_than_asked
-from training.comparison.processes import Child, Lost, Started
+from training.comparison.workers import LocalWorker, Lost, Worker
 from training.stopping import Stop
 
-Start = Callable[[Sequence[str], Path], Started]
-"""Starts a command, whose output goes to a file."""
 JOBS = 2
 """Runs at a time on one machine."""
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
 _MOST_LOSSES = 10
-"""Machines that may be lost under a run, which may be what takes them down."""
+"""Workers that may be lost under a run, which may be what takes them down."""
 
 
 class Running:
@@ -30,57 +27,31 @@ class Running:
 
     Args:
         job: The run.
-        training: The command that trains it; None if that is done.
-        evaluation: The command that evaluates it.
-        start: Starts a command.
+        commands: What trains it, unless that is done, and what evaluates it.
+        worker: What runs the commands.
         position: Its line.
     """
 
     def __init__(
-        self,
-        job: Job,
-        training: list[str] | None,
-        evaluation: list[str],
-        *,
-        start: Start,
-        position: int,
+        self, job: Job, commands: list[list[str]], *, worker: Worker, position: int
     ) -> None:
-        self.job = job
-        self.position = position
-        self._start = start
-        self._commands = [evaluation] if training is None else [training, evaluation]
+        self.job, self.worker, self._commands = job, worker, commands
         job.path.mkdir(parents=True, exist_ok=True)
         self.log = job.path / "output.log"
-        self._bar = tqdm(desc=job.name, unit="episode", position=position, leave=False)
-        self._child = start(self._commands.pop(0), self.log)
+        self.bar = tqdm(desc=job.name, unit="episode", position=position, leave=False)
+        worker.start(commands.pop(0), self.log)
 
     def ended(self) -> int | None:
         """Exit status of the last command, or of one that failed; None while it runs."""
         status = self.job.status()
-        self._bar.total, self._bar.n = status.get("total"), status.get("done", 0)
-        self._bar.unit = status.get("unit", "it")
-        self._bar.set_postfix_str(status.get("summary", "") if self._commands else "evaluation")
-        try:
-            exit_status = self._child.ended()
-        except Lost:
-            self._bar.close()
-            raise
+        self.bar.total, self.bar.n = status.get("total"), status.get("done", 0)
+        self.bar.unit = status.get("unit", "it")
+        self.bar.set_postfix_str(status.get("summary", "") if self._commands else "evaluation")
+        exit_status = self.worker.ended()
         if exit_status == 0 and self._commands:
-            self._child = self._start(self._commands.pop(0), self.log)
+            self.worker.start(self._commands.pop(0), self.log)
             return None
-        if exit_status is not None:
-            self._bar.close()
         return exit_status
-
-    def stop(self) -> None:
-        """Ask it to save and end."""
-        self._child.stop()
-
-    def wait(self) -> None:
-        """Wait until it has."""
-        with suppress(Lost):
-            self._child.wait()
-        self._bar.close()
 
 
 class Runs:
@@ -91,8 +62,7 @@ class Runs:
         overrides: Settings of all of them.
         wanted: What their policies shall do.
         anew: Runs to train again from the start.
-        start: Starts a command.
-        most: How many may be on their way.
+        workers: What makes them, each one run after another.
     """
 
     def __init__(
@@ -102,56 +72,66 @@ class Runs:
         wanted: Evaluation,
         *,
         anew: set[Job],
-        start: Start,
-        most: int,
+        workers: Sequence[Worker],
     ) -> None:
         self.waiting, self.overrides, self.wanted = waiting, overrides, wanted
-        self.anew, self.start, self.most = anew, start, most
-        self.running: list[Running] = []
+        self.anew, self.workers = anew, workers
+        self.running: dict[int, Running] = {}
+        """By the number of their worker."""
         self.failed: list[Job] = []
         self._losses: Counter[Job] = Counter()
+        # The average of the runs that are done tells how long the others will take.
+        self._bar = tqdm(desc="runs", total=len(waiting), unit="run", smoothing=0, leave=False)
 
     def __bool__(self) -> bool:
         return bool(self.waiting or self.running)
 
     def begin(self) -> None:
-        """Start as many as may be on their way."""
-        while self.waiting and len(self.running) < self.most:
-            job = self.waiting.pop(0)
-            free = min(set(range(self.most)) - {each.position for each in self.running})
-            anew = job in self.anew
-            trained = job.is_trained() and not anew
-            training = None if trained else job.trains(self.overrides, anew=anew)
-            evaluation = job.evaluates(self.wanted)
-            self.running.append(Running(job, training, evaluation, start=self.start, position=free))
+        """Have the workers that have nothing to do begin the next ones, or end."""
+        for number, worker in enumerate(self.workers):
+            if number in self.running:
+                continue
+            if not self.waiting:
+                worker.stop()
+                worker.wait()
+            elif worker.ready():
+                job = self.waiting.pop(0)
+                anew = job in self.anew
+                trained = job.is_trained() and not anew
+                commands = [] if trained else [job.trains(self.overrides, anew=anew)]
+                commands.append(job.evaluates(self.wanted))
+                self.running[number] = Running(job, commands, worker=worker, position=number + 1)
 
     def look(self) -> None:
         """Take note of those that have ended."""
-        for each in list(self.running):
+        for number, each in list(self.running.items()):
+            job = each.job
             try:
                 status = each.ended()
             except Lost as error:
-                self.running.remove(each)
-                self._lost(each, error)
-                continue
-            if status is None:
-                continue
-            self.running.remove(each)
-            if status == 0:
-                tqdm.write(f"{each.job.name}: trained and evaluated")
+                self._lost(job, error)
             else:
-                self.failed.append(each.job)
-                tqdm.write(f"{each.job.name}: failed, see {each.log}")
+                if status is None:
+                    continue
+                if status == 0:
+                    tqdm.write(f"{job.name}: trained and evaluated")
+                else:
+                    self._fail(job, f"see {each.log}")
+            self._bar.update(job not in self.waiting)
+            each.bar.close()
+            del self.running[number]
 
-    def _lost(self, run: Running, error: Lost) -> None:
+    def _fail(self, job: Job, why: str) -> None:
+        self.failed.append(job)
+        tqdm.write(f"{job.name}: failed, {why}")
+
+    def _lost(self, job: Job, error: Lost) -> None:
         """Have a run go on elsewhere."""
-        job = run.job
         self._losses[job] += 1
         if self._losses[job] > _MOST_LOSSES:
-            self.failed.append(job)
-            tqdm.write(f"{job.name}: failed, lost {_MOST_LOSSES} machines: {error}")
+            self._fail(job, f"lost {_MOST_LOSSES} workers: {error}")
             return
-        tqdm.write(f"{job.name}: its machine is gone, goes on at its last checkpoint: {error}")
+        tqdm.write(f"{job.name}: its worker is gone, goes on at its last checkpoint: {error}")
         # Once it has begun anew, it has the settings that are asked for.
         if job in self.anew and not other_than_asked([job], self.overrides):
             self.anew.discard(job)
@@ -159,10 +139,12 @@ class Runs:
 
     def stop(self) -> None:
         """Have all of them save and end."""
-        for each in self.running:
-            each.stop()
-        for each in self.running:
-            each.wait()
+        for worker in self.workers:
+            worker.stop()
+        for worker in self.workers:
+            worker.wait()
+        for bar in (*(each.bar for each in self.running.values()), self._bar):
+            bar.close()
 
 
 def make_runs(
@@ -194,11 +176,9 @@ def make_runs(
             )
         waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
         print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {comparison.folder}")
-        with _starting(ray if waiting else None) as start:
-            most = most or (JOBS if ray is None else len(waiting))
-            runs = Runs(
-                waiting, comparison.settings, wanted, anew=set(others), start=start, most=most
-            )
+        most = min(most or (JOBS if ray is None else len(waiting)), len(waiting))
+        with _workers(ray if waiting else None, most) as workers:
+            runs = Runs(waiting, comparison.settings, wanted, anew=set(others), workers=workers)
             stop = _run_all(runs)
         if stop:
             return stop.exit_status
@@ -207,18 +187,18 @@ def make_runs(
 
 
 @contextmanager
-def _starting(address: str | None) -> Iterator[Start]:
-    """Whatever starts a command: on this machine, or on a cluster."""
+def _workers(address: str | None, count: int) -> Iterator[list[Worker]]:
+    """Workers on this machine, or on a cluster."""
     if address is None:
-        yield Child
+        yield [LocalWorker() for _ in range(count)]
         return
     try:
-        from training.comparison.clusters import RemoteChild, connected
+        from training.comparison.clusters import RemoteWorker, connected
     except ImportError as error:
         raise ValueError("--ray needs Ray: pip install 'torchrl-mpfa[ray]'") from error
     try:
         with connected(address or None):
-            yield RemoteChild
+            yield [RemoteWorker() for _ in range(count)]
     except ConnectionError as error:
         raise ValueError(f"--ray {address}: {error}") from error
 
@@ -227,9 +207,11 @@ def _run_all(runs: Runs) -> Stop:
     """Train and evaluate, some at a time; whether all was stopped."""
     stop = Stop("saving the runs; the same command continues them")
     with stop.listening():
-        while runs and not stop:
-            runs.begin()
-            time.sleep(_PAUSE)
-            runs.look()
-        runs.stop()
+        try:
+            while runs and not stop:
+                runs.begin()
+                time.sleep(_PAUSE)
+                runs.look()
+        finally:
+            runs.stop()
     return stop

@@ -27,11 +27,10 @@ from tests.integration.tiny_runs import OVERRIDES
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.assembly import unused_settings
 from torchrl_mpfa.methods.catalogue import check_ranges
-from training import files
+from training import figures, files
 from training.comparison import execution
 from training.comparison.arms import Arm, with_defaults
 from training.comparison.jobs import Comparison, Evaluation
-from training.run import running
 from training.settings.command_line import composed
 from training.settings.train import TrainSettings, register
 from training.worlds import parse_worlds
@@ -236,9 +235,9 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return {name: Table(name, "Why?", (each,), (), (), {}) for name, each in of.items()}
 
     monkeypatch.setattr(study, "tables", two)
-    monkeypatch.setattr(execution, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
     monkeypatch.setattr(execution, "_PAUSE", 0.0)
-    monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
+    monkeypatch.setattr(figures, "plot_learning_curve", lambda *_: None)
     return tmp_path
 
 

@@ -54,14 +54,14 @@ def test_a_comparison_loses_a_machine_and_gives_the_rows_of_one_machine(
     thread.start()
     assert compare.main(arguments) == 0
     assert not thread.is_alive()
-    assert capsys.readouterr().out.count("its machine is gone, goes on at its last") == 1
+    assert capsys.readouterr().out.count("its worker is gone, goes on at its last") == 1
     # Neither run was begun twice.
     assert not list((tmp_path / "ray").glob(f"*/{files.PREVIOUS}"))
 
     arguments[1] = str(tmp_path / "serial")
     arguments.remove("--ray")
     arguments.remove(cluster.address)
-    monkeypatch.setattr(execution, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
     assert compare.main(arguments) == 0
     assert_same_rows(tmp_path / "ray", tmp_path / "serial")
     kept = json.loads((tmp_path / "ray" / files.SETTINGS).read_text())

@@ -16,11 +16,11 @@ import pytest
 import compare
 import evaluate
 from tests.integration.tiny_runs import OVERRIDES
-from training import files
+from training import figures, files
 from training.comparison import execution
 from training.comparison.arms import parse_arm, with_defaults
 from training.comparison.jobs import Job, other_than_asked
-from training.comparison.processes import Lost
+from training.comparison.workers import Lost
 from training.records import read_table
 from training.run import running
 from training.run.running import Refused, resume, start
@@ -40,9 +40,12 @@ def comparison(
 
 
 class InThisProcess:
-    """Does what a child process would, without the seconds that one takes to start."""
+    """Does what a worker would, without the seconds that one takes to start."""
 
-    def __init__(self, command: Sequence[str], log: Path) -> None:
+    def ready(self) -> bool:
+        return True
+
+    def start(self, command: Sequence[str], log: Path) -> None:
         arguments = list(command[1:])
         if command[0].endswith("evaluate.py"):
             evaluate.main(arguments)
@@ -61,13 +64,18 @@ class InThisProcess:
     def ended(self) -> int:
         return self.status
 
+    def stop(self) -> None:
+        pass
+
+    wait = stop
+
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(execution, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
     monkeypatch.setattr(execution, "_PAUSE", 0.0)
     # A picture of a run takes longer than the two episodes of one.
-    monkeypatch.setattr(running, "plot_learning_curve", lambda *_: None)
+    monkeypatch.setattr(figures, "plot_learning_curve", lambda *_: None)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -254,7 +262,7 @@ def test_a_killed_comparison_leaves_no_training_behind_and_goes_on_to_the_same_r
     assert_same_rows(tmp_path / "killed", tmp_path / "whole")
 
 
-def test_a_run_whose_machine_is_gone_goes_on_at_its_last_checkpoint(
+def test_a_run_whose_worker_is_gone_goes_on_at_its_last_checkpoint(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     in_this_process: None,
@@ -262,33 +270,33 @@ def test_a_run_whose_machine_is_gone_goes_on_at_its_last_checkpoint(
 ) -> None:
     commands: list[str] = []
 
-    class OnMachinesThatFail(InThisProcess):
+    class OnWorkersThatFail(InThisProcess):
         """Trains and is gone before it says so, then is gone at each evaluation but the last."""
 
-        def __init__(self, command: Sequence[str], log: Path) -> None:
+        def start(self, command: Sequence[str], log: Path) -> None:
             commands.append(Path(command[0]).name)
-            super().__init__(command, log)
+            super().start(command, log)
 
         def ended(self) -> int:
             if len(commands) < 4:
-                raise Lost("machine 7 is gone")
+                raise Lost("worker 7 is gone")
             return super().ended()
 
-    monkeypatch.setattr(execution, "Child", OnMachinesThatFail)
+    monkeypatch.setattr(execution, "LocalWorker", OnWorkersThatFail)
     assert compare.main(comparison(tmp_path / "lost", methods=("per",))) == 0
     assert commands == ["train.py", *["evaluate.py"] * 3]
-    assert capsys.readouterr().out.count("its machine is gone") == 3
+    assert capsys.readouterr().out.count("its worker is gone") == 3
     assert not (tmp_path / "lost" / "ddpg-per-0" / files.PREVIOUS).exists()
-    monkeypatch.setattr(execution, "Child", InThisProcess)
+    monkeypatch.setattr(execution, "LocalWorker", InThisProcess)
     assert compare.main(comparison(tmp_path / "whole", methods=("per",))) == 0
     assert_same_rows(tmp_path / "lost", tmp_path / "whole")
 
     # A run that takes down whatever it runs on is given up.
     commands.clear()
     monkeypatch.setattr(execution, "_MOST_LOSSES", 2)
-    monkeypatch.setattr(execution, "Child", OnMachinesThatFail)
+    monkeypatch.setattr(execution, "LocalWorker", OnWorkersThatFail)
     assert compare.main(comparison(tmp_path / "never", methods=("per",))) == 1
-    assert "ddpg-per-0: failed, lost 2 machines" in capsys.readouterr().out
+    assert "ddpg-per-0: failed, lost 2 workers" in capsys.readouterr().out
 
 
 def test_training_again_that_is_lost_goes_on_with_the_new_settings(
@@ -301,17 +309,17 @@ def test_training_again_that_is_lost_goes_on_with_the_new_settings(
     class Gone(InThisProcess):
         """Is gone before it has begun."""
 
-        def __init__(self, command: Sequence[str], log: Path) -> None:
+        def start(self, command: Sequence[str], log: Path) -> None:
             if not losses:
-                super().__init__(command, log)
+                super().start(command, log)
 
         def ended(self) -> int:
             if losses:
                 losses.clear()
-                raise Lost("machine 7 is gone")
+                raise Lost("worker 7 is gone")
             return super().ended()
 
-    monkeypatch.setattr(execution, "Child", Gone)
+    monkeypatch.setattr(execution, "LocalWorker", Gone)
     assert compare.main(arguments) == 0
     kept = json.loads((tmp_path / "ddpg-per-0" / files.SETTINGS).read_text())
     assert kept["method"]["alpha"] == 0.9

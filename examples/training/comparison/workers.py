@@ -1,0 +1,175 @@
+"""Processes that make one run after another, and never outlive the program that started them."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import runpy
+import signal
+import sys
+import threading
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Protocol
+
+Command = tuple[list[str], str]
+"""A script with its arguments, and the file that its output is appended to."""
+
+
+class Lost(Exception):
+    """The process or the machine that a script ran on is gone, and the script with it."""
+
+
+class Worker(Protocol):
+    """What makes runs, one at a time, on this machine or on another."""
+
+    def ready(self) -> bool:
+        """Whether a script would begin at once."""
+        ...
+
+    def start(self, command: Sequence[str], log: Path) -> None:
+        """Begin a script; its output is appended to a file."""
+        ...
+
+    def ended(self) -> int | None:
+        """Exit status of the script, None while it runs; raise :class:`Lost` if it was lost."""
+        ...
+
+    def stop(self) -> None:
+        """Ask the script to save and end, and the worker with it."""
+        ...
+
+    def wait(self) -> None:
+        """Wait until it has."""
+        ...
+
+
+class LocalWorker:
+    """A process of this machine that runs scripts one after another, each as if it were alone.
+
+    What a script imports, loads and compiles is there for the next one, which is most of the time
+    of a short run. A process that is gone is replaced when the next script begins.
+    """
+
+    def __init__(self) -> None:
+        self._process: SpawnProcess | None = None
+        self._commands: Connection
+        self._statuses: Connection
+
+    def ready(self) -> bool:
+        """Whether a script would begin at once."""
+        return True
+
+    def start(self, command: Sequence[str], log: Path) -> None:
+        """Begin a script; its output is appended to a file."""
+        if self._process is None:
+            context = multiprocessing.get_context("spawn")
+            theirs, self._commands = context.Pipe(duplex=False)
+            self._statuses, its = context.Pipe(duplex=False)
+            with theirs, its:
+                self._process = context.Process(target=_work, args=(theirs, its), name="worker")
+                self._process.start()
+        # A process that is gone by now is missed when it is asked for the end.
+        with suppress(BrokenPipeError):
+            self._commands.send((list(command), str(log)))
+
+    def ended(self) -> int | None:
+        """Exit status of the script, None while it runs; raise :class:`Lost` if it was lost."""
+        try:
+            return int(self._statuses.recv()) if self._statuses.poll() else None
+        except (EOFError, ConnectionResetError):
+            process = self._process
+            self.stop()
+            self.wait()
+            raise Lost(f"its process ended with {process and process.exitcode}") from None
+
+    def stop(self) -> None:
+        """Ask the script to save and end, and the process with it."""
+        if self._process is not None:
+            self._commands.close()
+
+    def wait(self) -> None:
+        """Wait until it has."""
+        if self._process is not None:
+            self._process.join()
+            self._statuses.close()
+            self._process = None
+
+
+def _work(sent: Connection, statuses: Connection) -> None:
+    """Run scripts until the program that sends them is gone, or one was asked to stop."""
+    # Ctrl-C goes to the parent alone, which says when they stop.
+    os.setsid()
+    # Where a script does not say how it ends by it: in good order as well.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    commands: SimpleQueue[Command | None] = SimpleQueue()
+    threading.Thread(target=_listen, args=(sent, commands), daemon=True, name="lifeline").start()
+    while (command := commands.get()) is not None:
+        status = _run(*command)
+        if status >= 128:
+            raise SystemExit(status)
+        with suppress(BrokenPipeError):
+            statuses.send(status)
+
+
+def _listen(sent: Connection, commands: SimpleQueue[Command | None]) -> None:
+    """Take commands; when the other end is closed, however, end by SIGTERM."""
+    with suppress(EOFError, OSError):
+        while True:
+            commands.put(sent.recv())
+    # For a script that has come to its end in spite of the signal.
+    commands.put(None)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _run(command: list[str], log: str) -> int:
+    """Run a script as ``python`` would, and give its exit status."""
+    output = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    os.close(output)
+    try:
+        with _unchanged():
+            sys.argv = command
+            runpy.run_path(command[0], run_name="__main__")
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except Exception:
+        traceback.print_exc()
+        status = 1
+    else:
+        status = 0
+    sys.stdout.flush()
+    # What a run leaves has cycles, and large buffers in them.
+    gc.collect()
+    return status
+
+
+@contextmanager
+def _unchanged() -> Iterator[None]:
+    """Leave the process to the next script as it was found, but for what is loaded."""
+    import torch
+
+    environment, folder = dict(os.environ), Path.cwd()
+    arguments, path = sys.argv, list(sys.path)
+    threads, numbers = torch.get_num_threads(), torch.get_rng_state()
+    try:
+        with warnings.catch_warnings():
+            yield
+    finally:
+        os.environ.clear()
+        os.environ.update(environment)
+        os.chdir(folder)
+        sys.argv, sys.path[:] = arguments, path
+        torch.set_num_threads(threads)
+        torch.set_rng_state(numbers)
+        torch.set_flush_denormal(False)
