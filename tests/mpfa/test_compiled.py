@@ -195,6 +195,60 @@ def test_a_traced_program_does_so_too_and_is_made_once_whatever_the_rates(name):
     assert len(made) == {"ddpg": 2, "td3": 3}[name]
 
 
+def counting(made):
+    """A compiler that only notes what it is given: Python stands in for it."""
+
+    def backend(module, inputs):
+        made.append(module)
+        return module.forward
+
+    return {"backend": backend}
+
+
+@pytest.mark.parametrize("name", ["ddpg", pytest.param("sac", marks=pytest.mark.slow)])
+def test_learners_of_equal_settings_share_programs_and_learn_as_each_alone(name):
+    made, others = [], []
+    shared, own = counting(made), counting(others)
+    learners = [make_learner(name, seed, compile=shared) for seed in range(2)]
+    alone = make_learner(name, 1, compile=own)
+    for seed in range(3):
+        update_both(learners[:1], seed)
+    needed = len(made)
+    for seed in range(3):
+        update_both([alone, learners[1]], 10 + seed)
+        update_both(learners[:1], 20 + seed)
+    assert len(made) == len(others) == needed
+    assert_alike(learners[1], alone, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gamma": 0.5},
+        {"reward_scale": 0.1},
+        {"importance": "none"},
+        {"loss_function": "smooth_l1"},
+        {"networks": make_networks(width=17)},
+        {"networks": make_networks(layer_norm=False)},
+        {"policy_noise": 0.3, "bounds": BOUNDS},
+    ],
+    ids=str,
+)
+def test_learners_of_other_settings_learn_as_each_alone(options):
+    made = []
+    shared = counting(made)
+    first = make_learner(compile=shared)
+    update_both([first], 0)
+    options_again = copy.deepcopy(options)
+    second = make_learner(of_loss=options, compile=shared)
+    alone = make_learner(of_loss=options_again, compile=counting([]))
+    for seed in range(2):
+        update_both([alone, second], seed)
+    assert_alike(second, alone, rtol=0, atol=0)
+    # The discount is a tensor of the loss, which programs take as an input.
+    assert len(made) == (1 if "gamma" in options else 2)
+
+
 @pytest.mark.parametrize("name", LEARNERS)
 def test_batches_for_one_of_both_move_that_one_alone(name):
     learners = make_pair(name)

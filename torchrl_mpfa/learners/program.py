@@ -3,6 +3,8 @@
 With networks of a hundred units an update is mostly the cost of calling some five hundred small
 operations, of which ``torch.compile`` makes one. They are recorded while the losses run once, so
 that nothing is said a second time, and what a loss or network of a user does is in the program.
+Learners whose losses record the same operations share one compiled program, as all tensors of a
+loss are inputs of it: a learner of the same settings as one before it is only recorded.
 """
 
 from __future__ import annotations
@@ -24,15 +26,19 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torchrl_mpfa.selection import Trains
 
 Entries = dict[NestedKey, Tensor]
+Call = Callable[..., list[Tensor]]
+
+_COMPILED: dict[Any, Call] = {}
+"""What the learners of this process have compiled, by all that it depends on."""
 
 
 class Program(NamedTuple):
     """Losses with their gradients, for batches of one form."""
 
-    call: Callable[..., list[Tensor]]
+    call: Call
     """From the entries of a batch and ``state`` to gradients, signals, and values for the log."""
     state: list[Tensor]
-    """Tensors of the loss, which later updates change in place."""
+    """Tensors of the loss, and those that it keeps; later updates change them in place."""
     moved: list[Tensor]
     """Parameters that the gradients belong to."""
     written: list[NestedKey]
@@ -138,24 +144,32 @@ class CompiledGradients:
             # Layers with running statistics have counted the batch of the trace.
             for value, before in buffers:
                 value.copy_(before)
-        names = _take_state(graph_module, state)
-        taken = [state[name] for name in names]
-        # Another one, without what the first one held.
-        graph_module = fx.GraphModule(graph_module, graph_module.graph)
-        program = _compiled(graph_module, [*entries.values(), *taken], self._arguments)
-        return Program(program, taken, moved, list(written), list(log))
+        taken = _take_state(graph_module, state)
+        call = self._compiled(graph_module.graph, [*entries.values(), *taken])
+        return Program(call, taken, moved, list(written), list(log))
+
+    def _compiled(self, graph: fx.Graph, inputs: list[Any]) -> Call:
+        """A graph as a program, the same one for equal graphs of equal inputs."""
+        # Operations are compared as objects; numbers and names of nodes as they are written.
+        nodes = tuple((n.name, n.op, n.target, repr((n.args, n.kwargs))) for n in graph.nodes)
+        forms = tuple((v.shape, v.stride(), v.dtype, v.device, v.requires_grad) for v in inputs)
+        # The number of threads is in what is compiled.
+        key = nodes, forms, torch.get_num_threads(), repr(self._arguments)
+        if key not in _COMPILED:
+            # A module without what was recorded with it.
+            module = fx.GraphModule(torch.nn.Module(), graph)
+            _COMPILED[key] = _compile(module, inputs, self._arguments)
+        return _COMPILED[key]
 
 
-def _compiled(
-    graph_module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any]
-) -> Callable[..., Any]:
-    """The program of a trace, by Inductor itself unless ``torch.compile`` has another backend."""
+def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any]) -> Call:
+    """The program of a record, by Inductor itself unless ``torch.compile`` has another backend."""
     if arguments.keys() - {"options"}:
-        return torch.compile(graph_module, **{"fullgraph": True, "dynamic": False, **arguments})
-    # ``torch.compile`` would trace it once more, and compare the inputs in each call: three seconds
+        return torch.compile(module, **{"fullgraph": True, "dynamic": False, **arguments})
+    # ``torch.compile`` would record it once more, and compare the inputs in each call: three seconds
     # at the start, and a third of an update.
     return standalone_compile(
-        graph_module,
+        module,
         inputs,
         dynamic_shapes="from_example_inputs",
         # The random numbers that the losses would have.
@@ -193,22 +207,28 @@ def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
     return key, value.shape, value.dtype, value.device
 
 
-def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[str]:
-    """Have a trace take tensors of a loss as its last inputs, and give their names."""
-    graph, inputs = trace.graph, dict[str, fx.Node]()
-    of_storage = {value.untyped_storage().data_ptr(): name for name, value in state.items()}
+def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[Tensor]:
+    """Have a trace take all tensors that it holds as its last inputs, and give them."""
+    graph, inputs = trace.graph, dict[int, tuple[fx.Node, Tensor]]()
+    of_storage = {_place(value): value for value in state.values()}
     last = graph.find_nodes(op="placeholder")[-1]
     for node in graph.find_nodes(op="get_attr"):
         value = getattr(trace, node.target)
-        name = of_storage.get(value.untyped_storage().data_ptr())
-        if name is None:
-            continue
-        if name not in inputs:
+        place = _place(value)
+        if place not in inputs:
             with graph.inserting_after(last):
-                inputs[name] = last = graph.placeholder(f"state_{len(inputs)}")
+                last = graph.placeholder(f"state_{len(inputs)}")
+            # What is no tensor of the loss was made by it for the trace, or is kept by it.
+            inputs[place] = last, of_storage.get(place, value)
         view = value.shape, value.stride(), value.storage_offset()
         with graph.inserting_before(node):
-            taken = graph.call_function(torch.ops.aten.as_strided.default, (inputs[name], *view))
+            source = inputs[place][0], *view
+            taken = graph.call_function(torch.ops.aten.as_strided.default, source)
         node.replace_all_uses_with(taken)
         graph.erase_node(node)
-    return list(inputs)
+    return [value for _, value in inputs.values()]
+
+
+def _place(value: Tensor) -> int:
+    """Where the numbers of a tensor are; a tensor without any is a place of its own."""
+    return value.untyped_storage().data_ptr() or -id(value)
