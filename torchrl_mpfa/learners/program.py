@@ -166,8 +166,8 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
     """The program of a record, by Inductor itself unless ``torch.compile`` has another backend."""
     if arguments.keys() - {"options"}:
         return torch.compile(module, **{"fullgraph": True, "dynamic": False, **arguments})
-    # ``torch.compile`` would record it once more, and compare the inputs in each call: three seconds
-    # at the start, and a third of an update.
+    # ``torch.compile`` would record it once more, three seconds at the start, and would compare the
+    # inputs in each call, a third of an update.
     return standalone_compile(
         module,
         inputs,
