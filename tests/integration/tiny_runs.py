@@ -24,6 +24,7 @@ STAGES = [Stage("A", 3), Stage("B", 3)]
 OVERRIDES = [
     "regime=paper",
     "learner.width=8",
+    "learner.compile=false",
     "method.batch_size=8",
     "method.capacity=200",
     "environment.physics=kinematic",

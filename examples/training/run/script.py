@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -19,16 +20,6 @@ REFUSED = 2
 _SWEEP = ("-m", "--multirun")
 
 
-def run(config: DictConfig) -> None:
-    """One run, in the folder that Hydra found for it."""
-    try:
-        status = start(as_settings(config), Path(HydraConfig.get().runtime.output_dir))
-    except Refused as error:
-        refuse(error)
-    if status:
-        raise SystemExit(status)
-
-
 def refuse(error: Exception) -> NoReturn:
     """Say in one line what is wrong."""
     print(f"train.py: {error}", file=sys.stderr)
@@ -41,16 +32,38 @@ def train(arguments: list[str]) -> None:
     try:
         overrides = parse_overrides(arguments)
         folders = [o.value() for o in overrides if o.key_or_group == "resume"]
-        if folders and folders[-1] is not None:
-            raise SystemExit(resume(Path(str(folders[-1])), overrides))
+        resumes = bool(folders) and folders[-1] is not None
+        runs = [] if resumes else list(composed(arguments))
         named = any(override.key_or_group == "run_dir" for override in overrides)
-        if named and any(option in arguments for option in _SWEEP):
+        if named and any(option in arguments for option in _SWEEP) and not resumes:
             raise ValueError(
                 "run_dir is for one run: those of a sweep have their settings as names, in the "
                 "folder hydra.sweep.dir=FOLDER"
             )
-        for settings in composed(arguments):
+        for settings in runs:
             check_folder(Path(settings.run_dir))
-    except (ValueError, Refused) as error:
+    except ValueError as error:
         refuse(error)
-    hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()
+    if resumes:
+        _end_with(lambda: resume(Path(str(folders[-1])), overrides))
+    elif len(runs) == 1 and not any(text.startswith(("-", "hydra")) for text in arguments):
+        _end_with(lambda: start(runs[0], Path(runs[0].run_dir)))
+    else:
+        # Sweeps, and whatever else Hydra can; it composes the settings once more.
+        hydra.main(version_base="1.3", config_path=None, config_name="train")(_run)()
+
+
+def _run(config: DictConfig) -> None:
+    """One run, in the folder that Hydra found for it."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    _end_with(lambda: start(as_settings(config), folder))
+
+
+def _end_with(run: Callable[[], int]) -> None:
+    """Run; the exit status of the script is that of the run."""
+    try:
+        status = run()
+    except Refused as error:
+        refuse(error)
+    if status:
+        raise SystemExit(status)
