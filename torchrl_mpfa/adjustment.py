@@ -280,7 +280,7 @@ class PositiveDecay:
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Decay the positive transitions above the threshold, shape ``[B]``."""
-        threshold = decay_threshold(priority)
+        threshold = decay_threshold(priority).item()
         decayed = priority * self.factors(priority, batch)
         positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
         # The mean of equal numbers may be rounded to below them.

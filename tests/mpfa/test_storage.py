@@ -165,10 +165,12 @@ def test_get_equals_plain_indexing(make_storage, index):
     data = make_transitions(6)
     data["pixels"] = torch.randint(255, (6, 2, 3), generator=seeded(), dtype=torch.uint8)
     data["long", "nested", "flag"] = torch.tensor([True, False] * 3)
+    data["walkers"] = TensorDict({"place": torch.rand(6, 4, 2)}, [6, 4])
     for storage in (ours, plain):
         storage.set(torch.arange(6), data)
     found, expected = ours.get(index), plain.get(index)
-    assert found.batch_size == expected.batch_size
+    for key in ((), "long", "walkers"):
+        assert found[key].batch_size == expected[key].batch_size
     assert same(found.to_dict(), expected.to_dict())
     if not isinstance(index, slice):
         found["observation"].fill_(-1)

@@ -24,6 +24,8 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
     """Slots ``[B]`` along the flattened storage, from slots or places ``[B, D]`` or a tuple."""
     if isinstance(index, tuple):
         index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
+    if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
+        return index.cpu()
     slots = torch.as_tensor(index, device="cpu")
     if slots.numel() == 0:
         return slots.new_empty(0, dtype=torch.long)

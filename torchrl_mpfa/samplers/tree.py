@@ -286,7 +286,7 @@ class TreeSampler(SavedTrees):
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
         """Slots sampled in proportion to the leaves of a tree of sums, shape ``[B]``."""
         mass = self._mass(batch_size).mul_(tree.query(0, size))
-        index = torch.as_tensor(tree.scan_lower_bound(mass)).reshape(-1)
+        index: Tensor = tree.scan_lower_bound(mass)
         # Rounding can carry the last bit of mass past the last slot.
         return index.clamp_max_(size - 1)
 
