@@ -9,13 +9,16 @@
     python examples/compare.py --ray HEAD:6379            on all machines of a Ray cluster
 
 A run of the default 50,000 actions, with its evaluation, takes some one and a half minutes of a
-core: on two cores the first line takes some eight minutes, the second a quarter of an hour.
+core: on two cores the first line takes some eight minutes, the second a quarter of an hour. Each of
+the --jobs processes makes one run after another, with the numbers of train.py and evaluate.py alone
+and without the ten seconds or more that a process takes to start.
 
 What follows ``--`` goes to ``train.py``; an arm adds settings of its own, for every learner, method
 and seed. It can be stopped at any moment and continued by the same command: finished runs are left
-alone, others resume from their last checkpoint, also if their machine was lost (``docs/scaling.md``
-has the requirements of ``--ray``). A run that was trained with other settings is an error, or with
-``--anew`` is trained again. ``report.py`` makes tables and figures from the folder. Its files:
+alone, others resume from their last checkpoint, also if their process was killed or their machine
+was lost (``docs/scaling.md`` has the requirements of ``--ray``). A run that was trained with other
+settings is an error, or with ``--anew`` is trained again. ``report.py`` makes tables and figures
+from the folder. Its files:
 
     LEARNER-METHOD-SEED/   a run of train.py, with the output of evaluate.py; with arms
                            LEARNER-METHOD-ARM-SEED/

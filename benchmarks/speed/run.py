@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.speed import environment, loss, method_steps, replay, training, vector, worlds
+from benchmarks.speed import environment, loss, method_steps, replay, runs, training, vector, worlds
 from benchmarks.speed.timing import Entry
 from torchrl_mpfa.saving import write_text_atomically
 
@@ -70,6 +70,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "environment": measure_environment,
     "vector": vector.measure,
     "worlds": worlds.measure,
+    "runs": runs.measure,
 }
 
 

@@ -149,8 +149,10 @@ def _run(command: list[str], log: str) -> int:
     else:
         status = 0
     sys.stdout.flush()
-    # What a run leaves has cycles, and large buffers in them.
+    # What a run leaves has cycles, and large buffers in them. What is loaded by now is kept, and
+    # need not be gone through by each collection after this one.
     gc.collect()
+    gc.freeze()
     return status
 
 

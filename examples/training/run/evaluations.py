@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from functools import lru_cache
 
 from tensordict.nn import TensorDictModule
 
-from mpfa_envs import Policy, evaluate
+from mpfa_envs import Policy, WorldTask, run_tasks, world_tasks
 from training.environments import env_arguments
 from training.records import EvaluationRecord
 from training.run.assembly import policy_layers
@@ -55,10 +56,9 @@ def evaluate_policy(
         Rates of success, collision and timeout, and the mean SPL.
     """
     start = time.perf_counter()
-    wanted = settings.evaluation
-    results = evaluate(
-        exported_policy(policy, settings), wanted.world, episodes=wanted.episodes, seed=SEED
-    )
+    wanted, driver = settings.evaluation, exported_policy(policy, settings)
+    tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
+    results = run_tasks(driver, tasks, **driver.env_arguments)
     names = ("success", "collision", "timeout", "spl")
     return EvaluationRecord(
         total_steps=total_steps,
@@ -68,3 +68,9 @@ def evaluate_policy(
         trained_for=trained_for,
         **{name: sum(getattr(r, name) for r in results) / len(results) for name in names},
     )
+
+
+@lru_cache(maxsize=4)
+def _tasks(world: str, episodes: int, robot: str) -> list[WorldTask]:
+    """The tasks of each evaluation, with worlds whose shortest paths are known from the second."""
+    return world_tasks(world, episodes=episodes, seed=SEED, robot=robot)
