@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.speed import method_steps, replay, run, scaling, timing, training, vector
+from benchmarks.speed import method_steps, replay, run, scaling, start, timing, training, vector
 from benchmarks.speed.timing import Entry, Timing, entry
 from torchrl_mpfa.methods import METHODS
 from training.settings.train import register
@@ -97,7 +97,7 @@ def test_check_fails_if_a_ratio_is_above_its_target(
 
 
 def test_every_target_belongs_to_a_benchmark() -> None:
-    assert set(run.TARGETS) <= set(run.BENCHMARKS)
+    assert set(run.TARGETS) <= {*run.BENCHMARKS, *start.COMMANDS}
 
 
 def test_calls_take_turns_and_a_ratio_is_the_median_of_the_rounds() -> None:

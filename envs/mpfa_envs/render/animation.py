@@ -59,9 +59,12 @@ def write_animation(
         raise ValueError(f"palette_size must be at most 256, got {palette_size}")
     step = -(-len(frames) // check_count("most", most))
     delay = 1000 * step * check_positive("frame_time", frame_time) / check_positive("speed", speed)
-    chosen = [Image.fromarray(frame) for frame in [*frames[:-1:step], frames[-1]]]
+    chosen = [*frames[:-1:step], frames[-1]]
     palette = _palette(chosen, palette_size)
-    pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chosen]
+    pictures = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in chosen
+    ]
     pictures[0].save(
         Path(path),
         save_all=True,
@@ -72,10 +75,10 @@ def write_animation(
     )
 
 
-def _palette(pictures: Sequence[Image.Image], size: int) -> Image.Image:
+def _palette(pictures: Sequence[NDArray[np.uint8]], size: int) -> Image.Image:
     """One palette for all pictures: colors of the kit that occur, and the most frequent others."""
     # Trails and maps are longest at the end, scans differ in the middle.
-    samples = np.concatenate([np.asarray(pictures[n]) for n in (0, len(pictures) // 2, -1)])
+    samples = np.concatenate([pictures[n] for n in (0, len(pictures) // 2, -1)])
     found, counts = np.unique(samples.reshape(-1, 3), axis=0, return_counts=True)
     # A few pixels of one color are a mark; a few of many colors are blurred edges.
     there = {tuple(color) for color in found[counts > 3].tolist()}

@@ -85,16 +85,12 @@ def film_episode(
             worth.append(float(np.asarray(values(moment.observations)).reshape(-1)[0]))
         if moment.wheels is not None:
             wheels.append(moment.wheels)
-    frames = list(pictures.values())
     if traces:
         panels = panels_of(wheels, worth, step_time=step_time)
-        frames = [
-            np.concatenate(
-                (each, render_traces(panels, at, step_time=step_time, height=len(each))), 1
-            )
-            for at, each in pictures.items()
-        ]
-    return Film(frames, step_time * stride)
+        for at, each in pictures.items():
+            beside = render_traces(panels, at, step_time=step_time, height=len(each))
+            pictures[at] = np.concatenate((each, beside), 1)
+    return Film(list(pictures.values()), step_time * stride)
 
 
 class Moment(NamedTuple):
