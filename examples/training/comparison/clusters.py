@@ -65,7 +65,6 @@ class RemoteWorker:
         try:
             return int(ray.get(self._task))
         except (Lost, *_GONE) as error:
-            self.stop()
             self.wait()
             raise Lost(str(error).strip().splitlines()[-1]) from error
         except exceptions.RayTaskError as error:

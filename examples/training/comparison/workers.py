@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import multiprocessing
 import os
 import runpy
@@ -164,6 +165,7 @@ def _unchanged() -> Iterator[None]:
     environment, folder = dict(os.environ), Path.cwd()
     arguments, path = sys.argv, list(sys.path)
     threads, numbers = torch.get_num_threads(), torch.get_rng_state()
+    level, handlers = logging.root.level, list(logging.root.handlers)
     try:
         with warnings.catch_warnings():
             yield
@@ -172,6 +174,8 @@ def _unchanged() -> Iterator[None]:
         os.environ.update(environment)
         os.chdir(folder)
         sys.argv, sys.path[:] = arguments, path
+        logging.root.setLevel(level)
+        logging.root.handlers[:] = handlers
         torch.set_num_threads(threads)
         torch.set_rng_state(numbers)
         torch.set_flush_denormal(False)

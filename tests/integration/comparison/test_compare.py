@@ -229,8 +229,12 @@ def descendants(process: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGKILL, -9), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
+)
 def test_a_killed_comparison_leaves_no_training_behind_and_goes_on_to_the_same_rows(
-    tmp_path: Path, request: pytest.FixtureRequest
+    number: int, status: int, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     arguments = [*comparison(tmp_path / "killed", methods=("mpfa_per",), length=20)]
     arguments.append("checkpoint_every=20")
@@ -246,8 +250,8 @@ def test_a_killed_comparison_leaves_no_training_behind_and_goes_on_to_the_same_r
         time.sleep(0.05)
     started = descendants(process.pid)
     assert len(started) >= 2
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.send_signal(number)
+    assert process.wait() == status
     while any(map(alive, started)):
         assert time.monotonic() < deadline, "a training outlived the comparison"
         time.sleep(0.05)
