@@ -19,7 +19,8 @@ _PAUSE = 0.3
 """Between two looks at a script [s]."""
 _PATIENCE = 150.0
 """How long a folder may stay locked after its machine is gone [s]. NFS lets go after 90."""
-
+_MOST_IN_VAIN = 10
+"""Machines that a worker may lose before it is of use."""
 _GONE = (
     exceptions.RayActorError,
     exceptions.NodeDiedError,
@@ -41,6 +42,7 @@ class RemoteWorker:
         self._begun: Any = None
         self._task: Any = None
         self._stopped: Any = None
+        self._in_vain = 0
         self._log = Path()
 
     def ready(self) -> bool:
@@ -50,7 +52,17 @@ class RemoteWorker:
             options = {"num_cpus": 1, "max_concurrency": 2, "scheduling_strategy": "SPREAD"}
             self._actor = ray.remote(**options)(_Host).remote()
             self._begun = self._actor.begun.remote()
-        return bool(ray.wait([self._begun], timeout=0)[0])
+        if not ray.wait([self._begun], timeout=0)[0]:
+            return False
+        try:
+            ray.get(self._begun)
+        except _GONE:
+            # Its machine was gone before it had a run. What always fails is a run's own loss.
+            self._in_vain += 1
+            if self._in_vain <= _MOST_IN_VAIN:
+                self._actor = None
+                return False
+        return True
 
     def start(self, command: Sequence[str], log: Path) -> None:
         """Begin a script; its output is appended to a file."""

@@ -163,7 +163,7 @@ def _unchanged() -> Iterator[None]:
     import torch
 
     environment, folder = dict(os.environ), Path.cwd()
-    arguments, path = sys.argv, list(sys.path)
+    arguments = sys.argv
     threads, numbers = torch.get_num_threads(), torch.get_rng_state()
     level, handlers = logging.root.level, list(logging.root.handlers)
     try:
@@ -173,7 +173,7 @@ def _unchanged() -> Iterator[None]:
         os.environ.clear()
         os.environ.update(environment)
         os.chdir(folder)
-        sys.argv, sys.path[:] = arguments, path
+        sys.argv = arguments
         logging.root.setLevel(level)
         logging.root.handlers[:] = handlers
         torch.set_num_threads(threads)

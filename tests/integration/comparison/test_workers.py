@@ -100,13 +100,13 @@ def test_a_script_finds_its_process_as_it_was_before_the_others(
     looks.write_text(
         "import logging, os, sys, warnings, torch\n"
         "print(logging.root.level, logging.root.handlers)\n"
-        "print(sys.argv[1:], sys.path, os.getcwd(), os.environ, warnings.filters)\n"
+        "print(sys.argv[1:], os.getcwd(), os.environ, warnings.filters)\n"
         "print(torch.get_num_threads(), torch.rand(1), torch.tensor(1e-39) * 0.5)\n"
     )
     spoils.write_text(
         "import logging, os, sys, warnings, torch\n"
         "logging.basicConfig(level=1)\n"
-        "os.chdir('/'); os.environ['NEW'] = '1'; sys.path.append('new'); sys.argv.append('new')\n"
+        "os.chdir('/'); os.environ['NEW'] = '1'; sys.argv.append('new')\n"
         "warnings.simplefilter('error')\n"
         "torch.set_num_threads(3); torch.manual_seed(7); torch.set_flush_denormal(True)\n"
         "raise RuntimeError('it is spoilt')\n"
