@@ -119,22 +119,13 @@ def settle(
     return left
 
 
-@njit
 def outcomes(
     episodes: EpisodeArrays, moving: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
     """Rewards, terminations and truncations, ``[N]``; zero and false for robots at rest."""
-    robots = moving.shape[0]
-    rewards = np.zeros(robots)
-    terminated, truncated = np.zeros(robots, np.bool_), np.zeros(robots, np.bool_)
-    for robot in range(robots):
-        if moving[robot]:
-            for term in range(REWARD, REWARD + 4):
-                rewards[robot] += episodes.numbers[term, robot]
-            flags = episodes.flags
-            terminated[robot] = flags[SUCCESS, robot] or flags[COLLISION, robot]
-            truncated[robot] = flags[TIMEOUT, robot]
-    return rewards, terminated, truncated
+    rewards = np.where(moving, episodes.numbers[REWARD : REWARD + 4].sum(axis=0), 0.0)
+    terminated = moving & (episodes.flags[SUCCESS] | episodes.flags[COLLISION])
+    return rewards, terminated, moving & episodes.flags[TIMEOUT]
 
 
 @njit
