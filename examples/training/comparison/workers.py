@@ -112,12 +112,16 @@ def _work(sent: Connection, statuses: Connection) -> None:
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     commands: SimpleQueue[Command | None] = SimpleQueue()
     threading.Thread(target=_listen, args=(sent, commands), daemon=True, name="lifeline").start()
-    while (command := commands.get()) is not None:
-        status = _run(*command)
-        if status >= 128:
-            raise SystemExit(status)
-        with suppress(BrokenPipeError):
-            statuses.send(status)
+    try:
+        while (command := commands.get()) is not None:
+            status = _run(*command)
+            if status >= 128:
+                raise SystemExit(status)
+            with suppress(BrokenPipeError):
+                statuses.send(status)
+    finally:
+        # Triton would report what is not freed at the end.
+        gc.unfreeze()
 
 
 def _listen(sent: Connection, commands: SimpleQueue[Command | None]) -> None:
