@@ -60,19 +60,25 @@ class CompiledGradients:
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
         """Set gradients and write signals as losses and a backward pass do; values for the log."""
-        entries = self._entries(batch)
-        form = trains, loss_function, self._options(), *map(_form, entries.items())
-        program = self._programs.get(form)
-        if program is None:
-            made = self._make(entries, batch.batch_size[:1], trains, loss_function)
-            program = self._programs[form] = made
-        with torch.no_grad():
-            found = iter(program.call(*entries.values(), *program.state))
-        for parameter in program.moved:
-            parameter.grad = next(found)
-        for key in program.written:
-            batch.set(key, next(found))
-        return dict(zip(program.log, found, strict=True))
+        entries, options = self._entries(batch), self._options()
+        # One for the critics and one for the actor: an update of both need not be a third, which
+        # takes as long to compile as the two of them.
+        parts: tuple[Trains, ...] = ("critic", "actor") if trains == "both" else (trains,)
+        log: dict[str, Tensor] = {}
+        for part in parts:
+            form = part, loss_function, options, *map(_form, entries.items())
+            program = self._programs.get(form)
+            if program is None:
+                made = self._make(entries, batch.batch_size[:1], part, loss_function)
+                program = self._programs[form] = made
+            with torch.no_grad():
+                found = iter(program.call(*entries.values(), *program.state))
+            for parameter in program.moved:
+                parameter.grad = next(found)
+            for key in program.written:
+                batch.set(key, next(found))
+            log |= dict(zip(program.log, found, strict=True))
+        return log
 
     def _entries(self, batch: TensorDictBase) -> Entries:
         """What a program may read: all tensors but those that the loss itself writes."""
@@ -167,15 +173,17 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
     if arguments.keys() - {"options"}:
         return torch.compile(module, **{"fullgraph": True, "dynamic": False, **arguments})
     # ``torch.compile`` would record it once more, three seconds at the start, and would compare the
-    # inputs in each call, a third of an update.
-    return standalone_compile(
-        module,
-        inputs,
-        dynamic_shapes="from_example_inputs",
-        # The random numbers that the losses would have.
-        options={"config_patches": {"fallback_random": True, **arguments.get("options", {})}},
-        donate_graph_module=True,
-    )
+    # inputs in each call, a third of an update. With gradients enabled there would be a second half
+    # of the program, for the gradients of the gradients.
+    with torch.no_grad():
+        return standalone_compile(
+            module,
+            inputs,
+            dynamic_shapes="from_example_inputs",
+            # The random numbers that the losses would have.
+            options={"config_patches": {"fallback_random": True, **arguments.get("options", {})}},
+            donate_graph_module=True,
+        )
 
 
 def _keep_programs() -> None:

@@ -46,9 +46,8 @@ def has_compiler() -> bool:
 
 def prepare_compiler() -> None:
     """Have PyTorch compile as fits a few small programs for a CPU."""
-    # Threads, each of which waits for a C++ compiler; the processes that would wait beside them for
-    # programs of a GPU have nothing to do.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", str(min(4, os.cpu_count() or 1)))
+    # Threads wait for the C++ compiler. Processes beside them, to compile programs of a GPU, would
+    # be started for nothing.
     os.environ.setdefault("TORCH_WARM_POOL", "0")
     # It need not compile a program for each set of vector instructions that the processor has, a
     # quarter of the time: a compiler that takes PyTorch's C++20 knows them.
