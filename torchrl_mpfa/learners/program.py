@@ -60,25 +60,19 @@ class CompiledGradients:
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
         """Set gradients and write signals as losses and a backward pass do; values for the log."""
-        entries, options = self._entries(batch), self._options()
-        # One for the critics and one for the actor: an update of both need not be a third, which
-        # takes as long to compile as the two of them.
-        parts: tuple[Trains, ...] = ("critic", "actor") if trains == "both" else (trains,)
-        log: dict[str, Tensor] = {}
-        for part in parts:
-            form = part, loss_function, options, *map(_form, entries.items())
-            program = self._programs.get(form)
-            if program is None:
-                made = self._make(entries, batch.batch_size[:1], part, loss_function)
-                program = self._programs[form] = made
-            with torch.no_grad():
-                found = iter(program.call(*entries.values(), *program.state))
-            for parameter in program.moved:
-                parameter.grad = next(found)
-            for key in program.written:
-                batch.set(key, next(found))
-            log |= dict(zip(program.log, found, strict=True))
-        return log
+        entries = self._entries(batch)
+        form = trains, loss_function, self._options(), *map(_form, entries.items())
+        program = self._programs.get(form)
+        if program is None:
+            made = self._make(entries, batch.batch_size[:1], trains, loss_function)
+            program = self._programs[form] = made
+        with torch.no_grad():
+            found = iter(program.call(*entries.values(), *program.state))
+        for parameter in program.moved:
+            parameter.grad = next(found)
+        for key in program.written:
+            batch.set(key, next(found))
+        return dict(zip(program.log, found, strict=True))
 
     def _entries(self, batch: TensorDictBase) -> Entries:
         """What a program may read: all tensors but those that the loss itself writes."""
