@@ -1,16 +1,14 @@
 """An update as one program: the same numbers as the losses give, whatever their options."""
 
 import copy
-import os
-from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch._dynamo.exc import BackendCompilerFailed
-from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from torchrl.objectives import ValueEstimators
 
+from tests.mpfa.compiled import UNTRACED, assert_alike, fail_with, make_pair, update_both
 from tests.mpfa.losses import (
     BOUNDS,
     LEARNERS,
@@ -24,12 +22,9 @@ from tests.mpfa.losses import (
 )
 from torchrl_mpfa import DDPGLearner, SignalDDPGLoss, make_ddpg_loss
 from torchrl_mpfa.saving import load_safely, save_atomically
-from torchrl_mpfa.selection import SampledBatch
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
-# The function itself, where tracing takes most of the time.
-UNTRACED = {"disable": True}
 NOISE = {"policy_noise": 0.3, "bounds": BOUNDS}
 
 
@@ -102,50 +97,6 @@ def test_critic_or_actor_alone_get_the_gradients_of_their_loss(name, trains):
     assert_same_gradients(name, {}, make_batch(), trains=trains)
 
 
-def fail_with(error):
-    """A function that raises this, whatever it is given."""
-
-    def fail(*args, **kwargs):
-        raise error
-
-    return fail
-
-
-def make_pair(name, compile=UNTRACED, *, loss=None, **options):
-    """An eager learner and a compiled one, with networks of the same weights."""
-    return [make_learner(name, of_loss=loss, compile=each, **options) for each in (False, compile)]
-
-
-def update_both(learners, seed, **given):
-    """One update each by the same batch; their values for the log and their batches."""
-    logs, batches = [], []
-    for learner in learners:
-        torch.manual_seed(seed)  # TD3 has noise in its targets.
-        batches.append(make_batch(seed=seed, weighted=True))
-        logs.append(learner.update(SampledBatch(batches[-1], **given)))
-    return logs, batches
-
-
-def tensors_of(state, name="state"):
-    """All that a state holds, by where it lies."""
-    if isinstance(state, dict):
-        return {k: v for key in state for k, v in tensors_of(state[key], f"{name}.{key}").items()}
-    if isinstance(state, list):
-        return tensors_of(dict(enumerate(state)), name)
-    return (
-        {name: torch.as_tensor(state)} if not isinstance(state, tuple) and state is not None else {}
-    )
-
-
-def assert_alike(one, other, *, rtol=1e-4, atol=1e-5):
-    one, other = tensors_of(one.state_dict()), tensors_of(other.state_dict())
-    assert one.keys() == other.keys()
-    for key, value in one.items():
-        assert other[key].shape == value.shape
-        assert other[key].dtype == value.dtype
-        torch.testing.assert_close(other[key], value, rtol=rtol, atol=atol)
-
-
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -172,81 +123,6 @@ def test_a_program_takes_the_same_forty_steps(name, options):
             for learner in learners:
                 learner.end_episode()
     assert_alike(*learners)
-
-
-@pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
-def test_a_traced_program_does_so_too_and_is_made_once_whatever_the_rates(name):
-    made = []
-
-    def backend(module, inputs):
-        """Python stands in for the C++ compiler: what is traced is the same."""
-        made.append(module)
-        return module.forward
-
-    options = {"target_average": 2} if name == "ddpg" else {}
-    learners = make_pair(name, {"backend": backend}, loss=options)
-    for seed in range(12):
-        for learner in learners:
-            learner.anneal(1.0 - seed / 12)
-        update_both(learners, seed)
-        update_both(learners, seed + 50, trains="critic", loss_function="pal", new_step=False)
-    assert_alike(*learners)
-    # One for both networks and one for the critic; TD3 delays its actor.
-    assert len(made) == {"ddpg": 2, "td3": 3}[name]
-
-
-def counting(made):
-    """A compiler that only notes what it is given: Python stands in for it."""
-
-    def backend(module, inputs):
-        made.append(module)
-        return module.forward
-
-    return {"backend": backend}
-
-
-@pytest.mark.parametrize("name", ["ddpg", pytest.param("sac", marks=pytest.mark.slow)])
-def test_learners_of_equal_settings_share_programs_and_learn_as_each_alone(name):
-    made, others = [], []
-    shared, own = counting(made), counting(others)
-    learners = [make_learner(name, seed, compile=shared) for seed in range(2)]
-    alone = make_learner(name, 1, compile=own)
-    for seed in range(3):
-        update_both(learners[:1], seed)
-    needed = len(made)
-    for seed in range(3):
-        update_both([alone, learners[1]], 10 + seed)
-        update_both(learners[:1], 20 + seed)
-    assert len(made) == len(others) == needed
-    assert_alike(learners[1], alone, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"gamma": 0.5},
-        {"reward_scale": 0.1},
-        {"importance": "none"},
-        {"loss_function": "smooth_l1"},
-        {"networks": make_networks(width=17)},
-        {"networks": make_networks(layer_norm=False)},
-        {"policy_noise": 0.3, "bounds": BOUNDS},
-    ],
-    ids=lambda options: "-".join(options),
-)
-def test_learners_of_other_settings_learn_as_each_alone(options):
-    made = []
-    shared = counting(made)
-    first = make_learner(compile=shared)
-    update_both([first], 0)
-    options_again = copy.deepcopy(options)
-    second = make_learner(of_loss=options, compile=shared)
-    alone = make_learner(of_loss=options_again, compile=counting([]))
-    for seed in range(2):
-        update_both([alone, second], seed)
-    assert_alike(second, alone, rtol=0, atol=0)
-    # The discount is a tensor of the loss, which programs take as an input.
-    assert len(made) == (1 if "gamma" in options else 2)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -385,62 +261,6 @@ def test_a_compiler_that_fails_is_not_taken_for_a_batch_that_does_not_fit():
         learner.update(make_batch())
 
 
-def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, monkeypatch):
-    # TorchRL has PyTorch name its own folder in the environment, which is not a user's choice.
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
-    make_pair("ddpg")
-    folder = Path(os.environ["TORCHINDUCTOR_CACHE_DIR"])
-    assert folder.is_relative_to(tmp_path)
-    assert folder.stat().st_mode & 0o777 == 0o700
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "anything")
-    make_pair("ddpg")
-    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "anything"
-    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
-    monkeypatch.setattr(Path, "chmod", fail_with(PermissionError("not yours")))
-    with pytest.raises(PermissionError, match="must be a folder of your own: set XDG_CACHE_HOME"):
-        make_pair("ddpg")
-
-
-def test_where_the_user_has_no_folder_programs_stay_where_pytorch_has_them(tmp_path, monkeypatch):
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
-    make_pair("ddpg")
-    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == default_cache_dir()
-
-
-def change_reward(loss):
-    loss.set_keys(reward="other_reward")
-
-
-def change_gamma(loss):
-    loss.value_estimator.gamma = torch.tensor(0.5)
-
-
-@pytest.mark.parametrize("change", [change_reward, change_gamma])
-def test_a_program_is_made_again_for_a_loss_that_is_changed(change):
-    learners = make_pair("ddpg")
-    for seed in range(4):
-        if seed == 2:
-            for learner in learners:
-                change(learner.loss)
-        for learner in learners:
-            batch = make_batch(seed=seed, weighted=True)
-            batch["next", "other_reward"] = 5.0 * batch["next", "reward"] + 1.0
-            torch.manual_seed(seed)
-            learner.update(batch)
-    assert_alike(*learners)
-
-
-def test_a_program_is_made_again_for_another_precision():
-    learners = make_pair("ddpg")
-    for seed in range(4):
-        with torch.autocast("cpu", torch.bfloat16, enabled=seed < 2):
-            update_both(learners, seed)
-    assert_alike(*learners, rtol=1e-3, atol=1e-4)
-
-
 def test_running_statistics_count_each_batch_once():
     counts = []
     for compile in (False, UNTRACED):
@@ -459,17 +279,6 @@ def test_a_batch_without_entries_is_rejected_as_in_eager():
     for learner in make_pair("ddpg"):
         with pytest.raises(KeyError):
             learner.update(TensorDict({}, [8]))
-
-
-def test_slices_of_other_tensors_need_no_program_of_their_own():
-    plain, traced = make_pair("ddpg")
-    for step in range(1, 12):
-        for learner in (plain, traced):
-            batch = make_batch(seed=step)
-            wide = batch["observation"].repeat_interleave(step, -1)
-            batch["observation"] = wide[:, ::step]
-            learner.update(batch)
-    assert_alike(plain, traced)
 
 
 @pytest.mark.slow

@@ -1,0 +1,157 @@
+"""Compiled programs: when one is made, who shares it, and where it is kept."""
+
+import copy
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from torch._inductor.runtime.cache_dir_utils import default_cache_dir
+
+from tests.mpfa.compiled import assert_alike, counting, fail_with, make_pair, update_both
+from tests.mpfa.losses import BOUNDS, make_batch, make_learner, make_networks
+from torchrl_mpfa.learners import program
+
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
+
+
+@pytest.mark.parametrize("name", ["ddpg", pytest.param("td3", marks=pytest.mark.slow)])
+def test_a_traced_program_does_so_too_and_is_made_once_whatever_the_rates(name):
+    made = []
+    options = {"target_average": 2} if name == "ddpg" else {}
+    learners = make_pair(name, counting(made), loss=options)
+    for seed in range(12):
+        for learner in learners:
+            learner.anneal(1.0 - seed / 12)
+        update_both(learners, seed)
+        update_both(learners, seed + 50, trains="critic", loss_function="pal", new_step=False)
+    assert_alike(*learners)
+    # One for both networks and one for the critic; TD3 delays its actor.
+    assert len(made) == {"ddpg": 2, "td3": 3}[name]
+
+
+@pytest.mark.parametrize("name", ["ddpg", pytest.param("sac", marks=pytest.mark.slow)])
+def test_learners_of_equal_settings_share_programs_and_learn_as_each_alone(name):
+    made, others = [], []
+    shared, own = counting(made), counting(others)
+    learners = [make_learner(name, seed, compile=shared) for seed in range(2)]
+    alone = make_learner(name, 1, compile=own)
+    for seed in range(3):
+        update_both(learners[:1], seed)
+    needed = len(made)
+    for seed in range(3):
+        update_both([alone, learners[1]], 10 + seed)
+        update_both(learners[:1], 20 + seed)
+    assert len(made) == len(others) == needed
+    assert_alike(learners[1], alone, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gamma": 0.5},
+        {"reward_scale": 0.1},
+        {"importance": "none"},
+        {"loss_function": "smooth_l1"},
+        {"networks": make_networks(width=17)},
+        {"networks": make_networks(layer_norm=False)},
+        {"policy_noise": 0.3, "bounds": BOUNDS},
+    ],
+    ids=lambda options: "-".join(options),
+)
+def test_learners_of_other_settings_learn_as_each_alone(options):
+    made = []
+    shared = counting(made)
+    first = make_learner(compile=shared)
+    update_both([first], 0)
+    options_again = copy.deepcopy(options)
+    second = make_learner(of_loss=options, compile=shared)
+    alone = make_learner(of_loss=options_again, compile=counting([]))
+    for seed in range(2):
+        update_both([alone, second], seed)
+    assert_alike(second, alone, rtol=0, atol=0)
+    # The discount is a tensor of the loss, which programs take as an input.
+    assert len(made) == (1 if "gamma" in options else 2)
+
+
+def test_programs_are_kept_in_a_folder_that_only_the_user_may_enter(tmp_path, monkeypatch):
+    # TorchRL has PyTorch name its own folder in the environment, which is not a user's choice.
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
+    make_pair("ddpg")
+    folder = Path(os.environ["TORCHINDUCTOR_CACHE_DIR"])
+    assert folder.is_relative_to(tmp_path)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "anything")
+    make_pair("ddpg")
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "anything"
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    monkeypatch.setattr(Path, "chmod", fail_with(PermissionError("not yours")))
+    with pytest.raises(PermissionError, match="must be a folder of your own: set XDG_CACHE_HOME"):
+        make_pair("ddpg")
+
+
+def test_where_the_user_has_no_folder_programs_stay_where_pytorch_has_them(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())
+    make_pair("ddpg")
+    assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == default_cache_dir()
+
+
+def change_reward(loss):
+    loss.set_keys(reward="other_reward")
+
+
+def change_gamma(loss):
+    loss.value_estimator.gamma = torch.tensor(0.5)
+
+
+@pytest.mark.parametrize("change", [change_reward, change_gamma])
+def test_a_program_is_made_again_for_a_loss_that_is_changed(change):
+    learners = make_pair("ddpg")
+    for seed in range(4):
+        if seed == 2:
+            for learner in learners:
+                change(learner.loss)
+        for learner in learners:
+            batch = make_batch(seed=seed, weighted=True)
+            batch["next", "other_reward"] = 5.0 * batch["next", "reward"] + 1.0
+            torch.manual_seed(seed)
+            learner.update(batch)
+    assert_alike(*learners)
+
+
+def test_a_program_is_made_again_for_another_precision():
+    learners = make_pair("ddpg")
+    for seed in range(4):
+        with torch.autocast("cpu", torch.bfloat16, enabled=seed < 2):
+            update_both(learners, seed)
+    assert_alike(*learners, rtol=1e-3, atol=1e-4)
+
+
+def test_slices_of_other_tensors_need_no_program_of_their_own():
+    plain, traced = make_pair("ddpg")
+    for step in range(1, 12):
+        for learner in (plain, traced):
+            batch = make_batch(seed=step)
+            wide = batch["observation"].repeat_interleave(step, -1)
+            batch["observation"] = wide[:, ::step]
+            learner.update(batch)
+    assert_alike(plain, traced)
+
+
+def test_inductor_is_asked_for_no_second_half_and_for_the_random_numbers_of_the_losses(monkeypatch):
+    asked = []
+
+    def compile(module, inputs, *, options, **_):
+        asked.append((torch.is_grad_enabled(), options["config_patches"]["fallback_random"]))
+        return module.forward
+
+    monkeypatch.setattr(program, "_COMPILED", {})
+    monkeypatch.setattr(program, "standalone_compile", compile)
+    learners = make_pair("td3", True, policy_delay=1)
+    for seed in range(3):
+        update_both(learners, seed)
+    assert asked == [(False, True)]
+    assert_alike(*learners)
