@@ -33,7 +33,8 @@ def main() -> None:
         try:
             print(help_text(__doc__ or "", arguments))
         except ValueError as error:
-            raise SystemExit(f"train.py: {error}") from error
+            print(f"train.py: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
         return
     only, _, folder = "".join(arguments).partition("resume=")
     if len(arguments) == 1 and not only and is_finished(Path(folder)):

@@ -61,6 +61,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
 @pytest.mark.parametrize(
     ("main", "line", "message"),
     [
+        (train.main, "--help foo=3", "^train.py: Could not override 'foo'"),
         (train.main, "resume=nowhere", "resume: there is no folder nowhere"),
         (train.main, "resume=file", "resume: there is no folder file"),
         (train.main, "resume=rows", "there is no checkpoint.pt in rows"),

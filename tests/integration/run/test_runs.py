@@ -346,3 +346,14 @@ def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_p
     assert read_checkpoint(tmp_path)["schedule"]["actions"] == 23
     with pytest.raises(KeyboardInterrupt):
         run.stop.ask(number)
+
+
+def test_the_help_has_all_choices_and_the_values_of_those_that_are_given(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["train.py", "--help", "learner=td3"])
+    train.main()
+    said = capsys.readouterr().out
+    assert "learner: ddpg, dqn, plain, q_learning, sac, td3" in said
+    assert "policy_noise: 0.2" in said
+    assert "name: td3" in said
