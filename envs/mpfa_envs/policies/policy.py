@@ -103,16 +103,12 @@ class Policy:
 
     def _choose(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         """From ``[N, O]`` to ``[N, A]``."""
-        # Always the same number of rows: products of other heights add in another order.
-        padding = -len(rows) % _BLOCK
-        padded = np.pad(rows.astype(np.float64), ((0, padding), (0, 0)))
-        blocks = padded.reshape(-1, _BLOCK, self.observation_size)
-        actions = np.empty((len(blocks) * _BLOCK, self.action_size), dtype=np.float32)
-        for number, block in enumerate(blocks):
-            values: NDArray[np.float64] = block
-            for layer in self.layers:
-                values = layer(values)
-            actions[number * _BLOCK : (number + 1) * _BLOCK] = values
+        # Always the same number of rows in a block: products of other heights add in another order.
+        blocks = np.zeros((-(-len(rows) // _BLOCK), _BLOCK, self.observation_size))
+        blocks.reshape(-1, self.observation_size)[: len(rows)] = rows
+        for layer in self.layers:
+            blocks = layer(blocks)
+        actions = blocks.reshape(-1, self.action_size).astype(np.float32)
         return actions[: len(rows)]
 
     def __repr__(self) -> str:
