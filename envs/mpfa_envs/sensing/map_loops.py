@@ -110,14 +110,17 @@ def _enter(levels: NDArray[np.uint8], u: float, v: float, blocked: float, near: 
     """Enter a point that the lidar hit; tell whether the map has changed."""
     nx, ny = levels.shape
     changed = False
+    outer, inner = near * near, blocked * blocked
+    first, last = max(math.ceil(v - near), 0), min(math.floor(v + near), ny - 1)
     for i in range(max(math.ceil(u - near), 0), min(math.floor(u + near), nx - 1) + 1):
-        for j in range(max(math.ceil(v - near), 0), min(math.floor(v + near), ny - 1) + 1):
-            square = (i - u) * (i - u) + (j - v) * (j - v)
-            if square <= near * near:
-                level = BLOCKED if square <= blocked * blocked else NEAR
-                if level > levels[i, j]:
-                    levels[i, j] = level
-                    changed = True
+        across = (i - u) * (i - u)
+        for j in range(first, last + 1):
+            square = across + (j - v) * (j - v)
+            # BLOCKED, NEAR or 0 without a branch, which would often be taken wrongly.
+            level = (square <= outer) + (square <= inner)
+            if level > levels[i, j]:
+                levels[i, j] = level
+                changed = True
     return changed
 
 
