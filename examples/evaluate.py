@@ -41,7 +41,6 @@ from training import files
 from training.environments import check_physics
 from training.evaluating import (
     Drivable,
-    Drives,
     drive,
     evaluation_folder,
     summary_row,
@@ -264,19 +263,15 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
     how = {"noise": options.noise, "physics": physics}
     if options.live:
         return show_live(options, how)
-    results: list[EpisodeResult] = []
-    driven: list[Drives] = []
-    rows = []
     with held(folder):
-        for world in options.names:
-            drives = drive(
-                policy, world, noise=options.noise, progress=not options.no_pictures, **asked
-            )
-            results += drives.results
-            driven.append(drives)
-            rows.append(
-                {"world": world_name(world), "physics": physics, **summary_row(drives.results)}
-            )
+        driven = drive(
+            policy, options.names, noise=options.noise, progress=not options.no_pictures, **asked
+        )
+        results = [result for drives in driven for result in drives.results]
+        rows = [
+            {"world": world_name(world), "physics": physics, **summary_row(drives.results)}
+            for world, drives in zip(options.names, driven, strict=True)
+        ]
         if not options.no_pictures:
             write_pictures(policy, driven, folder, values=critic(options), **how)
         if len(rows) > 1:

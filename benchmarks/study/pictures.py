@@ -92,7 +92,7 @@ def rooms(output: Path) -> None:
     """Paths in nine rooms of different kinds."""
     kinds = ("rooms", "clutter", "bars", "fields", "mazes")
     policy = load_policy(SHIPPED)
-    driven = [drive(policy, f"{kind}:test", episodes=200, **_HOW) for kind in kinds]
+    driven = drive(policy, [f"{kind}:test" for kind in kinds], episodes=200, **_HOW)
     save(trajectories_of(driven, size=_TILE), output / "rooms.png")
 
 
@@ -103,7 +103,7 @@ def methods(output: Path) -> None:
         "four maps": load_policy(POLICIES / "td3-mpfa_per.npz"),
         "planner": make_planner("dwa"),
     }
-    driven = {name: drive(each, WORLD, episodes=20, **_HOW) for name, each in drivers.items()}
+    driven = {name: drive(each, [WORLD], episodes=20, **_HOW)[0] for name, each in drivers.items()}
     first = driven["many rooms"]
     picture = render_methods(
         first.tasks[0].world,
@@ -118,7 +118,7 @@ def methods(output: Path) -> None:
 
 def filmed(policy: Policy) -> tuple[int, WorldTask]:
     """Number and task of the animation: the longest of twenty in mazes that ends in the goal."""
-    return longest([drive(policy, MAZE, episodes=20, **_HOW)])
+    return longest(drive(policy, [MAZE], episodes=20, **_HOW))
 
 
 def episode(output: Path) -> None:

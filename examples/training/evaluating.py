@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import accumulate
 from typing import Any
 
 from mpfa_envs import (
@@ -16,7 +17,9 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.evaluation.runs import ENVS_AT_ONCE
 from mpfa_envs.planners import DynamicWindow, MapPlanner
+from mpfa_envs.robots.drives import SERVERS
 from training.worlds import worlds_label
 
 Drivable = Policy | MapPlanner | DynamicWindow
@@ -70,41 +73,60 @@ def tasks_of(
 
 def drive(
     policy: Drivable,
-    world: str,
+    worlds: Sequence[str],
     *,
     episodes: int | None,
     seed: int,
     physics: str | None,
     noise: RobotNoise | None = None,
     progress: bool,
-) -> Drives:
+) -> list[Drives]:
     """Drive a policy through fixed tasks, contact being the only collision.
 
     As :func:`mpfa_envs.evaluate`, and the paths are kept.
 
     Args:
         policy: The policy, or a planner.
-        world: What :func:`mpfa_envs.world_tasks` takes.
-        episodes: Number of tasks; None: as many as there usually are.
+        worlds: Each what :func:`mpfa_envs.world_tasks` takes.
+        episodes: Number of tasks in each; None: as many as there usually are.
         seed: Seed of the tasks in a world.
         physics: ``wheels`` or ``kinematic``; None: as trained.
         noise: Errors of the robot; None: none.
         progress: Whether to show a bar.
 
     Returns:
-        Tasks, results and paths.
+        Tasks, results and paths in each of the worlds, the same whichever others there are.
     """
     arguments: dict[str, Any] = {**policy.env_arguments, "noise": noise}
     if physics is not None:
         arguments["physics"] = physics
-    tasks = tasks_of(policy, [world], episodes=episodes, seed=seed)
+    sets = [tasks_of(policy, [each], episodes=episodes, seed=seed) for each in worlds]
+    # A robot goes on with the next world while the slowest ones of this are under way. Robots on
+    # wheels that share a physics server must be the same ones as if there was no other world.
+    apart = arguments.get("physics") != "kinematic" and max(map(len, sets)) > SERVERS
+    driven: list[Drives] = []
+    for group in [[each] for each in sets] if apart else [sets]:
+        driven += _drive_together(policy, group, progress, arguments)
+    return driven
+
+
+def _drive_together(
+    policy: Drivable, sets: Sequence[list[WorldTask]], progress: bool, arguments: dict[str, Any]
+) -> list[Drives]:
+    """Drive sets of tasks by as many robots as the largest of them has."""
+    tasks = [task for each in sets for task in each]
     trails: list[list[tuple[float, float]]] = [[]] * len(tasks)
 
     def keep(env: VectorNavigationEnv, robot: int, number: int) -> None:
         trails[number] = env.trail(robot)
 
-    results = run_tasks(policy, tasks, progress_bar=progress, on_end=keep, **arguments)
-    return Drives(tasks, results, trails)
+    robots = min(ENVS_AT_ONCE, max(map(len, sets)))
+    results = run_tasks(
+        policy, tasks, envs_at_once=robots, progress_bar=progress, on_end=keep, **arguments
+    )
+    ends = list(accumulate(map(len, sets)))
+    parts = [slice(end - len(each), end) for end, each in zip(ends, sets, strict=True)]
+    return [Drives(tasks[part], results[part], trails[part]) for part in parts]
 
 
 def summary_row(results: Sequence[EpisodeResult]) -> dict[str, float]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -15,7 +17,7 @@ from mpfa_envs.evaluation.results import EpisodeResult
 from mpfa_envs.render import film_episode
 from training import files
 from training.comparison.jobs import Evaluation, Job
-from training.evaluating import summary_row
+from training.evaluating import drive, summary_row
 from training.records import read_table
 from training.run.assembly import make_learner
 from training.run.evaluations import exported_policy
@@ -33,6 +35,17 @@ def run(tmp_path: Path) -> Path:
     learner = make_learner(settings.learner, GROUPS["method"]["per"], 24, 2)
     save_policy(exported_policy(learner.policy, settings), tmp_path / "policy.npz")
     return tmp_path
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
+def test_worlds_are_driven_together_as_each_is_alone(run: Path, physics: str) -> None:
+    policy, words = load_policy(run), ["B", "bars:test", "rooms:test"]
+    how: dict[str, Any] = {"episodes": 5, "seed": 0, "physics": physics, "progress": False}
+    for word, together in zip(words, drive(policy, words, **how), strict=True):
+        [alone] = drive(policy, [word], **how)
+        assert together.trails == alone.trails
+        for one, same in zip(together.results, alone.results, strict=True):
+            assert replace(one, plan_s=0, decision_s=0) == replace(same, plan_s=0, decision_s=0)
 
 
 def test_the_script_writes_tables_and_pictures(

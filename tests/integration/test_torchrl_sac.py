@@ -25,7 +25,7 @@ def test_a_trained_policy_is_one_of_this_project(
     policy = load_policy(torchrl_sac.main(words.split()))
     assert policy.card["method"] == replay
     # As evaluate.py drives it, which has the robot from nowhere but its defaults.
-    driven = drive(policy, "A", episodes=2, seed=0, physics=None, progress=False)
+    [driven] = drive(policy, ["A"], episodes=2, seed=0, physics=None, progress=False)
     assert len(driven.results) == 2
 
 

@@ -27,8 +27,8 @@ The wheels keep their speeds as exactly at 30 Hz as at 240 Hz; at 20 Hz they do 
 """
 Physics = Literal["kinematic", "wheels"]
 """Kinds of motion."""
-_SERVERS: Final = 32
-"""Physics servers at most."""
+SERVERS: Final = 32
+"""Physics servers at most; up to as many robots on wheels drive the same bits as alone."""
 
 
 class Drives:
@@ -83,7 +83,7 @@ class WheelDrives(Drives):
         self._wheel_radius = robot.wheel_radius
         self._simulations = [
             Simulation(time_step=time_step, substeps=max(1, round(time_step / SUBSTEP)))
-            for _ in range(min(robots, _SERVERS))
+            for _ in range(min(robots, SERVERS))
         ]
         self._names = [f"robot_{index}" for index in range(robots)]
         # Speeds of each robot in its episode so far, and their number.

@@ -49,8 +49,8 @@ def show_policy(
         return 0.0
     begun, wanted = time.perf_counter(), settings.evaluation
     save_policy(policy, folder / files.POLICY, overwrite=True)
-    drives = drive(
-        policy, wanted.world, episodes=wanted.episodes, seed=SEED, physics=None, progress=False
+    [drives] = drive(
+        policy, [wanted.world], episodes=wanted.episodes, seed=SEED, physics=None, progress=False
     )
     values = values_of(learner, policy, settings)
     with TemporaryDirectory() as place:

@@ -32,7 +32,7 @@ def test_a_run_learns_from_choices_and_saves_a_policy_that_drives_them(tmp_path,
     chosen = run.learner.policy.outputs({"observation": torch.from_numpy(seen)})["action"]
     pairs = np.array(WHEEL_PAIRS, np.float32)[chosen.argmax(-1).numpy()]
     assert (policy(seen) == pairs).all()
-    driven = drive(policy, "A", episodes=3, seed=0, physics=None, progress=False)
+    [driven] = drive(policy, ["A"], episodes=3, seed=0, physics=None, progress=False)
     assert len(driven.results) == 3
 
 
