@@ -68,7 +68,7 @@ def render_traces(
     for number, panel in enumerate(panels):
         box = (_LEFT, number * tall + _TOP, FINE * width - _RIGHT, (number + 1) * tall - _BELOW)
         _draw_panel(draw, box, panel, step, step_time)
-    small = image.resize((width, height), Image.Resampling.BOX)
+    small = image.reduce(FINE)
     return np.asarray(small, dtype=np.uint8).copy()
 
 

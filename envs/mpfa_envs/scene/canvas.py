@@ -29,7 +29,6 @@ from mpfa_envs.scene.colors import (
     WALL,
     Color,
 )
-from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.world import World
 
 Point = tuple[float, float]
@@ -86,17 +85,18 @@ class Canvas:
         for polygon in world.polygons:
             self.polygon(polygon.vertices, fill=OBSTACLE, outline=OBSTACLE_EDGE)
         if world.occupancy is not None:
-            self._draw_cells(world.occupancy)
+            self.cells(world.occupancy.occupied, world.occupancy.resolution, OBSTACLE)
 
-    def _draw_cells(self, grid: OccupancyGrid) -> None:
-        """Fill the occupied cells; a pixel with any is an obstacle."""
-        half = grid.size[0] / 2, grid.size[1] / 2
+    def cells(self, filled: NDArray[np.bool_], resolution: float, color: Color) -> None:
+        """Fill cells ``[columns, rows]`` around the middle, of a side [m], and all their pixels."""
+        half = filled.shape[0] * resolution / 2, filled.shape[1] * resolution / 2
         left, top = map(round, self.at(-half[0], half[1]))
         right, bottom = map(round, self.at(half[0], -half[1]))
-        cells = Image.fromarray(np.flipud(grid.occupied.T).astype(np.uint8) * 255)
-        shrunk = cells.resize((right - left, bottom - top), Image.Resampling.BOX)
-        mask = shrunk.point([0] + 255 * [255])
-        self.image.paste(OBSTACLE, (left, top, right, bottom), mask)
+        picture = Image.fromarray(np.flipud(filled.T).astype(np.uint8) * 255)
+        scaled = picture.resize((right - left, bottom - top), Image.Resampling.BOX)
+        # The canvas stays opaque: the mask alone says how much of the color is seen.
+        mask = scaled.point([0] + 255 * [color[3]])
+        self.image.paste((*color[:3], 255), (left, top, right, bottom), mask)
 
     def rectangle(
         self,
@@ -192,7 +192,7 @@ class Canvas:
 
     def pixels(self) -> NDArray[np.uint8]:
         """The finished picture, shape ``[height, width, 3]``."""
-        picture = self.image.convert("RGB").resize(self._shape, Image.Resampling.BOX)
+        picture = self.image.convert("RGB").reduce(FINE)
         return np.asarray(picture, dtype=np.uint8).copy()
 
 

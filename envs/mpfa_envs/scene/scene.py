@@ -63,10 +63,7 @@ def render_scene(
     canvas = Canvas(world, size=size)
     x, y, heading = pose
     if sketch is not None:
-        half = sketch.resolution / 2
-        with canvas.layer():
-            for at_x, at_y in sketch.blocked:
-                canvas.rectangle(at_x - half, at_y - half, at_x + half, at_y + half, fill=MET)
+        canvas.cells(sketch.blocked, sketch.resolution, MET)
         canvas.line([(x, y), *sketch.path], PATH, 1.5)
     if rays is not None:
         ends = [

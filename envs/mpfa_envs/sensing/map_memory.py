@@ -33,8 +33,9 @@ _NEAR: Final = 0.22
 class Sketch(NamedTuple):
     """A robot's map as a picture needs it."""
 
-    blocked: list[tuple[float, float]]
-    """Centers of the cells where the robot's center cannot be (x, y) [m]."""
+    blocked: NDArray[np.bool_]
+    """Where the robot's center cannot be, ``[columns, rows]`` of cells around the room's middle,
+    the first column at the left and the first row at the bottom."""
     path: list[tuple[float, float]]
     """Centers of the cells of its path to the goal, in order (x, y) [m]."""
     resolution: float
@@ -143,11 +144,8 @@ class MapMemory:
         origin = self.arrays.origins[index]
         u, v = (np.array((x, y)) - origin) / RESOLUTION
         path = follow_path(levels, costs, cell_of(u, columns), cell_of(v, rows))
-        places, along = (
-            [(across, up) for across, up in (origin + RESOLUTION * cells).tolist()]
-            for cells in (np.argwhere(levels == BLOCKED), path)
-        )
-        return Sketch(places, along, RESOLUTION)
+        along = [(across, up) for across, up in (origin + RESOLUTION * path).tolist()]
+        return Sketch(levels == BLOCKED, along, RESOLUTION)
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """The maps and the paths, as arrays."""
