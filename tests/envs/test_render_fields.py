@@ -167,7 +167,7 @@ def test_a_film_shows_each_decision_and_the_end() -> None:
         return observations[:, 0]
 
     film = film_episode(ahead, task, values=values, physics="kinematic", max_steps=6)
-    assert len(film.frames) == 4 and seen == [1] * 4
+    assert len(film.frames) == 4 and seen == [4]
     assert film.frame_time == pytest.approx(0.2)
     assert {frame.shape for frame in film.frames} == {(480, 720, 3)}
     bare = film_episode(ahead, task, traces=False, physics="kinematic", max_steps=6)

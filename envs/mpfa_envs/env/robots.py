@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from mpfa_envs.worlds.task import read_task
 from mpfa_envs.worlds.walker import no_encounters
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -300,20 +301,21 @@ class RobotBatch:
         rows = self.trails[index, : self.episodes.steps[index] + 1]
         return [(x, y) for x, y in rows.tolist()]
 
-    def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """A picture of each robot's room from above, ``[H, W, 3]``."""
+    def snapshots(self) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
+        """Functions that render each robot's room as it is now from above, ``[H, W, 3]``."""
         # Imported here because training does not render.
         from mpfa_envs.scene.scene import render_scene
 
         return tuple(
-            render_scene(
+            partial(
+                render_scene,
                 self.worlds[index],
                 robot=self._config.robot,
                 pose=(x, y, heading),
                 goal=tuple(self.episodes.goals[index].tolist()),
                 goal_radius=self._config.goal_radius,
                 trail=self.trail(index),
-                rays=(self._lidar.angles, self.ranges[index]),
+                rays=(self._lidar.angles, self.ranges[index].copy()),
                 sketch=None if self.memory is None else self.memory.sketch(index, x, y),
                 walkers=self.walkers.of(index),
             )

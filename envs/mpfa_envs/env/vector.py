@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -406,9 +406,20 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         """
         if self.render_mode is None:
             return None
+        return tuple(snapshot() for snapshot in self.snapshots())
+
+    def snapshots(self) -> tuple[Callable[[], NDArray[np.uint8]], ...]:
+        """Keep how each robot's room is now, to render it later or never.
+
+        Returns:
+            A function for each robot, which gives the picture of :meth:`render`.
+
+        Raises:
+            ResetNeeded: If no episode has started.
+        """
         if not self._begun:
             raise ResetNeeded("there is nothing to render: call reset() before render()")
-        return self._batch.render()
+        return self._batch.snapshots()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the physics server; keyword arguments are not used."""

@@ -48,7 +48,7 @@ def film_episode(
     Args:
         policy: As for :func:`~mpfa_envs.run_tasks`; its ``env_arguments`` hold unless given here.
         episode: The task and its world.
-        values: From observations, ``[1, O]``, to their value, ``[1]``, such as Q.
+        values: From observations, ``[T, O]``, to their values, ``[T]``, such as Q.
         traces: Whether speeds and values are beside the picture.
         most: Greatest number of pictures, besides the last one: of a long episode every second
             step, every fourth, and so on.
@@ -69,23 +69,25 @@ def film_episode(
         (3, (480, 720, 3), 0.2)
     """
     check_count("most", most, least=2)
-    pictures: dict[int, NDArray[np.uint8]] = {}
+    snapshots: dict[int, Callable[[], NDArray[np.uint8]]] = {}
     stride, step_time = 1, 0.0
     wheels: list[tuple[float, float]] = []
-    worth: list[float] = []
+    seen: list[NDArray[np.float32]] = []
     for moment in drive_episode(policy, episode, seed=seed, **env_arguments):
         env, step, ended = moment.env, moment.step, moment.wheels is None
         step_time = env.config.time_step * env.config.action_repeat
         if step % stride == 0 or ended:
-            (pictures[step],) = env.render() or ()
-        if len(pictures) > most and not ended:
+            (snapshots[step],) = env.snapshots()
+        if len(snapshots) > most and not ended:
             stride *= 2
-            pictures = {at: each for at, each in pictures.items() if at % stride == 0}
-        if values is not None:
-            worth.append(float(np.asarray(values(moment.observations)).reshape(-1)[0]))
+            snapshots = {at: each for at, each in snapshots.items() if at % stride == 0}
+        seen.append(moment.observations)
         if moment.wheels is not None:
             wheels.append(moment.wheels)
+    # Only now it is known which pictures are kept.
+    pictures = {at: snapshot() for at, snapshot in snapshots.items()}
     if traces:
+        worth = [] if values is None else np.reshape(values(np.concatenate(seen)), -1).tolist()
         panels = panels_of(wheels, worth, step_time=step_time)
         for at, each in pictures.items():
             beside = render_traces(panels, at, step_time=step_time, height=len(each))
