@@ -94,18 +94,21 @@ class Simulation:
             for other in self._wheels:
                 for link in links.values():
                     server.setCollisionFilterGroupMask(self.bodies[other], link, _ROBOTS, ~_ROBOTS)
+        # Friction in a call of its own: beside damping the engine gives that of a link to the base
+        # (https://github.com/bulletphysics/bullet3/issues/3314).
+        server.changeDynamics(
+            body,
+            -1,
+            linearDamping=0.0,
+            angularDamping=0.0,
+            jointDamping=0.0,
+            # A robot that fell asleep would wake up a step late.
+            activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+        )
         for part, link in links.items():
-            server.changeDynamics(
-                body,
-                link,
-                # The casters slide; the wheels alone hold the ground.
-                lateralFriction=1.0 if part.endswith("wheel") else 0.0,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                jointDamping=0.0,
-                # A robot that fell asleep would wake up a step late.
-                activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-            )
+            # The casters slide; the wheels alone hold the ground.
+            friction = 1.0 if part.endswith("wheel") else 0.0
+            server.changeDynamics(body, link, lateralFriction=friction)
 
     def place_robot(self, x: float, y: float, heading: float, *, name: str = "robot") -> None:
         """Put a robot at rest at a pose [m, m, rad], without any trace of earlier motion."""
