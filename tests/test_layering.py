@@ -106,6 +106,7 @@ ROOMS = (
     {"worlds"},
     {"paths", "robots"},
     {"generators", "sensing"},
+    {"safety"},
     {"walkers", "tasks", "scene", "deploy"},
     {"env"},
     {"policies", "planners", "ros"},

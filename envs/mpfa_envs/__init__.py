@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mpfa_envs.robots.model import ROBOTS as ROBOTS
     from mpfa_envs.robots.model import RobotModel as RobotModel
     from mpfa_envs.robots.noise import RobotNoise as RobotNoise
+    from mpfa_envs.safety.filter import SafetyFilter as SafetyFilter
     from mpfa_envs.sensing.lidar import Lidar as Lidar
     from mpfa_envs.sensing.mirror import Mirror as Mirror
     from mpfa_envs.sensing.mirror import RandomMirror as RandomMirror
@@ -72,6 +73,7 @@ _NAMES = {
     "robots.discrete": "DiscreteWheels",
     "robots.model": "ROBOTS RobotModel",
     "robots.noise": "RobotNoise",
+    "safety.filter": "SafetyFilter",
     "sensing.lidar": "Lidar",
     "sensing.mirror": "Mirror RandomMirror",
     "sensing.observation": "OBSERVATION",

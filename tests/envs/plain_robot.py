@@ -19,6 +19,7 @@ class PlainRobot:
         self.lidar = config.make_lidar(world)
         x, y, heading = task.start
         self.motion = x, y, math.remainder(heading, math.tau), 0.0, 0.0
+        self.wheels = 0.0, 0.0
         self.steps, self.path_length, self.over = 0, 0.0, False
         self.min_clearance = distance(x, y, world) - config.robot.radius
 
@@ -38,7 +39,12 @@ class PlainRobot:
 
     def _advance(self, left: float, right: float) -> float:
         before, far = self.motion, self.distance
-        self.motion = drive_arc(before, left, right, self.config)
+        change = self.config.time_step * (self.config.robot.wheel_acceleration or math.inf)
+        self.wheels = tuple(
+            min(max(wanted, now - change), now + change)
+            for now, wanted in zip(self.wheels, (left, right), strict=True)
+        )
+        self.motion = drive_arc(before, *self.wheels, self.config)
         self.steps += 1
         self.path_length += math.dist(before[:2], self.motion[:2])
         clearance = distance(*self.motion[:2], self.world)

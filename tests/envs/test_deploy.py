@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 import mpfa_envs
-from mpfa_envs import NavigationEnv, RobotModel
+from mpfa_envs import ROBOTS, NavigationEnv, RobotModel, TaskConfig
 from mpfa_envs.deploy import Card, CardError, Pilot, Scan, read_exported
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.exported import card, exported
@@ -31,7 +31,7 @@ def sense(env: NavigationEnv) -> Recorded:
 
 
 def size_of(arguments: dict[str, Any]) -> int:
-    sectors = arguments.get("lidar", {}).get("sectors", 18)
+    sectors = TaskConfig(**arguments).make_lidar().sectors
     remembered = {name: arguments[name] for name in ("memory", "history") if name in arguments}
     return max(part.stop for part in observation_slices(sectors, **remembered).values())
 
@@ -91,6 +91,23 @@ def test_a_slower_robot_drives_the_same_arcs_more_slowly(tmp_path: Path) -> None
     found = slow.decide(scan, (0.0, 0.0, 0.1), (0.3 * pace, 0.5 * pace))
     assert found[2:] == pytest.approx((pace * want.linear, pace * want.angular), rel=1e-5)
     assert (found.right - found.left) / 0.16 == pytest.approx(found.angular)
+
+
+@pytest.mark.parametrize("pace", [None, 0.5])
+def test_a_pilot_with_a_filter_does_not_drive_into_a_wall(pace: float | None) -> None:
+    robot = ROBOTS["kobuki"]
+    facts = card(robot=robot, sectors=36, field_of_view=360.0, observation_size=42)
+    ahead = np.ones((1, 2), np.float32)
+    scan = Scan(-math.pi, math.pi / 180, np.full(360, 2.0))
+    wall = np.full(360, 2.0)
+    wall[150:211] = 0.3
+    for clearance, slower in ((None, False), (0.03, True)):
+        pilot = Pilot(facts, lambda _: ahead, pace=pace, clearance=clearance)
+        pilot.begin((4.0, 0.0))
+        still = (0.0, 0.0, 0.0), (0.35, 0.0)
+        assert pilot.decide(scan, *still).linear == pytest.approx(0.7 * pilot.pace)
+        near = pilot.decide(scan._replace(ranges=wall), *still)
+        assert (near.linear < 0.6 * pilot.pace) == slower
 
 
 def test_a_new_goal_clears_the_map_unlike_a_moved_one(tmp_path: Path) -> None:

@@ -163,7 +163,7 @@ def test_a_policys_env_arguments_hold_unless_others_are_given(
 
     monkeypatch.setattr(VectorNavigationEnv, "__init__", remember)
     learned = {"robot": "burger", "max_steps": 7, "action_repeat": 2, "closeness_distance": 0.2}
-    learned = {**learned, "progress": "shortest_path"}
+    learned |= {"progress": "shortest_path", "lidar": {"sectors": 18}}
     policy = steering_policy(**learned)
     evaluate(policy, "A", episodes=1)
     evaluate(policy, "A", episodes=1, action_repeat=3, collision_distance=0.3)

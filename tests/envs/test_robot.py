@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pybullet
 import pytest
 
 from benchmarks.speed.bullet_world import BulletWorld
@@ -30,13 +31,8 @@ class Wheels:
 @pytest.mark.parametrize("wheels", ["fast", "slow", "left", "right"])
 def test_the_simulated_robot_drives_and_turns_as_commanded(name: str, wheels: str) -> None:
     robot = ROBOTS[name]
-    slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
-    left, right = {
-        "fast": (fast, fast),
-        "slow": (slow, slow),
-        "left": (slow, fast),
-        "right": (fast, slow),
-    }[wheels]
+    actions = {"fast": (1, 1), "slow": (-1, -1), "left": (-1, 1), "right": (1, -1)}
+    left, right = robot.wheel_speeds(np.array(actions[wheels], dtype=np.float32))
     drive = Wheels(robot)
     drive.place(0.0, 0.0, 0.5)
     for _ in range(8):
@@ -44,12 +40,38 @@ def test_the_simulated_robot_drives_and_turns_as_commanded(name: str, wheels: st
     driven = turned = 0.0
     for _ in range(20):
         after = drive.move(left, right)
-        driven += math.dist(after[:2], before[:2])
+        middle = before[2] + 0.5 * math.remainder(after[2] - before[2], math.tau)
+        driven += math.cos(middle) * (after[0] - before[0])
+        driven += math.sin(middle) * (after[1] - before[1])
         turned += math.remainder(after[2] - before[2], math.tau)
         before = after
     drive.drives.close()
-    assert driven / 2.0 == pytest.approx((left + right) / 2, rel=0.03)
+    assert driven / 2.0 == pytest.approx((left + right) / 2, rel=0.03, abs=0.005)
     assert turned / 2.0 == pytest.approx((right - left) / robot.wheel_base, rel=0.03, abs=0.01)
+
+
+@pytest.mark.parametrize("name", [name for name in ROBOTS if ROBOTS[name].wheel_acceleration])
+def test_a_simulated_robot_that_brakes_stays_on_its_wheels(name: str) -> None:
+    robot = ROBOTS[name]
+    change = robot.wheel_limits.acceleration * 0.1
+    drive = Wheels(robot)
+    drive.place(0.0, 0.0, 0.0)
+    speed, motions = 0.0, []
+    for wanted in [robot.max_wheel_speed] * 15 + [robot.min_wheel_speed] * 30:
+        speed = min(max(wanted, speed - change), speed + change)
+        motions.append((speed, drive.move(speed, speed)[3]))
+    drive.drives.close()
+    commanded, driven = np.array(motions).T
+    assert np.abs(driven - commanded).max() < 0.1 * robot.max_wheel_speed + change
+
+
+def test_the_casters_slide_and_the_wheels_hold() -> None:
+    simulation = BulletWorld(WORLDS["A"], time_step=0.1)
+    simulation.add_robot(ROBOTS["kobuki"])
+    body, client = simulation.bodies["robot"], simulation.client
+    friction = [pybullet.getDynamicsInfo(body, link, client)[1] for link in (-1, 0, 1)]
+    simulation.close()
+    assert friction == [0.0, 1.0, 1.0]
 
 
 def test_a_wall_stops_the_simulated_robot() -> None:

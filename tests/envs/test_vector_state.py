@@ -256,7 +256,10 @@ OTHERS: list[tuple[dict[str, Any], str]] = [
     ({"reward": lambda outcome: RewardTerms()}, "reward = 'navigation_reward', got .* of your own"),
     ({"lidar": {"max_range": 2.0}}, "lidar.max_range = 10.0, got one with 2.0"),
     ({"lidar": {"reduction": "median"}}, "lidar.reduction = 'min', got one with 'median'"),
-    ({"lidar": {"field_of_view": 90.0}}, "lidar.field_of_view = 180.0, got one with 90.0"),
+    (
+        {"lidar": {"field_of_view": 90.0, "sectors": 36}},
+        "lidar.field_of_view = 360.0, got one with 90.0",
+    ),
     ({"lidar": {"noise": 0.1}}, "lidar.noise = 0.0, got one with 0.1"),
     ({"lidar": {"dropout": 0.1}}, "lidar.dropout = 0.0, got one with 0.1"),
     ({"noise": ALL}, "noise = None, got one with "),
@@ -314,7 +317,8 @@ def test_saved_states_keep_the_names_of_their_arguments() -> None:
     assert {name for name in names if "." not in name} == {
         *("num_envs", "robot", "physics", "max_steps", "time_step", "action_repeat"),
         *("goal_radius", "collision_distance", "closeness_distance", "progress", "memory"),
-        *("reward", "goal_reward", "collision_reward", "progress_scale", "history", "noise"),
+        *("reward", "goal_reward", "collision_reward", "progress_scale", "step_cost"),
+        *("history", "noise"),
         *("rays", "sectors", "min_goal_distance", "detour_chance", "world", "difficulty"),
         *("max_goal_distance", "episodes_per_world", "split", "autoreset_mode"),
     }

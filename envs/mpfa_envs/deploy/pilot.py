@@ -12,6 +12,8 @@ from mpfa_envs.deploy.card import Card, CardError, check_finite, read_exported
 from mpfa_envs.deploy.network import Network
 from mpfa_envs.deploy.sectors import Scan, Sectors, Silent
 from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.safety.filter import SafetyFilter
+from mpfa_envs.sensing.lidar import ray_angles
 from mpfa_envs.sensing.observation_loops import observe_all
 
 if TYPE_CHECKING:
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 _WIDER: Final = 0.01
 """A robot's radius may exceed that in training by this [m]."""
+_RAYS: Final = 3
+"""Rays of a sector, any of which may be the one that it reports."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _BEYOND: Final = 0.02
@@ -60,6 +64,8 @@ class Pilot:
         silent: As there.
         map_size: Side of the map of a policy that has one [m], a square around the robot's first
             position; the path leads through it alone.
+        clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
+            filter.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -78,6 +84,7 @@ class Pilot:
         unseen: float | None = None,
         silent: Silent = "refuse",
         map_size: float = 40.0,
+        clearance: float | None = None,
     ) -> None:
         self.card = card
         self.robot = card.robot if robot is None else resolve_robot(robot)
@@ -110,6 +117,7 @@ class Pilot:
             from mpfa_envs.deploy.map_path import MapPath
 
             self._map = MapPath(card, size=self._map_size)
+        self._keep = None if clearance is None else _filter_of(card, clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
@@ -261,9 +269,12 @@ class Pilot:
         Returns:
             The speeds.
         """
-        action = self._network(self.observe(scan, pose, speeds, scan_pose=scan_pose)[None])[0]
+        observation = self.observe(scan, pose, speeds, scan_pose=scan_pose)
+        action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
+        if self._keep is not None:
+            action = self._keep(observation, action)
         left, right = self.card.robot.wheel_speeds(action)
         linear = self.pace * 0.5 * (left + right)
         angular = self.pace * (right - left) / self.card.robot.wheel_base
@@ -279,6 +290,24 @@ class Pilot:
                 f"goal must be on the map, {self._map_size:g} m (map_size) around "
                 f"({center[0]:.2f}, {center[1]:.2f}), got ({goal[0]:.2f}, {goal[1]:.2f})"
             )
+
+
+def _filter_of(card: Card, clearance: float) -> SafetyFilter:
+    """The filter of the task that a policy learned."""
+    repeat = int(card.env_arguments.get("action_repeat", 2))
+    rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
+    return SafetyFilter(
+        card.robot,
+        angles=ray_angles(card.field_of_view, rays),
+        sectors=card.sectors,
+        max_range=card.max_range,
+        closeness_distance=card.closeness_distance,
+        memory=card.memory,  # type: ignore[arg-type]
+        history=card.history,
+        time_step=card.period / repeat,
+        action_repeat=repeat,
+        clearance=clearance,
+    )
 
 
 def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:

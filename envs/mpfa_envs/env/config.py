@@ -21,6 +21,7 @@ from mpfa_envs.checks import (
 from mpfa_envs.robots.drives import Physics
 from mpfa_envs.robots.model import ROBOTS, RobotModel, resolve_collision_distance, resolve_robot
 from mpfa_envs.robots.noise import NoisyMotion, RobotNoise, resolve_noise
+from mpfa_envs.safety.filter import CLEARANCE, SafetyFilter
 from mpfa_envs.sensing.lidar import Lidar
 from mpfa_envs.sensing.observation import Memory, observation_bounds, observation_slices
 from mpfa_envs.tasks.reward import PROGRESS_SCALE, RewardFunction, payments_of, resolve_reward
@@ -57,8 +58,12 @@ _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
     "detour_chance": check_share,
 }
 _EMPTY: Final = World(name="empty")
+_AHEAD: Final = 180.0
+"""The field of view that a lidar has by default [deg]."""
+_SECTOR: Final = 10.0
+"""Angle of a sector of the lidar of a robot with another one [deg]."""
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
-_PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale")
+_PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale", "step_cost")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +117,8 @@ class TaskConfig:
     fast. Another function pays as it likes; with ``progress="none"`` it is told the straight
     distances."""
     lidar: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``."""
+    """Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``. Unless
+    they say so, the field of view is that of the robot, in sectors of 10 degrees."""
     memory: Memory = "none"
     """``"map"``: the robot keeps a map of what its lidar hit in this episode and senses the path to
     the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
@@ -174,6 +180,9 @@ class TaskConfig:
         if not isinstance(self.lidar, Mapping | None):
             raise ValueError(f"lidar must hold arguments of Lidar, got {self.lidar!r}")
         arguments = dict(self.lidar or {})
+        view = self.robot.field_of_view
+        if view != _AHEAD and not {"field_of_view", "sectors"} & set(arguments):
+            arguments.update(field_of_view=view, sectors=max(round(view / _SECTOR), 1))
         for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
             if value > 0.0:
                 if name in arguments:
@@ -189,6 +198,29 @@ class TaskConfig:
             raise ValueError(
                 f"lidar must hold arguments of Lidar, got {self.lidar!r}: {error}"
             ) from error
+
+    def make_filter(self, *, clearance: float = CLEARANCE) -> SafetyFilter:
+        """Make the filter that keeps the robot off what its lidar sees.
+
+        Args:
+            clearance: Clearance of the rim to be kept [m].
+
+        Raises:
+            ValueError: If it is negative.
+        """
+        lidar = self.make_lidar()
+        return SafetyFilter(
+            self.robot,
+            angles=lidar.angles,
+            sectors=lidar.sectors,
+            max_range=lidar.max_range,
+            closeness_distance=self.closeness_distance,
+            memory=self.memory,
+            history=self.history,
+            time_step=self.time_step,
+            action_repeat=self.action_repeat,
+            clearance=clearance,
+        )
 
     def make_noise(self, robots: int) -> NoisyMotion | None:
         """Make the errors of some robots' motion, if there are any."""
@@ -224,7 +256,7 @@ class TaskConfig:
         }
         robot = asdict(self.robot)
         described["robot"] = robot.pop("name")
-        described.update({f"robot.{name}": float(value) for name, value in robot.items()})
+        described.update({f"robot.{name}": value and float(value) for name, value in robot.items()})
         # Older states have None for no noise.
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
         described["reward"] = "a function of your own"

@@ -23,7 +23,7 @@ from mpfa_envs.env.step_loops import (
 )
 from mpfa_envs.paths.batch import FieldBatch
 from mpfa_envs.robots.drives import make_drives
-from mpfa_envs.robots.motion_loops import scale_actions
+from mpfa_envs.robots.motion_loops import accelerate, scale_actions
 from mpfa_envs.saved import read_array, read_list
 from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.sensing.observation import FLAGS, NUMBERS
@@ -95,6 +95,9 @@ class RobotBatch:
         """Errors of the robots' motion, if there are any."""
         self._held = np.zeros((len(NUMBERS), count))
         robot = config.robot
+        self.commands = np.zeros((count, 2))
+        """Speeds that the wheels have by now been told, as fast as they may change [m/s]."""
+        self._change = robot.wheel_limits.acceleration * config.time_step
         self._lengths = (
             robot.radius,
             config.collision_distance,
@@ -120,6 +123,7 @@ class RobotBatch:
         clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
         clearance -= self._config.robot.radius
         self.drives.place(index, x, y, heading)
+        self.commands[index] = 0.0
         self.tasks[index] = task
         episodes.motions[index] = x, y, heading, 0.0, 0.0
         episodes.goals[index] = task.goal
@@ -148,7 +152,7 @@ class RobotBatch:
             raise ValueError(f"actions must have shape ({len(self.tasks)}, 2), got {values.shape}")
         speeds = np.empty_like(values)
         robot = self._config.robot
-        if not scale_actions(values, robot.min_wheel_speed, robot.max_wheel_speed, speeds):
+        if not scale_actions(values, robot.wheel_limits, speeds):
             rows = np.flatnonzero(np.isnan(values).any(axis=1)).tolist()
             raise ValueError(f"actions must not hold NaN, got some for robots {rows}")
         return speeds
@@ -167,7 +171,10 @@ class RobotBatch:
             self.trails = grown(self.trails, 2 * last + 1)
         for _ in range(self._config.action_repeat):
             self.walkers.move(running, episodes.motions)
-            driven = speeds if self.noise is None else self.noise.drive(speeds, running, rngs)
+            accelerate(self.commands, speeds, running, self._change)
+            driven = self.commands
+            if self.noise is not None:
+                driven = self.noise.drive(driven, running, rngs)
             self.drives.move(episodes.motions, running, driven)
             if self.noise is not None:
                 self.noise.measure(episodes.motions, running)
@@ -177,7 +184,7 @@ class RobotBatch:
                 measure_remaining(episodes, running, self._fields.arrays)
             if self._payments is None:
                 self._pay_by_function(running)
-            if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0)):
+            if not settle(episodes, running, self._payments or (0.0, 0.0, 0.0, 0.0)):
                 break
         self.running[moving] = running[moving]
 
@@ -240,6 +247,7 @@ class RobotBatch:
             **{"ways" if n == "remaining" else n: a for n, a in self.episodes._asdict().items()},
             "running": self.running,
             "observations": self.observations,
+            **({} if math.isinf(self._change) else {"commands": self.commands}),
             "ranges": self.ranges,
             **({} if self.noise is None else self.noise.arrays()),
         }

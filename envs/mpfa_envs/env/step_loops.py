@@ -98,7 +98,7 @@ def judge(
 def settle(
     episodes: EpisodeArrays,
     running: NDArray[np.bool_],  # have moved, [N]
-    payments: tuple[float, float, float],  # for the goal, a collision, a meter of approach
+    payments: tuple[float, float, float, float],  # goal, collision, meter, cost of a step
 ) -> bool:
     """Add the terms of Eq. (25), stop ended episodes, and tell whether any robot still runs."""
     numbers, flags = episodes.numbers, episodes.flags
@@ -113,6 +113,7 @@ def settle(
         else:
             approach = episodes.remaining[1, robot] - episodes.remaining[0, robot]
             numbers[REWARD + 2, robot] += payments[2] * approach
+            numbers[REWARD + 3, robot] -= payments[3]
         ended = flags[SUCCESS, robot] or flags[COLLISION, robot] or flags[TIMEOUT, robot]
         running[robot] = not ended
         left |= not ended

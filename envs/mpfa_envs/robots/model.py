@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from mpfa_envs.checks import all_finite, check_number, check_positive, did_you_mean
-from mpfa_envs.robots.motion_loops import scale_actions
+from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,6 +36,10 @@ class RobotModel:
         wheel_radius: Radius of a wheel [m].
         min_wheel_speed: Slowest speed of a wheel over the ground [m/s].
         max_wheel_speed: Fastest speed of a wheel over the ground [m/s].
+        wheel_acceleration: How fast the speed of a wheel changes [m/s²]; None: at once.
+        turn_limit: Fastest turn that it makes where its wheels could turn it faster [rad/s]; None:
+            as they can. Both wheels then change by the same, so that the forward speed stays.
+        field_of_view: Angle that its lidar sees, which its front halves [deg].
 
     Raises:
         ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the
@@ -59,12 +63,17 @@ class RobotModel:
     wheel_radius: float
     min_wheel_speed: float
     max_wheel_speed: float
+    wheel_acceleration: float | None = None
+    turn_limit: float | None = None
+    field_of_view: float = 180.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name must be a non-empty string, got {self.name!r}")
         for field in fields(self)[1:]:
             value = getattr(self, field.name)
+            if value is None and field.name in ("wheel_acceleration", "turn_limit"):
+                continue
             if not isinstance(value, (int, float)):
                 raise ValueError(f"{field.name} must be a finite number, got {value!r}")
             (check_number if field.name == "min_wheel_speed" else check_positive)(field.name, value)
@@ -82,11 +91,26 @@ class RobotModel:
                 f"min_wheel_speed must be below max_wheel_speed = {self.max_wheel_speed}, "
                 f"got {self.min_wheel_speed}"
             )
+        if self.field_of_view > 360.0:
+            raise ValueError(f"field_of_view must be at most 360 degrees, got {self.field_of_view}")
 
     @property
     def max_angular_speed(self) -> float:
-        """Fastest turn: one wheel at its fastest, the other at its slowest [rad/s]."""
-        return (self.max_wheel_speed - self.min_wheel_speed) / self.wheel_base
+        """Fastest turn, with the wheels at both ends of their range or at its limit [rad/s]."""
+        by_wheels = (self.max_wheel_speed - self.min_wheel_speed) / self.wheel_base
+        return by_wheels if self.turn_limit is None else min(by_wheels, self.turn_limit)
+
+    @property
+    def can_stop(self) -> bool:
+        """Whether it can stand still: both wheels may have a speed of zero."""
+        return self.min_wheel_speed <= 0.0 <= self.max_wheel_speed
+
+    @property
+    def wheel_limits(self) -> WheelLimits:
+        """What its wheels can do, as compiled loops read it."""
+        change = math.inf if self.wheel_acceleration is None else self.wheel_acceleration
+        across = math.inf if self.turn_limit is None else 0.5 * self.turn_limit * self.wheel_base
+        return WheelLimits(self.min_wheel_speed, self.max_wheel_speed, across, change)
 
     @property
     def collision_distance(self) -> float:
@@ -114,7 +138,7 @@ class RobotModel:
         if values.shape != (2,):
             raise ValueError(f"action must have shape (2,), got {values.shape}")
         speeds = np.empty((1, 2))
-        if not scale_actions(values[None], self.min_wheel_speed, self.max_wheel_speed, speeds):
+        if not scale_actions(values[None], self.wheel_limits, speeds):
             raise ValueError(f"action must not hold NaN, got {action!r}")
         left, right = speeds[0].tolist()
         return left, right
@@ -192,18 +216,81 @@ def _escape(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
 
 
-_MEASURES = tuple(field.name for field in fields(RobotModel)[1:])
 ROBOTS: Final[Mapping[str, RobotModel]] = {
-    name: RobotModel(name=name, **dict(zip(_MEASURES, row, strict=True)))
-    for name, row in {
-        # radius, height, mass, wheel_base, wheel_radius, min_wheel_speed, max_wheel_speed
-        "turtlebot2": (0.18, 0.42, 6.3, 0.23, 0.035, 0.05, 0.5),
-        "burger": (0.105, 0.192, 1.0, 0.16, 0.033, 0.022, 0.22),
-        "waffle": (0.22, 0.141, 1.8, 0.287, 0.033, 0.026, 0.26),
-        "turtlebot4": (0.175, 0.351, 3.9, 0.233, 0.03575, 0.031, 0.306),
-    }.items()
+    robot.name: robot
+    for robot in (
+        # The paper's: a TurtleBot2 whose wheels neither stop nor reverse.
+        RobotModel(
+            name="turtlebot2",
+            radius=0.18,
+            height=0.42,
+            mass=6.3,
+            wheel_base=0.23,
+            wheel_radius=0.035,
+            min_wheel_speed=0.05,
+            max_wheel_speed=0.5,
+        ),
+        # The same body as it is sold. Speeds: user's guide of the Kobuki; acceleration: default of
+        # its velocity smoother in ROS 2, kobuki_velocity_smoother.
+        RobotModel(
+            name="kobuki",
+            radius=0.18,
+            height=0.42,
+            mass=6.3,
+            wheel_base=0.23,
+            wheel_radius=0.035,
+            min_wheel_speed=-0.7,
+            max_wheel_speed=0.7,
+            wheel_acceleration=0.8,
+            turn_limit=math.pi,
+            field_of_view=360.0,
+        ),
+        # Speeds: specifications of the manufacturer (ROBOTIS e-Manual); acceleration: acc_lim_x of
+        # its parameters for Nav2, turtlebot3_navigation2.
+        RobotModel(
+            name="burger",
+            radius=0.105,
+            height=0.192,
+            mass=1.0,
+            wheel_base=0.16,
+            wheel_radius=0.033,
+            min_wheel_speed=-0.22,
+            max_wheel_speed=0.22,
+            wheel_acceleration=2.5,
+            turn_limit=2.84,
+            field_of_view=360.0,
+        ),
+        RobotModel(
+            name="waffle",
+            radius=0.22,
+            height=0.141,
+            mass=1.8,
+            wheel_base=0.287,
+            wheel_radius=0.033,
+            min_wheel_speed=-0.26,
+            max_wheel_speed=0.26,
+            wheel_acceleration=2.5,
+            turn_limit=1.82,
+            field_of_view=360.0,
+        ),
+        # Speeds: TurtleBot 4 User Manual, safe mode; acceleration: default wheel_accel_limit of its
+        # base, the Create 3. Its safety_override must be backup_only for it to reverse.
+        RobotModel(
+            name="turtlebot4",
+            radius=0.175,
+            height=0.351,
+            mass=3.9,
+            wheel_base=0.233,
+            wheel_radius=0.03575,
+            min_wheel_speed=-0.306,
+            max_wheel_speed=0.306,
+            wheel_acceleration=0.9,
+            turn_limit=1.9,
+            field_of_view=360.0,
+        ),
+    )
 }
-"""The robots known by name. As on the TurtleBot2, no wheel stops or turns backwards."""
+"""The robots known by name: the paper's, and some as they are sold."""
 
 
 def resolve_robot(robot: str | RobotModel) -> RobotModel:

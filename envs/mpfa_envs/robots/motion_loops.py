@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from mpfa_envs.compiled import njit
 
@@ -12,19 +12,52 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+class WheelLimits(NamedTuple):
+    """What the wheels of a robot can do."""
+
+    slow: float
+    """Slowest speed of a wheel [m/s]."""
+    fast: float
+    """Fastest speed of a wheel [m/s]."""
+    across: float
+    """Greatest difference of a wheel's speed from the mean of both [m/s]."""
+    acceleration: float
+    """How fast the speed of a wheel changes [m/s²]."""
+
+
 @njit
 def scale_actions(
-    actions: NDArray[np.float64], slow: float, fast: float, speeds: NDArray[np.float64]
+    actions: NDArray[np.float64], limits: WheelLimits, speeds: NDArray[np.float64]
 ) -> bool:
     """Turn clipped actions into speeds [m/s], both ``[N, 2]``; tell whether all are numbers."""
-    middle, span = 0.5 * (fast + slow), 0.5 * (fast - slow)
+    middle, span = 0.5 * (limits.fast + limits.slow), 0.5 * (limits.fast - limits.slow)
     numbers = True
     for robot in range(actions.shape[0]):
         for wheel in range(2):
             action = actions[robot, wheel]
             numbers &= action == action  # NaN is not.
             speeds[robot, wheel] = middle + span * min(max(action, -1.0), 1.0)
+        across = 0.5 * (speeds[robot, 1] - speeds[robot, 0])
+        if abs(across) > limits.across:
+            forward = 0.5 * (speeds[robot, 0] + speeds[robot, 1])
+            across = math.copysign(limits.across, across)
+            speeds[robot, 0], speeds[robot, 1] = forward - across, forward + across
     return numbers
+
+
+@njit
+def accelerate(
+    speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2], changed in place
+    wanted: NDArray[np.float64],  # [m/s], [N, 2]
+    running: NDArray[np.bool_],  # [N]
+    change: float,  # at most [m/s]
+) -> None:
+    """Bring the speeds of the wheels as near to the wanted ones as one time step allows."""
+    for robot in range(speeds.shape[0]):
+        if running[robot]:
+            for wheel in range(2):
+                now = speeds[robot, wheel]
+                speeds[robot, wheel] = min(max(wanted[robot, wheel], now - change), now + change)
 
 
 @njit

@@ -30,6 +30,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "unseen": 0.0,
     "silent": "refuse",
     "map_size": 40.0,
+    "clearance": 0.0,
     "stop_distance": 0.05,
     "scan_timeout": 0.5,
     "odometry_timeout": 0.5,
@@ -61,6 +62,7 @@ class PolicyNode(Node):
             pace=value("pace") or None,
             mount=tuple(value("mount")),
             unseen=value("unseen") or None,
+            clearance=value("clearance") or None,
             **options,
         )
         rate = check_positive("rate", value("rate"))

@@ -28,6 +28,11 @@ Reduction = Literal["min", "median", "single"]
 """The range of a sector: its nearest ray, the median, or its only one."""
 
 
+def ray_angles(field_of_view: float, rays: int) -> NDArray[np.float64]:
+    """Directions of the rays of a field of view [deg], left to right [rad], ``[rays]``."""
+    return math.radians(field_of_view) * (0.5 - (np.arange(rays) + 0.5) / rays)
+
+
 class Lidar:
     """Ranges over a field of view that the robot's front halves, left to right, one per sector.
 
@@ -80,7 +85,7 @@ class Lidar:
             raise ValueError(f"field_of_view must be at most 360 degrees, got {field_of_view}")
         self.dropout = check_share("dropout", dropout)
         rays = check_count("sectors * rays_per_sector", self.sectors * self.rays_per_sector)
-        self.angles = math.radians(self.field_of_view) * (0.5 - (np.arange(rays) + 0.5) / rays)
+        self.angles = ray_angles(self.field_of_view, rays)
         """Direction of each ray in the robot's frame, left to right [rad], shape ``[rays]``."""
         self._directions = np.stack((np.cos(self.angles), np.sin(self.angles)))
         self._rooms = WorldBatch([replace(world, walkers=())])

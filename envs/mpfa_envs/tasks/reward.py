@@ -65,6 +65,7 @@ def navigation_reward(
     progress_scale: float = PROGRESS_SCALE,
     goal_reward: float = 10.0,
     collision_reward: float = -5.0,
+    step_cost: float = 0.0,
 ) -> RewardTerms:
     r"""Reward one step by Eq. (25), with the sign that rewards an approach.
 
@@ -81,9 +82,12 @@ def navigation_reward(
         progress_scale: ε_p, reward per meter of approach [1/m].
         goal_reward: Reward for the goal.
         collision_reward: Reward for a collision.
+        step_cost: What any other time step costs, for robots that can stand still; none in the
+            paper.
 
     Returns:
-        The terms. As in the equation only one of them is not zero, and the goal comes first.
+        The terms. As in the equation only one of the first three is not zero, and the goal comes
+        first.
 
     Examples:
         >>> from mpfa_envs import StepOutcome, navigation_reward
@@ -96,7 +100,8 @@ def navigation_reward(
     if outcome.collision:
         return RewardTerms(collision=collision_reward)
     # Eq. (25), last case, with its sign corrected.
-    return RewardTerms(progress=progress_scale * (outcome.previous_distance - outcome.distance))
+    progress = progress_scale * (outcome.previous_distance - outcome.distance)
+    return RewardTerms(progress=progress, other=-step_cost)
 
 
 def resolve_reward(
@@ -128,8 +133,8 @@ def read_terms(terms: Any) -> RewardTerms:
     return RewardTerms(float(goal), float(collision), float(progress), float(other))
 
 
-def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
-    """Rewards of Eq. (25) for goal, collision and a meter; None for another function."""
+def payments_of(reward: RewardFunction) -> tuple[float, float, float, float] | None:
+    """Eq. (25): rewards for goal, collision and a meter, cost of a step; None for another one."""
     function = reward.func if isinstance(reward, partial) else reward
     if function is not navigation_reward or (isinstance(reward, partial) and reward.args):
         return None
@@ -139,8 +144,8 @@ def payments_of(reward: RewardFunction) -> tuple[float, float, float] | None:
     except TypeError as error:
         raise ValueError(f"reward must have keywords of navigation_reward: {error}") from error
     given.apply_defaults()
-    goal, collision, progress = (
+    goal, collision, progress, cost = (
         check_number(name, given.arguments[name])
-        for name in ("goal_reward", "collision_reward", "progress_scale")
+        for name in ("goal_reward", "collision_reward", "progress_scale", "step_cost")
     )
-    return goal, collision, progress
+    return goal, collision, progress, cost

@@ -1,0 +1,174 @@
+"""A filter of actions: what could end in a collision is replaced by the nearest that cannot."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from mpfa_envs.checks import check_count, check_number, check_positive
+from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.safety.loops import Body, filter_actions
+from mpfa_envs.sensing.observation import Memory, observation_slices
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+CLEARANCE: Final = 0.03
+"""Clearance of the rim that the filter keeps by default [m]."""
+
+
+class SafetyFilter:
+    """Lets an action pass if the robot can still keep off everything that its lidar sees.
+
+    An action is admissible if the robot's rim stays clear while it is carried out and for the time
+    that the robot takes to stand still then. A robot that cannot stand still, as the paper's, must
+    have room for a whole turning circle to the left or to the right afterwards. In place of any
+    other action the nearest admissible one of a grid is taken; if there is none, the robot brakes,
+    or turns.
+
+    It is a function of the observation and the action alone, so that whatever drives can have it:
+    a policy, a planner, a training and a robot. :meth:`mpfa_envs.TaskConfig.make_filter` makes the
+    one of a task.
+
+    Args:
+        robot: A :class:`~mpfa_envs.RobotModel`, or a name in :data:`~mpfa_envs.ROBOTS`.
+        angles: Directions of the lidar's rays in the robot's frame, left to right [rad], ``[R]``;
+            :attr:`mpfa_envs.Lidar.angles`.
+        sectors: Number of its sectors, which share the rays.
+        max_range: Range of a sector that meets nothing [m].
+        closeness_distance: A range of this or less has closeness one [m].
+        memory: As for :class:`~mpfa_envs.NavigationEnv`.
+        history: As there.
+        time_step: As there [s].
+        action_repeat: As there.
+        clearance: Clearance of the rim to be kept [m]; a third of it where the robot passes by
+            what it is nearer to already.
+        samples: Speeds of each wheel among which to find another action.
+
+    Raises:
+        ValueError: If a number is out of its range.
+
+    Examples:
+        >>> import numpy as np
+        >>> from mpfa_envs import NavigationEnv, TaskConfig
+        >>> keep_off = TaskConfig(robot="kobuki").make_filter()
+        >>> env = NavigationEnv(world="D", robot="kobuki", physics="kinematic")
+        >>> observation, info = env.reset(seed=0)
+        >>> ended = False
+        >>> while not ended:
+        ...     action = keep_off(observation, env.action_space.sample())
+        ...     observation, _, ended, timeout, info = env.step(action)
+        ...     ended = ended or timeout
+        >>> info["collision"]
+        False
+    """
+
+    def __init__(
+        self,
+        robot: str | RobotModel,
+        *,
+        angles: NDArray[np.float64],
+        sectors: int,
+        max_range: float,
+        closeness_distance: float,
+        memory: Memory = "none",
+        history: int = 0,
+        time_step: float = 0.1,
+        action_repeat: int = 2,
+        clearance: float = CLEARANCE,
+        samples: int = 9,
+    ) -> None:
+        self.robot = resolve_robot(robot)
+        if check_number("clearance", clearance) < 0.0:
+            raise ValueError(f"clearance must not be negative, got {clearance}")
+        self._parts = observation_slices(sectors, memory=memory, history=history)
+        if len(angles) == 0 or len(angles) % sectors:
+            raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")
+        self._rays = len(angles) // sectors
+        self._directions = np.stack((np.cos(angles), np.sin(angles)))
+        self._max_range = check_positive("max_range", max_range)
+        self._near = check_positive("closeness_distance", closeness_distance)
+        self._body = Body(
+            self.robot.wheel_limits,
+            self.robot.wheel_base,
+            self.robot.radius,
+            clearance,
+            check_positive("time_step", time_step),
+            check_count("action_repeat", action_repeat),
+        )
+        self._candidates = _candidates(check_count("samples", samples, least=2), self._body)
+
+    def __call__(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Filter actions.
+
+        Args:
+            observation: Observations, ``[..., O]``.
+            action: What the policy would do, ``[..., 2]``.
+
+        Returns:
+            The actions that may be carried out, ``[..., 2]``, float32; an admissible one is as it
+            was given.
+
+        Raises:
+            ValueError: If the shapes do not fit, or there is NaN among them.
+        """
+        size = max(part.stop for part in self._parts.values())
+        seen = np.asarray(observation, dtype=np.float64)
+        wanted = np.asarray(action, dtype=np.float32)
+        if seen.ndim == 0 or seen.shape[-1] != size:
+            raise ValueError(f"observation must have shape [..., {size}], got {seen.shape}")
+        if wanted.shape != (*seen.shape[:-1], 2):
+            raise ValueError(f"action must have shape {(*seen.shape[:-1], 2)}, got {wanted.shape}")
+        if np.isnan(seen).any() or np.isnan(wanted).any():
+            raise ValueError("observation and action must not hold NaN")
+        rows = seen.reshape(-1, size)
+        actions = np.clip(wanted.reshape(-1, 2), -1.0, 1.0).astype(np.float64)
+        chosen = np.empty_like(actions)
+        filter_actions(
+            actions,
+            self._ranges(rows),
+            self._directions,
+            self._wheel_speeds(rows),
+            self._candidates,
+            self._body,
+            chosen,
+        )
+        changed = (chosen != actions).any(axis=1)
+        kept = wanted.reshape(-1, 2).copy()
+        kept[changed] = chosen[changed]
+        return kept.reshape(wanted.shape)
+
+    def _ranges(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Ranges of all rays [m], ``[N, R]``: each may be the one that its sector reports."""
+        closeness = rows[:, self._parts["lidar"]]
+        ranges = self._near / np.maximum(closeness, 1e-9)
+        # What is nearer than the observation tells may be at the rim.
+        ranges[closeness >= 1.0] = min(self._near, self.robot.radius)
+        ranges[ranges >= 0.999 * self._max_range] = math.inf
+        return np.repeat(ranges, self._rays, axis=1)
+
+    def _wheel_speeds(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Speeds of the wheels [m/s], ``[N, 2]``."""
+        robot, parts = self.robot, self._parts
+        forward = rows[:, parts["linear_speed"]] * robot.max_wheel_speed
+        turning = rows[:, parts["angular_speed"]] * robot.max_angular_speed
+        across = 0.5 * robot.wheel_base * turning
+        return np.concatenate((forward - across, forward + across), axis=1)
+
+
+def _candidates(samples: int, body: Body) -> NDArray[np.float64]:
+    """Actions of a grid, and the safe one at the end, ``[K, 2]``."""
+    limits = body.limits
+    values = np.linspace(-1.0, 1.0, samples)
+    grid = np.stack(np.meshgrid(values, values), axis=-1).reshape(-1, 2)
+    if limits.slow > 0.0:
+        return np.concatenate((grid, [[1.0, -1.0]]))
+    middle, span = 0.5 * (limits.fast + limits.slow), 0.5 * (limits.fast - limits.slow)
+    stand = -middle / span
+    turns = [(-turn + stand, turn + stand) for turn in (-0.5, -0.25, 0.0, 0.25, 0.5)]
+    inside = [pair for pair in turns if max(map(abs, pair)) <= 1.0]
+    return np.concatenate((grid, inside, [[stand, stand]]))

@@ -1,0 +1,173 @@
+"""The search for admissible actions, robot by robot."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from mpfa_envs.compiled import njit
+from mpfa_envs.robots.motion_loops import WheelLimits, scale_actions
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class Body(NamedTuple):
+    """What the filter knows of a robot and its time."""
+
+    limits: WheelLimits
+    wheel_base: float
+    """[m]"""
+    radius: float
+    """Of the footprint [m]."""
+    clearance: float
+    """Of the rim, to be kept from what the lidar hits [m]."""
+    time_step: float
+    """For which wheel speeds are held [s]."""
+    repeat: int
+    """Time steps from decision to decision."""
+
+
+_PARTS = 2
+"""Places in each time step that are tested: some 3 cm apart, a dip of under 1 mm between them."""
+_SHARE = 0.25
+"""Of the clearance that is left where it is below what is kept, how much a decision may take."""
+_LEAST = 1 / 3
+"""Share of the clearance that is kept in any case."""
+_TURNS = 0.1
+"""Weight of another turn beside that of another forward speed. The robot steers clear rather than
+stopping: with equal weights it stands before walls (docs/robot.md)."""
+_TOUCH = 1e-9
+"""Rounding of distances [m]."""
+
+
+@njit
+def filter_actions(
+    actions: NDArray[np.float64],  # wanted, in [-1, 1], [N, 2]
+    ranges: NDArray[np.float64],  # of the rays, [N, R] [m]; infinite where they hit nothing
+    directions: NDArray[np.float64],  # of the rays, cosine and sine, [2, R]
+    speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2]
+    candidates: NDArray[np.float64],  # actions to choose among, [K, 2]; the last one is safe
+    body: Body,
+    chosen: NDArray[np.float64],  # [N, 2]
+) -> None:
+    """Write each wanted action that is admissible, else the nearest candidate that is."""
+    commands = np.empty_like(candidates)
+    scale_actions(candidates, body.limits, commands)
+    wanted = np.empty_like(actions)
+    scale_actions(actions, body.limits, wanted)
+    points = np.empty((ranges.shape[1], 3))
+    last = candidates.shape[0] - 1
+    for robot in range(actions.shape[0]):
+        chosen[robot] = actions[robot]
+        count = _near_points(ranges[robot], directions, speeds[robot], body, points)
+        if count == 0 or _is_admissible(wanted[robot], speeds[robot], points[:count], body):
+            continue
+        gaps = np.empty(last)
+        for k in range(last):
+            across, along = candidates[k] - actions[robot]
+            gaps[k] = (across + along) ** 2 + _TURNS * (across - along) ** 2
+        chosen[robot] = candidates[last]
+        if body.limits.slow > 0.0:
+            # Sectors tell less than the truth: the circle that was free before may seem to be
+            # blocked now, and the freer one is the better guess.
+            around = _turning_radius(body.limits, body.wheel_base)
+            to_left = _nearest(0.0, around, points[:count])
+            side = 1.0 if to_left >= _nearest(0.0, -around, points[:count]) else -1.0
+            chosen[robot, 0], chosen[robot, 1] = -side, side
+        for k in np.argsort(gaps):
+            if _is_admissible(commands[k], speeds[robot], points[:count], body):
+                chosen[robot] = candidates[k]
+                break
+
+
+@njit
+def _near_points(
+    ranges: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    speeds: NDArray[np.float64],
+    body: Body,
+    points: NDArray[np.float64],  # x, y and the squared distance to be kept from it [m], [R, 3]
+) -> int:
+    """Write the points that the robot may reach before it stands; their number."""
+    fastest = max(abs(body.limits.slow), abs(body.limits.fast), abs(speeds[0]), abs(speeds[1]))
+    reach = fastest * body.repeat * body.time_step
+    if body.limits.slow > 0.0:
+        reach += 2.0 * _turning_radius(body.limits, body.wheel_base)
+    else:
+        # Speeds fall in steps: the first one is still at full speed.
+        reach += 0.5 * fastest * fastest / body.limits.acceleration + fastest * body.time_step
+    kept = body.radius + body.clearance
+    count = 0
+    for ray in range(ranges.shape[0]):
+        if ranges[ray] <= reach + kept:
+            points[count, 0] = ranges[ray] * directions[0, ray]
+            points[count, 1] = ranges[ray] * directions[1, ray]
+            # What is nearer already may come nearer by a share of what is left, which lets the
+            # robot pass by it, but not nearer than the least.
+            left = (1.0 - _SHARE) * (ranges[ray] - body.radius)
+            left = max(left, _LEAST * body.clearance)
+            distance = min(ranges[ray], kept, body.radius + left) - _TOUCH
+            points[count, 2] = distance * distance
+            count += 1
+    return count
+
+
+@njit
+def _is_admissible(
+    command: NDArray[np.float64],  # speeds of the wheels [m/s], [2]
+    speeds: NDArray[np.float64],  # now [m/s], [2]
+    points: NDArray[np.float64],  # [P, 3]
+    body: Body,
+) -> bool:
+    """Whether the robot stays off the points while it does this, and can do so afterwards.
+
+    It can if it stands still in time or, where it cannot stand still, if a full circle is free.
+    """
+    change = body.limits.acceleration * body.time_step
+    left, right = speeds[0], speeds[1]
+    x, y, heading = 0.0, 0.0, 0.0
+    step = 0
+    while step < body.repeat or (body.limits.slow <= 0.0 and (left != 0.0 or right != 0.0)):
+        to_left, to_right = (command[0], command[1]) if step < body.repeat else (0.0, 0.0)
+        left = min(max(to_left, left - change), left + change)
+        right = min(max(to_right, right - change), right + change)
+        part = body.time_step / _PARTS
+        turn = (right - left) / body.wheel_base * part
+        along = 0.5 * (left + right) * part
+        for _ in range(_PARTS):
+            x += along * math.cos(heading + 0.5 * turn)
+            y += along * math.sin(heading + 0.5 * turn)
+            heading += turn
+            for point in range(points.shape[0]):
+                across, ahead = points[point, 1] - y, points[point, 0] - x
+                if across * across + ahead * ahead < points[point, 2]:
+                    return False
+        step += 1
+    if body.limits.slow <= 0.0:
+        return True
+    radius = _turning_radius(body.limits, body.wheel_base)
+    kept = radius + body.radius + body.clearance
+    across, along = radius * math.sin(heading), radius * math.cos(heading)
+    return (
+        _nearest(x - across, y + along, points) >= kept
+        or _nearest(x + across, y - along, points) >= kept
+    )
+
+
+@njit
+def _nearest(x: float, y: float, points: NDArray[np.float64]) -> float:
+    """Distance of the nearest point from a place (x, y) [m]."""
+    nearest = math.inf
+    for point in range(points.shape[0]):
+        across, ahead = points[point, 1] - y, points[point, 0] - x
+        nearest = min(nearest, across * across + ahead * ahead)
+    return math.sqrt(nearest)
+
+
+@njit
+def _turning_radius(limits: WheelLimits, wheel_base: float) -> float:
+    """Radius of the smallest circle of the robot's center [m]."""
+    return 0.5 * wheel_base * (limits.fast + limits.slow) / (limits.fast - limits.slow)
