@@ -37,6 +37,7 @@ from mpfa_envs.planners import (
     path_length,
 )
 from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.sensing.observation import Memory
 
 SEARCHES = {"astar": astar_path, "dijkstra": dijkstra_path}
 # A wall from side to side: nothing gets through.
@@ -207,6 +208,44 @@ def test_the_followers_reach_the_goals_of_map_d(name: str) -> None:
     # Robots start in any direction: what they drive to turn is in it.
     assert np.mean([result.spl for result in results]) > 0.85
     assert all(result.plan_s > 0.0 and result.decision_s > 0.0 for result in results)
+
+
+@pytest.mark.parametrize("robot", ["kobuki", "turtlebot4", "burger"])
+@pytest.mark.parametrize("name", ["dijkstra", "dwa"])
+def test_robots_that_can_stop_reach_the_goals_of_map_d(name: str, robot: str) -> None:
+    memory: Memory = "map" if name == "dwa" else "none"
+    planner = make_planner(name, robot=robot, memory=memory)
+    results = evaluate(planner, "D", episodes=8, seed=3, max_steps=1500)
+    assert all(result.success for result in results)
+
+
+def seen_by_kobuki(ranges: dict[int, float], *, way: float = 0.0) -> np.ndarray:
+    """What a standing Kobuki sees: ranges by sector [m], the goal 3 m away at an angle."""
+    lidar = np.full(36, 0.25 / 10.0)
+    for sector, distance in ranges.items():
+        lidar[sector] = min(0.25 / distance, 1.0)
+    return np.array([*lidar, math.cos(way), math.sin(way), 0.1, 0.3, 0.0, 0.0], np.float32)
+
+
+def test_the_dynamic_window_turns_on_the_spot_to_a_goal_behind() -> None:
+    around = dict.fromkeys(range(36), 0.27)
+    left, right = make_planner("dwa", robot="kobuki")(seen_by_kobuki(around, way=2.5))
+    assert right > 0.0 > left and left + right == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_dynamic_window_does_not_drive_at_a_wall() -> None:
+    wall = {sector: 0.28 / math.cos(math.radians(175 - 10 * sector)) for sector in range(12, 24)}
+    left, right = make_planner("dwa", robot="kobuki")(seen_by_kobuki(wall))
+    # It does not stand and face the goal behind the wall either.
+    assert left != right and left + right <= 0.5
+
+
+def test_pursuit_turns_on_the_spot_to_a_point_beside_the_robot() -> None:
+    grid = FreeGrid(WORLDS["A"], distance=0.25)
+    for side in (1.0, -1.0):
+        pursuit = PurePursuit([(0.0, 0.0), (0.0, side * 3.0)], ROBOTS["kobuki"], grid)
+        left, right = pursuit.act(0.0, 0.0, 0.0)
+        assert left == -right and side * right > 0.0
 
 
 @pytest.mark.usefixtures("wheels")

@@ -22,10 +22,16 @@ _BESIDE: Final = math.radians(60.0)
 """To a point farther to the side the robot turns on its tightest circle [rad]."""
 _BEHIND: Final = math.radians(120.0)
 """A point farther to the side than this is behind the robot [rad]."""
+_FACING: Final = math.radians(10.0)
+"""A point less to the side than this is faced [rad]."""
 _RIM: Final = 0.03
 """Clearance that the robot's rim keeps if it can [m]."""
 _ARC: Final = 0.5
 """Length of the arcs that are tested [m]."""
+_SLOWER: Final = 0.8
+"""Share of its speed that a robot that can stop loses towards a point at that angle."""
+_TURN_TIME: Final = 0.4
+"""Time in which a turn on the spot would be made at its first speed [s]."""
 _CURVATURES: Final = 41
 """Number of arcs that are tested."""
 
@@ -39,6 +45,10 @@ class PurePursuit:
     is at its fastest; the other is slower by what the arc asks for, as far as it can be. To a point
     beside or behind it the robot turns on its tightest circle. Of the arcs that are free for the
     next half meter it takes the one nearest to the wanted arc.
+
+    A robot that can stop turns on the spot to a point beside or behind it, and where no arc is free
+    for as long as it takes to brake. It drives no faster than it can brake in the free part of its
+    arc, and more slowly the farther to the side the point is.
 
     Args:
         path: Positions from the start to the goal [m].
@@ -73,7 +83,9 @@ class PurePursuit:
         """The path [m], ``[points, 2]``."""
         self._place = 0
         self._side = 0.0
-        slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
+        # Neither wheel goes backwards on an arc: that is for turns on the spot.
+        slow, fast = max(robot.min_wheel_speed, 0.0), robot.max_wheel_speed
+        self._slow = slow
         self._tightest = 2.0 * (fast - slow) / (robot.wheel_base * (fast + slow))
         self._curvatures = np.linspace(-self._tightest, self._tightest, _CURVATURES)
         along = np.arange(_SPACING, _ARC + 1e-9, _SPACING)
@@ -86,6 +98,8 @@ class PurePursuit:
         """Speeds of left and right wheel at a pose [m, m, rad], from -1, the slowest, to 1."""
         ahead_x, ahead_y = self._point_ahead(x, y)
         angle = math.remainder(math.atan2(ahead_y - y, ahead_x - x) - heading, math.tau)
+        if self.robot.can_stop and abs(angle) > _BESIDE:
+            return self._turn_on_the_spot(angle)
         if abs(angle) > _BESIDE:
             wanted = self._turn_to(angle)
         else:
@@ -93,7 +107,15 @@ class PurePursuit:
             # Near the end of the path the arc would become as tight as the point is near.
             distance = max(math.hypot(ahead_x - x, ahead_y - y), 2 * _SPACING)
             wanted = 2.0 * math.sin(angle) / distance
-        return self._wheels(self._nearest_free(x, y, heading, wanted))
+        curvature, free = self._nearest_free(x, y, heading, wanted)
+        if not self.robot.can_stop:
+            return self._wheels(curvature, self.robot.max_wheel_speed)
+        if free < _SPACING:
+            # The point is in the open: once the robot faces it, it may creep there.
+            if abs(angle) > _FACING:
+                return self._turn_on_the_spot(angle)
+            curvature, free = 0.0, 0.5 * _SPACING
+        return self._wheels(curvature, self._safe_speed(angle, free))
 
     def _point_ahead(self, x: float, y: float) -> Point:
         """The point to drive at."""
@@ -126,8 +148,8 @@ class PurePursuit:
             self._side = math.copysign(1.0, angle)
         return self._side * self._tightest
 
-    def _nearest_free(self, x: float, y: float, heading: float, wanted: float) -> float:
-        """The curvature nearest to the wanted one whose arc is free [1/m], or free for longest."""
+    def _nearest_free(self, x: float, y: float, heading: float, wanted: float) -> Point:
+        """Curvature nearest to the wanted one of an arc that is free for longest [1/m, m]."""
         cosine, sine = math.cos(heading), math.sin(heading)
         across, up = self._arcs[..., 0], self._arcs[..., 1]
         rooms = self._clearances(x + across * cosine - up * sine, y + across * sine + up * cosine)
@@ -135,7 +157,8 @@ class PurePursuit:
         # An arc that is blocked nowhere is free for all of its steps.
         steps = np.where(blocked.any(axis=1), blocked.argmax(axis=1), blocked.shape[1])
         off = np.abs(self._curvatures - wanted)
-        return float(self._curvatures[np.lexsort((off, -steps))[0]])
+        best = np.lexsort((off, -steps))[0]
+        return float(self._curvatures[best]), float(steps[best]) * _SPACING
 
     def _clearances(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float32]:
         """Clearances of the cells at some places [m], of any shape."""
@@ -146,13 +169,31 @@ class PurePursuit:
         )
         return np.asarray(grid.clearance[columns, rows])
 
-    def _wheels(self, curvature: float) -> tuple[float, float]:
-        """The fastest wheel speeds on an arc [1/m], left is positive."""
-        slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
+    def _turn_on_the_spot(self, angle: float) -> tuple[float, float]:
+        """Actions that turn to a point; behind, the robot keeps its side."""
+        side = math.copysign(1.0, self._turn_to(angle))
+        speed = 0.5 * self.robot.wheel_base * abs(angle) / _TURN_TIME
+        speed = min(speed, self.robot.wheel_limits.across, self.robot.max_wheel_speed)
+        return self._action(-side * speed), self._action(side * speed)
+
+    def _safe_speed(self, angle: float, free: float) -> float:
+        """Speed of the faster wheel [m/s], for a point at an angle and the free part of an arc."""
+        limits = self.robot.wheel_limits
+        speed = limits.fast * (1.0 - _SLOWER * abs(angle) / _BESIDE)
+        # Half the speed from which it can brake: speeds follow the decisions late.
+        return min(speed, 0.5 * math.sqrt(2.0 * limits.acceleration * free))
+
+    def _wheels(self, curvature: float, fast: float) -> tuple[float, float]:
+        """The wheel speeds on an arc [1/m], the faster one at a speed [m/s], left is positive."""
         half = 0.5 * self.robot.wheel_base * abs(curvature)
-        inner = max(fast * (1.0 - half) / (1.0 + half), slow)
-        action = 2.0 * (inner - slow) / (fast - slow) - 1.0
-        return (action, 1.0) if curvature > 0.0 else (1.0, action)
+        inner = self._action(max(fast * (1.0 - half) / (1.0 + half), self._slow))
+        outer = self._action(fast)
+        return (inner, outer) if curvature > 0.0 else (outer, inner)
+
+    def _action(self, speed: float) -> float:
+        """Action of a wheel's speed [m/s]."""
+        slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
+        return min(max(2.0 * (speed - slow) / (fast - slow) - 1.0, -1.0), 1.0)
 
 
 def _resampled(path: NDArray[np.float64]) -> NDArray[np.float64]:
