@@ -36,6 +36,8 @@ import pandas as pd
 
 from mpfa_envs import GENERATORS, PLANNERS, Policy, RobotNoise, load_policy, make_planner
 from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.robots.model import ROBOTS
+from mpfa_envs.safety.filter import CLEARANCE
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.environments import check_physics
@@ -43,6 +45,7 @@ from training.evaluating import (
     Drivable,
     drive,
     evaluation_folder,
+    filtered,
     summary_row,
     tasks_of,
 )
@@ -86,6 +89,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--memory", choices=["none", "map"], default="none", help="map: dwa has a map of its own"
     )
     parser.add_argument(
+        "--robot", choices=list(ROBOTS), help="what a planner drives (default: turtlebot2)"
+    )
+    parser.add_argument(
         "--worlds",
         nargs="+",
         default=["test"],
@@ -109,6 +115,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="errors of the robot: range_noise, dropout, slip, latency, drift (default: none)",
     )
     parser.add_argument(
+        "--filter",
+        action="store_true",
+        help="let actions pass a filter that keeps the robot off what its lidar sees",
+    )
+    parser.add_argument(
         "--live", action="store_true", help="watch the episodes in a window; write nothing"
     )
     parser.add_argument("--no-pictures", action="store_true", help="write only tables")
@@ -121,6 +132,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error("give either the path of a trained policy or --policy with a planner")
     if options.memory != "none" and options.policy != "dwa":
         parser.error(f"--memory {options.memory} is for --policy dwa alone")
+    if options.robot is not None and options.policy is None:
+        parser.error(f"--robot {options.robot} is for planners: a policy has its own")
     try:
         options.names = parse_worlds(options.worlds)
         options.loaded = load_driver(options)
@@ -149,20 +162,26 @@ def load_driver(options: argparse.Namespace) -> Drivable:
     """The policy or the planner that the command line names."""
     if options.policy is None:
         return load_policy(options.path)
-    return make_planner(options.policy, memory=options.memory, seed=options.seed)
+    robot = options.robot or "turtlebot2"
+    return make_planner(options.policy, robot=robot, memory=options.memory, seed=options.seed)
 
 
 def name_of(options: argparse.Namespace) -> str:
-    """What is evaluated: the path of a policy, or a planner and what it remembers."""
+    """What is evaluated: the path of a policy, or a planner, what it remembers and drives."""
     if options.policy is None:
         return str(options.path)
-    return str(options.policy) if options.memory == "none" else f"{options.policy}-map"
+    parts = [options.policy, options.memory if options.memory != "none" else "", options.robot]
+    return "-".join(part for part in parts if part)
 
 
 def output_folder(options: argparse.Namespace) -> Path:
     """Where results go unless the command line says."""
     name = evaluation_folder(
-        options.worlds, options.physics, seed=options.seed, noise=options.noise
+        options.worlds,
+        options.physics,
+        seed=options.seed,
+        noise=options.noise,
+        filtered=options.filter,
     )
     policy = options.path
     if policy is None:
@@ -225,11 +244,13 @@ def critic(options: argparse.Namespace) -> Values | None:
     return values_of(learner, options.loaded, settings)
 
 
-def show_live(options: argparse.Namespace, how: Mapping[str, Any]) -> pd.DataFrame:
+def show_live(
+    driver: Drivable, options: argparse.Namespace, how: Mapping[str, Any]
+) -> pd.DataFrame:
     """Show the episodes in a window, one after another, and tell how each ended."""
     rows = []
-    tasks = tasks_of(options.loaded, options.names, episodes=options.episodes, seed=options.seed)
-    for end in watch(options.loaded, tasks, **how):
+    tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)
+    for end in watch(driver, tasks, **how):
         print(f"{end.world}: {end.outcome} after {end.time_s:.1f} s")
         rows.append(end._asdict())
     return pd.DataFrame(rows)
@@ -256,16 +277,17 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         A row for each world, and the total.
     """
     options = parse(arguments)
-    policy: Drivable = options.loaded
+    policy = options.loaded
+    driver: Drivable = filtered(policy, physics=options.physics) if options.filter else policy
     folder = options.output or output_folder(options)
     physics = options.physics
     asked = {"episodes": options.episodes, "seed": options.seed, "physics": physics}
     how = {"noise": options.noise, "physics": physics}
     if options.live:
-        return show_live(options, how)
+        return show_live(driver, options, how)
     with held(folder):
         driven = drive(
-            policy, options.names, noise=options.noise, progress=not options.no_pictures, **asked
+            driver, options.names, noise=options.noise, progress=not options.no_pictures, **asked
         )
         results = [result for drives in driven for result in drives.results]
         rows = [
@@ -273,7 +295,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             for world, drives in zip(options.names, driven, strict=True)
         ]
         if not options.no_pictures:
-            write_pictures(policy, driven, folder, values=critic(options), **how)
+            write_pictures(driver, driven, folder, values=critic(options), **how)
         if len(rows) > 1:
             rows.append({"world": "total", "physics": physics, **summary_row(results)})
         summary = pd.DataFrame(rows)
@@ -285,6 +307,8 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             json.dumps(as_document(rows), indent=2, allow_nan=False) + "\n", folder / EVALUATION
         )
         document: dict[str, Any] = {"words": options.worlds, **asked}
+        if options.filter:
+            document["filter"] = {"clearance": CLEARANCE}
         if options.noise is not None:
             document["noise"] = asdict(options.noise)
         if isinstance(policy, Policy):
@@ -292,6 +316,8 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
             document |= {"card": policy.card, "sha256": files.digest(file)}
         else:
             document |= {"policy": options.policy, "memory": options.memory}
+            if options.robot is not None:
+                document["robot"] = options.robot
         write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)
     print(f"\n{name_of(options)}, physics: {physics}\n{printed(summary)}")
     print(f"written: {folder}")

@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import partial
 from importlib import import_module
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from mpfa_envs import DiscreteWheels, NavigationTorchEnv, VectorNavigationEnv
+from mpfa_envs import (
+    DiscreteWheels,
+    NavigationTorchEnv,
+    SafetyFilter,
+    TaskConfig,
+    VectorNavigationEnv,
+    navigation_reward,
+)
 from mpfa_envs.robots.model import resolve_robot
+from mpfa_envs.tasks.reward import RewardFunction
 from training.settings.environment import EnvironmentSettings
 
-_AHEAD, _SECTOR = 180.0, 10.0
-"""The lidar's field of view unless it is said, and that of a sector [deg]."""
+_SECTOR = 10.0
+"""Angle of a sector of the lidar [deg]."""
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
@@ -29,8 +40,10 @@ def check_physics(physics: str) -> None:
 
 def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     """What a policy must find again wherever it drives: robot, time, and lidar."""
+    robot = resolve_robot(settings.robot)
     # Only where it is not the default: policies are asked for no argument that they do not need.
-    seen = {} if settings.field_of_view == _AHEAD else {"lidar": _lidar(settings.field_of_view)}
+    view = settings.field_of_view
+    seen = {} if view in (None, robot.field_of_view) else {"lidar": _lidar(view)}
     return {
         "robot": settings.robot,
         "physics": settings.physics,
@@ -39,8 +52,9 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "memory": settings.memory,
         "history": settings.history,
         **seen,
-        # The lidar saturates where the training ends an episode, and tells all distances above.
-        "closeness_distance": collision_distance(settings),
+        # The lidar saturates where the training ends an episode, and tells all distances above; a
+        # robot that can stop may drive on from there, and must know how near it is.
+        "closeness_distance": robot.radius if robot.can_stop else collision_distance(settings),
     }
 
 
@@ -62,7 +76,14 @@ def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         "detour_chance": settings.detour_chance,
         "noise": asdict(settings.noise),
         **env_arguments(settings),
+        **({"reward": _costly_reward(settings)} if settings.step_cost else {}),
     }
+
+
+def _costly_reward(settings: EnvironmentSettings) -> RewardFunction:
+    """Eq. (25) with a cost of time."""
+    scale, cost = settings.progress_scale, settings.step_cost
+    return partial(navigation_reward, progress_scale=scale, step_cost=cost)
 
 
 def make_training_env(
@@ -88,6 +109,19 @@ def make_training_env(
         **task_arguments(settings),
     )
     return TransformedEnv(env, DiscreteWheels()) if discrete else env
+
+
+def make_filter(settings: EnvironmentSettings) -> SafetyFilter | None:
+    """The filter that actions pass, if the settings ask for it."""
+    return TaskConfig(**env_arguments(settings)).make_filter() if settings.filter else None
+
+
+def filtered(state: TensorDictBase, keep: SafetyFilter | None) -> TensorDictBase:
+    """Robots with the actions that pass a filter, if there is one."""
+    if keep is None:
+        return state
+    actions = keep(state["observation"].numpy(), state["action"].numpy())
+    return state.set("action", torch.from_numpy(actions))
 
 
 def vector_of(env: EnvBase) -> VectorNavigationEnv:

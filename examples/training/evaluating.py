@@ -10,6 +10,7 @@ from typing import Any
 from mpfa_envs import (
     Policy,
     RobotNoise,
+    TaskConfig,
     VectorNavigationEnv,
     WorldTask,
     run_tasks,
@@ -17,12 +18,12 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.results import EpisodeResult
-from mpfa_envs.evaluation.runs import ENVS_AT_ONCE
+from mpfa_envs.evaluation.runs import ENVS_AT_ONCE, Filtered
 from mpfa_envs.planners import DynamicWindow, MapPlanner
 from mpfa_envs.robots.drives import SERVERS
 from training.worlds import worlds_label
 
-Drivable = Policy | MapPlanner | DynamicWindow
+Drivable = Policy | MapPlanner | DynamicWindow | Filtered
 """What drives, and knows by ``env_arguments`` what it must sense."""
 
 
@@ -41,7 +42,12 @@ class Drives:
 
 
 def evaluation_folder(
-    words: Sequence[str], physics: str, *, seed: int = 0, noise: RobotNoise | None = None
+    words: Sequence[str],
+    physics: str,
+    *,
+    seed: int = 0,
+    noise: RobotNoise | None = None,
+    filtered: bool = False,
 ) -> str:
     """Name of the folder of an evaluation: each choice has its own.
 
@@ -53,10 +59,16 @@ def evaluation_folder(
     return "".join(
         [
             f"evaluation-{worlds_label(words)}-{physics}",
+            "-filter" if filtered else "",
             f"-seed{seed}" if seed else "",
             *(f"-{what}{value:g}" for what, value in errors.items() if value),
         ]
     )
+
+
+def filtered(policy: Policy | MapPlanner | DynamicWindow, **env_arguments: Any) -> Filtered:
+    """The same, with the filter that keeps the robot off what its lidar sees."""
+    return Filtered(policy, TaskConfig(**policy.env_arguments | env_arguments).make_filter())
 
 
 def tasks_of(

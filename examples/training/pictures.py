@@ -13,6 +13,7 @@ from PIL import Image
 
 from mpfa_envs import Policy, World, WorldTask
 from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.render import (
     film_episode,
     render_trajectories,
@@ -46,8 +47,9 @@ def write_pictures(
     # The number of a task is the seed of its walkers, and of the noise.
     film = film_episode(policy, task, values=values, seed=number, **env_arguments)
     write_animation(film.frames, folder / EPISODE, frame_time=film.frame_time, speed=4.0)
-    if isinstance(policy, Policy):
-        Image.fromarray(values_over(policy, task, values)).save(folder / VALUES, optimize=True)
+    seen = policy.policy if isinstance(policy, Filtered) else policy
+    if isinstance(seen, Policy):
+        Image.fromarray(values_over(seen, task, values)).save(folder / VALUES, optimize=True)
 
 
 def trajectories_of(driven: Sequence[Drives], *, size: int = 360) -> NDArray[np.uint8]:

@@ -85,6 +85,48 @@ class Blind:
         return actions
 
 
+class Filtered:
+    """A policy, or a driver, whose actions pass a filter: a :class:`Driver`.
+
+    Args:
+        policy: As for :func:`run_tasks`.
+        keep: From observations, ``[N, O]``, and actions, ``[N, 2]``, to the actions that are
+            carried out, ``[N, 2]``; a :class:`~mpfa_envs.SafetyFilter`, say.
+
+    Examples:
+        >>> from mpfa_envs import TaskConfig, evaluate
+        >>> from mpfa_envs.evaluation.runs import Filtered
+        >>> task = {"robot": "kobuki", "physics": "kinematic"}
+        >>> ahead = lambda observations: np.ones((len(observations), 2))
+        >>> careful = Filtered(ahead, TaskConfig(**task).make_filter())
+        >>> sum(each.collision for each in evaluate(careful, "D", episodes=5, **task))
+        0
+    """
+
+    def __init__(
+        self,
+        policy: Action | Driver,
+        keep: Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]],
+    ) -> None:
+        self.policy, self.keep = policy, keep
+        self._driver = as_driver(policy)
+        self.env_arguments: dict[str, Any] = dict(getattr(policy, "env_arguments", {}))
+        """Those of the policy."""
+
+    def begin(self, env: VectorNavigationEnv, robot: int) -> None:
+        """Prepare the driver for the episode of a robot."""
+        self._driver.begin(env, robot)
+
+    def drive(
+        self,
+        env: VectorNavigationEnv,
+        robots: NDArray[np.int64],
+        observations: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """The driver's actions, filtered."""
+        return self.keep(observations, self._driver.drive(env, robots, observations))
+
+
 def as_driver(policy: Action | Driver, *, alone: bool = False) -> Driver:
     """A policy, or a driver, as a :class:`Driver`."""
     return policy if isinstance(policy, Driver) else Blind(policy, alone=alone)

@@ -8,7 +8,8 @@ from functools import lru_cache
 from tensordict.nn import TensorDictModule
 
 from mpfa_envs import Policy, WorldTask, run_tasks, world_tasks
-from training.environments import env_arguments
+from mpfa_envs.evaluation.runs import Filtered
+from training.environments import env_arguments, make_filter
 from training.records import EvaluationRecord
 from training.run.assembly import policy_layers
 from training.settings.train import TrainSettings
@@ -58,7 +59,9 @@ def evaluate_policy(
     start = time.perf_counter()
     wanted, driver = settings.evaluation, exported_policy(policy, settings)
     tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
-    results = run_tasks(driver, tasks, **driver.env_arguments)
+    keep = make_filter(settings.environment)
+    filtered = driver if keep is None else Filtered(driver, keep)
+    results = run_tasks(filtered, tasks, **driver.env_arguments)
     names = ("success", "collision", "timeout", "spl")
     return EvaluationRecord(
         total_steps=total_steps,

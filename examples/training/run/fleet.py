@@ -24,12 +24,12 @@ from torchrl.weight_update import _ray
 from tqdm import tqdm
 
 from torchrl_mpfa.methods import Method, RaySignalReplayBuffer, Replay, make_ray_replay
-from training.environments import make_training_env
+from training.environments import filtered, make_filter, make_training_env
 from training.records import EpisodeRecord
 from training.run.driving import TRANSITION, Robots
 from training.run.exploration import Explorer, make_explorer
 from training.settings.learners import is_discrete
-from training.settings.train import ExplorationSettings, TrainSettings
+from training.settings.train import TrainSettings
 
 # Learner and workers meet in a process of its own before weights are sent, for which TorchRL waits
 # one minute. On a loaded machine it takes longer to start.
@@ -45,19 +45,18 @@ class ExploringPolicy(TensorDictModuleBase):
 
     Args:
         policy: What it explores around.
-        settings: Of the exploration.
+        settings: Of the run.
         action_spec: Of the robots of a worker, shape ``[N, A]``.
     """
 
-    def __init__(
-        self, policy: nn.Module, settings: ExplorationSettings, action_spec: TensorSpec
-    ) -> None:
+    def __init__(self, policy: nn.Module, settings: TrainSettings, action_spec: TensorSpec) -> None:
         super().__init__()
         self.in_keys, self.out_keys = ["observation", "is_init"], ["action"]
         self.policy = policy
         self.register_buffer("actions", torch.zeros((), dtype=torch.long))
-        self._settings, self._spec = settings, action_spec
-        self._explorer = make_explorer(policy, settings, action_spec)  # type: ignore[arg-type]
+        self._settings, self._spec = settings.exploration, action_spec
+        self._filter = make_filter(settings.environment)
+        self._explorer = make_explorer(policy, self._settings, action_spec)  # type: ignore[arg-type]
 
     def follow(self, policy: nn.Module, actions: int) -> None:
         """Take over the weights of a policy, and how many actions the run has behind it."""
@@ -72,9 +71,10 @@ class ExploringPolicy(TensorDictModuleBase):
             self._explorer.begin_episodes(begun)
         steps = int(self.actions) - self._settings.random_steps
         if steps < 0:
-            return state.set("action", self._spec.rand())
+            return filtered(state.set("action", self._spec.rand()), self._filter)
         self._explorer.move_to(steps)
-        return state.set("action", self._explorer.act(state["observation"]))
+        state.set("action", self._explorer.act(state["observation"]))
+        return filtered(state, self._filter)
 
 
 class RobotCollector(Collector):
@@ -230,7 +230,7 @@ class Fleet(Robots):
         workers, sync = self.settings.ray.workers, self.settings.ray.sync
         policy = copy.deepcopy(explorer.policy).cpu()
         spec = self.environment(self._world).action_spec
-        self._policy = ExploringPolicy(policy, self.settings.exploration, spec)
+        self._policy = ExploringPolicy(policy, self.settings, spec)
         self._policy.follow(explorer.policy, actions)
         self._launches += 1
         seeds = np.random.SeedSequence([self._seed, self._launches]).generate_state(workers)

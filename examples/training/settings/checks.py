@@ -82,6 +82,9 @@ def check_settings(settings: TrainSettings) -> None:
         if settings.learner.compile is True:
             name = settings.learner.algorithm
             raise ValueError(f"learner.compile must be false with {name}, got True")
+        if settings.environment.filter:
+            name = settings.learner.algorithm
+            raise ValueError(f"environment.filter must be false with {name}, got True")
         _check_values_alone(settings)
     _check_device(settings.device)
     check_physics(settings.environment.physics)

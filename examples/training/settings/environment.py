@@ -29,7 +29,7 @@ class EnvironmentSettings:
     """The navigation task."""
 
     robot: str = "turtlebot2"
-    """``turtlebot2``, ``turtlebot4``, ``burger`` or ``waffle``."""
+    """``turtlebot2``, the paper's, ``kobuki``, ``turtlebot4``, ``burger`` or ``waffle``."""
     physics: str = "wheels"
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int = 500
@@ -40,6 +40,8 @@ class EnvironmentSettings:
     progress_scale: float = setting(5.0, NOT_NEGATIVE)
     """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
     far away, and a critic that is a little too smooth would rather circle than arrive."""
+    step_cost: float = setting(0.0, NOT_NEGATIVE)
+    """What a time step of 0.1 s costs, so that a robot that can stand still does not."""
     clearance: float = setting(0.07, NOT_NEGATIVE)
     """Clearance below which training counts a collision [m]. With 0.17 m, 0.35 m from the robot's
     center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
@@ -59,10 +61,13 @@ class EnvironmentSettings:
     history: int = setting(0, at_least(0))
     """Earlier scans of the lidar that it senses beside the last one, by which it may tell what
     moves."""
-    field_of_view: float = setting(180.0, between(10.0, 360.0, "from 10 to 360 [deg]"))
-    """Angle that the lidar sees [deg], in sectors of 10 degrees. A robot that must keep moving is
-    run into from behind by people unless it sees all 360."""
+    field_of_view: float | None = setting(None, between(10.0, 360.0, "from 10 to 360 [deg]"))
+    """Angle that the lidar sees [deg], in sectors of 10 degrees; null: as the robot has it. A robot
+    that must keep moving is run into from behind by people unless it sees all 360."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""
+    filter: bool = False
+    """Whether actions pass the filter that keeps the robot off what its lidar sees
+    (:class:`mpfa_envs.SafetyFilter`); the buffer stores those that were carried out."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""

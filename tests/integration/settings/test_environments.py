@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 
@@ -20,20 +21,65 @@ from mpfa_envs import (
     load_policy,
 )
 from tests.integration.tiny_runs import tiny, train
-from training.environments import env_arguments, make_training_env, vector_of
+from training.environments import env_arguments, make_filter, make_training_env, vector_of
+from training.run.driving import Robots
 from training.settings.environment import EnvironmentSettings, NoiseSettings
 from training.settings.train import REGIMES
 
 
-@pytest.mark.parametrize(("robot", "radius"), [("turtlebot2", 0.18), ("burger", 0.105)])
-def test_a_robot_learns_with_a_clearance(robot: str, radius: float) -> None:
+@pytest.mark.parametrize(
+    ("robot", "radius", "nearest"), [("turtlebot2", 0.18, 0.28), ("burger", 0.105, 0.105)]
+)
+def test_a_robot_learns_with_a_clearance(robot: str, radius: float, nearest: float) -> None:
     settings = EnvironmentSettings(
         robot=robot, physics="kinematic", clearance=0.1, progress_scale=3.0
     )
     training = make_training_env("C", settings)
     assert training.env.config.collision_distance == pytest.approx(radius + 0.1)
-    assert env_arguments(settings)["closeness_distance"] == pytest.approx(radius + 0.1)
+    assert env_arguments(settings)["closeness_distance"] == pytest.approx(nearest)
     training.close()
+
+
+def test_standing_still_costs_what_the_settings_say() -> None:
+    settings = EnvironmentSettings(robot="kobuki", physics="kinematic", step_cost=0.05)
+    training = make_training_env("C", settings)
+    training.set_seed(1)
+    state = training.reset()
+    state["action"] = torch.zeros(1, 2)
+    assert training.step(state)["next", "reward"].item() == pytest.approx(-0.1)
+    training.close()
+
+
+class Ahead:
+    """Acts straight on, whatever it sees."""
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.ones(len(observation), 2)
+
+    def behavior(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.ones(1), torch.ones(1)
+
+    def begin_episodes(self, begun: torch.Tensor) -> None: ...
+
+
+@pytest.mark.parametrize("random_steps", [0, 10_000])
+def test_what_the_filter_lets_pass_is_carried_out_and_stored(random_steps: int) -> None:
+    settings = tiny(robots=8)
+    settings.exploration.random_steps = random_steps
+    settings.environment = EnvironmentSettings(
+        robot="kobuki", physics="kinematic", filter=True, clearance=0.0
+    )
+    robots, keep = Robots(settings), make_filter(settings.environment)
+    robots.begin("mazes", Ahead(), seed=1)
+    changed = 0
+    for step in range(150):
+        data, records = robots.drive(Ahead(), actions=8 * step, episode=0)
+        seen, action = data["observation"].numpy(), data["action"].numpy()
+        assert np.array_equal(keep(seen, action), action)
+        changed += int((action != 1.0).any(axis=1).sum())
+        assert not any(record.collision for record in records)
+    robots.close()
+    assert changed > 20
 
 
 def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
