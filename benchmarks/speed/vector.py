@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.speed.timing import Call, Entry, entry, take_turns
-from mpfa_envs import Box, Cylinder, VectorNavigationEnv, Walker, World
+from mpfa_envs import Box, Cylinder, TaskConfig, VectorNavigationEnv, Walker, World
 
 ROBOTS = 64
 _CIRCLE = (-1.0, 1.0)
 """Slowest left and fastest right wheel: a circle of 0.3 m."""
 _WALKERS = (Walker(radius=0.25, speed=0.2),) * 6
-_BESIDE_KINEMATIC = ("vector_map", "vector_walkers", "vector_cylinders")
+_BESIDE_KINEMATIC = ("vector_map", "vector_walkers", "vector_cylinders", "vector_filter")
 """Entries with a ratio to ``vector_kinematic``."""
 
 
@@ -63,6 +63,21 @@ def _stepper(
     return lambda: env.step(actions)
 
 
+def _filter(world: World) -> Call:
+    """A call of the filter alone, of robots that want to do anything anywhere in a world."""
+    arguments: dict[str, Any] = {"robot": "kobuki", "physics": "kinematic"}
+    env = VectorNavigationEnv(ROBOTS, world=world, detour_chance=0.0, **arguments)
+    rng = np.random.default_rng(0)
+    observations, _ = env.reset(seed=0)
+    for _ in range(50):
+        actions = rng.uniform(-0.5, 1.0, (ROBOTS, 2)).astype(np.float32)
+        observations, *_ = env.step(actions)
+    env.close()
+    actions = rng.uniform(-1.0, 1.0, (ROBOTS, 2)).astype(np.float32)
+    keep = TaskConfig(**arguments).make_filter()
+    return lambda: keep(observations, actions)
+
+
 def _torchrl_stepper(world: World) -> Call:
     """The same through TorchRL: a step, and the reset of the robots whose episode has ended."""
     import torch
@@ -89,15 +104,15 @@ def _torchrl_stepper(world: World) -> Call:
 
 
 def measure(*, quick: bool) -> list[Entry]:
-    """Measure kinematic robots among 30 obstacles, walkers, or 300 cylinders, a map, and wheels.
+    """Measure kinematic robots among 30 obstacles, walkers, or 300 cylinders, map, filter, wheels.
 
     Args:
         quick: Fewer and shorter rounds.
 
     Returns:
         Rates, that of TorchRL's environment among them; the ratios of ``vector_map``,
-        ``vector_walkers`` and ``vector_cylinders`` are their times over that of
-        ``vector_kinematic``.
+        ``vector_walkers``, ``vector_cylinders`` and ``vector_filter`` are their times over that
+        of ``vector_kinematic``.
     """
     sparse = cluttered("thirty", 1, boxes=20, cylinders=10, size=14.0)
     dense = cluttered("three hundred", 2, cylinders=300, size=20.0)
@@ -106,6 +121,7 @@ def measure(*, quick: bool) -> list[Entry]:
         "vector_map": _stepper(sparse, memory="map"),
         "vector_walkers": _stepper(replace(sparse, walkers=_WALKERS)),
         "vector_cylinders": _stepper(dense),
+        "vector_filter": _filter(dense),
         "vector_wheels": _stepper(sparse, physics="wheels", robots=16),
     }
     calls["torchrl_vector"] = _torchrl_stepper(sparse)
