@@ -53,14 +53,13 @@ class SafetyFilter:
     Examples:
         >>> import numpy as np
         >>> from mpfa_envs import NavigationEnv, TaskConfig
-        >>> keep_off = TaskConfig(robot="kobuki").make_filter()
-        >>> env = NavigationEnv(world="D", robot="kobuki", physics="kinematic")
+        >>> task = {"robot": "kobuki", "physics": "kinematic", "collision_distance": "contact"}
+        >>> keep_off = TaskConfig(**task).make_filter()
+        >>> env = NavigationEnv(world="D", **task)
         >>> observation, info = env.reset(seed=0)
-        >>> ended = False
-        >>> while not ended:
-        ...     action = keep_off(observation, env.action_space.sample())
-        ...     observation, _, ended, timeout, info = env.step(action)
-        ...     ended = ended or timeout
+        >>> for _ in range(100):  # Straight on, if it may.
+        ...     action = keep_off(observation, np.ones(2))
+        ...     observation, *_, info = env.step(action)
         >>> info["collision"]
         False
     """
