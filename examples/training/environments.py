@@ -20,12 +20,11 @@ from mpfa_envs import (
     VectorNavigationEnv,
     navigation_reward,
 )
+from mpfa_envs.env.config import lidar_arguments
 from mpfa_envs.robots.model import resolve_robot
 from mpfa_envs.tasks.reward import RewardFunction
 from training.settings.environment import EnvironmentSettings
 
-_SECTOR = 10.0
-"""Angle of a sector of the lidar [deg]."""
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
@@ -43,7 +42,7 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
     robot = resolve_robot(settings.robot)
     # Only where it is not the default: policies are asked for no argument that they do not need.
     view = settings.field_of_view
-    seen = {} if view in (None, robot.field_of_view) else {"lidar": _lidar(view)}
+    seen = {} if view in (None, robot.field_of_view) else {"lidar": lidar_arguments(view)}
     return {
         "robot": settings.robot,
         "physics": settings.physics,
@@ -56,10 +55,6 @@ def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
         # robot that can stop may drive on from there, and must know how near it is.
         "closeness_distance": robot.radius if robot.can_stop else collision_distance(settings),
     }
-
-
-def _lidar(field_of_view: float) -> dict[str, Any]:
-    return {"field_of_view": field_of_view, "sectors": round(field_of_view / _SECTOR)}
 
 
 def collision_distance(settings: EnvironmentSettings) -> float:
@@ -116,7 +111,7 @@ def make_filter(settings: EnvironmentSettings) -> SafetyFilter | None:
     return TaskConfig(**env_arguments(settings)).make_filter() if settings.filter else None
 
 
-def filtered(state: TensorDictBase, keep: SafetyFilter | None) -> TensorDictBase:
+def apply_filter(state: TensorDictBase, keep: SafetyFilter | None) -> TensorDictBase:
     """Robots with the actions that pass a filter, if there is one."""
     if keep is None:
         return state

@@ -60,10 +60,13 @@ _CHECKS: Final[Mapping[str, Callable[[str, Any], Any]]] = {
 _EMPTY: Final = World(name="empty")
 _AHEAD: Final = 180.0
 """The field of view that a lidar has by default [deg]."""
-_SECTOR: Final = 10.0
-"""Angle of a sector of the lidar of a robot with another one [deg]."""
 _OF_THE_LIDAR: Final = ("reduction", "max_range", "noise", "field_of_view", "dropout")
 _PAYMENTS: Final = ("goal_reward", "collision_reward", "progress_scale", "step_cost")
+
+
+def lidar_arguments(field_of_view: float) -> dict[str, Any]:
+    """Arguments of a lidar with a field of view [deg] in sectors of 10 degrees."""
+    return {"field_of_view": field_of_view, "sectors": max(round(field_of_view / 10.0), 1)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +185,7 @@ class TaskConfig:
         arguments = dict(self.lidar or {})
         view = self.robot.field_of_view
         if view != _AHEAD and not {"field_of_view", "sectors"} & set(arguments):
-            arguments.update(field_of_view=view, sectors=max(round(view / _SECTOR), 1))
+            arguments |= lidar_arguments(view)
         for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
             if value > 0.0:
                 if name in arguments:

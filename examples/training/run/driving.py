@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_mpfa.methods import Method, Replay, make_replay
-from training.environments import INFO, filtered, make_filter, make_training_env, vector_of
+from training.environments import INFO, apply_filter, make_filter, make_training_env, vector_of
 from training.records import EpisodeRecord
 from training.run.checkpoints import as_arrays, as_tensors
 from training.run.exploration import Explorer
@@ -171,7 +171,7 @@ class Robots:
         if "behavior_mean" in entries:
             for name, value in zip(("behavior_mean", "behavior_sigma"), behavior, strict=True):
                 state.set(name, value.clone())
-        return filtered(state, self._filter)
+        return apply_filter(state, self._filter)
 
     def _record(
         self, after: TensorDictBase, robot: int, *, episode: int, total_steps: int

@@ -24,7 +24,7 @@ from torchrl.weight_update import _ray
 from tqdm import tqdm
 
 from torchrl_mpfa.methods import Method, RaySignalReplayBuffer, Replay, make_ray_replay
-from training.environments import filtered, make_filter, make_training_env
+from training.environments import apply_filter, make_filter, make_training_env
 from training.records import EpisodeRecord
 from training.run.driving import TRANSITION, Robots
 from training.run.exploration import Explorer, make_explorer
@@ -71,10 +71,10 @@ class ExploringPolicy(TensorDictModuleBase):
             self._explorer.begin_episodes(begun)
         steps = int(self.actions) - self._settings.random_steps
         if steps < 0:
-            return filtered(state.set("action", self._spec.rand()), self._filter)
+            return apply_filter(state.set("action", self._spec.rand()), self._filter)
         self._explorer.move_to(steps)
         state.set("action", self._explorer.act(state["observation"]))
-        return filtered(state, self._filter)
+        return apply_filter(state, self._filter)
 
 
 class RobotCollector(Collector):
