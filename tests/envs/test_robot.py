@@ -65,6 +65,16 @@ def test_a_simulated_robot_that_brakes_stays_on_its_wheels(name: str) -> None:
     assert np.abs(driven - commanded).max() < 0.1 * robot.max_wheel_speed + change
 
 
+@pytest.mark.parametrize(("name", "fastest"), [("turtlebot4", 1.9), ("kobuki", math.pi)])
+def test_a_robot_turns_no_faster_than_its_limit(name: str, fastest: float) -> None:
+    robot = ROBOTS[name]
+    for action in ((-1.0, 1.0), (1.0, -1.0)):
+        left, right = robot.wheel_speeds(np.array(action, dtype=np.float32))
+        assert (right - left) / robot.wheel_base == pytest.approx(action[1] * fastest)
+        assert left + right == pytest.approx(0.0)
+    assert robot.max_angular_speed == pytest.approx(fastest)
+
+
 def test_the_casters_slide_and_the_wheels_hold() -> None:
     simulation = BulletWorld(WORLDS["A"], time_step=0.1)
     simulation.add_robot(ROBOTS["kobuki"])

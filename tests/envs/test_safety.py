@@ -138,6 +138,11 @@ def test_what_is_too_near_may_be_passed_but_not_approached(gap: float) -> None:
     assert np.array_equal(keep(observed(config, before), -slowly), -slowly)
 
 
+def test_what_is_nearer_than_the_observation_tells_may_be_at_the_rim() -> None:
+    config = TaskConfig(**task(closeness_distance=0.4))
+    assert config.make_filter()(observed(config, 0.3), np.full(2, 0.1, np.float32)).sum() <= 0.0
+
+
 def test_turning_on_the_spot_is_always_possible() -> None:
     config = TaskConfig(**task())
     turn = np.array([-0.3, 0.3], np.float32)

@@ -310,6 +310,18 @@ def test_equal_worlds_alone_have_the_same_fingerprint() -> None:
     assert len({fingerprint(world) for world in WORLDS.values()}) == len(WORLDS)
 
 
+def test_wheels_that_change_slowly_go_on_from_a_state_and_begin_at_rest() -> None:
+    ahead = np.ones((2, 2), np.float32)
+    env, other = burgers(robot="kobuki"), burgers(robot="kobuki")
+    begun, _ = env.reset(seed=0)
+    env.step(ahead)
+    other.load_state_dict(env.state_dict())
+    assert np.array_equal(env.step(-ahead)[0], other.step(-ahead)[0])
+    assert np.array_equal(env.reset(seed=0)[0], begun)
+    env.step(ahead)
+    assert env.motions[:, 3] == pytest.approx(0.8 * 0.2)
+
+
 def test_saved_states_keep_the_names_of_their_arguments() -> None:
     env = VectorNavigationEnv(1, physics="kinematic")
     names = set(env.state_dict()["arguments"])
