@@ -317,6 +317,7 @@ def test_wheels_that_change_slowly_go_on_from_a_state_and_begin_at_rest() -> Non
     env.step(ahead)
     other.load_state_dict(env.state_dict())
     assert np.array_equal(env.step(-ahead)[0], other.step(-ahead)[0])
+    env.step(ahead)
     assert np.array_equal(env.reset(seed=0)[0], begun)
     env.step(ahead)
     assert env.motions[:, 3] == pytest.approx(0.8 * 0.2)
