@@ -3,7 +3,7 @@
     python examples/evaluate.py runs/demo --worlds A --episodes 100
     python examples/evaluate.py runs/demo --worlds test rooms:100-109 bars:test barn
     python examples/evaluate.py runs/demo --worlds all        all test worlds without walkers
-    python examples/evaluate.py examples/policies/td3-mpfa_per.npz    shipped with the project
+    python examples/evaluate.py td3-rooms                 a policy that comes with the package
     python examples/evaluate.py --policy dwa --worlds bars:validation    a planner
     python examples/evaluate.py runs/demo --worlds mazes:test --live     in a window, not kept
 
@@ -34,8 +34,17 @@ import training.extra  # noqa: F401
 # isort: split
 import pandas as pd
 
-from mpfa_envs import GENERATORS, PLANNERS, Policy, RobotNoise, load_policy, make_planner
+from mpfa_envs import (
+    GENERATORS,
+    PLANNERS,
+    POLICIES,
+    Policy,
+    RobotNoise,
+    load_policy,
+    make_planner,
+)
 from mpfa_envs.evaluation.results import EpisodeResult
+from mpfa_envs.policies.files import policy_file
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.safety.filter import CLEARANCE
 from torchrl_mpfa.saving import write_text_atomically
@@ -77,7 +86,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "path", type=Path, nargs="?", help="policy.npz of a trained policy, or the folder of a run"
+        "path",
+        type=Path,
+        nargs="?",
+        help=f"policy.npz, the folder of a run, or {', '.join(POLICIES)}",
     )
     parser.add_argument(
         "--policy",
@@ -312,8 +324,7 @@ def main(arguments: Sequence[str] | None = None) -> pd.DataFrame:
         if options.noise is not None:
             document["noise"] = asdict(options.noise)
         if isinstance(policy, Policy):
-            file = options.path / files.POLICY if options.path.is_dir() else options.path
-            document |= {"card": policy.card, "sha256": files.digest(file)}
+            document |= {"card": policy.card, "sha256": files.digest(policy_file(options.path))}
         else:
             document |= {"policy": options.policy, "memory": options.memory}
             if options.robot is not None:

@@ -1,7 +1,7 @@
 """Write a trained policy as an ONNX file with a JSON card, for robots and other tools.
 
     python examples/export.py runs/demo                             writes runs/demo/policy.onnx
-    python examples/export.py examples/policies/td3-mpfa_per.npz --output turtle.onnx
+    python examples/export.py td3-rooms                 a policy that comes with the package
     python examples/export.py runs/demo --quantize --output small.onnx    eight-bit weights
 
 The card, ``policy.json``, says what the policy senses and in which units, what its robot may do,
@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from mpfa_envs import Policy, evaluate, export_policy, load_policy
+from mpfa_envs import POLICIES, Policy, evaluate, export_policy, load_policy
+from mpfa_envs.policies.files import policy_file
 from training import files
 
 TOLERANCE = 1e-6
@@ -36,7 +37,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("path", type=Path, help="policy.npz, or the folder of a run")
+    parser.add_argument(
+        "path", type=Path, help=f"policy.npz, the folder of a run, or {', '.join(POLICIES)}"
+    )
     parser.add_argument("--output", type=Path, help="the file (default: NAME.onnx beside it)")
     parser.add_argument("--quantize", action="store_true", help="round weights to eight bits")
     parser.add_argument("--world", default="test", help="where both drive (default: test)")
@@ -50,8 +53,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         options.policy = load_policy(options.path)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    options.source = options.path / files.POLICY if options.path.is_dir() else options.path
-    options.output = options.output or options.source.with_suffix(".onnx")
+    options.source = policy_file(options.path)
+    # One of the package is written where the command is called.
+    beside = options.source if options.path.exists() else Path(options.source.name)
+    options.output = options.output or beside.with_suffix(".onnx")
     if options.output.suffix != ".onnx":
         parser.error(f"--output must end in .onnx, got {options.output}")
     try:

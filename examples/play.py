@@ -1,6 +1,6 @@
 """Race a policy by keyboard: both robots start in the same room, and the first to arrive wins.
 
-    python examples/play.py                                the policy shipped with the project
+    python examples/play.py                                td3-rooms, which comes with the package
     python examples/play.py runs/demo --worlds mazes:test
     python examples/play.py --worlds D --speed 2           twice as fast as real time
 
@@ -16,20 +16,19 @@ import argparse
 import math
 from collections.abc import Iterable, Sequence
 from contextlib import closing
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from mpfa_envs import NavigationEnv, Policy, WorldTask, load_policy
+from mpfa_envs import POLICIES, NavigationEnv, Policy, WorldTask, load_policy
 from mpfa_envs.scene.scene import render_scene
 from mpfa_envs.scene.window import Window
 from training.evaluating import tasks_of
 from training.worlds import parse_worlds
 
-POLICY = Path(__file__).parent / "policies" / "td3-mpfa_per-rooms.npz"
+POLICY = "td3-rooms"
 LETTERS = {"w": "up", "a": "left", "s": "down", "d": "right"}
 _PAUSE = 2.0
 """For which the end of a race is shown [s]."""
@@ -149,7 +148,10 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, int]:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "path", type=Path, nargs="?", default=POLICY, help="policy.npz, or the folder of a run"
+        "path",
+        nargs="?",
+        default=POLICY,
+        help=f"policy.npz, the folder of a run, or {', '.join(POLICIES)} (default: {POLICY})",
     )
     parser.add_argument(
         "--worlds",

@@ -22,7 +22,7 @@ from mpfa_envs import World, deploy, export_policy, load_policy, planners, rende
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
-TEXTS = ["../README.md", "../CONTRIBUTING.md", "../examples/policies/README.md", *PAGES]
+TEXTS = ["../README.md", "../CONTRIBUTING.md", *PAGES]
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)(?:#([^)\s]+))?\)")
 ITEM = r"^(?:[-*]|\d+\.) .*\n"
 PART_OF_A_LIST = re.compile(ITEM + r"(?: .*\n)*\n+    [^`\s].*", re.MULTILINE)
@@ -118,7 +118,7 @@ SMALL = {
 EPISODES = {
     "planners.md": {"episodes=5": "episodes=1"},
     "worlds.md": {"episodes=50": "episodes=1"},
-    "../examples/policies/README.md": {'"test")))': '"test", episodes=1)))'},
+    "policies.md": {'"test")))': '"test", episodes=1)))'},
 }
 """The episodes that other pages evaluate, and those that the tests do."""
 
@@ -130,9 +130,9 @@ TASK_PAGES = [
     "moving.md",
     "noise.md",
     "planners.md",
+    "policies.md",
     "vector.md",
     "worlds.md",
-    "../examples/policies/README.md",
 ]
 ELSEWHERE = ["methods/README.md", "methods/mpfa_per.md", "torchrl_trainer.md"]
 """Pages whose code is run by the tests of what they are about."""
@@ -208,7 +208,7 @@ def test_pieces_and_sums_on_the_page_on_sequences_are_of_one_trajectory(seed: in
 
 def test_the_pilot_on_the_page_on_robots_decides_by_scans(folder: Path) -> None:
     pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
-    export_policy(load_policy("examples/policies/td3-mpfa_per.npz"), folder / "policy.onnx")
+    export_policy(load_policy("td3-paper"), folder / "policy.onnx")
     control = run("robot.md", {})["control"]
     message = SimpleNamespace(
         angle_min=-np.pi, angle_increment=0.01, ranges=np.full(629, 3.0), range_min=0.1

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mpfa_envs import load_policy
+from mpfa_envs import POLICIES, load_policy
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -54,5 +54,5 @@ def test_no_line_is_longer_than_a_page_is_wide() -> None:
 def test_neighboring_lines_of_the_readme_compare_drives_with_the_same_physics() -> None:
     lines = re.findall(r"examples/evaluate\.py (.*?)(?:  #|$)", README, re.MULTILINE)
     (planner,) = (line for line in lines if "--policy" in line)
-    policy = load_policy(ROOT / next(line for line in lines if line.endswith(".npz")))
+    policy = load_policy(next(line.strip() for line in lines if line.strip() in POLICIES))
     assert planner.split("--physics ")[1] == policy.env_arguments.get("physics", "wheels")

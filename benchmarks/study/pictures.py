@@ -52,8 +52,7 @@ from training.run.checkpoints import read_checkpoint
 from training.run.values import load_learner, values_of
 
 ROOT = Path(__file__).parents[2]
-POLICIES = ROOT / "examples/policies"
-SHIPPED = POLICIES / "td3-mpfa_per-rooms.npz"
+SHIPPED = "td3-rooms"
 """What drives in the pictures that need no critic."""
 WORLD = "test"
 MAZE = "mazes:test"
@@ -100,7 +99,7 @@ def methods(output: Path) -> None:
     """Paths of a policy of today, one of the paper's task, and a planner, side by side."""
     drivers: dict[str, Drivable] = {
         "many rooms": load_policy(SHIPPED),
-        "four maps": load_policy(POLICIES / "td3-mpfa_per.npz"),
+        "four maps": load_policy("td3-paper"),
         "planner": make_planner("dwa"),
     }
     driven = {name: drive(each, [WORLD], episodes=20, **_HOW)[0] for name, each in drivers.items()}

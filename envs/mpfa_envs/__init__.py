@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mpfa_envs.planners import PLANNERS as PLANNERS
     from mpfa_envs.planners import make_planner as make_planner
     from mpfa_envs.policies.export import export_policy as export_policy
+    from mpfa_envs.policies.files import POLICIES as POLICIES
     from mpfa_envs.policies.files import load_policy as load_policy
     from mpfa_envs.policies.files import save_policy as save_policy
     from mpfa_envs.policies.policy import Policy as Policy
@@ -68,7 +69,7 @@ _NAMES = {
     "generators": "GENERATORS generate_world register_generator",
     "planners": "PLANNERS make_planner",
     "policies.export": "export_policy",
-    "policies.files": "load_policy save_policy",
+    "policies.files": "POLICIES load_policy save_policy",
     "policies.policy": "Policy",
     "robots.discrete": "DiscreteWheels",
     "robots.model": "ROBOTS RobotModel",

@@ -12,7 +12,8 @@ from mpfa_envs.deploy import Card
 from mpfa_envs.policies.layers import LayerNorm, Linear, ReLU, Tanh
 from mpfa_envs.robots.model import ROBOTS
 
-SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "td3-mpfa_per.npz"
+SHIPPED = "td3-paper"
+"""A policy without a map."""
 ENV_ARGUMENTS = {"robot": "turtlebot2", "physics": "kinematic", "closeness_distance": 0.23}
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mpfa_envs import (
+    POLICIES,
     Policy,
     TaskConfig,
     VectorNavigationEnv,
@@ -24,10 +24,9 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, spl, wilson
+from mpfa_envs.policies.files import policy_file
 from mpfa_envs.policies.layers import Linear, Tanh
 from mpfa_envs.robots.model import resolve_robot
-
-POLICIES = sorted((Path(__file__).parents[2] / "examples" / "policies").glob("*.npz"))
 
 
 def steer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -291,15 +290,15 @@ def test_no_tasks_have_no_results() -> None:
 
 
 def test_there_is_a_policy_to_start_from() -> None:
-    assert POLICIES
+    assert "td3-rooms" in POLICIES
 
 
-@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.name)
-def test_a_policy_of_the_project_drives_around_obstacles(path: Path) -> None:
-    assert path.stat().st_size < 100_000
-    policy = load_policy(path)
+@pytest.mark.parametrize("name", POLICIES)
+def test_a_policy_of_the_package_drives_around_obstacles(name: str) -> None:
+    assert policy_file(name).stat().st_size < 100_000
+    policy = load_policy(name)
     assert policy.card["method"] == "mpfa_per"
-    memory = {"memory": "map"} if path.stem.endswith("-rooms") else {}
+    memory = {} if name.endswith("-paper") else {"memory": "map"}
     assert set(policy.env_arguments) == {
         "robot", "physics", "max_steps", "action_repeat", "closeness_distance", *memory,
     }  # fmt: skip

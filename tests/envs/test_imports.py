@@ -45,7 +45,7 @@ def test_without_gymnasium_the_package_can_still_be_imported() -> None:
         ),
         (
             "onnx",
-            f"from mpfa_envs import *;export_policy(load_policy({str(SHIPPED)!r}), 'policy.onnx')",
+            f"from mpfa_envs import *;export_policy(load_policy({SHIPPED!r}), 'policy.onnx')",
             "pip install 'torchrl-mpfa[onnx]'",
         ),
     ],

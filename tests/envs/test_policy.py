@@ -199,6 +199,19 @@ def test_a_file_that_unpacks_to_much_is_rejected_unread(
         load_policy(file)
 
 
+def test_a_policy_of_the_package_is_found_by_its_name_unless_there_is_such_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = load_policy("td3-rooms")
+    Path("td3-rooms").mkdir()
+    with pytest.raises(FileNotFoundError, match="those that come with the package are ddpg-"):
+        load_policy("td3-rooms")
+    save_policy(load_policy("td3-paper"), "td3-rooms")
+    assert shipped.observation_size == 27
+    assert load_policy("td3-rooms").observation_size == 24
+
+
 def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no policy at .*policy\.npz"):
         load_policy(tmp_path)

@@ -24,7 +24,7 @@ from training.run.evaluations import exported_policy
 from training.settings.train import GROUPS, TrainSettings
 from training.worlds import parse_worlds, worlds_label
 
-SHIPPED = Path(evaluate.__file__).parent / "policies" / "td3-mpfa_per.npz"
+SHIPPED = "td3-paper"
 
 
 @pytest.fixture
@@ -228,9 +228,9 @@ def test_the_policy_that_comes_with_the_project_reaches_its_goals(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     arguments = ["--worlds", "A", "--episodes", "6", "--physics", "kinematic", "--no-pictures"]
-    summary = evaluate.main([str(SHIPPED), *arguments])
+    summary = evaluate.main([SHIPPED, *arguments])
     assert summary["success"].iloc[0] == 1.0
-    assert (tmp_path / "runs/evaluation-td3-mpfa_per/evaluation-A-kinematic/episodes.csv").exists()
+    assert (tmp_path / "runs/evaluation-td3-paper/evaluation-A-kinematic/episodes.csv").exists()
 
 
 def test_worlds_and_their_label_agree() -> None:

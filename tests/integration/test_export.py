@@ -13,14 +13,15 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 import evaluate
 import export
 from mpfa_envs import load_policy
+from mpfa_envs.policies.files import policy_file
 
-SHIPPED = Path(export.__file__).parent / "policies" / "td3-mpfa_per.npz"
+SHIPPED = "td3-paper"
 
 
 def test_the_script_tells_what_it_compared_and_puts_known_results_on_the_card(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shutil.copy(SHIPPED, tmp_path / "policy.npz")
+    shutil.copy(policy_file(SHIPPED), tmp_path / "policy.npz")
     evaluate.main([str(tmp_path), *["--worlds", "B", "--episodes", "2", "--no-pictures"]])
     stale = tmp_path / "evaluation-stale"
     shutil.copytree(tmp_path / "evaluation-B-wheels", stale)
@@ -44,12 +45,12 @@ def test_a_file_that_differs_is_not_written(
 ) -> None:
     monkeypatch.setattr(export, "TOLERANCE", -1.0)
     with pytest.raises(SystemExit, match="the file differs from the policy by"):
-        export.main([str(SHIPPED), "--output", str(tmp_path / "policy.onnx"), "--episodes", "0"])
+        export.main([SHIPPED, "--output", str(tmp_path / "policy.onnx"), "--episodes", "0"])
     assert not list(tmp_path.iterdir())
 
 
 def test_a_quantized_file_is_written_with_how_it_drives(tmp_path: Path) -> None:
     file = tmp_path / "small.onnx"
-    export.main([str(SHIPPED), "--output", str(file), "--episodes", "1", "--quantize"])
+    export.main([SHIPPED, "--output", str(file), "--episodes", "1", "--quantize"])
     assert json.loads((tmp_path / "small.json").read_text())["precision"] == "int8"
     assert load_policy(file).observation_size == 24

@@ -17,9 +17,10 @@ import export
 import play
 import report
 import train
+from mpfa_envs.policies.files import policy_file
 from training import files
 
-POLICY = str(Path(__file__).parents[2] / "examples/policies/td3-mpfa_per.npz")
+POLICY = "td3-paper"
 A_FILE = r"file cannot be a folder, as .*file is a file: name another one"
 
 
@@ -29,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("x")
     (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 and no more")
-    flipped = bytearray(Path(POLICY).read_bytes())
+    flipped = bytearray(policy_file(POLICY).read_bytes())
     flipped[len(flipped) // 2] ^= 1
     (tmp_path / "flipped.npz").write_bytes(flipped)
     np.savez(tmp_path / "other.npz", a=np.zeros(3))

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 FILE_NAME: Final = "policy.npz"
 """Name of the file in the folder of a run."""
+_SHIPPED: Final = Path(__file__).parents[1] / "data" / "policies"
+POLICIES: Final = tuple(sorted(file.stem for file in _SHIPPED.glob("*.npz")))
+"""Names of the trained policies that come with the package."""
 _FORMAT: Final = 1
 _ABOUT: Final = "about"
 """The entry with everything but the weights: JSON as bytes."""
@@ -57,7 +60,7 @@ def save_policy(policy: Policy, path: str | os.PathLike[str], *, overwrite: bool
     """
     if not policy.layers:
         raise ValueError(f"policy must have layers, got {policy!r}: copy its file and its card")
-    file = _file(path)
+    file = _inside(path)
     plain = [
         {
             "kind": type(layer).__name__,
@@ -88,8 +91,9 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Read a policy without executing anything in the file.
 
     Args:
-        path: The file, or the folder of a run; or an ONNX file of :func:`~mpfa_envs.export_policy`
-            with its card beside it, which needs onnxruntime.
+        path: The file, or the folder of a run; an ONNX file of :func:`~mpfa_envs.export_policy`
+            with its card beside it, which needs onnxruntime; or a name in
+            :data:`~mpfa_envs.POLICIES`.
 
     Returns:
         The policy.
@@ -97,8 +101,13 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     Raises:
         FileNotFoundError: If there is no such file.
         PolicyFileError: If it is no policy, was damaged, or is of another version.
+
+    Examples:
+        >>> from mpfa_envs import load_policy
+        >>> load_policy("td3-rooms").env_arguments["memory"]
+        'map'
     """
-    file = _file(path)
+    file = policy_file(path)
     if file.suffix == ".onnx":
         return OnnxPolicy(file)
     return _load(file)
@@ -109,7 +118,9 @@ def _load(file: Path) -> Policy:
     try:
         return _read(read_file(file, _LARGEST))
     except FileNotFoundError:
-        raise FileNotFoundError(f"there is no policy at {file}") from None
+        names = ", ".join(POLICIES)
+        message = f"there is no policy at {file}, and those that come with the package are {names}"
+        raise FileNotFoundError(message) from None
     # A damaged archive raises many errors: a wrong checksum, header, length, number, password.
     except Exception as error:
         raise PolicyFileError(f"{file} holds no policy, or is damaged: {error}") from error
@@ -142,7 +153,13 @@ def _read(content: bytes) -> Policy:
     return Policy(layers, card=about["card"], env_arguments=about["env_arguments"])
 
 
-def _file(path: str | os.PathLike[str]) -> Path:
+def policy_file(path: str | os.PathLike[str]) -> Path:
+    """Find the file of a policy: itself, in the folder of a run, or in the package by its name."""
+    shipped = str(path) in POLICIES and not Path(path).exists()
+    return _SHIPPED / f"{path}.npz" if shipped else _inside(path)
+
+
+def _inside(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     return path / FILE_NAME if path.is_dir() else path
 
