@@ -13,13 +13,14 @@ from scipy.sparse.csgraph import dijkstra
 from mpfa_envs import Box, Lidar, NavigationEnv, VectorNavigationEnv, World, generate_world
 from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import PATH
+from mpfa_envs.sensing.map_loops import BLOCKED
 from mpfa_envs.sensing.map_memory import RESOLUTION, MapMemory
 from mpfa_envs.sensing.observation import observation_slices
 from tests.envs.paper import drive_to_end
 from tests.envs.shapes import random_shapes
 
 ROBOT = ROBOTS["turtlebot2"]
-FACTORS = (1, 3, 30)
+FACTORS = (1, 3, 30, 200)
 POCKET = World(
     name="pocket",
     boxes=(Box(1.0, -1.5, 1.2, 1.5), Box(-1.0, 1.3, 1.0, 1.5), Box(-1.0, -1.5, 1.0, -1.3)),
@@ -39,7 +40,7 @@ def levels_of_points(points: np.ndarray, memory: MapMemory) -> np.ndarray:
     x = origin[0] + RESOLUTION * np.arange(columns)[:, None, None]
     y = origin[1] + RESOLUTION * np.arange(rows)[None, :, None]
     gaps = np.hypot(x - points[:, 0], y - points[:, 1]).min(axis=2) - ROBOT.radius
-    return np.where(gaps <= 0.06, 2, np.where(gaps <= 0.22, 1, 0))
+    return np.searchsorted([-0.22, -0.06, 0.0], -gaps, side="right")
 
 
 def cheapest(levels: np.ndarray, goal: tuple[int, int]) -> np.ndarray:
@@ -151,6 +152,20 @@ def test_the_path_leads_out_of_a_pocket() -> None:
     env.close()
 
 
+def test_the_path_leads_round_a_wall_however_long_that_is() -> None:
+    world = World(name="long", size=(30.0, 6.0), boxes=(Box(-15.0, -0.1, 13.0, 0.1),))
+    lidar, memory = Lidar(world), MapMemory(1, ROBOT, Lidar(world))
+    memory.begin(0, world)
+    for x in range(-14, 14, 2):
+        for heading in (-1.6, 0.0, 1.6, 3.1):
+            path = scan(memory, lidar, (x, -1.0, heading), (-14.0, 1.0))
+    path = scan(memory, lidar, (-14.0, -1.0, 0.0), (-14.0, 1.0))
+    assert 55.0 < path[2] < 70.0
+    sketch = memory.sketch(0, -14.0, -1.0)
+    places = np.rint((np.array(sketch.path) - memory.arrays.origins[0]) / RESOLUTION).astype(int)
+    assert not sketch.blocked[places[:, 0], places[:, 1]].any()
+
+
 def test_the_map_extends_the_observation_and_changes_nothing_else() -> None:
     worlds = [generate_world("mazes", 3), generate_world("halls", 4)]
     envs = [
@@ -179,7 +194,7 @@ def test_a_picture_shows_obstacles_and_the_path_to_the_goal() -> None:
     assert math.dist(sketch.path[-1], (3.0, 0.0)) < 0.1
     steps = [math.dist(a, b) for a, b in zip(sketch.path, sketch.path[1:], strict=False)]
     assert max(steps) == pytest.approx(math.sqrt(2) * RESOLUTION)
-    assert sketch.blocked.sum() == (memory.arrays.levels[0] == 2).sum() > 50
+    assert sketch.blocked.sum() == (memory.arrays.levels[0] == BLOCKED).sum() > 50
     # Past what it sees of an arm of the pocket, which is the part before it.
     assert min(x for x, y in sketch.path if abs(y) > 1.4) < -0.3
     orange = (env.render() == PATH[:3]).all(axis=-1)

@@ -14,18 +14,21 @@ if TYPE_CHECKING:
 
 NEAR: Final = 1
 """A cell near an obstacle."""
-BLOCKED: Final = 2
+TIGHT: Final = 2
+"""A cell where the robot's rim would be within centimeters of an obstacle."""
+BLOCKED: Final = 3
 """A cell where the robot's center cannot be."""
-FACTORS: Final = np.array((1, 3, 30), dtype=np.int64)
-"""Cost of a step in a free cell, one near an obstacle and a blocked one. None is infinite: a
-robot may stand where it should not, and where all paths are blocked it goes on looking."""
+FACTORS: Final = np.array((1, 3, 30, 200), dtype=np.int64)
+"""Cost of a step in a free cell, one near an obstacle, a tight and a blocked one. None is infinite:
+a robot may stand where it should not, and where all paths are blocked it goes on looking. But a
+wall, some five blocked cells thick, must cost more than any way round it."""
 STRAIGHT: Final = 10
 """Length of a straight step."""
 DIAGONAL: Final = 14
 """Length of a diagonal step."""
 UNKNOWN: Final = int(np.iinfo(np.int32).max)
 """Cost of a cell without a known path."""
-_RING: Final = 512
+_RING: Final = 4096
 """More than the costliest step."""
 _NEXT_CELLS: Final = 20
 """Cells of the path that its direction depends on."""
@@ -40,7 +43,8 @@ class MapArrays(NamedTuple):
     """Maps by robot, changed in place; of each only the first columns and rows count."""
 
     levels: NDArray[np.uint8]
-    """0 where nothing was met, :data:`NEAR` or :data:`BLOCKED`, ``[N, columns, rows]``."""
+    """0 where nothing was met, :data:`NEAR`, :data:`TIGHT` or :data:`BLOCKED`,
+    ``[N, columns, rows]``."""
     costs: NDArray[np.int32]
     """Cost of the cheapest path to the goal, ``[N, columns, rows]``."""
     shapes: NDArray[np.int64]
@@ -57,12 +61,13 @@ def remember(
     chosen: NDArray[np.bool_],  # [N]; the others' rows stay
     directions: NDArray[np.float64],  # cosine and sine in the robot's frame, [2, rays]
     maps: MapArrays,
-    lengths: tuple[float, float, float, float],  # cell, blocked below, near below, max_range [m]
+    # [m]: a cell, up to where cells are blocked, tight and near, max_range
+    lengths: tuple[float, float, float, float, float],
     paths: NDArray[np.float64],  # direction (x, y) in the robot's frame and length [m], [N, 3]
 ) -> None:
     """Enter a scan of the chosen robots in their maps, and find the paths to their goals."""
-    resolution, blocked, near, max_range = lengths
-    blocked, near = blocked / resolution, near / resolution
+    resolution, blocked, tight, near, max_range = lengths
+    bounds = blocked / resolution, tight / resolution, near / resolution
     links = np.empty((3, maps.levels.shape[1] * maps.levels.shape[2]), dtype=np.int32)
     for robot in range(motions.shape[0]):
         if not chosen[robot]:
@@ -80,7 +85,7 @@ def remember(
                 reach = ranges[robot, ray] / resolution
                 across = directions[0, ray] * cosine - directions[1, ray] * sine
                 up = directions[0, ray] * sine + directions[1, ray] * cosine
-                changed |= _enter(levels, u + reach * across, v + reach * up, blocked, near)
+                changed |= _enter(levels, u + reach * across, v + reach * up, bounds)
         i, j = cell_of(u, nx), cell_of(v, ny)
         if costs[i, j] == UNKNOWN or (changed and not _costs_the_same(levels, costs, i, j)):
             goal = (
@@ -106,18 +111,21 @@ def cell_of(place: float, count: int) -> int:
 
 
 @njit
-def _enter(levels: NDArray[np.uint8], u: float, v: float, blocked: float, near: float) -> bool:
+def _enter(
+    levels: NDArray[np.uint8], u: float, v: float, bounds: tuple[float, float, float]
+) -> bool:
     """Enter a point that the lidar hit; tell whether the map has changed."""
+    blocked, tight, near = bounds
     nx, ny = levels.shape
     changed = False
-    outer, inner = near * near, blocked * blocked
+    outer, inner, core = near * near, tight * tight, blocked * blocked
     first, last = max(math.ceil(v - near), 0), min(math.floor(v + near), ny - 1)
     for i in range(max(math.ceil(u - near), 0), min(math.floor(u + near), nx - 1) + 1):
         across = (i - u) * (i - u)
         for j in range(first, last + 1):
             square = across + (j - v) * (j - v)
-            # BLOCKED, NEAR or 0 without a branch, which would often be taken wrongly.
-            level = (square <= outer) + (square <= inner)
+            # BLOCKED, TIGHT, NEAR or 0 without a branch, which would often be taken wrongly.
+            level = (square <= outer) + (square <= inner) + (square <= core)
             if level > levels[i, j]:
                 levels[i, j] = level
                 changed = True

@@ -24,8 +24,8 @@ RESOLUTION: Final = 0.1
 """Side of a cell [m]."""
 _MARGIN: Final = 5
 """Cells around the room: where it ends is not known before a wall was seen."""
-_BLOCKED: Final = 0.06
-"""Clearance of the robot's rim below which a cell is blocked [m]."""
+_TIGHT: Final = 0.06
+"""Clearance of the robot's rim below which a cell is tight [m]."""
 _NEAR: Final = 0.22
 """Clearance below which a cell is near an obstacle [m]."""
 
@@ -45,11 +45,12 @@ class Sketch(NamedTuple):
 class MapMemory:
     """A map for each of many robots, empty when an episode begins.
 
-    The map has square cells. A cell nearer to a point that the lidar hit than the robot's rim can
-    be is blocked; unseen cells count as free. The path is the cheapest one to the goal over the
-    map, where cells near an obstacle cost three times as much as free ones and blocked cells thirty
-    times, found again whenever a scan makes it costlier. Its direction is that of the farthest of
-    its next cells, two meters away at most, to which a straight line is no narrower than its ends.
+    The map has square cells. Where the robot's center cannot be, as its rim would touch a point
+    that the lidar hit, a cell is blocked; unseen cells count as free. The path is the cheapest one
+    to the goal over the map, where cells near an obstacle cost three times as much as free ones,
+    tight ones thirty and blocked ones two hundred times, found again whenever a scan makes it
+    costlier. Its direction is that of the farthest of its next cells, two meters away at most, to
+    which a straight line is no narrower than its ends.
 
     It knows of the room only the scans, entered at the poses that odometry gives.
 
@@ -81,7 +82,8 @@ class MapMemory:
         """The maps, as compiled loops read them."""
         self._paths = np.zeros((count, 3))
         self._directions = np.stack((np.cos(lidar.angles), np.sin(lidar.angles)))
-        self._lengths = RESOLUTION, robot.radius + _BLOCKED, robot.radius + _NEAR, lidar.max_range
+        bounds = robot.radius, robot.radius + _TIGHT, robot.radius + _NEAR
+        self._lengths = RESOLUTION, *bounds, lidar.max_range
 
     def begin(self, index: int, world: World) -> None:
         """Clear a robot's map.
