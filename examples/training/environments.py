@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from mpfa_envs import (
     DiscreteWheels,
     NavigationTorchEnv,
-    SafetyFilter,
     TaskConfig,
     VectorNavigationEnv,
     navigation_reward,
@@ -106,17 +105,22 @@ def make_training_env(
     return TransformedEnv(env, DiscreteWheels()) if discrete else env
 
 
-def make_filter(settings: EnvironmentSettings) -> SafetyFilter | None:
-    """The filter that actions pass, if the settings ask for it."""
-    return TaskConfig(**env_arguments(settings)).make_filter() if settings.filter else None
+class FilteredRobots:
+    """Lets the actions of some robots pass the filter, as many as the settings say: the first."""
 
+    def __init__(self, settings: EnvironmentSettings) -> None:
+        self._share = settings.filter
+        self._keep = TaskConfig(**env_arguments(settings)).make_filter() if self._share else None
 
-def apply_filter(state: TensorDictBase, keep: SafetyFilter | None) -> TensorDictBase:
-    """Robots with the actions that pass a filter, if there is one."""
-    if keep is None:
-        return state
-    actions = keep(state["observation"].numpy(), state["action"].numpy())
-    return state.set("action", torch.from_numpy(actions))
+    def __call__(self, state: TensorDictBase) -> TensorDictBase:
+        """Replace ``"action"`` by what is carried out, ``[N, 2]``."""
+        if self._keep is None:
+            return state
+        actions = state["action"].clone()
+        some = slice(math.ceil(self._share * len(actions)))
+        kept = self._keep(state["observation"][some].numpy(), actions[some].numpy())
+        actions[some] = torch.from_numpy(kept)
+        return state.set("action", actions)
 
 
 def vector_of(env: EnvBase) -> VectorNavigationEnv:

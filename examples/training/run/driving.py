@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_mpfa.methods import Method, Replay, make_replay
-from training.environments import INFO, apply_filter, make_filter, make_training_env, vector_of
+from training.environments import INFO, FilteredRobots, make_training_env, vector_of
 from training.records import EpisodeRecord
 from training.run.checkpoints import as_arrays, as_tensors
 from training.run.exploration import Explorer
@@ -47,7 +47,7 @@ class Robots:
         self.given_up = 0
         """Episodes of the run that were under way when another stage began."""
         self._started = time.perf_counter()
-        self._filter = make_filter(settings.environment)
+        self._filter = FilteredRobots(settings.environment)
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
@@ -171,7 +171,7 @@ class Robots:
         if "behavior_mean" in entries:
             for name, value in zip(("behavior_mean", "behavior_sigma"), behavior, strict=True):
                 state.set(name, value.clone())
-        return apply_filter(state, self._filter)
+        return self._filter(state)
 
     def _record(
         self, after: TensorDictBase, robot: int, *, episode: int, total_steps: int

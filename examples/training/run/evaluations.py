@@ -8,8 +8,8 @@ from functools import lru_cache
 from tensordict.nn import TensorDictModule
 
 from mpfa_envs import Policy, WorldTask, run_tasks, world_tasks
-from mpfa_envs.evaluation.runs import Filtered
-from training.environments import env_arguments, make_filter
+from training.environments import env_arguments
+from training.evaluating import Drivable, filtered
 from training.records import EvaluationRecord
 from training.run.assembly import policy_layers
 from training.settings.train import TrainSettings
@@ -57,11 +57,12 @@ def evaluate_policy(
         Rates of success, collision and timeout, and the mean SPL.
     """
     start = time.perf_counter()
-    wanted, driver = settings.evaluation, exported_policy(policy, settings)
+    wanted, exported = settings.evaluation, exported_policy(policy, settings)
+    # A policy that some robots try without the filter is to be good without it.
+    always = settings.environment.filter == 1.0
+    driver: Drivable = filtered(exported) if always else exported
     tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
-    keep = make_filter(settings.environment)
-    filtered = driver if keep is None else Filtered(driver, keep)
-    results = run_tasks(filtered, tasks, **driver.env_arguments)
+    results = run_tasks(driver, tasks, **driver.env_arguments)
     names = ("success", "collision", "timeout", "spl")
     return EvaluationRecord(
         total_steps=total_steps,

@@ -24,7 +24,7 @@ from torchrl.weight_update import _ray
 from tqdm import tqdm
 
 from torchrl_mpfa.methods import Method, RaySignalReplayBuffer, Replay, make_ray_replay
-from training.environments import apply_filter, make_filter, make_training_env
+from training.environments import FilteredRobots, make_training_env
 from training.records import EpisodeRecord
 from training.run.driving import TRANSITION, Robots
 from training.run.exploration import Explorer, make_explorer
@@ -55,7 +55,7 @@ class ExploringPolicy(TensorDictModuleBase):
         self.policy = policy
         self.register_buffer("actions", torch.zeros((), dtype=torch.long))
         self._settings, self._spec = settings.exploration, action_spec
-        self._filter = make_filter(settings.environment)
+        self._filter = FilteredRobots(settings.environment)
         self._explorer = make_explorer(policy, self._settings, action_spec)  # type: ignore[arg-type]
 
     def follow(self, policy: nn.Module, actions: int) -> None:
@@ -71,10 +71,10 @@ class ExploringPolicy(TensorDictModuleBase):
             self._explorer.begin_episodes(begun)
         steps = int(self.actions) - self._settings.random_steps
         if steps < 0:
-            return apply_filter(state.set("action", self._spec.rand()), self._filter)
+            return self._filter(state.set("action", self._spec.rand()))
         self._explorer.move_to(steps)
         state.set("action", self._explorer.act(state["observation"]))
-        return apply_filter(state, self._filter)
+        return self._filter(state)
 
 
 class RobotCollector(Collector):

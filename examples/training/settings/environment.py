@@ -66,8 +66,9 @@ class EnvironmentSettings:
     that must keep moving is run into from behind by people unless it sees all 360."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""
-    filter: bool = False
-    """Whether actions pass the filter that keeps the robot off what its lidar sees
-    (:class:`mpfa_envs.SafetyFilter`); the buffer stores those that were carried out."""
+    filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
+    """Share of the robots whose actions pass the filter that keeps them off what their lidar sees
+    (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With
+    some, a policy learns from long drives and from collisions; with 1, it needs the filter."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""

@@ -21,7 +21,7 @@ from mpfa_envs import (
     load_policy,
 )
 from tests.integration.tiny_runs import tiny, train
-from training.environments import env_arguments, make_filter, make_training_env, vector_of
+from training.environments import env_arguments, make_training_env, vector_of
 from training.run.driving import Robots
 from training.settings.environment import EnvironmentSettings, NoiseSettings
 from training.settings.train import REGIMES
@@ -62,24 +62,31 @@ class Ahead:
     def begin_episodes(self, begun: torch.Tensor) -> None: ...
 
 
-@pytest.mark.parametrize("random_steps", [0, 10_000])
-def test_what_the_filter_lets_pass_is_carried_out_and_stored(random_steps: int) -> None:
+@pytest.mark.parametrize(("random_steps", "share"), [(0, 1.0), (0, 0.3), (10_000, 1.0)])
+def test_what_the_filter_lets_pass_is_carried_out_and_stored(
+    random_steps: int, share: float
+) -> None:
     settings = tiny(robots=8)
     settings.exploration.random_steps = random_steps
     settings.environment = EnvironmentSettings(
-        robot="kobuki", physics="kinematic", filter=True, clearance=0.0
+        robot="kobuki", physics="kinematic", filter=share, clearance=0.0
     )
-    robots, keep = Robots(settings), make_filter(settings.environment)
+    robots = Robots(settings)
+    keep = TaskConfig(**env_arguments(settings.environment)).make_filter()
+    some = 8 if share == 1.0 else 3
     robots.begin("mazes", Ahead(), seed=1)
-    changed = 0
+    changed = collisions = 0
     for step in range(150):
         data, records = robots.drive(Ahead(), actions=8 * step, episode=0)
         seen, action = data["observation"].numpy(), data["action"].numpy()
-        assert np.array_equal(keep(seen, action), action)
-        changed += int((action != 1.0).any(axis=1).sum())
-        assert not any(record.collision for record in records)
+        assert np.array_equal(keep(seen[:some], action[:some]), action[:some])
+        changed += int((action != 1.0).any(axis=1)[:some].sum())
+        if not random_steps:
+            assert (action[some:] == 1.0).all()
+        collisions += sum(record.collision for record in records)
     robots.close()
     assert changed > 20
+    assert (collisions > 0) == (some < 8)
 
 
 def test_it_senses_alike_where_it_learns_and_where_it_is_judged() -> None:
