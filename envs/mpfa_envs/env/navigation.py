@@ -53,7 +53,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
     ====== ================ ==================================================== ==========
     24-25  way_direction    cosine and sine of the direction, in the robot's     [-1, 1]
                             frame, of the path to the goal on its map
-    26     way_length       ``length / 10 m``, longer where it is narrow         [0, 10]
+    26     way_length       ``length / 10 m``, longer where it is narrow         [0, 1.5]
     ====== ================ ==================================================== ==========
 
     With ``history=K`` there are ``18 K`` more at the end, ``lidar_history``: the lidar's sectors at
