@@ -29,8 +29,13 @@ COMMON = (
     "learner.compile=true",
     "tracking=off",
     "evaluation.every=2000",
+    "evaluation.world=mixed:validation",
     "evaluation.episodes=40",
     "evaluation.choose=false",
+    # The paper's robot, without what the regime has for others.
+    "environment.robot=turtlebot2",
+    "environment.filter=0",
+    "environment.step_cost=0",
 )
 """Settings of all tables but A."""
 SPARSE = (

@@ -23,6 +23,8 @@ from mpfa_envs.env.config import lidar_arguments
 from mpfa_envs.robots.model import resolve_robot
 from mpfa_envs.tasks.reward import RewardFunction
 from training.settings.environment import EnvironmentSettings
+from training.settings.learners import is_discrete
+from training.settings.train import TrainSettings
 
 INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
@@ -108,9 +110,10 @@ def make_training_env(
 class FilteredRobots:
     """Lets the actions of some robots pass the filter, as many as the settings say: the first."""
 
-    def __init__(self, settings: EnvironmentSettings) -> None:
-        self._share = settings.filter
-        self._keep = TaskConfig(**env_arguments(settings)).make_filter() if self._share else None
+    def __init__(self, settings: TrainSettings) -> None:
+        task = settings.environment
+        self._share = 0.0 if is_discrete(settings.learner) else task.filter
+        self._keep = TaskConfig(**env_arguments(task)).make_filter() if self._share else None
 
     def __call__(self, state: TensorDictBase) -> TensorDictBase:
         """Replace ``"action"`` by what is carried out, ``[N, 2]``."""

@@ -17,7 +17,7 @@ _WORLD_OF = {
 }
 ENV_IDS = tuple(_WORLD_OF)
 """The ids of worlds and of generators that ``gymnasium.make`` and ``gymnasium.make_vec`` know once
-this package is imported; ``mpfa/Rooms-v1`` is the task of ``regime=rooms``."""
+this package is imported; ``mpfa/Rooms-v1`` is that of ``regime=rooms`` for the paper's robot."""
 ROOMS_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "world": "mixed",
@@ -30,7 +30,8 @@ ROOMS_TASK: Final[Mapping[str, Any]] = MappingProxyType(
     }
 )
 """Arguments of :class:`~mpfa_envs.NavigationEnv` and :class:`~mpfa_envs.VectorNavigationEnv` for
-the task of ``regime=rooms``, with its TurtleBot2: those of ``mpfa/Rooms-v1``."""
+the task of ``regime=rooms`` for the paper's robot, without a filter and a cost of time: those of
+``mpfa/Rooms-v1``."""
 
 for _id, _arguments in {
     **{name: {"world": world} for name, world in _WORLD_OF.items()},

@@ -47,7 +47,7 @@ class Robots:
         self.given_up = 0
         """Episodes of the run that were under way when another stage began."""
         self._started = time.perf_counter()
-        self._filter = FilteredRobots(settings.environment)
+        self._filter = FilteredRobots(settings)
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None

@@ -12,6 +12,7 @@ from training.environments import env_arguments
 from training.evaluating import Drivable, filtered
 from training.records import EvaluationRecord
 from training.run.assembly import policy_layers
+from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
 
 SEED = 1
@@ -59,7 +60,7 @@ def evaluate_policy(
     start = time.perf_counter()
     wanted, exported = settings.evaluation, exported_policy(policy, settings)
     # A policy that some robots try without the filter is to be good without it.
-    always = settings.environment.filter == 1.0
+    always = settings.environment.filter == 1.0 and not is_discrete(settings.learner)
     driver: Drivable = filtered(exported) if always else exported
     tasks = _tasks(wanted.world, wanted.episodes, settings.environment.robot)
     results = run_tasks(driver, tasks, **driver.env_arguments)

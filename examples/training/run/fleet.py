@@ -55,7 +55,7 @@ class ExploringPolicy(TensorDictModuleBase):
         self.policy = policy
         self.register_buffer("actions", torch.zeros((), dtype=torch.long))
         self._settings, self._spec = settings.exploration, action_spec
-        self._filter = FilteredRobots(settings.environment)
+        self._filter = FilteredRobots(settings)
         self._explorer = make_explorer(policy, self._settings, action_spec)  # type: ignore[arg-type]
 
     def follow(self, policy: nn.Module, actions: int) -> None:

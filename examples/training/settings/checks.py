@@ -82,11 +82,6 @@ def check_settings(settings: TrainSettings) -> None:
         if settings.learner.compile is True:
             name = settings.learner.algorithm
             raise ValueError(f"learner.compile must be false with {name}, got True")
-        if settings.environment.filter:
-            name = settings.learner.algorithm
-            raise ValueError(
-                f"environment.filter must be 0 with {name}, got {settings.environment.filter}"
-            )
         _check_values_alone(settings)
     _check_device(settings.device)
     check_physics(settings.environment.physics)

@@ -29,7 +29,8 @@ class EnvironmentSettings:
     """The navigation task."""
 
     robot: str = "turtlebot2"
-    """``turtlebot2``, the paper's, ``kobuki``, ``turtlebot4``, ``burger`` or ``waffle``."""
+    """``turtlebot2``, the paper's, which can neither stop nor reverse; ``kobuki``, the same body
+    with its real wheels, ``turtlebot4``, ``burger`` or ``waffle``."""
     physics: str = "wheels"
     """``wheels``: simulated motors; ``kinematic``: exact arcs, several times faster."""
     max_steps: int = 500
@@ -69,6 +70,7 @@ class EnvironmentSettings:
     filter: float = setting(0.0, between(0.0, 1.0, "from 0 to 1"))
     """Share of the robots whose actions pass the filter that keeps them off what their lidar sees
     (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With
-    some, a policy learns from long drives and from collisions; with 1, it needs the filter."""
+    some, a policy learns from long drives and from collisions; with 1, it needs the filter. DQN and
+    Q learning, which choose among a few actions, have none."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""

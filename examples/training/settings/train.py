@@ -128,7 +128,8 @@ class EvaluationSettings:
     """Actions between two evaluations; 0: none."""
     world: str = "validation"
     """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
-    which nothing may be chosen, are refused with ``choose``. ``same``: where the last stage is."""
+    which nothing may be chosen, are refused with ``choose``. ``same``: where the last stage is; of
+    ``mixed``, in ``mazes``, where policies still differ."""
     episodes: int = setting(20, at_least(1))
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
     choose: bool = False
@@ -262,6 +263,8 @@ class TrainSettings:
 
 SAME = "same"
 """Evaluations in worlds such as those of the training."""
+HARDEST = {"mixed": "mazes"}
+"""Where policies that do well in a mixture of worlds still differ."""
 REGIMES: dict[str, dict[str, Any]] = {
     "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
     "rooms": {
@@ -279,6 +282,11 @@ REGIMES: dict[str, dict[str, Any]] = {
         },
         "exploration": {"random_steps": 2_000, "annealing_steps": 20_000},
         "environment": {
+            # The paper's robot can neither stop nor reverse; its body with its real wheels can.
+            "robot": "kobuki",
+            # Half of the robots drive on where the others collide, and both is to be learned.
+            "filter": 0.5,
+            "step_cost": 0.05,
             "physics": "kinematic",
             "progress": "shortest_path",
             "max_goal_distance": 20.0,
@@ -362,5 +370,6 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
         from mpfa_envs import GENERATORS
 
         last = curriculum.stages[-1].world
-        settings.evaluation.world = f"{last}:validation" if last in GENERATORS else last
+        known = last in GENERATORS
+        settings.evaluation.world = f"{HARDEST.get(last, last)}:validation" if known else last
     return settings

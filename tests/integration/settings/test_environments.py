@@ -131,11 +131,15 @@ def test_the_settings_of_a_run_start_from_the_defaults_of_the_environment() -> N
     training.close()
 
 
+OF_THE_PAPER = {"robot": "turtlebot2", "step_cost": 0.0}
+"""What the ids keep."""
+
+
 @pytest.mark.parametrize(
     ("env_id", "world", "changed"),
     [
         ("mpfa/Navigation-D-v1", "D", {"physics": "kinematic"}),
-        ("mpfa/Rooms-v1", "mixed", REGIMES["rooms"]["environment"]),
+        ("mpfa/Rooms-v1", "mixed", {**REGIMES["rooms"]["environment"], **OF_THE_PAPER}),
     ],
 )
 def test_the_ids_are_the_tasks_that_the_regimes_learn(

@@ -108,7 +108,7 @@ def test_a_run_is_called_after_the_stages_that_it_has(arguments: list[str], name
 @pytest.mark.parametrize(
     ("arguments", "world"),
     [
-        ([], "mixed:validation"),
+        ([], "mazes:validation"),
         (
             ["curriculum.stages=[{world: A, actions: 5},{world: crowd, actions: 5}]"],
             "crowd:validation",

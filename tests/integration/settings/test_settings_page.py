@@ -15,7 +15,7 @@ def test_the_page_has_every_setting_with_the_defaults_that_hold_in_each_regime()
     for row in (
         "| `robots` | **`16`** | **`1`** |",
         "| `learner.tau` | **`0.005`** | **`0.01`** |",
-        "| `evaluation.world` | **`mixed:validation`** | **`validation`** |",
+        "| `evaluation.world` | **`mazes:validation`** | **`validation`** |",
         "| `method.alpha` | `0.6` | `0.6` |",
     ):
         assert row in PAGE
