@@ -60,8 +60,8 @@ demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unse
 	@echo "== training $(DEMO_ACTIONS) actions in rooms that are new each episode; Ctrl-C stops and saves"
 	$(BIN)/python examples/train.py run_dir=runs/demo overwrite=true tracking=off 'curriculum.stages=[{world: mixed, actions: $(DEMO_ACTIONS)}]' $(ARGS)
 	@echo "== driving through test worlds of every generator"
-	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED)
-	@cd runs/demo/evaluation-all-$(EVALUATED) && cp evaluation.json trajectories.png episode.gif ..
+	$(BIN)/python examples/evaluate.py runs/demo --worlds all --episodes $(EPISODES) --physics $(EVALUATED) --filter
+	@cd runs/demo/evaluation-all-$(EVALUATED)-filter && cp evaluation.json trajectories.png episode.gif ..
 	@echo "written: runs/demo/evaluation.json, trajectories.png, episode.gif"
 
 train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)

@@ -208,7 +208,7 @@ def test_a_policy_of_the_package_is_found_by_its_name_unless_there_is_such_a_run
     with pytest.raises(FileNotFoundError, match="those that come with the package are ddpg-"):
         load_policy("td3-rooms")
     save_policy(load_policy("td3-paper"), "td3-rooms")
-    assert shipped.observation_size == 27
+    assert shipped.observation_size == 45
     assert load_policy("td3-rooms").observation_size == 24
 
 
