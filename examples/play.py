@@ -5,9 +5,9 @@
     python examples/play.py --worlds D --speed 2           twice as fast as real time
 
 Drive with the arrow keys or WASD: up is full speed ahead, left and right turn, both together make
-a curve. Without a key the robot drives on at its lowest speed, as it cannot stop. Your robot is
-black, with its lidar; the policy's is vermilion; they pass through each other. N starts the next
-room, Escape ends. It needs pygame (extra ``live``).
+a curve. Without a key the robot stands, and down reverses; the paper's robot, which can do neither,
+drives on at its lowest speed. Your robot is black, with its lidar; the policy's is vermilion; they
+pass through each other. N starts the next room, Escape ends. It needs pygame (extra ``live``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from mpfa_envs import POLICIES, NavigationEnv, Policy, WorldTask, load_policy
+from mpfa_envs import POLICIES, NavigationEnv, Policy, RobotModel, WorldTask, load_policy
 from mpfa_envs.scene.scene import render_scene
 from mpfa_envs.scene.window import Window
 from training.evaluating import tasks_of
@@ -35,23 +35,31 @@ _PAUSE = 2.0
 Winner = Literal["you", "policy", "nobody"]
 
 
-def action_of(keys: Iterable[str]) -> NDArray[np.float32]:
+def action_of(keys: Iterable[str], robot: RobotModel) -> NDArray[np.float32]:
     """The action of some held keys.
 
     Args:
         keys: Their names.
+        robot: What they drive.
 
     Returns:
         Speeds of the left and the right wheel, ``[2]``, in [-1, 1].
     """
     held = {LETTERS.get(key, key) for key in keys}
-    ahead = 1.0 if "up" in held else -1.0
     turn = ("right" in held) - ("left" in held)
+    slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
+    rest = -(fast + slow) / (fast - slow) if robot.can_stop else -1.0
     if not turn:
+        ahead = 1.0 if "up" in held else -1.0 if "down" in held else rest
         return np.array([ahead, ahead], dtype=np.float32)
-    # Ahead and a turn is a wide curve; a turn alone is as narrow as it can be.
-    slower = 0.3 if "up" in held else -1.0
-    return np.array([1.0, slower] if turn > 0 else [slower, 1.0], dtype=np.float32)
+    if "up" in held:
+        outer, inner = 1.0, 0.3
+    elif robot.can_stop:
+        outer, inner = rest + 0.3, rest - 0.3
+    else:
+        # As narrow as it can be.
+        outer, inner = 1.0, -1.0
+    return np.array([outer, inner] if turn > 0 else [inner, outer], dtype=np.float32)
 
 
 class Racer:
@@ -104,7 +112,7 @@ def race(policy: Policy, episode: WorldTask, window: Window, **env_arguments: An
         while you.running or rival.running:
             if not window.show(picture_of(you, rival)) or "n" in window.pressed:
                 return None
-            you.drive(action_of(window.keys))
+            you.drive(action_of(window.keys, you.env.config.robot))
             rival.drive(policy(rival.observation))
             # Whoever arrives ends the race for the other, unless both do in this step.
             if min(you.arrival, rival.arrival) < math.inf:

@@ -13,6 +13,7 @@ import evaluate
 import play
 from mpfa_envs import Policy, world_tasks
 from mpfa_envs.policies.layers import Linear
+from mpfa_envs.robots.model import ROBOTS
 from mpfa_envs.scene.colors import RIVAL, ROBOT
 from training.live import watch
 
@@ -77,19 +78,31 @@ def test_both_robots_are_drawn() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "action"),
+    ("robot", "keys", "action"),
     [
-        ([], (-1.0, -1.0)),
-        (["up"], (1.0, 1.0)),
-        (["w"], (1.0, 1.0)),
-        (["left"], (-1.0, 1.0)),
-        (["d"], (1.0, -1.0)),
-        (["up", "left"], (0.3, 1.0)),
-        (["up", "left", "right"], (1.0, 1.0)),
+        ("turtlebot2", [], (-1.0, -1.0)),
+        ("turtlebot2", ["up"], (1.0, 1.0)),
+        ("turtlebot2", ["w"], (1.0, 1.0)),
+        ("turtlebot2", ["left"], (-1.0, 1.0)),
+        ("turtlebot2", ["d"], (1.0, -1.0)),
+        ("turtlebot2", ["up", "left"], (0.3, 1.0)),
+        ("turtlebot2", ["up", "left", "right"], (1.0, 1.0)),
+        ("kobuki", [], (0.0, 0.0)),
+        ("kobuki", ["s"], (-1.0, -1.0)),
+        ("kobuki", ["left"], (-0.3, 0.3)),
+        ("kobuki", ["up", "right"], (1.0, 0.3)),
     ],
 )
-def test_keys_are_wheel_speeds(keys: list[str], action: tuple[float, float]) -> None:
-    assert play.action_of(keys) == pytest.approx(action)
+def test_keys_are_wheel_speeds(robot: str, keys: list[str], action: tuple[float, float]) -> None:
+    assert play.action_of(keys, ROBOTS[robot]) == pytest.approx(action)
+
+
+def test_without_a_key_a_robot_that_can_stop_stands() -> None:
+    racer = play.Racer(straight_task(), robot="kobuki", physics="kinematic")
+    start = racer.pose
+    for _ in range(5):
+        racer.drive(play.action_of([], racer.env.config.robot))
+    assert racer.pose == start
 
 
 def test_a_player_may_leave(capsys: pytest.CaptureFixture[str]) -> None:
