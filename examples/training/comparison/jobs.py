@@ -45,6 +45,8 @@ class Evaluation:
     """Pairs of start and goal in each of them."""
     physics: str | None = None
     """``wheels`` or ``kinematic``; None: as trained."""
+    filtered: bool = False
+    """Whether actions pass the filter."""
 
 
 TESTED = Evaluation(("test",), 200)
@@ -104,6 +106,7 @@ class Job:
             *(str(SCRIPTS / "evaluate.py"), str(self.path)),
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
             *(["--physics", wanted.physics] if wanted.physics else []),
+            *(["--filter"] if wanted.filtered else []),
         ]
 
     def physics(self, wanted: Evaluation) -> str:
@@ -115,7 +118,9 @@ class Job:
 
     def results(self, wanted: Evaluation) -> Path:
         """Folder of its evaluation."""
-        return self.path / evaluation_folder(wanted.words, self.physics(wanted))
+        return self.path / evaluation_folder(
+            wanted.words, self.physics(wanted), filtered=wanted.filtered
+        )
 
     def status(self) -> Mapping[str, Any]:
         """How far it says that it is; nothing before its first episode."""
@@ -134,6 +139,7 @@ class Job:
             and found.get("episodes") == wanted.episodes
             and found.get("words") == list(wanted.words)
             and found.get("physics") == self.physics(wanted)
+            and ("filter" in found) == wanted.filtered
             # A comparison drives the pairs of the first seed, and robots without errors.
             and found.get("seed", 0) == 0
             and found.get("noise") is None
@@ -180,6 +186,8 @@ class Comparison:
             words += ["--episodes", str(self.evaluation.episodes)]
         if self.evaluation.physics is not None:
             words += ["--physics", self.evaluation.physics]
+        if self.evaluation.filtered:
+            words += ["--filter"]
         return [*words, "--", *self.settings]
 
     @property
@@ -249,6 +257,7 @@ def collect(jobs: Sequence[Job], wanted: Evaluation, folder: Path) -> None:
         "worlds": wanted.words,
         "episodes": wanted.episodes,
         "physics": wanted.physics,
+        "filter": wanted.filtered,
         "runs": settings,
     }
     write_text_atomically(json.dumps(document, indent=2) + "\n", folder / files.SETTINGS)

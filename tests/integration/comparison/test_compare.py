@@ -144,7 +144,7 @@ def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_comparison_is_evaluated_again_in_other_physics_and_trains_nothing_for_it(
+def test_a_comparison_is_evaluated_again_on_wheels_and_filtered_and_trains_nothing_for_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plain = comparison(tmp_path, methods=("per",))
@@ -159,9 +159,14 @@ def test_a_comparison_is_evaluated_again_in_other_physics_and_trains_nothing_for
     assert not found["path_length"].equals(as_trained["path_length"])
     assert json.loads((tmp_path / files.SETTINGS).read_text())["physics"] == "wheels"
     assert checkpoint.stat().st_mtime_ns == before
-    # Both stay where they are: either can be asked for again.
+    filtered = comparison(tmp_path, "--physics", "wheels", "--filter", methods=("per",))
+    assert compare.main(filtered) == 0
+    assert not read_table(tmp_path / files.EPISODES)["path_length"].equals(found["path_length"])
+    assert json.loads((tmp_path / files.SETTINGS).read_text())["filter"] is True
+    assert checkpoint.stat().st_mtime_ns == before
+    # All stay where they are: each can be asked for again.
     capsys.readouterr()
-    for arguments in (plain, on_wheels):
+    for arguments in (plain, on_wheels, filtered):
         assert compare.main(arguments) == 0
         assert "1 runs, 1 of them done" in capsys.readouterr().out
 
