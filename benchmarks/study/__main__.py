@@ -14,6 +14,7 @@ COMMANDS = {
     "report": ("report", "make the pages and figures of the tables"),
     "statistics": ("statistics", "make every statistic of comparisons by compare.py"),
     "paper": ("paper_report", "make the paper's figures and tables"),
+    "drivers": ("drivers", "compare learned policies with planners, by their evaluations"),
     "strength": ("strength", "measure how strongly methods prioritize"),
     "cliffwalk": ("cliffwalk", "count updates to convergence on the blind cliffwalk"),
     "sampling": ("sampling", "plot how often each method samples which transitions"),
