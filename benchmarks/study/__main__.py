@@ -9,7 +9,7 @@ from importlib import import_module
 import training.extra  # noqa: F401
 
 COMMANDS = {
-    "run": ("run", "train and evaluate the runs of tables A to E"),
+    "run": ("run", "train and evaluate the runs of tables A to D"),
     "gym": ("gym.script", "train the runs of table F, on Gymnasium tasks"),
     "report": ("report", "make the pages and figures of the tables"),
     "statistics": ("statistics", "make every statistic of comparisons by compare.py"),

@@ -3,8 +3,8 @@
     python -m benchmarks.study drivers runs/drivers --keep docs/results/rooms/drivers.csv
     python -m benchmarks.study drivers docs/results/rooms/drivers.csv    the tables of kept rows
 
-Takes what ``compare.py`` and ``evaluate.py`` wrote in the folder, however deep. A row is a driver, a
-seed and a kind of worlds.
+Takes what ``compare.py`` and ``evaluate.py`` wrote in the folder, however deep. A row is a driver,
+a seed and a kind of worlds.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from benchmarks.study.intervals import (
     resampled_means,
     widened_ends,
 )
-from benchmarks.study.protocol import HEIGHT, KEY, OF_VOLUMES, VOLUMES, Table, short_names
+from benchmarks.study.protocol import HEIGHT, KEY, OF_VOLUMES, Table, short_names
 from benchmarks.study.rows import Rows, by_run, scores_of
 from benchmarks.study.tables import FEWEST, MEASURES
 from mpfa_envs.render.charts import finish, look, new_figure
@@ -30,8 +30,6 @@ _SIZE = (3.6, 2.8)
 _SMALL = (2.4, 2.0)
 """Of one of three side by side [inch]."""
 _DPI = 160
-_VOLUMES = (*(("sparse", volume) for volume in VOLUMES), ("dense", 32), ("dense", 256))
-"""Columns of the picture of replay volumes: reward and volume."""
 _SPREAD = 4
 """An arm with fewer runs has no distribution to be seen."""
 _GRAY = {"color": "0.5", "linestyle": "-"}
@@ -186,12 +184,12 @@ def plot_arms(table: Table, scores: Mapping[str, pd.DataFrame], path: Path) -> N
 
 def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
     """Plot the area by replay volume and method, colored by the difference from uniform replay."""
-    gaps: dict[tuple[str, int], dict[str, tuple[float, str]]] = {}
-    for reward, volume in _VOLUMES:
+    gaps: dict[int, dict[str, tuple[float, str]]] = {}
+    for volume, of_volume in OF_VOLUMES.items():
         suffix = "" if volume == 32 else f"/v{volume}"
-        uniform = scores.get(f"{reward}/td3/uniform{suffix}", pd.DataFrame({"area": []}))["area"]
-        for method in OF_VOLUMES:
-            runs = scores.get(f"{reward}/td3/{method}{suffix}", uniform[:0].to_frame())["area"]
+        uniform = scores.get(f"sparse/td3/uniform{suffix}", pd.DataFrame({"area": []}))["area"]
+        for method in of_volume:
+            runs = scores.get(f"sparse/td3/{method}{suffix}", uniform[:0].to_frame())["area"]
             # Of the same seeds, as in the tables; one run shows nothing.
             shared = (runs - uniform).dropna()
             if len(shared) > 1:
@@ -199,29 +197,22 @@ def plot_volumes(scores: Mapping[str, pd.DataFrame], path: Path) -> None:
                 # No minus before what is nothing when rounded.
                 text += f", {round(shared.mean(), 2) + 0.0:+.2f}" if method != "uniform" else ""
                 cell = shared.mean(), f"{text}\n{len(runs)} runs"
-                gaps.setdefault((reward, volume), {})[method] = cell
-    methods = [name for name in OF_VOLUMES if any(name in cells for cells in gaps.values())]
-    rewards = list(dict.fromkeys(reward for reward, _ in gaps))
-    widths = [sum(each == reward for each, _ in gaps) for reward in rewards]
-    how: dict[str, Any] = {"width_ratios": widths, "squeeze": False}
-    panel = 7.2 / len(rewards), 0.5 * len(methods) + 1.2
-    figure, axes = new_figure(1, len(rewards), panel=panel, **how)
-    for axis, reward in zip(axes, rewards, strict=True):
-        volumes = [volume for each, volume in gaps if each == reward]
-        found = np.full((len(methods), len(volumes)), np.nan)
-        for column, volume in enumerate(volumes):
-            for name, (gap, text) in gaps[reward, volume].items():
-                found[methods.index(name), column] = gap
-                color = "white" if abs(gap) > 0.14 else "black"
-                where = column, methods.index(name)
-                axis.text(*where, text, ha="center", va="center", color=color, fontsize="small")
-        axis.set_facecolor("0.85")  # of cells without runs
-        image = axis.imshow(found, cmap="RdBu", vmin=-0.2, vmax=0.2, aspect="auto")
-        axis.set_xticks(range(len(volumes)), [str(volume) for volume in volumes])
-        axis.set_yticks(range(len(methods)) if axis is axes[0] else [])
-        axis.set(xlabel="replay volume", title=f"{reward} reward")
-    axes[0].set_yticklabels(methods)
-    figure.colorbar(image, ax=axes, label="minus that of uniform replay")
+                gaps.setdefault(volume, {})[method] = cell
+    named = [name for name in OF_VOLUMES[32] if any(name in cells for cells in gaps.values())]
+    found = np.full((len(named), len(gaps)), np.nan)
+    figure, (axis,) = new_figure(1, 1, panel=(7.2, 0.5 * len(named) + 1.2))
+    for column, cells in enumerate(gaps.values()):
+        for name, (gap, text) in cells.items():
+            row = named.index(name)
+            found[row, column] = gap
+            color = "white" if abs(gap) > 0.14 else "black"
+            axis.text(column, row, text, ha="center", va="center", color=color, fontsize="small")
+    axis.set_facecolor("0.85")  # of cells without runs
+    image = axis.imshow(found, cmap="RdBu", vmin=-0.2, vmax=0.2, aspect="auto")
+    axis.set_xticks(range(len(gaps)), [str(volume) for volume in gaps])
+    axis.set_yticks(range(len(named)), named)
+    axis.set(xlabel="replay volume", title="sparse reward")
+    figure.colorbar(image, ax=axis, label="minus that of uniform replay")
     figure.suptitle(MEASURES["area"].format(height=HEIGHT), fontsize="medium")
     finish(figure, [], path, dpi=_DPI)
 

@@ -1,6 +1,6 @@
-"""The study as data: tables A to E, each a question, its runs, and what is compared in it.
+"""The study as data: tables A to D, each a question, its runs, and what is compared in it.
 
-Table F, off navigation, is in ``gym/table.py``.
+Table F, off navigation, is in ``gym/table.py``, table G, value learning, in ``benchmarks/values``.
 
 Arms that two tables have in common are trained once: runs with the same task and settings have one
 folder, whatever table asks for them. Settings were chosen with seeds from 1000 on and validation
@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks.study.paper import NAMES, TABLE_2, TABLE_4, Tested, comparisons
 from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods.catalogue import ALIASES
-from training.comparison.arms import Arm
+from training.comparison.arms import PLAIN, Arm
 from training.comparison.jobs import TESTED, Comparison, Evaluation, Job
 
 ROOT = Path("runs/study")
@@ -66,7 +66,15 @@ TEST = Evaluation(tuple(f"{name}:test" for name in GENERATORS), 20, "wheels")
 """What last policies are asked to do."""
 
 KEY = ("uniform", "per", "mpfa_per", "mpf_per", "mpfa_plus", "lap", "la3p", "uniform_halves")
-OF_VOLUMES = ("uniform", "per", "mpfa_per", "mpfa_plus", "lap", "geometric")
+FULL = ("uniform", "per", "mpfa_per", "mpf_per", "mpfa_plus", "lap", "pal")
+"""Methods that have twenty seeds with sparse rewards."""
+OF_VOLUMES = {
+    8: ("uniform", "per", "mpfa_per"),
+    32: ("uniform", "per", "mpfa_per", "mpfa_plus", "lap", "geometric"),
+    128: ("uniform", "per", "mpfa_per", "mpfa_plus", "lap", "geometric"),
+    256: ("uniform", "per", "mpfa_per", "mpfa_plus"),
+}
+"""Methods by replay volume."""
 EVERY = tuple(name for name in METHODS if name not in ALIASES.values())
 """Every method of the catalogue by the name that fits all learners."""
 
@@ -80,33 +88,6 @@ LETTER = Arm(
 ONE_ROBOT = Arm("one_robot", ("robots=1", "updates=1"))
 UNSEEN = Evaluation(("rooms:100-109", "bars:test"), 40)
 """Where the policies of table A are tested beside the test world."""
-
-PARTS = (
-    Arm("reward", ("method.signals=[reward]",)),
-    Arm("td_error", ("method.signals=[td_error]",)),
-    Arm("gradient", ("method.signals=[action_gradient]",)),
-    Arm("reward+td_error", ("method.signals=[reward,td_error]",)),
-    Arm("reward+gradient", ("method.signals=[reward,action_gradient]",)),
-    Arm("td_error+gradient", ("method.signals=[td_error,action_gradient]",)),
-    Arm("equal_weights", ("method.fusion=fixed",)),
-    Arm("equal_shares", ("method.fusion=scaled",)),
-    Arm("no_boost", ("method.boost=false",)),
-    Arm("no_decay", ("method.decay=false",)),
-    Arm("phi2", ("method.boost_factor=2",)),
-    Arm("phi4", ("method.boost_factor=4",)),
-    Arm("alpha0.4", ("method.alpha=0.4",)),
-    Arm("alpha0.8", ("method.alpha=0.8",)),
-    Arm("beta1", ("method.beta=1",)),
-    # Readings: the population of Eqs. 16-17, what is positive in Eqs. 17 and 22-24, the 1 of
-    # Eq. 22, and j of Eq. 23.
-    Arm("eq16_batch", ("method.population=batch",)),
-    Arm("eq17_mean", ("method.positive_above=mean",)),
-    Arm("eq22_cap", ("method.boost_bound=cap",)),
-    Arm("eq22_none", ("method.boost_bound=none",)),
-    Arm("eq23_rank", ("method.decay_position=rank",)),
-    Arm("eq23_count", ("method.decay_position=count",)),
-)
-"""MPFA-PER with one thing changed."""
 
 MEDIAN = Arm("median", ("method.floor_quantile=0.5",))
 """LAP whose floor is the median of the TD errors: it was added once LAP as published had lost."""
@@ -183,11 +164,11 @@ def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
 
     Examples:
         >>> [len(table.comparisons) for table in tables(Path("runs/study")).values()]
-        [3, 4, 2, 8, 1]
+        [4, 6, 8, 1]
     """
     if most is not None and most < 1:
         raise ValueError(f"most must be at least 1, got {most}")
-    made = (_table_c(root), _table_d(root), _table_e(root), _table_a(root), _table_b(root))
+    made = (_table_c(root), _table_d(root), _table_a(root), _table_b(root))
     return {table.name: _at_most(table, most) for table in made}
 
 
@@ -234,12 +215,14 @@ def _table_c(root: Path) -> Table:
         if a not in ("uniform", "per") and not {(a, b), (b, a)} & planned
     ]
     rest = [name for name in EVERY if name not in KEY]
+    few = tuple(name for name in EVERY if name not in FULL)
     return Table(
         "C",
         "Sparse reward: does any priority learn faster than uniform replay, and MPFA-PER than PER?",
         (
-            Comparison(folder, EVERY, SPARSE, seeds, ("td3",), evaluation=TEST),
-            Comparison(folder, KEY, SPARSE, seeds, ("ddpg",), evaluation=TEST),
+            Comparison(folder, FULL, SPARSE, seeds, ("td3",), evaluation=TEST),
+            Comparison(folder, few, SPARSE, _seeds(10), ("td3",), evaluation=TEST),
+            Comparison(folder, KEY, SPARSE, _seeds(10), ("ddpg",), evaluation=TEST),
             Comparison(folder, ("lap",), SPARSE, seeds, ("td3",), (MEDIAN,), TEST),
         ),
         _pairs("sparse/td3", *_SIX),
@@ -265,54 +248,37 @@ def _table_c(root: Path) -> Table:
 
 
 def _table_d(root: Path) -> Table:
-    arms = {v: Arm(f"v{v}", settings) for v, settings in VOLUMES.items() if v != 32}
-    sparse, dense = root / "sparse", root / "dense"
-    where = {
-        f"{reward}, volume {volume}": (f"{reward}/td3", "" if volume == 32 else f"/v{volume}")
-        for reward, volumes in (("sparse", VOLUMES), ("dense", (32, 256)))
-        for volume in volumes
-    }
-    more = ("mpfa_plus-uniform", "lap-uniform", "geometric-uniform")
+    folder, at = root / "sparse", "sparse/td3"
+
+    def of(volume: int, methods: Sequence[str], seeds: int) -> Comparison:
+        arms = (PLAIN,) if volume == 32 else (Arm(f"v{volume}", VOLUMES[volume]),)
+        return Comparison(folder, tuple(methods), SPARSE, _seeds(seeds), ("td3",), arms, TEST)
+
+    ends = {volume: "" if volume == 32 else f"/v{volume}" for volume in OF_VOLUMES}
+    first = OF_VOLUMES[8]
     return Table(
         "D",
         "Replay volume: how often must transitions be replayed for priorities to pay?",
         (
-            Comparison(sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), evaluation=TEST),
-            Comparison(
-                sparse, OF_VOLUMES, SPARSE, _seeds(20), ("td3",), tuple(arms.values()), TEST
-            ),
-            Comparison(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), evaluation=TEST),
-            Comparison(dense, OF_VOLUMES, DENSE, _seeds(10), ("td3",), (arms[256],), TEST),
+            of(8, first, 20),
+            of(32, OF_VOLUMES[32][:-1], 20),
+            of(32, OF_VOLUMES[32][-1:], 10),
+            of(128, first, 20),
+            of(128, OF_VOLUMES[128][len(first) :], 10),
+            of(256, OF_VOLUMES[256], 10),
         ),
-        # Those of volume 32 are in tables C and B, and corrected there.
-        tuple(pair for at, end in where.values() if end for pair in _pairs(at, *_FIVE, suffix=end)),
+        # Those of volume 32 are in table C, and corrected there.
         (
-            *(p for at, end in where.values() if end for p in _pairs(at, *more, suffix=end)),
-            *_pairs("dense/td3", "geometric-uniform"),
+            *_pairs(at, *_FIVE[:3], suffix=ends[8]),
+            *(pair for volume in (128, 256) for pair in _pairs(at, *_FIVE, suffix=ends[volume])),
         ),
-        {title: _arms(at, *OF_VOLUMES, suffix=end) for title, (at, end) in where.items()},
-    )
-
-
-def _table_e(root: Path) -> Table:
-    folder, seeds = root / "sparse", _seeds(20)
-    whole = "sparse/td3/mpfa_per"
-    methods = ("mpfa_per", "mpf_per", "mpfa_adaptive")
-    parts = [f"{whole}/{arm.name}" for arm in PARTS]
-    others = _arms("sparse/td3", *methods[1:])
-    return Table(
-        "E",
-        "Which part of MPFA-PER does it?",
         (
-            Comparison(folder, methods, SPARSE, seeds, ("td3",), evaluation=TEST),
-            Comparison(folder, ("mpfa_per",), SPARSE, seeds, ("td3",), PARTS, TEST),
+            *_pairs(at, "mpfa_plus-uniform", "lap-uniform", "geometric-uniform", suffix=ends[128]),
+            *_pairs(at, "mpfa_plus-uniform", suffix=ends[256]),
         ),
-        tuple((other, whole) for other in (*parts, *others)),
-        (),
         {
-            "signals and weights": (whole, *parts[:8]),
-            "boost, decay, exponents": (whole, *parts[8:15], *others),
-            "readings": (whole, *parts[15:]),
+            f"sparse, volume {volume}": _arms(at, *methods, suffix=ends[volume])
+            for volume, methods in OF_VOLUMES.items()
         },
     )
 

@@ -9,7 +9,7 @@
 
 Every run is made as by ``compare.py`` with the commands that ``--list`` shows. What is trained and
 evaluated is left alone; Ctrl-C saves what is in progress, and the same command continues it. Tables
-A to E are in ``benchmarks/study/protocol.py``, with one folder per task in ``--folder``; table F,
+A to D are in ``benchmarks/study/protocol.py``, with one folder per task in ``--folder``; table F,
 which is not about navigation, is made by ``python -m benchmarks.study gym``. The checkpoint of a
 finished run is removed: thousands of them take tens of gigabytes.
 """

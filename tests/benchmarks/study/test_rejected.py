@@ -21,7 +21,7 @@ GYM = "--tasks Pendulum-v1"
 @pytest.mark.parametrize(
     ("main", "line", "message"),
     [
-        (run.main, "Z", "there is no table Z; there are: C, D, E, A, B"),
+        (run.main, "Z", "there is no table Z; there are: C, D, A, B"),
         (run.main, "--seeds 0", "--seeds must be at least 1, got 0"),
         (run.main, "--jobs 0", "--jobs must be at least 1, got 0"),
         (run.main, "--kept new", "new: no rows of the study are there, which --keep writes"),

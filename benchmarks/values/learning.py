@@ -1,0 +1,239 @@
+"""Value learning: critics from scratch on a frozen buffer, and how near they come to the values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from benchmarks.values.frozen import FrozenBuffer
+from torchrl_mpfa import run_updates
+from torchrl_mpfa.learners import ActorCriticLearner
+from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
+from torchrl_mpfa.selection import SampledBatch
+from torchrl_mpfa.signals import SIGNALS_KEY
+from training.run.assembly import make_learner
+
+BATCH = 256
+MARKS = (160, 400, 800, 1_600)
+"""Updates after which critics are looked at: a tenth, a quarter, half and all."""
+_TOGETHER = 2
+"""Updates whose batches are sampled together, as in the study."""
+_EPISODE = 4
+"""Updates for each episode of a run that ends, for what changes with episodes."""
+GOAL = 5.0
+"""A reward above this is that of a goal."""
+
+SignalFunction = Callable[[ActorCriticLearner, TensorDictBase], Tensor]
+"""From a learner and a batch to a signal, shape ``[B]``."""
+ReplayFunction = Callable[[FrozenBuffer, torch.Generator], Replay]
+"""Makes an empty replay of one's own for the transitions of a buffer."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Critics after so many updates."""
+
+    buffer: str
+    method: str
+    seed: int
+    updates: int
+    rmse: float
+    """Root of the mean square difference to the values of long training, in units of reward."""
+    bias: float
+    """Its mean."""
+    rank: float
+    """Rank correlation with them."""
+    returns_rmse: float
+    """The same three, against the Monte Carlo returns of the policy."""
+    returns_bias: float
+    returns_rank: float
+    effective: float
+    """Effective sample size of what was drawn so far, as a share of the buffer."""
+    goals: float
+    """Share of the drawn transitions that reached a goal."""
+
+
+class Draws:
+    """What was drawn from a buffer of ``size`` transitions, of which some reached a goal."""
+
+    def __init__(self, goal: Tensor) -> None:
+        self._goal = goal
+        self._counts = torch.zeros(len(goal), dtype=torch.double)
+
+    def __call__(self, draw: SampledBatch) -> SampledBatch:
+        """Count a batch that the critics learn from."""
+        if draw.gives_signals:
+            index = draw.batch["index"]
+            self._counts.index_add_(0, index, torch.ones(len(index), dtype=torch.double))
+        return draw
+
+    @property
+    def effective(self) -> float:
+        """Effective sample size, 1 / sum of P(i) squared, as a share of the buffer.
+
+        The sum is the chance that two draws are of the same transition, estimated without bias.
+        """
+        count, total = self._counts, self._counts.sum()
+        same = (count * (count - 1)).sum() / (total * (total - 1))
+        return float(1 / (same * len(count)))
+
+    @property
+    def goals(self) -> float:
+        """Share of the draws that reached a goal."""
+        return float(self._counts[self._goal].sum() / self._counts.sum())
+
+
+class FrozenPolicyLearner:
+    """A learner whose critics learn the values of a policy that does not change.
+
+    Args:
+        learner: With networks from scratch.
+        policy: Weights of its actor, from now on.
+        signals: What is written in a batch, by name, before the critics learn from it.
+    """
+
+    def __init__(
+        self,
+        learner: ActorCriticLearner,
+        policy: Mapping[str, Tensor],
+        signals: Mapping[str, SignalFunction] | None = None,
+    ) -> None:
+        self._learner, self._signals = learner, signals or {}
+        self.policy = learner.policy
+        for name in ("actor_network_params", "target_actor_network_params"):
+            weights = getattr(learner.loss, name).flatten_keys(".")
+            for key, value in policy.items():
+                weights[key].data.copy_(value)
+
+    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+        """One step of the critics, and of the targets when they are due."""
+        if not isinstance(draw, SampledBatch):
+            draw = SampledBatch(draw)
+        learner, log = self._learner, {}
+        if draw.trains == "actor":
+            learner.updates += draw.new_step
+        else:
+            for name, signal in self._signals.items():
+                draw.batch[SIGNALS_KEY, name] = signal(learner, draw.batch)
+            log = learner.update(replace(draw, trains="critic"))
+        # Of a learner they move with the actor, which is not asked to learn.
+        if draw.trains != "critic" and learner.updates % learner.policy_delay == 0:
+            learner.targets.step()
+        return log
+
+    def values(self, rows: TensorDictBase) -> Tensor:
+        """Mean of the critics' Q in units of the reward, shape ``[N]``."""
+        return critic_values(self._learner, rows).mean(0)
+
+    def end_episode(self) -> None:
+        """Take note that an episode has ended."""
+        self._learner.end_episode()
+
+    def anneal(self, factor: float) -> None:
+        """Set the learning rates to a fraction of their first values."""
+        self._learner.anneal(factor)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next update depends on."""
+        return self._learner.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self._learner.load_state_dict(state_dict)
+
+
+def make_frozen_learner(
+    buffer: FrozenBuffer,
+    method: Method,
+    seed: int,
+    signals: Mapping[str, SignalFunction] | None = None,
+    *,
+    compile: bool = False,
+) -> FrozenPolicyLearner:
+    """Critics from scratch for the policy of a buffer; they write the signals of a method."""
+    torch.manual_seed(seed)
+    known = [name for name in method.signals if name not in (signals or {})]
+    sizes = (buffer.rows[name].shape[-1] for name in ("observation", "action"))
+    learner = make_learner(buffer.learner, replace(method, signals=known), *sizes, compile=compile)
+    assert isinstance(learner, ActorCriticLearner)
+    return FrozenPolicyLearner(learner, buffer.policy, signals)
+
+
+def critic_values(learner: ActorCriticLearner, rows: TensorDictBase) -> Tensor:
+    """Q of each critic in units of the reward, shape ``[C, B]``: a signal may be made of it."""
+    loss: Any = learner.loss
+    asked = {"observation": rows["observation"], "action": rows["action"]}
+    with torch.no_grad():
+        found = [each.outputs(asked)["state_action_value"] for each in loss.current_critics()]
+    return torch.stack(found).squeeze(-1) / loss.reward_scale
+
+
+def learn(
+    buffer: FrozenBuffer,
+    method: str | Method | ReplayFunction,
+    seed: int,
+    *,
+    signals: Mapping[str, SignalFunction] | None = None,
+    marks: tuple[int, ...] = MARKS,
+    compile: bool = False,
+) -> Iterator[Measure]:
+    """Learn the values of a buffer's policy with one method and seed.
+
+    Args:
+        buffer: The buffer.
+        method: A name out of :data:`~torchrl_mpfa.methods.METHODS`, settings of your own, or what
+            makes a replay of your own.
+        seed: Of the critics' first weights and of what is drawn.
+        signals: Functions of your own that write the signals of a method.
+        marks: Even numbers of updates after which the critics are looked at.
+        compile: Make one program of an update: it takes half a minute once, then half of the time.
+
+    Yields:
+        What they had learned then.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    if isinstance(method, str):
+        method = METHODS[method]
+    if isinstance(method, Method):
+        learner = make_frozen_learner(buffer, method, seed, signals, compile=compile)
+        replay = make_replay(
+            method,
+            capacity=len(buffer),
+            batch_size=BATCH,
+            generator=generator,
+            policy=learner.policy,
+            sigma=float(buffer.rows["behavior_sigma"].mean()),
+        )
+    else:
+        replay = method(buffer, generator)
+        learner = make_frozen_learner(buffer, replay.method, seed, signals, compile=compile)
+    replay.buffer.extend(buffer.rows)
+    draws = Draws(buffer.rows["next", "reward"].squeeze(-1) > GOAL)
+    for done in range(_TOGETHER, marks[-1] + 1, _TOGETHER):
+        run_updates(replay.buffer, learner, replay.select, updates=_TOGETHER, prepare=draws)
+        replay.anneal(done / marks[-1])
+        if done % _EPISODE == 0:
+            learner.end_episode()
+        if done in marks:
+            yield Measure(
+                buffer.name,
+                replay.method.name,
+                seed,
+                done,
+                *compared(learner.values(buffer.rows), buffer.value),
+                *compared(learner.values(buffer.returns), buffer.returns["value"]),
+                draws.effective,
+                draws.goals,
+            )
+
+
+def compared(value: Tensor, reference: Tensor) -> tuple[float, float, float]:
+    """Root mean square difference, mean difference and rank correlation of two, shape ``[N]``."""
+    error = (value - reference).double()
+    ranks = torch.stack([each.argsort().argsort().double() for each in (value, reference)])
+    return float(error.square().mean().sqrt()), float(error.mean()), float(ranks.corrcoef()[0, 1])

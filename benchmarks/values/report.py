@@ -1,0 +1,209 @@
+"""Table G as a page and two figures, from the rows of its trainings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.study.intervals import t_interval
+from benchmarks.study.permutation import holm
+from benchmarks.values.arms import AGAINST, ARMS, LEFT_OUT, PLANNED
+from benchmarks.values.frozen import FrozenBuffer
+from benchmarks.values.learning import compared
+from benchmarks.values.statistics import RANKS, differences, paired
+from mpfa_envs.render.charts import finish, look, new_figure
+from torchrl_mpfa.saving import write_text_atomically
+from training.comparison.report import table
+
+SHOWN = ("uniform", "mpf_per", "mpfa_per", "mpfa_plus", "mixture", "lap")
+"""Arms whose curves are shown."""
+_DPI = 160
+
+
+def write_report(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer], folder: Path) -> list[Path]:
+    """Write ``G.md``, ``G_curves.png`` and ``G_arms.png``."""
+    found = [folder / name for name in ("G.md", "G_curves.png", "G_arms.png")]
+    write_text_atomically(page(rows, buffers), found[0])
+    plot_curves(rows, found[1])
+    plot_arms(rows, found[2])
+    return found
+
+
+def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
+    """The tables, in Markdown."""
+    seeds = rows.groupby(["buffer", "method"])["seed"].nunique()
+    parts = [
+        "# Table G: which replay learns values sooner?",
+        f"{rows['buffer'].nunique()} buffers, {seeds.min()} to {seeds.max()} seeds in each. "
+        f"Differences to `{AGAINST}`, of the same buffers and seeds, with 95 % intervals over "
+        "buffers; RMSE in per cent of that of PER. [What it is](../../values.md).",
+        "## Planned comparisons",
+        planned_table(rows),
+        "## All arms",
+        "Mean over all marks but for the last column; exploratory but for what was planned, and "
+        "not corrected.",
+        arm_table(rows),
+        f"Left out: {'; '.join(f'`{name}`, {why}' for name, why in LEFT_OUT.items())}.",
+        "## Fading",
+        "RMSE to long training after so many updates.",
+        fading_table(rows),
+        "## By buffer",
+        buffer_table(rows),
+        "## The two references",
+        "Long training with uniform replay against what the policy got in episodes of its own.",
+        reference_table(buffers),
+        "## Figures",
+        "![RMSE beside PER over updates](G_curves.png)",
+        "![RMSE beside PER of all arms](G_arms.png)",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def planned_table(rows: pd.DataFrame) -> str:
+    """The planned comparisons, corrected for each other."""
+    found = differences(rows, against=AGAINST)
+    there = found.loc[[name for name in PLANNED if name in found.index]]
+    corrected = holm(there["rmse_p"].to_numpy())
+    head = ("", "buffers", "RMSE, long training", "p", "corrected", "rank correlation", "p")
+    cells = [
+        [
+            f"{name} − {AGAINST}",
+            f"{row.units:.0f}",
+            _share(row, "rmse"),
+            _p(row.rmse_p),
+            _p(p),
+            _gap(row, "rank"),
+            _p(row.rank_p),
+        ]
+        for (name, row), p in zip(there.iterrows(), corrected, strict=True)
+    ]
+    return table(head, cells)
+
+
+def arm_table(rows: pd.DataFrame) -> str:
+    """All arms by both references, the best first."""
+    found = differences(rows, against=AGAINST)
+    drawn = rows[(rows["method"] == AGAINST) & (rows["updates"] == rows["updates"].max())]
+    head = (
+        *("", "RMSE, long training", "p", "rank correlation"),
+        *("RMSE, returns", "rank correlation, returns", "effective sample", "goals drawn"),
+    )
+    cells = [
+        [
+            f"`{name}`",
+            _share(row, "rmse"),
+            _p(row.rmse_p),
+            _gap(row, "rank"),
+            _share(row, "returns_rmse"),
+            _gap(row, "returns_rank"),
+            f"{row.effective:.0%}",
+            f"{row.goals:.1%}",
+        ]
+        for name, row in found.iterrows()
+    ]
+    own = [f"{drawn['effective'].mean():.0%}", f"{drawn['goals'].mean():.1%}"]
+    cells.append([f"`{AGAINST}`", "", "", "", "", "", *own])
+    return table(head, cells)
+
+
+def fading_table(rows: pd.DataFrame) -> str:
+    """Differences of the planned arms after each number of updates."""
+    marks = sorted(rows["updates"].unique())
+    by_mark = [differences(rows, against=AGAINST, at=mark) for mark in marks]
+    cells = [
+        [f"`{name}`", *(_share(found.loc[[name]].iloc[0], "rmse") for found in by_mark)]
+        for name in PLANNED
+        if name in by_mark[0].index
+    ]
+    return table(("", *(f"{mark} updates" for mark in marks)), cells)
+
+
+def buffer_table(rows: pd.DataFrame) -> str:
+    """RMSE of PER, and differences of the planned arms, in each buffer."""
+    gaps = paired(rows, "rmse", against=AGAINST)
+    of_per = rows[rows["method"] == AGAINST].groupby("buffer")["rmse"].mean()
+    there = [name for name in PLANNED if name in gaps]
+    cells = [
+        [name, f"{of_per[name]:.3f}", *(f"{np.expm1(row[arm]):+.1%}" for arm in there)]
+        for name, row in zip(map(str, gaps.index), gaps.to_dict("records"), strict=True)
+    ]
+    return table(("buffer", "RMSE of PER", *there), cells)
+
+
+def reference_table(buffers: Sequence[FrozenBuffer]) -> str:
+    """How far long training and Monte Carlo returns agree."""
+    cells = []
+    for each in buffers:
+        rmse, bias, rank = compared(each.returns["long"], each.returns["value"])
+        deviation = float(each.returns["value"].std())
+        numbers = [each.spread, float(each.value.std()), deviation, rmse, bias]
+        cells.append([each.name, *(f"{number:.2f}" for number in numbers), f"{rank:.2f}"])
+    head = (
+        *("buffer", "spread of long critics", "deviation of their values", "of returns"),
+        *("RMSE to returns", "bias", "rank correlation"),
+    )
+    return table(head, cells)
+
+
+def plot_curves(rows: pd.DataFrame, path: Path) -> None:
+    """RMSE beside PER over updates, by both references: means over buffers, 95 % intervals."""
+    figure, axes = new_figure(1, 2, panel=(3.8, 3.0), sharey=True)
+    marks = sorted(rows["updates"].unique())
+    titles = ("values of long training", "returns of the policy")
+    for axis, column, title in zip(axes, ("rmse", "returns_rmse"), titles, strict=True):
+        axis.axhline(0.0, color="0.5")
+        at = [paired(rows, column, against=AGAINST, at=mark) for mark in marks]
+        for place, arm in enumerate(SHOWN):
+            if arm not in at[0]:
+                continue
+            ends = [t_interval(gaps[arm].dropna().to_numpy()[:, None]) for gaps in at]
+            mean, low, high = 100 * np.expm1([(e.value, e.low, e.high) for e in ends]).T
+            axis.plot(marks, mean, **look(place), label=arm)
+            axis.fill_between(marks, low, high, color=look(place)["color"], alpha=0.15, lw=0)
+        axis.set(title=title, xlabel="updates")
+    axes[0].set_ylabel("RMSE beside PER [%]")
+    axes[0].legend(fontsize="x-small", frameon=False, ncols=2)
+    finish(figure, axes, path, dpi=_DPI)
+
+
+def plot_arms(rows: pd.DataFrame, path: Path) -> None:
+    """RMSE and rank correlation beside PER of all arms, with 95 % intervals over buffers."""
+    found = differences(rows, against=AGAINST)[::-1]
+    figure, axes = new_figure(1, 2, panel=(3.8, 0.19 * len(found) + 0.8), sharey=True)
+    heights = np.arange(len(found))
+    for axis, column in zip(axes, ("rmse", "rank"), strict=True):
+        scale = 1.0 if column in RANKS else 100.0
+        mean, low, high = (
+            scale * found[name].to_numpy() for name in (column, f"{column}_low", f"{column}_high")
+        )
+        axis.axvline(0.0, color="0.5")
+        axis.hlines(heights, low, high, color="C0", alpha=0.6)
+        axis.plot(mean, heights, "o", color="C0", ms=3)
+    axes[0].set_yticks(heights, found.index, fontsize="x-small")
+    axes[0].set_ylim(-0.7, len(found) - 0.3)
+    axes[0].set_xlabel("RMSE beside PER [%]")
+    axes[1].set_xlabel("rank correlation, minus that of PER")
+    finish(figure, axes, path, dpi=_DPI)
+
+
+def missing(rows: pd.DataFrame, buffers: Sequence[str], seeds: int) -> int:
+    """Trainings of table G that have no rows."""
+    made = rows[["buffer", "method", "seed"]].drop_duplicates()
+    return len(ARMS) * len(buffers) * seeds - len(made)
+
+
+def _share(row: pd.Series, column: str) -> str:
+    ends = f"[{row[f'{column}_low']:+.1%}, {row[f'{column}_high']:+.1%}]"
+    return f"{row[column]:+.1%} {ends}"
+
+
+def _gap(row: pd.Series, column: str) -> str:
+    ends = f"[{row[f'{column}_low']:+.3f}, {row[f'{column}_high']:+.3f}]"
+    return f"{row[column]:+.3f} {ends}"
+
+
+def _p(value: float) -> str:
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"

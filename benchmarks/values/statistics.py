@@ -1,0 +1,74 @@
+"""How far methods are apart: differences to one of them, paired by buffer and seed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.study.intervals import t_interval
+from benchmarks.study.permutation import flip_p
+
+_UNITS = 3
+"""From so many buffers on the unit is the buffer, below it the training."""
+ERRORS = ("rmse", "returns_rmse")
+"""Measures of which the ratio counts, in per cent."""
+RANKS = ("rank", "returns_rank")
+"""Measures of which the difference counts."""
+
+
+def paired(rows: pd.DataFrame, column: str, *, against: str, at: int | None = None) -> pd.DataFrame:
+    """Differences of every method to one of them.
+
+    Args:
+        rows: Measures of trainings.
+        column: The measure: of those in :data:`ERRORS` the logarithms are subtracted.
+        against: The method that is subtracted.
+        at: Updates; None: the mean over all marks.
+
+    Returns:
+        A column for each method; a row for each buffer, the mean over its seeds, or where there are
+        fewer than three buffers for each training. NaN where one of the two is missing.
+    """
+    chosen = rows if at is None else rows[rows["updates"] == at]
+    index = ["buffer", "seed", "updates"]
+    wide = chosen.pivot(index=index, columns="method", values=column)
+    if column in ERRORS:
+        wide = wide.apply(np.log)
+    runs = wide.sub(wide[against], axis=0).groupby(level=["buffer", "seed"]).mean()
+    few = runs.index.get_level_values("buffer").nunique() < _UNITS
+    return runs if few else runs.groupby(level="buffer").mean()
+
+
+def estimate(gaps: pd.Series, column: str) -> dict[str, float]:
+    """Mean of differences, its 95 % interval and p, by Student's t and by permuted signs."""
+    known = gaps.dropna().to_numpy()
+    found = t_interval(known[:, None])
+    ends = np.array([found.value, found.low, found.high])
+    mean, low, high = np.expm1(ends) if column in ERRORS else ends
+    p = float(flip_p(known[None])[0]) if len(known) > 1 else np.nan
+    return {column: mean, f"{column}_low": low, f"{column}_high": high, f"{column}_p": p}
+
+
+def differences(rows: pd.DataFrame, *, against: str, at: int | None = None) -> pd.DataFrame:
+    """How far every method is from one of them, the best first.
+
+    Args:
+        rows: Measures of trainings.
+        against: The method that they are compared with.
+        at: Updates; None: the mean over all marks.
+
+    Returns:
+        A row for each method by its name: ``rmse`` and ``returns_rmse``, changes as a share of the
+        other's (-0.05 is five per cent less), ``rank`` and ``returns_rank``, differences of rank
+        correlations, each with the ends of its 95 % interval and its p, and ``units``, the number
+        of buffers or trainings of which they are; and ``effective`` and ``goals`` of its draws.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for column in (*ERRORS, *RANKS):
+        for method, gaps in paired(rows, column, against=against, at=at).items():
+            if method != against:
+                of_method = found.setdefault(str(method), {"units": int(gaps.notna().sum())})
+                of_method |= estimate(gaps, column)
+    last = rows[rows["updates"] == rows["updates"].max()].groupby("method")
+    drawn = last[["effective", "goals"]].mean()
+    return pd.DataFrame.from_dict(found, "index").join(drawn).sort_values("rmse")
