@@ -29,12 +29,17 @@ _FIRST_SEED = 2_000
 """Of the runs: none that a table of the study has."""
 _ENTRIES = ("episode", "behavior_mean", "behavior_sigma")
 """What some method asks of transitions beside the usual."""
+_VALUES: dict[str, Any] = {"gamma": 0.97, "tau": 0.01, "compile": False}
+"""Of value learning, whatever the run had: with a farther horizon long training comes to no end."""
 _RETURNS = 2_000
 _STEPS = 1_200
 """Actions of each robot in which returns are gathered."""
 _CUT = 0.02
 """A return that goes on after what was driven is taken where less than this share is left."""
 _CRITICS = 4
+_LONG_TAU = 0.05
+"""Of those critics: targets that move faster come to the end sooner, and a policy that does not
+change forgives it."""
 _LONG_SEED = 500
 _LONG = 16_000
 """Updates of each critic that the values are the mean of."""
@@ -82,7 +87,7 @@ def capture(source: Source) -> FrozenBuffer:
         keys = [*TRANSITION, *_ENTRIES]
         rows = as_stored(run.buffer.storage[: len(run.buffer)].select(*keys))
         env = run.robots.environment(run.schedule.world)
-        learner, loss = replace(asked.learner, compile=False), cast(Any, run.learner).loss
+        learner, loss = replace(asked.learner, **_VALUES), cast(Any, run.learner).loss
         returns = monte_carlo(env, run.learner.policy, gamma=learner.gamma, seed=source.seed)
         returns = returns.half().float()
         policy = dict(loss.actor_network_params.flatten_keys(".").items())
@@ -145,6 +150,7 @@ def monte_carlo(env: EnvBase, policy: TensorDictModule, *, gamma: float, seed: i
 
 def long_training(buffer: FrozenBuffer, seed: int) -> FrozenPolicyLearner:
     """Critics after long training with uniform replay."""
+    buffer = replace(buffer, learner=replace(buffer.learner, tau=_LONG_TAU))
     learner = make_frozen_learner(buffer, METHODS["uniform"], _LONG_SEED + seed, compile=True)
     generator = torch.Generator().manual_seed(seed)
     for update in range(_LONG):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import torch
+from scipy.stats import spearmanr
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -16,6 +18,7 @@ from torchrl_mpfa.learners import ActorCriticLearner
 from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
 from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import SIGNALS_KEY
+from torchrl_mpfa.spelling import unknown
 from training.run.assembly import make_learner
 
 BATCH = 256
@@ -195,9 +198,17 @@ def learn(
 
     Yields:
         What they had learned then.
+
+    Raises:
+        ValueError: If the marks are odd or do not rise, or the method is unknown.
     """
+    rising = all(before < after for before, after in pairwise((0, *marks)))
+    if not marks or not rising or any(mark % _TOGETHER for mark in marks):
+        raise ValueError(f"marks must be even numbers of updates that rise, got {marks}")
     generator = torch.Generator().manual_seed(seed)
     if isinstance(method, str):
+        if method not in METHODS:
+            raise ValueError(unknown("method", method, METHODS))
         method = METHODS[method]
     if isinstance(method, Method):
         learner = make_frozen_learner(buffer, method, seed, signals, compile=compile)
@@ -235,5 +246,5 @@ def learn(
 def compared(value: Tensor, reference: Tensor) -> tuple[float, float, float]:
     """Root mean square difference, mean difference and rank correlation of two, shape ``[N]``."""
     error = (value - reference).double()
-    ranks = torch.stack([each.argsort().argsort().double() for each in (value, reference)])
-    return float(error.square().mean().sqrt()), float(error.mean()), float(ranks.corrcoef()[0, 1])
+    rank = spearmanr(value.numpy(), reference.numpy()).statistic
+    return float(error.square().mean().sqrt()), float(error.mean()), float(rank)

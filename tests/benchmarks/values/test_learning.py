@@ -1,0 +1,144 @@
+"""Value learning: what a frozen buffer holds, and that critics come to the values it has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from benchmarks.values import ARMS, FrozenBuffer, critic_values, frozen_buffers, learn
+from benchmarks.values.frozen import FOLDER, read_frozen
+from benchmarks.values.learning import Draws, compared, make_frozen_learner
+from torchrl_mpfa.methods import METHODS, make_replay
+from torchrl_mpfa.selection import SampledBatch
+
+
+def test_critics_come_to_the_values_of_the_policy(walk: FrozenBuffer) -> None:
+    first, last = learn(walk, "per", 0, marks=(20, 400))
+    deviation = float(walk.value.std())
+    assert last.rmse < 0.3 * deviation < first.rmse
+    assert last.rank > 0.98 and last.returns_rank > 0.98
+    assert abs(last.bias) < last.rmse
+
+
+def test_a_critic_that_gets_other_rewards_does_not(walk: FrozenBuffer) -> None:
+    shuffled = walk.rows.clone()
+    order = torch.randperm(len(walk), generator=torch.Generator().manual_seed(1))
+    shuffled["next", "reward"] = shuffled["next", "reward"][order]
+    (last,) = learn(replace(walk, rows=shuffled), "per", 0, marks=(400,))
+    assert last.rmse > 0.5 * float(walk.value.std())
+
+
+@pytest.mark.parametrize("marks", [(3,), (0,), (4, 2), ()])
+def test_marks_that_no_update_reaches_are_rejected(marks, walk: FrozenBuffer) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match="marks must be even numbers of updates that rise"):
+        next(learn(walk, "per", 0, marks=marks))
+
+
+def test_the_policy_stays_as_it_was_frozen(walk: FrozenBuffer) -> None:
+    learner = make_frozen_learner(walk, METHODS["la3p"], 0)
+    action = learner.policy(walk.rows[:16].clone())["action"]
+    for trains in ("both", "critic", "actor"):
+        learner.update(SampledBatch(walk.rows[:64].clone(), trains=trains))  # type: ignore[arg-type]
+    assert learner.policy(walk.rows[:16].clone())["action"].equal(action)
+    other = make_frozen_learner(walk, METHODS["per"], 7)
+    assert other.policy(walk.rows[:16].clone())["action"].equal(action)
+
+
+@pytest.mark.parametrize("arm", sorted(ARMS))
+@pytest.mark.filterwarnings("ignore:positive_above='mean'")
+def test_every_arm_of_the_table_learns_from_a_frozen_buffer(arm: str, walk: FrozenBuffer) -> None:
+    (found,) = learn(walk, ARMS[arm], 0, marks=(8,))
+    assert found.method == arm or arm in METHODS
+    assert math.isfinite(found.rmse) and 0.0 < found.effective < 1.5 and 0.0 <= found.goals < 1.0
+
+
+def test_a_signal_of_ones_own_decides_what_is_drawn(walk: FrozenBuffer) -> None:
+    def last_cell(learner: object, batch: object) -> torch.Tensor:
+        return (batch["observation"][:, -2] > 0).float()  # type: ignore[index]
+
+    settings = replace(METHODS["per"], name="last", signals=["last"], eps=1e-4, alpha=1.0)
+    (found,) = learn(walk, settings, 0, signals={"last": last_cell}, marks=(60,))
+    (uniform,) = learn(walk, "uniform", 0, marks=(60,))
+    assert found.goals > 3 * uniform.goals
+    assert found.effective < 0.7
+
+
+def test_a_replay_of_ones_own_is_used_as_it_is(walk: FrozenBuffer) -> None:
+    asked = []
+
+    def mine(buffer: FrozenBuffer, generator: torch.Generator):  # type: ignore[no-untyped-def]
+        asked.append(buffer.name)
+        return make_replay("rank_per", capacity=len(buffer), batch_size=64, generator=generator)
+
+    (found,) = learn(walk, mine, 3, marks=(8,))
+    assert asked == ["walk"] and found.method == "rank_per"
+    assert found == next(learn(walk, mine, 3, marks=(8,)))
+
+
+def test_the_values_of_critics_are_in_units_of_the_reward(walk: FrozenBuffer) -> None:
+    learner = make_frozen_learner(walk, METHODS["uniform"], 0)
+    inner = learner._learner
+    inner.loss.reward_scale = 1.0
+    plain = critic_values(inner, walk.rows[:5])
+    inner.loss.reward_scale = 0.1
+    assert critic_values(inner, walk.rows[:5]).allclose(10.0 * plain)
+    assert plain.shape == (2, 5)
+
+
+def test_the_effective_sample_is_that_of_the_probabilities() -> None:
+    generator = torch.Generator().manual_seed(0)
+    chance = torch.tensor([0.7, 0.1, 0.1, 0.1])
+    draws = Draws(torch.tensor([True, False, False, False]))
+    for _ in range(40):
+        index = chance.multinomial(256, replacement=True, generator=generator)
+        draws(SampledBatch(TensorDict({"index": index}, [256])))
+    assert draws.effective == pytest.approx(1 / (0.52 * 4), rel=0.03)
+    assert draws.goals == pytest.approx(0.7, abs=0.02)
+
+
+def test_differences_and_rank_correlations_are_what_numpy_has() -> None:
+    rng = np.random.default_rng(0)
+    value, reference = rng.normal(size=(2, 50))
+    rmse, bias, rank = compared(torch.from_numpy(value), torch.from_numpy(reference))
+    assert rmse == pytest.approx(float(np.sqrt(np.mean((value - reference) ** 2))))
+    assert bias == pytest.approx(float(np.mean(value - reference)))
+    ranks = [each.argsort().argsort() for each in (value, reference)]
+    assert rank == pytest.approx(float(np.corrcoef(ranks)[0, 1]))
+
+
+def test_a_buffer_is_read_as_it_was_written(walk: FrozenBuffer, tmp_path: Path) -> None:
+    path = walk.save(tmp_path)
+    read = read_frozen(path)
+    assert (read.rows["next"] == walk.rows["next"]).all()
+    assert read.rows["observation"].equal(walk.rows["observation"])
+    assert read.rows["action"].allclose(walk.rows["action"], atol=1e-3)
+    assert vars(read.learner) == vars(walk.learner)
+    assert read.robots == walk.robots and len(read) == len(walk)
+    before = path.read_bytes()
+    assert read.save(tmp_path).read_bytes() == before
+    assert [each.name for each in frozen_buffers(tmp_path)] == ["walk"]
+    # Observations after an action are those of later rows, and written once.
+    with np.load(path) as file:
+        assert len(file["last_observation"]) < 0.3 * len(walk)
+
+
+def test_a_folder_without_buffers_is_rejected(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no frozen buffers"):
+        frozen_buffers(tmp_path)
+
+
+def test_the_buffers_of_the_project_are_of_runs_with_and_without_dense_rewards() -> None:
+    found = {each.name: each for each in frozen_buffers(FOLDER)}
+    assert len(found) == 12
+    for name, buffer in found.items():
+        reward, time, _ = name.split("-")
+        assert len(buffer) == {"early": 6_000, "late": 20_000}[time]
+        rewards = buffer.rows["next", "reward"].unique()
+        assert (len(rewards) <= 3) == (reward == "sparse")
+        assert buffer.value.isfinite().all() and buffer.spread < 0.5 * float(buffer.value.std())
