@@ -112,6 +112,8 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"beta_end": NAN}, r"beta_end must be in \[0, 1\], got nan"),
         ({"curiosity_scale": -1}, "curiosity_scale must be positive and finite, got -1"),
         ({"boost_target": -1}, r"boost_target must be in \[0, 1\), got -1"),
+        ({"weight_floor": 1.0}, r"weight_floor must be in \[0, 1\), got 1.0"),
+        ({"method": "per", "weight_floor": 0.2}, "weight_floor must be 0.0 with fusion='fixed'"),
         ({"method": "geometric", "recency": -1}, "recency must be finite and not negative, got -1"),
         ({"method": "ref_er", "far_cutoff": 0}, "far_cutoff must be positive and finite, got 0"),
         (
@@ -158,6 +160,18 @@ def test_annealing_raises_beta_to_its_end_and_moves_the_fusion():
     method = replay.method
     assert betas == [method.beta, (method.beta + method.beta_end) / 2, method.beta_end]
     assert weights == [[0.0, 1.0], [0.25, 0.75], [0.5, 0.5]]
+
+
+@pytest.mark.parametrize(("floor", "shares"), [(0.0, [5, 0, 0]), (0.2, [5, 1, 1])])
+def test_with_a_floor_all_signals_count_before_the_first_goal(floor, shares):
+    replay = make_replay("mpfa_per", capacity=100, weight_floor=floor)
+    rows = make_transitions(8)
+    rows["next", "reward"] = -torch.arange(1.0, 9.0).unsqueeze(-1)
+    replay.buffer.extend(rows)
+    sampler = replay.buffer.sampler
+    table = replay.buffer.storage.signal_table
+    weights = sampler.fusion.weights(replay.method.signals, table, torch.arange(8))
+    assert weights.tolist() == pytest.approx([share / sum(shares) for share in shares])
 
 
 def test_annealing_by_a_fraction_that_is_none_changes_nothing():

@@ -47,6 +47,7 @@ _FUSIONS: dict[str, Callable[[Method], Fusion]] = {
     "entropy": lambda method: EntropyFusion(
         population=method.population,  # type: ignore[arg-type]
         positive_above=method.positive_above,
+        floor=method.weight_floor,
     ),
     "fixed": lambda method: _equal(method),
     "scaled": lambda method: ScaledFusion(_equal(method)),
@@ -232,6 +233,7 @@ def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
         (default, "selection", method.selection != "prioritized", ("reliability",)),
         (default, "combination", method.combination == "mixture", ("reliability",)),
         (default, "priority_floor", method.priority_floor == 0, ("floor_quantile",)),
+        (default, "fusion", method.fusion != "entropy", ("weight_floor",)),
         (named, "selection", uniform, ("boost", "decay")),
         (named, "boost", not method.boost, ("boost_factor", "boost_target", "boost_bound")),
         (named, "decay", not method.decay, ("decay_sharpness", "decay_position")),

@@ -35,6 +35,9 @@ class Method:
     fusion: str = "entropy"
     """``entropy`` (Eqs. 15-20), ``fixed`` (equal weights), ``scaled`` (equal shares: each signal
     is divided by its mean) or ``value_schedule`` (HVPER)."""
+    weight_floor: float = _within(BELOW_ONE, 0.0)
+    """Least weight of a signal by ``entropy``: without one the reward alone counts until the first
+    goal; 0: none, as in the paper."""
     combination: str = "sum"
     """Combination of the weighted signals: their ``sum`` (Eq. 21) or ``product``, or a
     ``mixture``: each signal has its own tree, and its share of a batch. The latter two need no
