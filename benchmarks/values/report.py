@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 import pandas as pd
@@ -11,6 +13,7 @@ import pandas as pd
 from benchmarks.study.intervals import t_interval
 from benchmarks.study.permutation import holm
 from benchmarks.values.arms import AGAINST, ARMS, LEFT_OUT, PLANNED
+from benchmarks.values.capture import REWARDS
 from benchmarks.values.frozen import FrozenBuffer
 from benchmarks.values.learning import compared
 from benchmarks.values.statistics import RANKS, differences, paired
@@ -43,8 +46,9 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         "## Planned comparisons",
         planned_table(rows),
         "## All arms",
-        "Mean over all marks but for the last column; exploratory but for what was planned, and "
-        "not corrected.",
+        "Means over all marks, the last two columns at the end; `sparse` and `dense` are the RMSE "
+        "to long training in six buffers each. Exploratory but for what was planned, and not "
+        "corrected.",
         arm_table(rows),
         f"Left out: {'; '.join(f'`{name}`, {why}' for name, why in LEFT_OUT.items())}.",
         "## Fading",
@@ -59,7 +63,9 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         "![RMSE beside PER over updates](G_curves.png)",
         "![RMSE beside PER of all arms](G_arms.png)",
     ]
-    return "\n\n".join(parts) + "\n"
+    kept = ("|", "#", "!")
+    lines = [part if part.startswith(kept) else fill(part, 120) for part in parts]
+    return "\n\n".join(lines) + "\n"
 
 
 def planned_table(rows: pd.DataFrame) -> str:
@@ -86,9 +92,13 @@ def planned_table(rows: pd.DataFrame) -> str:
 def arm_table(rows: pd.DataFrame) -> str:
     """All arms by both references, the best first."""
     found = differences(rows, against=AGAINST)
+    parts = [
+        differences(rows[rows["buffer"].str.startswith(reward)], against=AGAINST)
+        for reward in REWARDS
+    ]
     drawn = rows[(rows["method"] == AGAINST) & (rows["updates"] == rows["updates"].max())]
     head = (
-        *("", "RMSE, long training", "p", "rank correlation"),
+        *("", "RMSE, long training", "p", *REWARDS, "rank correlation"),
         *("RMSE, returns", "rank correlation, returns", "effective sample", "goals drawn"),
     )
     cells = [
@@ -96,6 +106,7 @@ def arm_table(rows: pd.DataFrame) -> str:
             f"`{name}`",
             _share(row, "rmse"),
             _p(row.rmse_p),
+            *(_share(part.loc[[name]].iloc[0], "rmse") for part in parts),
             _gap(row, "rank"),
             _share(row, "returns_rmse"),
             _gap(row, "returns_rank"),
@@ -105,7 +116,7 @@ def arm_table(rows: pd.DataFrame) -> str:
         for name, row in found.iterrows()
     ]
     own = [f"{drawn['effective'].mean():.0%}", f"{drawn['goals'].mean():.1%}"]
-    cells.append([f"`{AGAINST}`", "", "", "", "", "", *own])
+    cells.append([f"`{AGAINST}`", *[""] * 7, *own])
     return table(head, cells)
 
 
@@ -149,23 +160,25 @@ def reference_table(buffers: Sequence[FrozenBuffer]) -> str:
 
 
 def plot_curves(rows: pd.DataFrame, path: Path) -> None:
-    """RMSE beside PER over updates, by both references: means over buffers, 95 % intervals."""
-    figure, axes = new_figure(1, 2, panel=(3.8, 3.0), sharey=True)
+    """RMSE beside PER over updates, by reward and reference: means over buffers, 95 % intervals."""
+    figure, axes = new_figure(2, 2, panel=(3.8, 2.4), sharex=True, sharey="col")
     marks = sorted(rows["updates"].unique())
-    titles = ("values of long training", "returns of the policy")
-    for axis, column, title in zip(axes, ("rmse", "returns_rmse"), titles, strict=True):
+    references = {"rmse": "long training", "returns_rmse": "returns"}
+    for axis, (column, reward) in zip(axes, product(references, REWARDS), strict=True):
+        found = rows[rows["buffer"].str.startswith(reward)]
+        at = [paired(found, column, against=AGAINST, at=mark) for mark in marks]
         axis.axhline(0.0, color="0.5")
-        at = [paired(rows, column, against=AGAINST, at=mark) for mark in marks]
-        for place, arm in enumerate(SHOWN):
-            if arm not in at[0]:
-                continue
+        for place, arm in enumerate(name for name in SHOWN if name in at[0]):
             ends = [t_interval(gaps[arm].dropna().to_numpy()[:, None]) for gaps in at]
             mean, low, high = 100 * np.expm1([(e.value, e.low, e.high) for e in ends]).T
             axis.plot(marks, mean, **look(place), label=arm)
-            axis.fill_between(marks, low, high, color=look(place)["color"], alpha=0.15, lw=0)
-        axis.set(title=title, xlabel="updates")
-    axes[0].set_ylabel("RMSE beside PER [%]")
-    axes[0].legend(fontsize="x-small", frameon=False, ncols=2)
+            axis.fill_between(marks, low, high, color=look(place)["color"], alpha=0.12, lw=0)
+        axis.set_title(f"{reward} rewards, by {references[column]}", fontsize="medium")
+        axis.set_xscale("log", base=2)
+        axis.set_xticks(marks, [str(mark) for mark in marks])
+    figure.supxlabel("updates", fontsize="medium")
+    figure.supylabel("RMSE beside PER [%]", fontsize="medium")
+    axes[1].legend(fontsize="x-small", frameon=False, ncols=2)
     finish(figure, axes, path, dpi=_DPI)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,6 +49,7 @@ def compare(
     Raises:
         ValueError: If ``against`` is not among the methods.
     """
+    _quiet()
     names = [_name(method) for method in methods]
     if against not in names:
         raise ValueError(f"against must be one of the methods, {', '.join(names)}, got {against!r}")
@@ -120,7 +122,13 @@ def _buffers(folder: Path) -> list[FrozenBuffer]:
     return _READ[folder]
 
 
+def _quiet() -> None:
+    """Have TorchRL not tell of each storage that it makes."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+
+
 def _one_thread() -> None:
+    _quiet()
     torch.set_num_threads(1)
     # Of readings of the paper that are compared here.
     warnings.filterwarnings("ignore", message="positive_above='mean'")
