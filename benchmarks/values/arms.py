@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from benchmarks.values.learning import SignalFunction, mirror
+from torchrl_mpfa.learners import ActorCriticLearner
 from torchrl_mpfa.methods import ALIASES, METHODS, Method
 
 LEFT_OUT = {
@@ -41,35 +48,71 @@ PARTS: dict[str, dict[str, Any]] = {
     "eq23_count": {"decay_position": "count"},
 }
 """MPFA-PER with one thing changed."""
-STRONGER: dict[str, dict[str, Any]] = {
-    "eps0.005": {"eps": 0.005},
-    "eps0.005,alpha1": {"eps": 0.005, "alpha": 1.0},
+MIXTURE = replace(
+    METHODS["mpfa_plus"], name="mixture", signals=["reward", "td_error"], combination="mixture"
+)
+"""Half of each batch by the reward, half by the TD error, each by a tree of its own."""
+STRENGTHS: dict[str, dict[str, dict[str, Any]]] = {
+    # An epsilon of 0.05 is not small beside TD errors of 0.1.
+    "per": {
+        "eps0.005": {"eps": 0.005},
+        "eps0.005,alpha1": {"eps": 0.005, "alpha": 1.0},
+        "eps0.005,alpha1.5": {"eps": 0.005, "alpha": 1.5},
+    },
+    "mpfa_per": {"floor0.2": {"weight_floor": 0.2}, "alpha1": {"alpha": 1.0}},
+    "mpfa_plus": {"alpha0.3": {"alpha": 0.3}, "alpha1": {"alpha": 1.0}},
+    "mixture": {"alpha0.3": {"alpha": 0.3}, "alpha1": {"alpha": 1.0}},
 }
-"""PER that prioritizes more: its epsilon of 0.05 is not small beside TD errors of 0.1."""
+"""Kinds of priorities at several strengths."""
 
 
-def _varied(base: str, changes: dict[str, dict[str, Any]]) -> dict[str, Method]:
-    names = {f"{base}/{name}": settings for name, settings in changes.items()}
-    return {name: replace(METHODS[base], name=name, **each) for name, each in names.items()}
+@dataclass(frozen=True)
+class Arm:
+    """What learns from the buffers."""
+
+    method: Method
+    mirrored: bool = False
+    """Whether half of each batch is mirrored, as in the trainings of the study."""
+    signals: Mapping[str, SignalFunction] = field(default_factory=dict)
+    """Functions that write signals of the method."""
 
 
-ARMS: dict[str, Method] = {
+def both_images(learner: ActorCriticLearner, batch: TensorDictBase) -> Tensor:
+    """Mean TD error of a transition and of its mirror image, ``[B]``."""
+    squares = []
+    with torch.no_grad():
+        for rows in (batch.clone(), mirror(chance=1.0)(batch.clone())):
+            _, log = learner.loss.losses(rows, trains="critic")
+            squares.append(log["td_error"].amax(0))
+    return torch.stack(squares).sqrt().mean(0) / learner.loss.reward_scale
+
+
+def _varied(base: Method, changes: dict[str, dict[str, Any]]) -> dict[str, Arm]:
+    names = {f"{base.name}/{name}": settings for name, settings in changes.items()}
+    return {name: Arm(replace(base, name=name, **each)) for name, each in names.items()}
+
+
+ARMS: dict[str, Arm] = {
     **{
-        name: method
+        name: Arm(method)
         for name, method in METHODS.items()
         if name not in LEFT_OUT and name not in ALIASES.values()
     },
-    "mixture": replace(
-        METHODS["mpfa_plus"],
-        name="mixture",
-        signals=["reward", "td_error"],
-        combination="mixture",
+    "mixture": Arm(MIXTURE),
+    **_varied(METHODS["mpfa_per"], PARTS),
+    **{
+        name: arm
+        for base, changes in STRENGTHS.items()
+        for name, arm in _varied({**METHODS, "mixture": MIXTURE}[base], changes).items()
+    },
+    "per/mirrored": Arm(replace(METHODS["per"], name="per/mirrored"), mirrored=True),
+    "per/both_images": Arm(
+        replace(METHODS["per"], name="per/both_images", signals=["both_images"]),
+        mirrored=True,
+        signals={"both_images": both_images},
     ),
-    **_varied("per", STRONGER),
-    **_varied("mpfa_per", PARTS),
 }
-"""All arms by name: the methods of the catalogue, a mixture of the trees of reward and TD error,
-and what is changed of PER and of MPFA-PER."""
+"""All arms by name: the methods of the catalogue, what is changed of them, and mirrored batches."""
 PLANNED = ("uniform", "mpfa_per", "mpfa_plus", "mpf_per", "mpfa_per/reward", "mpfa_per/td_error")
 """Arms whose difference to :data:`AGAINST` was to be tested before the first run; all others are
 exploratory."""

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from benchmarks.values.frozen import FrozenBuffer
+from mpfa_envs import RandomMirror
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.learners import ActorCriticLearner
 from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
@@ -182,6 +183,7 @@ def learn(
     seed: int,
     *,
     signals: Mapping[str, SignalFunction] | None = None,
+    mirrored: bool = False,
     marks: tuple[int, ...] = MARKS,
     compile: bool = False,
 ) -> Iterator[Measure]:
@@ -193,6 +195,7 @@ def learn(
             makes a replay of your own.
         seed: Of the critics' first weights and of what is drawn.
         signals: Functions of your own that write the signals of a method.
+        mirrored: Mirror half of each batch, as the trainings do that the buffers come from.
         marks: Even numbers of updates after which the critics are looked at.
         compile: Make one program of an update: it takes half a minute once, then half of the time.
 
@@ -224,6 +227,8 @@ def learn(
         replay = method(buffer, generator)
         learner = make_frozen_learner(buffer, replay.method, seed, signals, compile=compile)
     replay.buffer.extend(buffer.rows)
+    if mirrored:
+        replay.buffer.append_transform(mirror())
     draws = Draws(buffer.rows["next", "reward"].squeeze(-1) > GOAL)
     for done in range(_TOGETHER, marks[-1] + 1, _TOGETHER):
         run_updates(replay.buffer, learner, replay.select, updates=_TOGETHER, prepare=draws)
@@ -241,6 +246,11 @@ def learn(
                 draws.effective,
                 draws.goals,
             )
+
+
+def mirror(*, chance: float = 0.5) -> RandomMirror:
+    """Mirrors transitions of the frozen buffers, whose robots have a map."""
+    return RandomMirror(memory="map", chance=chance)
 
 
 def compared(value: Tensor, reference: Tensor) -> tuple[float, float, float]:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -108,7 +109,9 @@ def make_rows(
 def _train(folder: Path, arm: str, seed: int, names: list[str]) -> list[dict[str, object]]:
     """Rows of one arm and seed on some buffers, in a process of their own."""
     wanted = {each.name: each for each in _buffers(folder)}
-    found = (learn(wanted[name], ARMS[arm], seed, compile=True) for name in names)
+    made = ARMS[arm]
+    train = partial(learn, signals=made.signals, mirrored=made.mirrored, compile=True)
+    found = (train(wanted[name], made.method, seed) for name in names)
     return [asdict(measure) for each in found for measure in each]
 
 

@@ -376,5 +376,5 @@ def test_the_real_tables_are_made_of_rows_of_every_arm(tmp_path: Path) -> None:
     )
     tests["success"], tests["episode"] = rng.uniform(size=len(tests)) < 0.5, 0
     text = study_tables(table, Rows(curves, tests), absent="")
-    assert text.count("| sparse/td3/per/v8 − sparse/td3/uniform/v8 |") == 3
+    assert text.count("| per/v8 − uniform/v8 |") == 3
     assert f"corrected for {len(table.planned)}" in text

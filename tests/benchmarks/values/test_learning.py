@@ -12,8 +12,9 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.values import ARMS, FrozenBuffer, critic_values, frozen_buffers, learn
+from benchmarks.values.arms import both_images
 from benchmarks.values.frozen import FOLDER, read_frozen
-from benchmarks.values.learning import Draws, compared, make_frozen_learner
+from benchmarks.values.learning import Draws, compared, make_frozen_learner, mirror
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.selection import SampledBatch
 
@@ -53,9 +54,12 @@ def test_the_policy_stays_as_it_was_frozen(walk: FrozenBuffer) -> None:
 @pytest.mark.parametrize("arm", sorted(ARMS))
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_every_arm_of_the_table_learns_from_a_frozen_buffer(arm: str, walk: FrozenBuffer) -> None:
-    (found,) = learn(walk, ARMS[arm], 0, marks=(8,))
-    assert found.method == arm or arm in METHODS
-    assert math.isfinite(found.rmse) and 0.0 < found.effective < 1.5 and 0.0 <= found.goals < 1.0
+    made = ARMS[arm]
+    buffer = frozen_buffers(FOLDER)[0] if made.mirrored else walk
+    how = {"signals": made.signals, "mirrored": made.mirrored}
+    (found,) = learn(buffer, made.method, 0, marks=(8,), **how)  # type: ignore[arg-type]
+    assert found.method == arm
+    assert math.isfinite(found.rmse) and 0.0 < found.effective < 2.0 and 0.0 <= found.goals < 1.0
 
 
 def test_a_signal_of_ones_own_decides_what_is_drawn(walk: FrozenBuffer) -> None:
@@ -142,3 +146,24 @@ def test_the_buffers_of_the_project_are_of_runs_with_and_without_dense_rewards()
         rewards = buffer.rows["next", "reward"].unique()
         assert (len(rewards) <= 3) == (reward == "sparse")
         assert buffer.value.isfinite().all() and buffer.spread < 0.5 * float(buffer.value.std())
+
+
+def test_the_error_of_both_images_is_the_mean_of_two_that_are_alone() -> None:
+    buffer = frozen_buffers(FOLDER)[0]
+    learner = make_frozen_learner(buffer, METHODS["per"], 0)._learner
+    learner.loss.policy_noise = 0.0
+    rows = buffer.rows[:32]
+    alone = []
+    for batch in (rows.clone(), mirror(chance=1.0)(rows.clone())):
+        learner.loss.losses(batch, trains="critic")
+        alone.append(batch["signals", "td_error"])
+    assert both_images(learner, rows).allclose(torch.stack(alone).mean(0), rtol=1e-4)
+    assert not alone[0].allclose(alone[1])
+
+
+def test_mirrored_batches_are_half_of_what_is_learned_from() -> None:
+    buffer = frozen_buffers(FOLDER)[0]
+    plain, mirrored = (
+        next(learn(buffer, "uniform", 0, mirrored=each, marks=(4,))) for each in (False, True)
+    )
+    assert plain.goals == mirrored.goals and plain.rmse != mirrored.rmse
