@@ -116,3 +116,15 @@ ARMS: dict[str, Arm] = {
 PLANNED = ("uniform", "mpfa_per", "mpfa_plus", "mpf_per", "mpfa_per/reward", "mpfa_per/td_error")
 """Arms whose difference to :data:`AGAINST` was to be tested before the first run; all others are
 exploratory."""
+PAIRS = (
+    ("mpfa_per/alpha0.4", "per"),
+    ("mpfa_plus/alpha0.3", "per"),
+    ("mpfa_per/alpha0.8", "per/eps0.005,alpha1"),
+    ("mpfa_plus", "per/eps0.005,alpha1"),
+    ("mpfa_per/alpha1", "per/eps0.005,alpha1.5"),
+    ("mpfa_plus/alpha1", "per/eps0.005,alpha1.5"),
+    ("mixture/alpha1", "per/eps0.005,alpha1.5"),
+    ("per/both_images", "per/mirrored"),
+    ("la3p", "uniform_halves"),
+)
+"""Other arms that are compared: of about equal effective samples, or with one thing changed."""

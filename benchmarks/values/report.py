@@ -12,7 +12,7 @@ import pandas as pd
 
 from benchmarks.study.intervals import t_interval
 from benchmarks.study.permutation import holm
-from benchmarks.values.arms import AGAINST, ARMS, LEFT_OUT, PLANNED
+from benchmarks.values.arms import AGAINST, ARMS, LEFT_OUT, PAIRS, PLANNED
 from benchmarks.values.capture import REWARDS
 from benchmarks.values.frozen import FrozenBuffer
 from benchmarks.values.learning import compared
@@ -38,9 +38,10 @@ def write_report(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer], folder: Pa
 def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
     """The tables, in Markdown."""
     seeds = rows.groupby(["buffer", "method"])["seed"].nunique()
+    count = " to ".join(str(number) for number in sorted({seeds.min(), seeds.max()}))
     parts = [
         "# Table G: which replay learns values sooner?",
-        f"{rows['buffer'].nunique()} buffers, {seeds.min()} to {seeds.max()} seeds in each. "
+        f"{rows['buffer'].nunique()} buffers, {count} seeds in each. "
         f"Differences to `{AGAINST}`, of the same buffers and seeds, with 95 % intervals over "
         "buffers; RMSE in per cent of that of PER. [What it is](../../values.md).",
         "## Planned comparisons",
@@ -51,6 +52,11 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         "corrected.",
         arm_table(rows),
         f"Left out: {'; '.join(f'`{name}`, {why}' for name, why in LEFT_OUT.items())}.",
+        "## Pairs",
+        "Kinds of priorities with about the same effective sample, and what has one thing changed. "
+        "Exploratory, not corrected. `la3p` and `uniform_halves` update the critics twice where "
+        "others do once, on half as many transitions.",
+        pair_table(rows),
         "## Fading",
         "RMSE to long training after so many updates.",
         fading_table(rows),
@@ -117,6 +123,30 @@ def arm_table(rows: pd.DataFrame) -> str:
     ]
     own = [f"{drawn['effective'].mean():.0%}", f"{drawn['goals'].mean():.1%}"]
     cells.append([f"`{AGAINST}`", *[""] * 7, *own])
+    return table(head, cells)
+
+
+def pair_table(rows: pd.DataFrame) -> str:
+    """Differences of :data:`PAIRS`."""
+    head = ("", "effective samples", "RMSE, long training", "p", *REWARDS, "RMSE, returns")
+    cells = []
+    for first, second in PAIRS:
+        two = rows[rows["method"].isin((first, second))]
+        if two["method"].nunique() < len((first, second)):
+            continue
+        parts = [two, *(two[two["buffer"].str.startswith(reward)] for reward in REWARDS)]
+        found, *by_reward = (differences(part, against=second).loc[first] for part in parts)
+        drawn = two[two["updates"] == two["updates"].max()].groupby("method")["effective"].mean()
+        cells.append(
+            [
+                f"`{first}` − `{second}`",
+                f"{drawn[first]:.0%}, {drawn[second]:.0%}",
+                _share(found, "rmse"),
+                _p(found["rmse_p"]),
+                *(_share(each, "rmse") for each in by_reward),
+                _share(found, "returns_rmse"),
+            ]
+        )
     return table(head, cells)
 
 
