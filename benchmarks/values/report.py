@@ -112,7 +112,7 @@ def arm_table(rows: pd.DataFrame) -> str:
             f"`{name}`",
             _share(row, "rmse"),
             _p(row.rmse_p),
-            *(_share(part.loc[[name]].iloc[0], "rmse") for part in parts),
+            *(_share(_row(part, name), "rmse") for part in parts),
             _gap(row, "rank"),
             _share(row, "returns_rmse"),
             _gap(row, "returns_rank"),
@@ -135,7 +135,7 @@ def pair_table(rows: pd.DataFrame) -> str:
         if two["method"].nunique() < len((first, second)):
             continue
         parts = [two, *(two[two["buffer"].str.startswith(reward)] for reward in REWARDS)]
-        found, *by_reward = (differences(part, against=second).loc[first] for part in parts)
+        found, *by_reward = (_row(differences(part, against=second), first) for part in parts)
         drawn = two[two["updates"] == two["updates"].max()].groupby("method")["effective"].mean()
         cells.append(
             [
@@ -155,7 +155,7 @@ def fading_table(rows: pd.DataFrame) -> str:
     marks = sorted(rows["updates"].unique())
     by_mark = [differences(rows, against=AGAINST, at=mark) for mark in marks]
     cells = [
-        [f"`{name}`", *(_share(found.loc[[name]].iloc[0], "rmse") for found in by_mark)]
+        [f"`{name}`", *(_share(_row(found, name), "rmse") for found in by_mark)]
         for name in PLANNED
         if name in by_mark[0].index
     ]
@@ -236,6 +236,10 @@ def missing(rows: pd.DataFrame, buffers: Sequence[str], seeds: int) -> int:
     """Trainings of table G that have no rows."""
     made = rows[["buffer", "method", "seed"]].drop_duplicates()
     return len(ARMS) * len(buffers) * seeds - len(made)
+
+
+def _row(found: pd.DataFrame, name: object) -> pd.Series:
+    return found.loc[[name]].iloc[0]
 
 
 def _share(row: pd.Series, column: str) -> str:
