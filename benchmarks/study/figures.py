@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchmarks.study.designs import KEY, OF_VOLUMES
 from benchmarks.study.intervals import (
     Array,
     mean_interval,
@@ -18,7 +19,7 @@ from benchmarks.study.intervals import (
     resampled_means,
     widened_ends,
 )
-from benchmarks.study.protocol import HEIGHT, KEY, OF_VOLUMES, Table, short_names
+from benchmarks.study.protocol import HEIGHT, Table, short_names
 from benchmarks.study.rows import Rows, by_run, scores_of
 from benchmarks.study.tables import FEWEST, MEASURES
 from mpfa_envs.render.charts import finish, look, new_figure

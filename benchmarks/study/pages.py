@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from benchmarks.study.designs import tables
 from benchmarks.study.figures import plot_study
 from benchmarks.study.gym import table as off_navigation
 from benchmarks.study.gym.table import FOLDER, TABLE_F
 from benchmarks.study.kept_rows import is_kept, read_kept
-from benchmarks.study.protocol import ROOT, Table, tables
+from benchmarks.study.protocol import ROOT, Table
 from benchmarks.study.rows import Rows, missing, read_runs
 from benchmarks.study.tables import study_tables
 from torchrl_mpfa.saving import write_text_atomically

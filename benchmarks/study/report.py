@@ -16,10 +16,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.study.designs import paper_comparisons, tables
 from benchmarks.study.kept_rows import is_kept
 from benchmarks.study.pages import write_study
 from benchmarks.study.paper_report import write_paper
-from benchmarks.study.protocol import paper_comparisons, tables
 from training import files
 
 

@@ -22,8 +22,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.study.designs import tables
 from benchmarks.study.kept_rows import is_kept, joined, keep, of_arms, read_all_kept
-from benchmarks.study.protocol import ROOT, Table, label_of, tables
+from benchmarks.study.protocol import ROOT, Table, label_of
 from benchmarks.study.remaining import counts, free_checkpoints, hours_left, parts_left
 from benchmarks.study.rows import Rows, read_runs, without_rows
 from training import files

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -25,7 +26,7 @@ from torchrl_mpfa.methods.hvper import (
     value_schedule,
 )
 from torchrl_mpfa.methods.klper import KLPERSelection
-from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches
+from torchrl_mpfa.methods.la3p import LA3PSampler, Part, la3p_batches
 from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
@@ -65,8 +66,8 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "rank": RankPERSampler,
     "capped": MWSampler,
     "split": LA3PSampler,
+    "apart": LA3PSampler,
 }
-_SELECTIONS: dict[str, Selection] = {"split": la3p_batches, "halves": uniform_halves}
 _OF_PRIORITIES = ("combination", "floor_quantile", "priority_floor", "replay_penalty")
 WORDS: dict[str, set[str]] = {
     "selection": {*_UNIFORM, *_PRIORITIZED},
@@ -252,7 +253,7 @@ def entries_of(method: Method) -> tuple[str, ...]:
 
 def has_one_batch_a_step(method: Method) -> bool:
     """Whether what samples one batch for each update, and no more, trains by the method."""
-    own = {*_SELECTIONS, "near_policy"}
+    own = {"split", "apart", "halves", "near_policy"}
     return method.selection not in own and method.candidates == 1
 
 
@@ -326,8 +327,11 @@ def make_selection(
     method: Method, policy: TensorDictModule | None, sigma: float | Callable[[], float] | None
 ) -> Selection:
     """The selection of a method."""
-    if method.selection in _SELECTIONS:
-        return _SELECTIONS[method.selection]
+    if method.selection == "halves":
+        return uniform_halves
+    if method.selection in ("split", "apart"):
+        part: Part = "inverse" if method.selection == "split" else "uniform"
+        return partial(la3p_batches, actor=part, squared=method.loss_function == "l2")
     if method.selection == "near_policy" and policy is not None:
         return ReFERSelection(policy, far_share=method.far_share, cutoff=method.far_cutoff)
     if policy is not None and sigma is not None and method.candidates > 1:

@@ -125,7 +125,9 @@ class LA3PSampler(SignalSampler):
             raise wrong("sampler", "_sum_tree", "positive where something was written", 0.0)
 
 
-def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
+def la3p_batches(
+    buffer: TensorDictReplayBuffer, *, actor: Part = "inverse", squared: bool = False
+) -> Iterator[SampledBatch]:
     """The three updates of an LA3P step, in the order of the authors' code.
 
     Critic and actor learn from a uniform part of the batch, with the loss PAL; then the critic from
@@ -134,6 +136,8 @@ def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
 
     Args:
         buffer: The buffer, with an :class:`LA3PSampler` and a batch size.
+        actor: The part that the actor learns from alone; not by the inverse, it is no LA3P.
+        squared: Whether the critic learns with its loss's own distance in place of PAL and Huber.
 
     Yields:
         Three batches.
@@ -147,12 +151,13 @@ def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
         raise TypeError(f"buffer must have an LA3PSampler, got {type(sampler).__name__}")
     if getattr(buffer, "_prefetch", False):
         raise ValueError("prefetch must be None with LA3P, whose parts depend on each other")
+    of_uniform, of_prioritized = (None, None) if squared else ("pal", "smooth_l1")
     with sampler.part("uniform"):
         batch = buffer.sample()
-    yield SampledBatch(batch, loss_function="pal")
+    yield SampledBatch(batch, loss_function=of_uniform)
     with sampler.part("prioritized"):
         batch = buffer.sample()
-    yield SampledBatch(batch, trains="critic", loss_function="smooth_l1", new_step=False)
-    with sampler.part("inverse"):
+    yield SampledBatch(batch, trains="critic", loss_function=of_prioritized, new_step=False)
+    with sampler.part(actor):
         batch = buffer.sample()
     yield SampledBatch(batch, trains="actor", new_step=False)

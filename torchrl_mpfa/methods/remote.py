@@ -142,4 +142,4 @@ def make_ray_replay(
 
 def can_be_remote(method: Method) -> bool:
     """Whether a method asks no more of its buffer than batches, and of transitions the usual."""
-    return method.selection not in ("split", "near_policy") and not entries_of(method)
+    return method.selection not in ("split", "apart", "near_policy") and not entries_of(method)

@@ -170,7 +170,7 @@ def _check_values_alone(settings: TrainSettings) -> None:
     distances = ("l2", "smooth_l1") if algorithm == "dqn" else ("l2",)
     for name, wrong in (
         ("signals", any(signal not in own for signal in method.signals)),
-        ("selection", method.selection in ("split", "halves", "near_policy")),
+        ("selection", method.selection in ("split", "apart", "halves", "near_policy")),
         ("candidates", method.candidates > 1),
         ("target_average", method.target_average > 1),
         ("loss_function", method.loss_function not in distances),

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from benchmarks.study.designs import KEY, OF_VOLUMES
 from benchmarks.study.figures import (
     looks_of,
     mean_curve,
@@ -17,7 +18,6 @@ from benchmarks.study.figures import (
     plot_profiles,
     plot_volumes,
 )
-from benchmarks.study.protocol import KEY, OF_VOLUMES
 from benchmarks.study.rows import (
     Rows,
 )

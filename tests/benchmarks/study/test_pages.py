@@ -15,13 +15,14 @@ from PIL import Image
 from benchmarks.study import pages as study_pages
 from benchmarks.study import report
 from benchmarks.study import run as study
+from benchmarks.study.designs import paper_comparisons, tables
 from benchmarks.study.figures import (
     plot_study,
 )
 from benchmarks.study.kept_rows import joined, keep, of_arms, read_all_kept, read_kept
 from benchmarks.study.paper import NAMES, PHIS
 from benchmarks.study.permutation import deal_p
-from benchmarks.study.protocol import Table, paper_comparisons, tables
+from benchmarks.study.protocol import Table
 from benchmarks.study.rows import (
     Rows,
     missing,

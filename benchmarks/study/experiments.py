@@ -1,0 +1,74 @@
+"""Experiments: tables H to L, each with its hypothesis in ``docs/study.md``.
+
+All are of the sparse task with TD3 unless they say otherwise, with the robots' map as it is now:
+the runs of table C had another, so that what is compared here is trained here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.study.protocol import (
+    SPARSE,
+    TEST,
+    Table,
+    pairs_of,
+    seeds_of,
+)
+from training.comparison.arms import PLAIN, Arm
+from training.comparison.jobs import Comparison, Evaluation
+
+EFFECTIVE = {"weak": 0.8, "medium": 0.5, "strong": 0.2}
+"""Effective sample sizes at which kinds of priorities are compared, as shares of the buffer."""
+KINDS: dict[str, tuple[str, ...]] = {
+    "floor": ("method=mpfa_per", "method.weight_floor=0.2"),
+    "mixture": (
+        "method=mpfa_plus",
+        "method.signals=[reward,td_error]",
+        "method.combination=mixture",
+    ),
+}
+"""Kinds of priorities that are not methods of the catalogue, by their settings."""
+NOTE = "Success is that of the last policy on exact arcs, each kind of worlds counting the same."
+DRIVEN = Evaluation(TEST.words, 20, "kinematic")
+"""What last policies are asked to do: on exact arcs, ten times as fast as on wheels."""
+
+
+BY_PRIORITY = (
+    "method.signals=[reward,td_error]",
+    "method.fusion=scaled",
+    "method.loss_function=l2",
+    "method.eps=0.05",
+    "method.alpha=0.6",
+    "method.priority_floor=0",
+    "method.max_priority_within_buffer=true",
+)
+"""LA3P's parts with squared errors, by reward and TD error in equal shares."""
+APART = (
+    Arm("inverse", BY_PRIORITY),
+    Arm("apart", (*BY_PRIORITY, "method.selection=apart")),
+)
+"""The critic learns from rows of high priority, the actor from others: by the inverse, or any."""
+
+
+def experiments(root: Path) -> tuple[Table, ...]:
+    """The tables of the experiments."""
+    return (_apart(root),)
+
+
+def _of(folder: Path, methods: tuple[str, ...], *arms: Arm) -> Comparison:
+    return Comparison(folder, methods, SPARSE, seeds_of(20), ("td3",), arms or (PLAIN,), DRIVEN)
+
+
+def _apart(root: Path) -> Table:
+    folder, at = root / "experiments", "experiments/td3"
+    control = f"{at}/uniform_halves"
+    return Table(
+        "J",
+        "Critic and actor apart: does it pay that each has its own batches?",
+        (_of(folder, ("uniform_halves",)), _of(folder, ("la3p",), *APART)),
+        tuple((f"{at}/la3p/{arm.name}", control) for arm in APART),
+        pairs_of(at, "la3p/apart-la3p/inverse"),
+        {"Critic and actor apart": (*(f"{at}/la3p/{arm.name}" for arm in APART), control)},
+        note=NOTE,
+    )
