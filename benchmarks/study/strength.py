@@ -2,13 +2,11 @@
 
     python -m benchmarks.study strength    seven methods, three seeds
     python -m benchmarks.study strength --methods per --seeds 1700    one run, half a minute
-    python -m benchmarks.study strength --methods per mpfa_per floor mixture    kinds of table H
     python -m benchmarks.study strength --show docs/results/strength.csv    the table of kept rows
 
 Writes ``strength.csv``: a row for each run and each number of actions in :data:`MARKS`. Its columns
 are the fields of :class:`Row`. Training is eager and without evaluations, otherwise as in the
-study; the seeds are none of its tables. It continues where it was stopped. Methods are those of the
-catalogue and of :data:`~benchmarks.study.experiments.KINDS`.
+study; the seeds are none of its tables. It continues where it was stopped.
 """
 
 from __future__ import annotations
@@ -26,15 +24,11 @@ from typing import cast
 
 import pandas as pd
 import torch
-from scipy.optimize import brentq
 from tensordict import TensorDict
 
-from benchmarks.study.experiments import EFFECTIVE, KINDS
 from benchmarks.study.protocol import SPARSE
 from mpfa_envs import RandomMirror
 from torchrl_mpfa import EntropyFusion, SignalSampler, TD3Learner
-from torchrl_mpfa.samplers.mixture import MixtureSampler
-from torchrl_mpfa.samplers.tree import TreeSampler
 from training.comparison.report import table
 from training.run.loop import TrainingRun
 from training.settings.command_line import composed
@@ -44,8 +38,6 @@ METHODS = ("per", "mpfa_per", "mpfa_plus", "mpf_per", "lap", "uniform", "pal")
 SEEDS = (1700, 1701, 1702)
 MARKS = (1_200, 4_000, 8_000, 16_000, 24_000)
 """Actions after which the buffer is looked at, the first time before there are goals."""
-_ALPHAS = (0.01, 10.0)
-"""Between which an exponent is looked for."""
 
 
 @dataclass(frozen=True)
@@ -67,49 +59,18 @@ class Row:
     """Rank correlation of the |TD error| of a transition and of its mirror image."""
     reward_weight: float
     """Weight of the reward among the signals (Eq. 18); NaN without entropy weights."""
-    alpha_weak: float
-    """The alpha with which these priorities would have the first effective sample size of
-    :data:`~benchmarks.study.experiments.EFFECTIVE`; NaN without priorities."""
-    alpha_medium: float
-    """The same for the second."""
-    alpha_strong: float
-    """The same for the third."""
 
 
-def chances(sampler: SignalSampler, size: int, alpha: float) -> torch.Tensor:
-    """Probability of each transition by its priorities as they are, with some alpha, ``[size]``."""
-    trees, shares = [cast(TreeSampler, sampler)], torch.ones(1)
-    if isinstance(sampler, MixtureSampler):
-        trees, shares = list(sampler._parts.values()), sampler.shares
-    found = torch.zeros(size, dtype=torch.double)
-    for tree, share in zip(trees, shares, strict=True):
-        powers = tree.priorities()[:size] ** alpha
-        found += share * powers / powers.sum()
-    return found
-
-
-def effective_share(chance: torch.Tensor) -> float:
-    """Effective sample size, 1 / sum of P(i) squared, as a share of the buffer."""
-    return float(1 / (chance.square().sum() * len(chance)))
-
-
-def alpha_for(sampler: SignalSampler, size: int, share: float) -> float:
-    """The alpha with which the effective sample is a share of the buffer, which falls with it."""
-    return float(
-        brentq(lambda alpha: effective_share(chances(sampler, size, alpha)) - share, *_ALPHAS)
-    )
-
-
-def measure(run: TrainingRun, name: str) -> Row:
+def measure(run: TrainingRun) -> Row:
     """Look at a run as it is now."""
     size, sampler = len(run.buffer), run.buffer.sampler
-    chance = torch.full((size,), 1 / size, dtype=torch.double)
-    weight, alphas = math.nan, [math.nan] * len(EFFECTIVE)
+    chance = torch.ones(size, dtype=torch.double)
+    weight = math.nan
     if isinstance(sampler, SignalSampler):
-        chance = chances(sampler, size, sampler.alpha)
-        alphas = [alpha_for(sampler, size, share) for share in EFFECTIVE.values()]
+        chance = sampler.priorities()[:size] ** sampler.alpha
         if isinstance(sampler.fusion, EntropyFusion):
             weight = sampler.weights["reward"]
+    chance /= chance.sum()
     rows = run.buffer.storage[:size]
     goal = rows["next", "reward"].reshape(-1) > 0
     # The map is what the robots of the regime remember; the run's own generator is not touched.
@@ -117,18 +78,15 @@ def measure(run: TrainingRun, name: str) -> Row:
     mirrored = mirror(rows.clone())
     errors, others = td_errors(run, rows), td_errors(run, mirrored)
     return Row(
-        method=name,
+        method=run.settings.method.name,
         seed=run.settings.seed,
         actions=run.actions,
         goals=int(goal.sum()),
-        effective=effective_share(chance),
+        effective=float(1 / (chance.square().sum() * size)),
         goals_sampled=float(chance[goal].sum()),
         td_error=float(errors.median()),
         mirror=pd.Series(errors).corr(pd.Series(others), method="spearman"),
         reward_weight=weight,
-        alpha_weak=alphas[0],
-        alpha_medium=alphas[1],
-        alpha_strong=alphas[2],
     )
 
 
@@ -146,15 +104,14 @@ def td_errors(run: TrainingRun, rows: TensorDict) -> torch.Tensor:
 def rows_of(method: str, seed: int) -> Iterator[Row]:
     """Train a run and look at it on the way."""
     with tempfile.TemporaryDirectory() as folder:
-        own = ("learner=td3", "learner.compile=false", "evaluation.every=0")
-        own += KINDS.get(method, (f"method={method}",))
+        own = ("learner=td3", "learner.compile=false", "evaluation.every=0", f"method={method}")
         (settings,) = composed([*SPARSE, *own, f"seed={seed}", f"run_dir={folder}"])
         found: list[Row] = []
         run = TrainingRun(settings, Path(folder))
 
         def look() -> None:
             if run.actions in MARKS:
-                found.append(measure(run, method))
+                found.append(measure(run))
 
         if not run.train(look):
             sys.exit("stopped: the run in progress is not kept")
@@ -162,7 +119,7 @@ def rows_of(method: str, seed: int) -> Iterator[Row]:
 
 
 def tables_of(rows: pd.DataFrame) -> str:
-    """Markdown tables: what is known of strength, weights over time, exponents if there are any."""
+    """Two Markdown tables: means, lowest and highest once goals are known; weights over time."""
     late, fused = rows[rows["actions"] > MARKS[0]], rows.dropna(subset="reward_weight")
     known = late.assign(goals=late["goals"] / late["actions"])
     parts = {
@@ -184,17 +141,7 @@ def tables_of(rows: pd.DataFrame) -> str:
         "weight of the reward after",
         *(f"{n:,} actions" for n in sorted(set(fused["actions"]))),
     ]
-    found = [table(["method", *parts], cells), table(head, weights)]
-    if "alpha_weak" in late:
-        at = ["effective sample of", *(f"{share:.0%}" for share in EFFECTIVE.values())]
-        columns = [f"alpha_{name}" for name in EFFECTIVE]
-        known = late.dropna(subset=columns)
-        exponents = [
-            [str(name), *(_range(each[column], ".2f") for column in columns)]
-            for name, each in known.groupby("method", sort=False)
-        ]
-        found.append(table(at, exponents))
-    return "\n\n".join(found)
+    return table(["method", *parts], cells) + "\n\n" + table(head, weights)
 
 
 def _range(values: pd.Series, form: str) -> str:
