@@ -20,15 +20,23 @@ from training.comparison.jobs import Comparison, Evaluation
 
 EFFECTIVE = {"weak": 0.8, "medium": 0.5, "strong": 0.2}
 """Effective sample sizes at which kinds of priorities are compared, as shares of the buffer."""
-KINDS: dict[str, tuple[str, ...]] = {
-    "floor": ("method=mpfa_per", "method.weight_floor=0.2"),
+KINDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "per": ("per", ()),
+    "mpfa_per": ("mpfa_per", ()),
+    "floor": ("mpfa_per", ("method.weight_floor=0.2",)),
     "mixture": (
-        "method=mpfa_plus",
-        "method.signals=[reward,td_error]",
-        "method.combination=mixture",
+        "mpfa_plus",
+        ("method.signals=[reward,td_error]", "method.combination=mixture"),
     ),
 }
-"""Kinds of priorities that are not methods of the catalogue, by their settings."""
+"""Kinds of priorities that are compared at equal strength: method and settings."""
+ALPHAS = {
+    "per": (0.63, 0.96, 1.31),
+    "mpfa_per": (0.41, 0.56, 0.73),
+    "floor": (0.45, 0.63, 0.83),
+    "mixture": (0.48, 0.64, 0.85),
+}
+"""What gives each kind those strengths: ``python -m benchmarks.values strength``."""
 NOTE = "Success is that of the last policy on exact arcs, each kind of worlds counting the same."
 DRIVEN = Evaluation(TEST.words, 20, "kinematic")
 """What last policies are asked to do: on exact arcs, ten times as fast as on wheels."""
@@ -53,7 +61,7 @@ APART = (
 
 def experiments(root: Path) -> tuple[Table, ...]:
     """The tables of the experiments."""
-    return (_apart(root),)
+    return (_apart(root), _strength(root))
 
 
 def _of(folder: Path, methods: tuple[str, ...], *arms: Arm) -> Comparison:
@@ -70,5 +78,35 @@ def _apart(root: Path) -> Table:
         tuple((f"{at}/la3p/{arm.name}", control) for arm in APART),
         pairs_of(at, "la3p/apart-la3p/inverse"),
         {"Critic and actor apart": (*(f"{at}/la3p/{arm.name}" for arm in APART), control)},
+        note=NOTE,
+    )
+
+
+def _strength(root: Path) -> Table:
+    folder, at = root / "experiments", "experiments/td3"
+    arms = {
+        (kind, strength): Arm(f"{kind}_{strength}", (*settings, f"method.alpha={alpha}"))
+        for kind, (_, settings) in KINDS.items()
+        for strength, alpha in zip(EFFECTIVE, ALPHAS[kind], strict=True)
+    }
+    labels = {key: f"{at}/{KINDS[key[0]][0]}/{arm.name}" for key, arm in arms.items()}
+    return Table(
+        "H",
+        "Strength or kind: what of a priority matters?",
+        tuple(
+            _of(folder, (method,), *(arms[kind, strength] for strength in EFFECTIVE))
+            for kind, (method, _) in KINDS.items()
+        ),
+        tuple(
+            (labels[kind, strength], labels["per", strength])
+            for strength in EFFECTIVE
+            for kind in KINDS
+            if kind != "per"
+        ),
+        tuple((labels[kind, "strong"], labels[kind, "weak"]) for kind in KINDS),
+        {
+            f"effective sample of {share:.0%}": tuple(labels[kind, strength] for kind in KINDS)
+            for strength, share in EFFECTIVE.items()
+        },
         note=NOTE,
     )
