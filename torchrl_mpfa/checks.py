@@ -25,8 +25,8 @@ COUNT: Rule = (
     "an integer from 1 to 2147483647",
 )
 COUNT_OR_ZERO: Rule = (
-    lambda value: value is not False and value == 0 or COUNT[0](value),
-    "an integer from 0 to 2147483647",
+    lambda value: not isinstance(value, bool) and COUNT[0](value + 1),
+    "an integer from 0 to 2147483646",
 )
 
 
