@@ -119,8 +119,9 @@ def test_what_is_stored_is_what_plain_loops_store(strategy, together):
         index = buffer.extend(as_tensordict(calls[-1]).reshape(ROBOTS, together))
         assert index.tolist() == list(range(len(buffer)))[-len(index) :]
     lengths = {}
-    for number, *_ in sum(calls, []):
-        lengths[number] = lengths.get(number, 0) + 1
+    for rows in calls:
+        for number, *_ in rows:
+            lengths[number] = lengths.get(number, 0) + 1
     expected = hindsight_by_hand(calls, relabel.steps)
     torch.testing.assert_close(torch.tensor(stored_in(buffer)), torch.tensor(expected))
     ended = [number for rows in calls for number, *_, done in rows if done]

@@ -9,7 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from torchrl_mpfa.checks import BELOW_ONE, COUNT, COUNT_OR_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
+from torchrl_mpfa.checks import (
+    BELOW_ONE,
+    COUNT,
+    COUNT_OR_ZERO,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    Rule,
+    check,
+)
 
 SWITCH: Rule = (lambda value: isinstance(value, bool), "true or false")
 

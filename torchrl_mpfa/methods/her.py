@@ -19,14 +19,12 @@ from torchrl_mpfa.spelling import unknown
 
 
 class Relabel(Protocol):
-    """Gives an episode other goals.
-
-    Attributes:
-        entries: What it reads beside the usual; it is not stored.
-    """
+    """Gives an episode other goals."""
 
     @property
-    def entries(self) -> tuple[NestedKey, ...]: ...
+    def entries(self) -> tuple[NestedKey, ...]:
+        """What it reads beside the usual; it is not stored."""
+        ...
 
     def __call__(self, episode: TensorDictBase, steps: Tensor) -> TensorDictBase:
         """Relabel an episode, once for each of some goals.

@@ -111,8 +111,8 @@ class GoalRelabeling:
         following = rows["next"]
         for key, value in (("reward", self._goal_reward), ("terminated", 1), ("done", 1)):
             following[key][last] = value
-        if "truncated" in following.keys():
-            following["truncated"][last] = False
+        if (truncated := following.get("truncated", None)) is not None:
+            truncated[last] = False
         return rows
 
     def _paths(

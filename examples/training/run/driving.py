@@ -231,9 +231,9 @@ class Robots:
         # A reset makes the entries that a step wants; what is in them is replaced.
         self._state = env.reset()
         vector_of(env).load_state_dict(as_arrays(state["environment"]))
-        for name in ("observation", "hindsight"):
-            if name in self._state.keys():
-                self._state[name] = state[name].clone()
+        self._state["observation"] = state["observation"].clone()
+        if self.settings.method.hindsight:
+            self._state["hindsight"] = state["hindsight"].clone()
         self.recall(state)
 
     def close(self) -> None:

@@ -64,5 +64,5 @@ def test_a_reward_for_progress_is_rejected_before_a_run_begins() -> None:
 def test_robots_on_other_machines_are_rejected() -> None:
     settings = sparse()
     settings.ray.workers = 3
-    with pytest.raises(ValueError, match="ray.workers must be 0 with method=her"):
+    with pytest.raises(ValueError, match=r"ray\.workers must be 0 with method=her"):
         check_settings(settings)

@@ -33,6 +33,9 @@ def settings_of(method: str, learner: str, episodes: int) -> TrainSettings:
         seed=5,
     )
     settings.tracking.mode = "off"
+    if method == "her":
+        # Progress to one goal is none to another.
+        settings.environment.progress = "none"
     if method == "ref_er":
         # How fast it sets the policy free goes by the slots of the buffer.
         settings.method.capacity = 10_000
