@@ -24,6 +24,10 @@ COUNT: Rule = (
     ),
     "an integer from 1 to 2147483647",
 )
+COUNT_OR_ZERO: Rule = (
+    lambda value: not isinstance(value, bool) and COUNT[0](value + 1),
+    "an integer from 0 to 2147483646",
+)
 
 
 def seeded_generator() -> torch.Generator:

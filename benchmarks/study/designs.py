@@ -34,8 +34,11 @@ OF_VOLUMES = {
     256: ("uniform", "per", "mpfa_per", "mpfa_plus"),
 }
 """Methods by replay volume."""
-EVERY = tuple(name for name in METHODS if name not in ALIASES.values())
-"""Every method of the catalogue by the name that fits all learners."""
+EVERY = tuple(
+    name for name, made in METHODS.items() if name not in ALIASES.values() and not made.hindsight
+)
+"""Methods of the catalogue by the name that fits all learners, but goals in hindsight, with which a
+run learns from more than its robots did."""
 
 PAPER = ("regime=paper", "robots=16", "updates=16", "learner.compile=true", "tracking=off")
 """The paper's task with the same replay volume and sixteen robots in the place of one."""

@@ -17,6 +17,7 @@ from torchrl_mpfa.methods import ALIASES, METHODS, Method
 LEFT_OUT = {
     "rud": "the policy is held anyway: it is uniform replay",
     "ddpg_radam": "it learns from other rewards, whose values are others",
+    "her": "it learns for other goals, of which the buffers keep nothing",
 }
 """Methods of the catalogue that cannot be compared here, and why."""
 AGAINST = "per"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mpfa_envs.env.config import PAPER_TASK as PAPER_TASK
     from mpfa_envs.env.config import TaskConfig as TaskConfig
+    from mpfa_envs.env.hindsight import GoalRelabeling as GoalRelabeling
     from mpfa_envs.env.navigation import NavigationEnv as NavigationEnv
     from mpfa_envs.env.registration import ENV_IDS as ENV_IDS
     from mpfa_envs.env.registration import ROOMS_TASK as ROOMS_TASK
@@ -60,6 +61,7 @@ EXAMPLE_WORLD = Path(__file__).parent / "assets" / "worlds" / "example.yaml"
 
 _NAMES = {
     "env.config": "PAPER_TASK TaskConfig",
+    "env.hindsight": "GoalRelabeling",
     "env.navigation": "NavigationEnv",
     "env.registration": "ENV_IDS ROOMS_TASK",
     "env.torchrl_env": "NavigationTorchEnv make_navigation_env",

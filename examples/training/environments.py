@@ -83,7 +83,12 @@ def _costly_reward(settings: EnvironmentSettings) -> RewardFunction:
 
 
 def make_training_env(
-    world: str, settings: EnvironmentSettings, *, robots: int = 1, discrete: bool = False
+    world: str,
+    settings: EnvironmentSettings,
+    *,
+    robots: int = 1,
+    discrete: bool = False,
+    hindsight: bool = False,
 ) -> EnvBase:
     """The environment to learn in.
 
@@ -92,6 +97,7 @@ def make_training_env(
         settings: The environment's settings.
         robots: Number of robots.
         discrete: Whether an action is a choice among pairs of wheel speeds.
+        hindsight: Whether transitions have what a goal in hindsight needs.
 
     Returns:
         The environment of batch size ``[robots]``, with the entries of ``info`` that a run records.
@@ -100,6 +106,7 @@ def make_training_env(
         world=world,
         num_envs=robots,
         info_keys=INFO,
+        hindsight=hindsight,
         max_goal_distance=settings.max_goal_distance or math.inf,
         episodes_per_world=settings.episodes_per_world,
         **task_arguments(settings),

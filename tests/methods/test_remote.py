@@ -73,6 +73,7 @@ def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
 
 def test_methods_that_look_into_their_buffer_stay_with_it() -> None:
     assert {name for name in METHODS if not can_be_remote(METHODS[name])} == {
+        "her",
         "la3p",
         "reaper",
         "ref_er",

@@ -19,6 +19,7 @@ from torchrl_mpfa.methods.catalogue import METHODS, Method, check_ranges
 from torchrl_mpfa.methods.cer import CERSampler
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.halves import uniform_halves
+from torchrl_mpfa.methods.her import STRATEGIES
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
@@ -79,6 +80,7 @@ WORDS: dict[str, set[str]] = {
     "importance": {"critic", "torchrl", "none"},
     "loss_function": {"l2", "smooth_l1", "pal"},
     "optimizer": {"adam", "radam"},
+    "hindsight_strategy": set(STRATEGIES),
 }
 """The words of each setting that is a word."""
 
@@ -239,6 +241,9 @@ def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
         (named, "boost", not method.boost, ("boost_factor", "boost_target", "boost_bound")),
         (named, "decay", not method.decay, ("decay_sharpness", "decay_position")),
         (named, "curiosity", not method.curiosity, ("curiosity_scale",)),
+        (default, "hindsight", not method.hindsight, ("hindsight_strategy",)),
+        # It adds up the errors of an episode's own rows.
+        (default, "hindsight", method.hindsight > 0, ("reliability",)),
     ):
         for name in names if wrong else ():
             if getattr(method, name) != getattr(base, name):
@@ -248,7 +253,8 @@ def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
 def entries_of(method: Method) -> tuple[str, ...]:
     """Entries that transitions must have beside the usual, see :class:`Replay`."""
     of_behavior = BEHAVIOR if method.selection == "near_policy" else ()
-    return ((EPISODE.name,) if method.reliability > 0 else ()) + of_behavior
+    numbered = method.reliability > 0 or method.hindsight > 0
+    return ((EPISODE.name,) if numbered else ()) + of_behavior
 
 
 def has_one_batch_a_step(method: Method) -> bool:

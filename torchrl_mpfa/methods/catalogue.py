@@ -9,7 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from torchrl_mpfa.checks import BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
+from torchrl_mpfa.checks import (
+    BELOW_ONE,
+    COUNT,
+    COUNT_OR_ZERO,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    Rule,
+    check,
+)
 
 SWITCH: Rule = (lambda value: isinstance(value, bool), "true or false")
 
@@ -118,6 +127,11 @@ class Method:
     """Whether rewards get a bonus for what the robot could not foresee (ICM)."""
     curiosity_scale: float = _within(POSITIVE, 0.01)
     """eta of that bonus."""
+    hindsight: int = _within(COUNT_OR_ZERO, 0)
+    """Goals for which each episode is learned from once more (HER); 0: none."""
+    hindsight_strategy: str = "future"
+    """Which of its outcomes are goals: ``future``, those of steps at random, or ``final``, its
+    last."""
 
 
 RANGES: dict[str, Rule] = {
@@ -201,6 +215,7 @@ METHODS: dict[str, Method] = {
     "uniform_halves": Method("uniform_halves", **{**_UNIFORM, "selection": "halves"}),
     "cer": Method("cer", **{**_UNIFORM, "selection": "newest"}),
     "geometric": Method("geometric", **{**_UNIFORM, "selection": "geometric"}),
+    "her": Method("her", **_UNIFORM, hindsight=4),
     # Another word for uniform replay, for learners that are not DDPG.
     "uniform": Method("uniform", **_UNIFORM),
 }

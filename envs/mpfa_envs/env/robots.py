@@ -296,6 +296,13 @@ class RobotBatch:
             self.observations,
         )
 
+    def moments(self) -> NDArray[np.float64]:
+        """What a goal in hindsight needs of the present, ``[N, 9 + rays]``."""
+        motions, held = self.episodes.motions, self._by_odometry()
+        sizes = np.array([world.size for world in self.worlds])
+        seen = self.walkers.without(motions, self._lidar, self.ranges)
+        return np.concatenate((motions[:, :2], sizes, held.motions, seen), axis=1)
+
     def _by_odometry(self) -> EpisodeArrays:
         """The episodes with poses, speeds and distances by the robots' odometry."""
         if self.noise is None or not self.noise.has_odometry:

@@ -42,6 +42,9 @@ class NavigationTorchEnv(EnvBase):
     and ``"truncated"``
     ``("info", name)``           ``[1]``   every entry of
                                            ``INFO_TYPES``, bool or float32
+    ``"hindsight"``              ``[M]``   float64, with ``hindsight=True``:
+                                           what a goal in hindsight needs,
+                                           :attr:`VectorNavigationEnv.moments`
     ============================ ========= =============================================
 
     All shapes follow the batch size: ``[]`` for one robot, else ``[num_envs]``. ``reset(seed=3)``
@@ -53,6 +56,7 @@ class NavigationTorchEnv(EnvBase):
         device: Where the tensors live; the simulation runs on the CPU.
         info_keys: Which entries of the info to pass on; None: all. Each costs TorchRL some 20 µs a
             step, which is more than it costs to compute.
+        hindsight: Whether to add ``"hindsight"``, for :class:`~mpfa_envs.GoalRelabeling`.
         **kwargs: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Raises:
@@ -75,6 +79,7 @@ class NavigationTorchEnv(EnvBase):
         num_envs: int | None = None,
         device: torch.device | str | None = None,
         info_keys: Iterable[str] | None = None,
+        hindsight: bool = False,
         **kwargs: Any,
     ) -> None:
         keys = list(INFO_TYPES if info_keys is None else info_keys)
@@ -87,6 +92,7 @@ class NavigationTorchEnv(EnvBase):
         super().__init__(device=device, batch_size=batch_size)
         self.env = env
         """The robots in the order of the batch."""
+        self._hindsight = hindsight
         self._flags, self._numbers = (
             {name: row for row, name in enumerate(names) if name in keys}
             for names in (FLAGS, NUMBERS)
@@ -109,6 +115,10 @@ class NavigationTorchEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Bounded(low=low, high=high, dtype=torch.float32), shape=self.batch_size
         )
+        if self._hindsight:
+            self.observation_spec["hindsight"] = Unbounded(
+                shape=(*self.batch_size, self.env.lidar.angles.size + 9), dtype=torch.float64
+            )
         if entries:
             self.observation_spec["info"] = Composite(entries, shape=self.batch_size)
         self.action_spec = Bounded(
@@ -214,6 +224,8 @@ class NavigationTorchEnv(EnvBase):
         """Build the output of a reset, or with further entries of a step."""
         shape = (*self.batch_size, observations.shape[1])
         rows: dict[str, Any] = {"observation": self._to_device(observations).view(shape), **entries}
+        if self._hindsight:
+            rows["hindsight"] = self._to_device(self.env.moments).view(*self.batch_size, -1)
         if self._numbers or self._flags:
             flags, numbers = self.env.info_tables
             # Two tensors, split into entries: creating a tensor costs more than anything else here.

@@ -178,6 +178,15 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         return self._batch.observations.copy()
 
     @property
+    def moments(self) -> NDArray[np.float64]:
+        """What a goal in hindsight needs of the present, ``[N, 9 + rays]``.
+
+        Position (x, y), the room's size, pose and speeds by odometry, and the range of each ray [m,
+        m/s, rad], of which a ray that met a walker has the greatest, as in the robot's map.
+        """
+        return self._batch.moments()
+
+    @property
     def info_tables(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """The infos as two tables, ``[3, N]`` and ``[15, N]``: the rows are flags and numbers."""
         return self._batch.episodes.flags.copy(), self._batch.episodes.numbers.copy()

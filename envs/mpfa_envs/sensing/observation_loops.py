@@ -52,8 +52,26 @@ def observe_all(
             for index in range(start, seen.shape[0]):
                 seen[index] = seen[(index - start) % sectors]
         motion = motions[robot]
-        speed, turn = motion[3] / fastest, motion[4] / fastest_turn
-        distance = distances[robot]
+        seen[sectors + 4] = min(max(motion[3] / fastest, -SPEED_BOUND), SPEED_BOUND)
+        seen[sectors + 5] = min(max(motion[4] / fastest_turn, -SPEED_BOUND), SPEED_BOUND)
+    observe_goals(motions, goals, distances, chosen, paths, sectors, observations)
+
+
+@njit
+def observe_goals(
+    motions: NDArray[np.float64],  # poses by odometry first [m, m, rad], [N, 5]
+    goals: NDArray[np.float64],  # x, y [m], [N, 2]
+    distances: NDArray[np.float64],  # of the two [m], [N]
+    chosen: NDArray[np.bool_],  # [N]; the others' observations stay
+    paths: NDArray[np.float64],  # direction (x, y) and length [m], [N, 3]; [0, 3] without maps
+    sectors: int,
+    observations: NDArray[np.float32],  # [N, O]
+) -> None:
+    """Write what depends on the goal in the observations of the chosen robots."""
+    for robot in range(observations.shape[0]):
+        if not chosen[robot]:
+            continue
+        seen, motion, distance = observations[robot], motions[robot], distances[robot]
         # A robot on the goal sees it ahead.
         bearing, closeness = 0.0, 1.0
         if distance > 0.0:
@@ -62,8 +80,6 @@ def observe_all(
             closeness = min(GOAL_CLOSENESS_DISTANCE / distance, 1.0)
         seen[sectors], seen[sectors + 1] = math.cos(bearing), math.sin(bearing)
         seen[sectors + 2], seen[sectors + 3] = closeness, distance / DISTANCE_SCALE
-        seen[sectors + 4] = min(max(speed, -SPEED_BOUND), SPEED_BOUND)
-        seen[sectors + 5] = min(max(turn, -SPEED_BOUND), SPEED_BOUND)
         if paths.shape[0] > 0:
             seen[sectors + 6], seen[sectors + 7] = paths[robot, 0], paths[robot, 1]
             seen[sectors + 8] = min(paths[robot, 2] / DISTANCE_SCALE, PATH_BOUND)

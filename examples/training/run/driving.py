@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -73,6 +74,7 @@ class Robots:
                 self.settings.environment,
                 robots=self.count,
                 discrete=is_discrete(self.settings.learner),
+                hindsight=self.settings.method.hindsight > 0,
             )
             self._world = world
         return self._env
@@ -100,7 +102,7 @@ class Robots:
         return self._begun - int((self._steps == 0).sum())
 
     def drive(
-        self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[str] = ()
+        self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[NestedKey] = ()
     ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
         """Take one action with each robot.
 
@@ -108,8 +110,9 @@ class Robots:
             explorer: What acts.
             actions: Of the run before these.
             episode: Episodes of the run that have ended.
-            entries: What else the transitions must have: ``"episode"``, or ``"behavior_mean"``
-                and ``"behavior_sigma"``, the actions without noise and the spread of that.
+            entries: What else the transitions must have: ``"episode"``; ``"behavior_mean"`` and
+                ``"behavior_sigma"``, the actions without noise and the spread of that; or entries
+                of the environment.
 
         Returns:
             The entries of :data:`TRANSITION` and those others, batch size ``[robots]``, and the
@@ -157,7 +160,7 @@ class Robots:
 
     @torch.no_grad()
     def _act(
-        self, explorer: Explorer, state: TensorDictBase, actions: int, entries: Sequence[str]
+        self, explorer: Explorer, state: TensorDictBase, actions: int, entries: Sequence[NestedKey]
     ) -> TensorDictBase:
         assert self._env is not None
         if actions < self.settings.exploration.random_steps:
@@ -197,9 +200,11 @@ class Robots:
         """Where every robot is, and what its next observation and record depend on."""
         assert self._env is not None and self._state is not None
         observation: Tensor = self._state["observation"]
+        hindsight: Tensor | None = self._state.get("hindsight", None)
         return {
             "environment": as_tensors(vector_of(self._env).state_dict()),
             "observation": observation.clone(),
+            "hindsight": None if hindsight is None else hindsight.clone(),
             "rewards": self._rewards.clone(),
             "steps": self._steps.clone(),
             "numbers": self._numbers.clone(),
@@ -227,6 +232,8 @@ class Robots:
         self._state = env.reset()
         vector_of(env).load_state_dict(as_arrays(state["environment"]))
         self._state["observation"] = state["observation"].clone()
+        if self.settings.method.hindsight:
+            self._state["hindsight"] = state["hindsight"].clone()
         self.recall(state)
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from ray.exceptions import RayActorError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.data import TensorSpec
@@ -170,7 +171,7 @@ class Fleet(Robots):
         self._begun += count
 
     def drive(
-        self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[str] = ()
+        self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[NestedKey] = ()
     ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
         """Take the actions of the worker that is ready first, or of all, in order, with ``sync``.
 

@@ -12,12 +12,14 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor
 from tqdm import tqdm
 
-from mpfa_envs import Policy, RandomMirror, save_policy
+from mpfa_envs import GoalRelabeling, Policy, RandomMirror, save_policy
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from torchrl_mpfa import run_updates
+from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.saving import save_atomically, write_text_atomically
 from torchrl_mpfa.selection import SampledBatch
 from training import files
@@ -76,6 +78,7 @@ class TrainingRun:
         self._action_spec = env.action_spec
         self._observation_size = env.observation_spec["observation"].shape[-1]
         robots = vector_of(env)
+        self._task = robots.config
         self._remembered: dict[str, Any] = {
             "sectors": robots.lidar.sectors,
             "memory": robots.config.memory,
@@ -119,10 +122,18 @@ class TrainingRun:
             sigma=lambda: self.explorer.sigma,
         )
         self._replay, self.buffer = replay, replay.buffer
-        self.select, self.entries = replay.select, replay.entries
+        self.select = replay.select
+        self.entries: tuple[NestedKey, ...] = replay.entries
         self.log.forget(method.capacity)
         wanted = settings.assessment
         self.assessment = Assessment(wanted) if wanted.episodes else None
+        if method.hindsight:
+            relabel = GoalRelabeling(self._task)
+            goals = HindsightGoals(
+                relabel, goals=method.hindsight, strategy=method.hindsight_strategy
+            )
+            self.buffer.append_transform(goals)
+            self.entries += relabel.entries
         if settings.environment.mirror:
             pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
             self.buffer.append_transform(RandomMirror(**self._remembered, pairs=pairs))

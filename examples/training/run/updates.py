@@ -62,12 +62,12 @@ class UpdateLog:
         """Take note of new transitions.
 
         Args:
-            index: Their slots, shape ``[B]``.
-            rewards: Their rewards, shape ``[B, 1]``.
+            index: Their slots, and those of what was written in hindsight, shape ``[B]``.
+            rewards: Of what the robots did, shape ``[N, 1]``.
         """
         self._learned_at[index] = _NEVER
         self._reward += float(rewards.sum())
-        self._actions += len(index)
+        self._actions += len(rewards)
 
     def learns(self, index: Tensor) -> None:
         """Take note that the critic learns from a batch, before it does.

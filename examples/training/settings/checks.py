@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mpfa_envs import RobotNoise, TaskConfig, world_tasks
+from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from mpfa_envs.robots.model import resolve_robot
 from torchrl_mpfa.checks import Rule
 from torchrl_mpfa.methods import Method, can_be_remote
@@ -57,7 +57,7 @@ def check_settings(settings: TrainSettings) -> None:
         if is_dataclass(group):
             check_rules(group, rules_of(group), f"{entry.name}.")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
-    _check_environment(settings.environment)
+    _check_environment(settings.environment, hindsight=settings.method.hindsight > 0)
     _check_stages(settings)
     _resolve(
         "evaluation.world",
@@ -91,16 +91,22 @@ def check_settings(settings: TrainSettings) -> None:
         )
 
 
-def _check_environment(environment: EnvironmentSettings) -> None:
+def _check_environment(environment: EnvironmentSettings, *, hindsight: bool) -> None:
     """Have the parts of the task reject what they cannot be."""
     for prefix, make in (
         ("environment.noise.", lambda: RobotNoise(**asdict(environment.noise))),
         ("environment.", lambda: TaskConfig(**task_arguments(environment))),
+        *((("environment.", lambda: _relabeling(environment)),) if hindsight else ()),
     ):
         try:
             make()
         except ValueError as error:
             raise ValueError(f"{prefix}{error}") from error
+
+
+def _relabeling(environment: EnvironmentSettings) -> GoalRelabeling:
+    """What a method with goals in hindsight relabels episodes with."""
+    return GoalRelabeling(TaskConfig(**task_arguments(environment)))
 
 
 def _check_method(method: Method) -> None:

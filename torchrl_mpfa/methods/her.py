@@ -1,0 +1,187 @@
+"""Hindsight experience replay: episodes are learned from once more, with goals that they reached.
+
+After Andrychowicz et al. (2017), "Hindsight experience replay", https://arxiv.org/abs/1707.01495.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import Transform
+
+from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.spelling import unknown
+
+
+class Relabel(Protocol):
+    """Gives an episode other goals."""
+
+    @property
+    def entries(self) -> tuple[NestedKey, ...]:
+        """What it reads beside the usual; it is not stored."""
+        ...
+
+    def __call__(self, episode: TensorDictBase, steps: Tensor) -> TensorDictBase:
+        """Relabel an episode, once for each of some goals.
+
+        Args:
+            episode: Its transitions in their order, batch size ``[T]``.
+            steps: Numbers of the steps after which the goals were reached, ``[K]``.
+
+        Returns:
+            Transitions, batch size ``[R]``, with the entries that are stored.
+        """
+        ...
+
+
+def future_goals(length: int, goals: int, generator: torch.Generator | None = None) -> Tensor:
+    """Steps of an episode at random, each at most once.
+
+    Args:
+        length: Steps of the episode ``T``.
+        goals: Number of steps; of a shorter episode all.
+        generator: Source of the choice; None: PyTorch's own.
+
+    Returns:
+        Numbers of the steps, at most ``[goals]``.
+
+    Examples:
+        >>> future_goals(3, 4).sort().values
+        tensor([0, 1, 2])
+    """
+    return torch.randperm(length, generator=generator)[:goals]
+
+
+def final_goal(length: int, goals: int, generator: torch.Generator | None = None) -> Tensor:
+    """The last step of an episode, whatever the other arguments are.
+
+    Examples:
+        >>> final_goal(3, 4)
+        tensor([2])
+    """
+    return torch.tensor([length - 1])
+
+
+STRATEGIES: dict[str, Callable[[int, int, torch.Generator | None], Tensor]] = {
+    "future": future_goals,
+    "final": final_goal,
+}
+"""Choices of the steps whose outcomes are goals."""
+
+
+class HindsightGoals(Transform):
+    """Writes each episode that has ended once more to a replay buffer, for other goals.
+
+    Append it to a buffer: what is written is stored as it is, and once an episode has ended, its
+    relabelled transitions follow in the same call. They are transitions like all others, with
+    signals and priorities of their own. Nothing changes when batches are sampled.
+
+    Transitions must have the number of their episode and what ``relabel`` reads; neither is stored.
+    Episodes that are under way are part of the state of the buffer.
+
+    Args:
+        relabel: Gives an episode other goals, say ``mpfa_envs.GoalRelabeling``.
+        goals: Goals of an episode ``K``.
+        strategy: ``"future"``: the goals are what was reached after steps at random, each a goal of
+            all that came before it; ``"final"``: one, what was reached last.
+        episode_key: Where the number of the episode is, ``[..., 1]``.
+        generator: Source of the choice of goals; None: PyTorch's own. Its state is not part of the
+            buffer's.
+
+    Raises:
+        ValueError: If ``goals`` is not a positive integer, or ``strategy`` is unknown.
+
+    Examples:
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> class ReachPlace:
+        ...     entries = ("place",)
+        ...
+        ...     def __call__(self, episode, steps):
+        ...         goals = episode["place"][steps]
+        ...         rows = [episode[: step + 1].clone() for step in steps]
+        ...         for each, goal in zip(rows, goals):
+        ...             each["goal"] = goal.expand(len(each), 1)
+        ...         return torch.cat(rows).exclude("place")
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100))
+        >>> buffer = buffer.append_transform(HindsightGoals(ReachPlace(), strategy="final"))
+        >>> episode = TensorDict(
+        ...     {
+        ...         "episode": torch.zeros(3, 1, dtype=torch.long),
+        ...         "place": torch.tensor([[1.0], [2.0], [3.0]]),
+        ...         "goal": torch.full((3, 1), 9.0),
+        ...         "next": {"done": torch.tensor([[False], [False], [True]])},
+        ...     },
+        ...     [3],
+        ... )
+        >>> index = buffer.extend(episode)
+        >>> buffer[:]["goal"].flatten()
+        tensor([9., 9., 9., 3., 3., 3.])
+    """
+
+    def __init__(
+        self,
+        relabel: Relabel,
+        *,
+        goals: int = 4,
+        strategy: str = "future",
+        episode_key: str = "episode",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        check_counts(goals=goals)
+        if strategy not in STRATEGIES:
+            raise ValueError(unknown("strategy", strategy, STRATEGIES))
+        self.goals, self.strategy, self.generator = goals, strategy, generator
+        self._relabel, self._episode_key = relabel, episode_key
+        self._pending: list[TensorDictBase] = []
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Leave a sampled batch as it is."""
+        return tensordict
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        beside = (self._episode_key, *self._relabel.entries)
+        for key in beside:
+            if tensordict.get(key, None) is None:
+                raise KeyError(f"transitions for goals in hindsight must have {key!r}")
+        rows = tensordict.reshape(-1)
+        self._pending.append(rows.clone())
+        written = [rows.exclude(*beside)]
+        done = rows["next", "done"].reshape(-1)
+        if done.any():
+            ended = rows[self._episode_key].reshape(-1)[done]
+            written += [self._in_hindsight(episode) for episode in self._take(ended)]
+        return torch.cat(written)
+
+    def _take(self, ended: Tensor) -> list[TensorDictBase]:
+        """Take the episodes with these numbers out of those under way."""
+        rows = torch.cat(self._pending)
+        numbers = rows[self._episode_key].reshape(-1)
+        self._pending = [rows[~torch.isin(numbers, ended)]]
+        return [rows[numbers == number] for number in ended.tolist()]
+
+    def _in_hindsight(self, episode: TensorDictBase) -> TensorDictBase:
+        steps = STRATEGIES[self.strategy](len(episode), self.goals, self.generator)
+        return self._relabel(episode.exclude(self._episode_key), steps)
+
+    def get_extra_state(self) -> dict[Any, Tensor]:
+        """The transitions of the episodes under way, by key."""
+        if not self._pending:
+            return {}
+        return dict(torch.cat(self._pending).items(include_nested=True, leaves_only=True))
+
+    def set_extra_state(self, state: dict[Any, Tensor]) -> None:
+        """Go on from what :meth:`get_extra_state` gave."""
+        if not state:
+            self._pending = []
+            return
+        count = len(next(iter(state.values())))
+        rows = TensorDict({}, [count])
+        for key, value in state.items():
+            rows.set(key, value.clone())
+        self._pending = [rows]
