@@ -37,7 +37,7 @@ OF_A_METHOD: dict[str, Rule] = {
 """Those of the package, and what this machine has room for."""
 SIGNALS = (
     *("reward", "td_error", "action_gradient", "value"),
-    *("relative_value", "relative_td_error"),
+    *("relative_value", "relative_td_error", "information_gain"),
 )
 """What the losses of ``train.py`` write; a script of your own may have others."""
 
