@@ -157,6 +157,7 @@ def _check_ray(settings: TrainSettings) -> None:
     for name, value, only in (
         ("assessment.episodes", settings.assessment.episodes, 0),
         ("method.update_block", settings.method.update_block, 1),
+        ("environment.reward_noise", settings.environment.reward_noise, 0),
     ):
         if value != only:
             raise ValueError(f"{name} must be {only} with ray.workers={workers}, got {value}")
