@@ -93,6 +93,7 @@ def test_rewards_are_noisy_in_the_buffer_and_in_some_states_alone(tmp_path: Path
     settings, plain = noisy(), noisy(0.0)
     for each in (settings, plain):
         each.exploration.random_steps, each.method.capacity = 1_000, 200
+        each.environment.mirror = False  # What is stored is looked at.
         each.evaluation.every, each.evaluation.episodes = 45, 2
     with_noise, without = train(tmp_path / "noisy", settings), train(tmp_path / "plain", plain)
     assert rows(with_noise) == rows(without)
