@@ -186,9 +186,10 @@ def test_noise_is_on_the_rewards_of_a_third_of_the_states_the_same_for_each_meth
     assert abs(float(some.mean())) < 4 * 2.0 / len(some) ** 0.5
 
 
-def test_noise_makes_values_harder_to_learn_and_not_larger() -> None:
+def test_values_are_harder_to_learn_from_noisy_rewards() -> None:
     buffer = next(each for each in frozen_buffers(FOLDER) if each.name == "sparse-early-per")
     plain, noisier = (
         next(learn(buffer, "uniform", 0, reward_noise=each, marks=(200,))) for each in (0.0, 4.0)
     )
-    assert noisier.rank < plain.rank and noisier.goals == plain.goals
+    assert noisier.rmse > 1.05 * plain.rmse and noisier.goals == plain.goals
+    assert noisier.returns_rank < plain.returns_rank
