@@ -71,6 +71,37 @@ def action_gradient_priority(action_gradient: Tensor, *, order: float = 2.0) -> 
     return torch.linalg.vector_norm(action_gradient, ord=order, dim=-1)
 
 
+def information_gain_priority(
+    td_error: Tensor, quantiles: Tensor, *, least_noise: float = 0.0
+) -> Tensor:
+    r"""Priority of UPER, :math:`p_i = \frac12 \ln(1 + E_i / A_i)`.
+
+    How much a Gaussian estimate with the variance :math:`E_i` learns from one observation with
+    noise of the variance :math:`A_i`. The mean square of the critics' errors is
+    :math:`E_i = \bar\delta_i^2 + \mathrm{Var}_k\,\delta_{ik}`, the distance from the target and the
+    disagreement of the critics; :math:`A_i` is the variance of the quantiles.
+
+    Carrasco-Davis et al. (2025), https://arxiv.org/abs/2506.09270
+
+    Args:
+        td_error: Errors of each critic, shape ``[C, B]``.
+        quantiles: Quantiles of the target, shape ``[B, K]``.
+        least_noise: Least standard deviation that noise is taken to have, in the units of both.
+
+    Returns:
+        Non-negative priorities without a unit, shape ``[B]``.
+
+    Examples:
+        >>> quantiles = torch.tensor([[-1.0, 1.0], [-3.0, 3.0]])
+        >>> gain = information_gain_priority(torch.tensor([[1.0, 3.0], [1.0, 3.0]]), quantiles)
+        >>> gain.exp().square().tolist()  # 1 + 1 / 1 and 1 + 9 / 9
+        [2.0, 2.0]
+    """
+    epistemic = td_error.square().mean(0)
+    aleatoric = quantiles.var(-1, correction=0).clamp_min(least_noise**2)
+    return 0.5 * torch.log1p(epistemic / aleatoric)
+
+
 def proportional_priority(td_error: Tensor, *, eps: float) -> Tensor:
     r"""Priority of plain PER, :math:`p_i = |\delta_i| + \epsilon` (Eq. 9).
 

@@ -91,7 +91,12 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
         },
         [count],
     )
-    known = {"td_error": td_error, "action_gradient": gradient, "value": value}
+    # Half of the places are noisy, with a deviation of 1, and half are hardly so.
+    deviation = rng.choice((0.1, 1.0), size=count)
+    known = {
+        **{"td_error": td_error, "action_gradient": gradient, "value": value},
+        "information_gain": 0.5 * np.log1p((td_error / deviation) ** 2),
+    }
     signals = {name: torch.as_tensor(v, dtype=torch.float) for name, v in known.items()}
     return Transitions(data, signals, kind)
 

@@ -110,7 +110,13 @@ def _train(folder: Path, arm: str, seed: int, names: list[str]) -> list[dict[str
     """Rows of one arm and seed on some buffers, in a process of their own."""
     wanted = {each.name: each for each in _buffers(folder)}
     made = ARMS[arm]
-    train = partial(learn, signals=made.signals, mirrored=made.mirrored, compile=True)
+    train = partial(
+        learn,
+        signals=made.signals,
+        mirrored=made.mirrored,
+        reward_noise=made.reward_noise,
+        compile=True,
+    )
     found = (train(wanted[name], made.method, seed) for name in names)
     return [asdict(measure) for each in found for measure in each]
 

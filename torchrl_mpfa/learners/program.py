@@ -78,7 +78,7 @@ class CompiledGradients:
         """What a program may read: all tensors but those that the loss itself writes."""
         keys = self._loss.tensor_keys
         written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
-        written.add(keys.value_signal)
+        written |= {keys.value_signal, keys.information_gain_signal}
         found = batch.items(True, True)
         # A program is for one layout, which a slice of another tensor has not.
         return {k: v.contiguous() for k, v in found if isinstance(v, Tensor) and k not in written}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -34,15 +35,23 @@ from torchrl_mpfa.losses.functional import (
     scale_rewards,
     trusted_loss,
 )
+from torchrl_mpfa.losses.noise import last_layer, quantile_loss, with_quantiles
 from torchrl_mpfa.networks import DirectModule
-from torchrl_mpfa.priorities import action_gradient_priority, td_error_priority
+from torchrl_mpfa.priorities import (
+    action_gradient_priority,
+    information_gain_priority,
+    td_error_priority,
+)
 from torchrl_mpfa.selection import Trains
-from torchrl_mpfa.signals import ACTION_GRADIENT, SIGNALS_KEY, TD_ERROR
+from torchrl_mpfa.signals import ACTION_GRADIENT, INFORMATION_GAIN, SIGNALS_KEY, TD_ERROR
 
 VALUE = "value"
 """Name of the signal that is Q itself, which may be negative."""
 DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
-_SIGNALS = (*DEFAULT_SIGNALS, VALUE)
+_SIGNALS = (*DEFAULT_SIGNALS, VALUE, INFORMATION_GAIN.name)
+LEAST_NOISE = 0.05
+"""Standard deviation below which a target counts as certain, in units of the reward: without noise
+the errors of a network would otherwise be infinitely informative."""
 _ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
 
 
@@ -55,6 +64,7 @@ class SignalKeys:
     td_error_signal: NestedKey = TD_ERROR.key
     action_gradient_signal: NestedKey = ACTION_GRADIENT.key
     value_signal: NestedKey = (SIGNALS_KEY, VALUE)
+    information_gain_signal: NestedKey = INFORMATION_GAIN.key
     bend: NestedKey = "bend"
 
 
@@ -69,7 +79,10 @@ class SignalLoss:
     Args:
         actor_network: Policy; reads observations, writes ``"action"``.
         critic_network: Critic; reads observations and action, writes ``"state_action_value"``.
-        signals: Which of ``"td_error"``, ``"action_gradient"`` and ``"value"`` (Q itself) to write.
+        signals: Which of ``"td_error"``, ``"action_gradient"``, ``"value"`` (Q itself) and
+            ``"information_gain"`` to write. The last is UPER's, of all critics and of a further
+            network, like the critic, which learns the quantiles of the targets: its loss is part
+            of the critics', and its weights are among theirs.
         gradient_order: Order of the norm in Eq. (14).
         importance: Use of ``"priority_weight"``: on the ``"critic"`` alone, divided by the batch
             size (Eq. 11); ``"torchrl"``: on all losses, divided by the sum of the weights;
@@ -138,6 +151,11 @@ class SignalLoss:
                 f"target_average = {target_average} needs a DirectModule as critic, "
                 f"got {type(critic_network).__name__}"
             )
+        one = critic_network[0] if isinstance(critic_network, list) else critic_network
+        with_noise = INFORMATION_GAIN.name in signals
+        if with_noise:
+            last_layer(one)
+            one = deepcopy(one)
         super().__init__(
             actor_network,
             critic_network,
@@ -152,6 +170,8 @@ class SignalLoss:
         self.saturation_limit = saturation_limit
         self.target_average = target_average
         self.pal_alpha = pal_alpha
+        # Last, so that the critics start as they would without it.
+        self.noise_network = with_quantiles(one) if with_noise else None
         self._bound: Networks | None = None
         self._deferred: tuple[Tensor, Tensor] | None = None
         """Actions and values, whose gradients the backward pass of the loss will find."""
@@ -251,7 +271,8 @@ class SignalLoss:
 
     def critic_parameters(self) -> list[nn.Parameter]:
         """Parameters that the critics' loss moves."""
-        return self._parameters_of(self._critic_name)
+        more = [] if self.noise_network is None else self.noise_network.parameters()
+        return [*self._parameters_of(self._critic_name), *more]
 
     def _parameters_of(self, name: str) -> list[nn.Parameter]:
         flat = getattr(self, f"{name}_params").flatten_keys().values()
@@ -333,11 +354,21 @@ class SignalLoss:
             unit=self.reward_scale * (1.0 if bend is None else bend.reshape(-1)),
             pal_alpha=self.pal_alpha,
         )
+        if self.noise_network is not None:
+            loss = loss + self._noise_loss(tensordict, (target - value).detach(), target)
         if self.importance == "critic":
             weight = tensordict.get(self.tensor_keys.priority_weight, None)
             if weight is not None:
                 loss = loss * weight.reshape(loss.shape).to(loss.device)
         return self._mean(tensordict, loss)
+
+    def _noise_loss(self, tensordict: TensorDictBase, td_error: Tensor, target: Tensor) -> Tensor:
+        """Loss of the quantiles of the targets, ``[B]``; writes the information gain."""
+        quantiles = call(self.noise_network, tensordict)[self.tensor_keys.state_action_value]
+        least = LEAST_NOISE * self.reward_scale
+        gain = information_gain_priority(td_error, quantiles.detach(), least_noise=least)
+        tensordict.set(self.tensor_keys.information_gain_signal, gain)
+        return quantile_loss(quantiles, target)
 
     def _mean(self, tensordict: TensorDictBase, loss: Tensor) -> Tensor:
         """Mean over the batch; with ``importance="torchrl"`` by TorchRL's weights."""

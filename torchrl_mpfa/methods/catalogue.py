@@ -209,6 +209,7 @@ METHODS: dict[str, Method] = {
     "reaper": Method(
         "reaper", **_PER, reliability=0.3, alpha=0.3, max_priority_within_buffer=False
     ),
+    "uper": Method("uper", **{**_PER, "signals": ["information_gain"], "eps": 0.01}),
     "lap": Method("lap", **_LAP),
     "pal": Method("pal", **_UNIFORM, loss_function="pal", alpha=0.4),
     "la3p": Method("la3p", **_LAP, selection="split"),

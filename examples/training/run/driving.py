@@ -12,8 +12,16 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from mpfa_envs import TaskConfig
 from torchrl_mpfa.methods import Method, Replay, make_replay
-from training.environments import INFO, FilteredRobots, make_training_env, vector_of
+from training.environments import (
+    INFO,
+    FilteredRobots,
+    env_arguments,
+    make_training_env,
+    vector_of,
+)
+from training.noise import noisy_rewards
 from training.records import EpisodeRecord
 from training.run.checkpoints import as_arrays, as_tensors
 from training.run.exploration import Explorer
@@ -49,6 +57,8 @@ class Robots:
         """Episodes of the run that were under way when another stage began."""
         self._started = time.perf_counter()
         self._filter = FilteredRobots(settings)
+        parts = TaskConfig(**env_arguments(settings.environment)).observation_slices
+        self._distance = parts["goal_distance"].start
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
@@ -128,7 +138,16 @@ class Robots:
         records = self._note(
             state["next"], self._everyone, explorer, episode=episode, total_steps=total
         )
-        return state.select(*TRANSITION, *entries), records
+        rows = state.select(*TRANSITION, *entries)
+        if self.settings.environment.reward_noise:
+            rows["next", "reward"] = noisy_rewards(
+                rows["next", "reward"],
+                rows["observation"][:, self._distance],
+                deviation=self.settings.environment.reward_noise,
+                # Of the place in the run, so that a run that goes on needs no other state.
+                seed=(self.settings.seed, actions),
+            )
+        return rows, records
 
     def _note(
         self,

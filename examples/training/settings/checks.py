@@ -37,7 +37,7 @@ OF_A_METHOD: dict[str, Rule] = {
 """Those of the package, and what this machine has room for."""
 SIGNALS = (
     *("reward", "td_error", "action_gradient", "value"),
-    *("relative_value", "relative_td_error"),
+    *("relative_value", "relative_td_error", "information_gain"),
 )
 """What the losses of ``train.py`` write; a script of your own may have others."""
 
@@ -163,6 +163,7 @@ def _check_ray(settings: TrainSettings) -> None:
     for name, value, only in (
         ("assessment.episodes", settings.assessment.episodes, 0),
         ("method.update_block", settings.method.update_block, 1),
+        ("environment.reward_noise", settings.environment.reward_noise, 0),
     ):
         if value != only:
             raise ValueError(f"{name} must be {only} with ray.workers={workers}, got {value}")

@@ -72,5 +72,9 @@ class EnvironmentSettings:
     (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With
     some, a policy learns from long drives and from collisions; with 1, it needs the filter. DQN and
     Q learning, which choose among a few actions, have none."""
+    reward_noise: float = setting(0.0, NOT_NEGATIVE)
+    """Standard deviation of noise on the rewards in the buffer, in the third of the states that
+    are 1 to 2 m, 4 to 5 m and so on from the goal. Records of episodes and evaluations are without
+    it."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""

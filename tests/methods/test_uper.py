@@ -1,0 +1,191 @@
+"""UPER: priorities by what there is to learn from a transition, and not by its noise."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from tests.mpfa.losses import KINDS, differentiate_at_once, make_batch, make_of
+from tests.mpfa.transitions import seeded
+from torchrl_mpfa import DDPGLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_mpfa.losses import base
+from torchrl_mpfa.losses.noise import QUANTILES, quantile_loss
+from torchrl_mpfa.methods import loss_options, make_replay
+from torchrl_mpfa.priorities import information_gain_priority
+
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
+
+SIGNAL = ("signals", "information_gain")
+
+
+def by_hand(errors, quantiles, least):
+    """The gain of one transition in plain loops."""
+    mean = sum(errors) / len(errors)
+    disagreement = sum((e - mean) ** 2 for e in errors) / len(errors)
+    middle = sum(quantiles) / len(quantiles)
+    noise = sum((q - middle) ** 2 for q in quantiles) / len(quantiles)
+    return 0.5 * math.log(1 + (mean**2 + disagreement) / max(noise, least**2))
+
+
+def test_the_gain_is_that_of_distance_and_disagreement_over_noise():
+    generator = seeded(0)
+    errors = torch.randn(5, 30, generator=generator, dtype=torch.double)
+    quantiles = torch.randn(30, 7, generator=generator, dtype=torch.double)
+    quantiles[0] = 1.0
+    found = information_gain_priority(errors, quantiles, least_noise=0.3)
+    for row in range(30):
+        expected = by_hand(errors[:, row].tolist(), quantiles[row].tolist(), 0.3)
+        assert found[row].item() == pytest.approx(expected)
+
+
+def test_numbers_of_the_gain():
+    # A distance of 2 and a disagreement of 1, over a variance of 4.
+    gain = information_gain_priority(torch.tensor([[1.0], [3.0]]), torch.tensor([[-2.0, 2.0]]))
+    assert gain.item() == pytest.approx(0.5 * math.log(1 + (4 + 1) / 4))
+    certain = information_gain_priority(torch.tensor([[3.0]]), torch.zeros(1, 4), least_noise=1.0)
+    assert certain.item() == pytest.approx(0.5 * math.log(10))
+    assert information_gain_priority(torch.zeros(2, 1), torch.ones(1, 4), least_noise=1.0) == 0
+
+
+def test_the_quantile_loss_equals_a_loop():
+    quantiles, target = torch.randn(6, 5, generator=seeded(1)), torch.randn(6, generator=seeded(2))
+    for row, loss in enumerate(quantile_loss(quantiles, target)):
+        total = 0.0
+        for place, quantile in enumerate(quantiles[row]):
+            error = (target[row] - quantile).item()
+            total += error * ((place + 0.5) / 5 - (error < 0))
+        assert loss.item() == pytest.approx(total / 5, abs=1e-6)
+
+
+def test_quantiles_that_minimize_the_loss_have_the_variance_of_the_target():
+    target = 2.0 * torch.randn(4_000, generator=seeded(0)) + 1.0
+    quantiles = torch.zeros(1, QUANTILES, requires_grad=True)
+    optimizer = torch.optim.Adam([quantiles], lr=0.03)
+    for _ in range(600):
+        optimizer.zero_grad()
+        quantile_loss(quantiles.expand(len(target), -1), target).mean().backward()
+        optimizer.step()
+    found = quantiles.detach()[0].tolist()
+    assert all(before < after for before, after in pairwise(found))
+    # Sixteen quantiles leave out the ends of the distribution, a twelfth of its variance.
+    assert 3.4 < quantiles.detach().var(correction=0).item() < 4.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_loss_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind):
+    batch, scale = make_batch(), 0.1
+    loss = make_of(kind, signals=["information_gain", "td_error"], reward_scale=scale)
+    with torch.no_grad():
+        for weight in loss.noise_network.parameters():
+            weight.add_(torch.randn(weight.shape, generator=seeded(3)))
+    torch.manual_seed(0)
+    _, log = loss.losses(batch, trains="critic")
+    quantiles = loss.noise_network.outputs(batch)["state_action_value"]
+    assert quantiles.shape == (6, QUANTILES)
+    squares = log["td_error"].reshape(-1, 6)
+    for row in range(6):
+        errors = (squares[:, row].sqrt() / scale).tolist()
+        if kind != "ddpg":
+            target = log["target_value"][row] / scale
+            errors = (target - log["pred_value"][:, row] / scale).tolist()
+        expected = by_hand(errors, (quantiles[row] / scale).tolist(), base.LEAST_NOISE)
+        assert batch[SIGNAL][row].item() == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_critics_and_actor_start_and_learn_as_without_it(kind):
+    plain = make_of(kind, signals=["td_error"])
+    loss = make_of(kind, signals=["information_gain"])
+    for each in (plain, loss):
+        torch.manual_seed(0)
+        losses, _ = each.losses(make_batch(weighted=True))
+        torch.autograd.backward([value for value in losses.values() if value.requires_grad])
+    found = dict(loss.named_parameters())
+    for name, parameter in plain.named_parameters():
+        assert parameter.equal(found[name])
+        assert (parameter.grad is None) == (found[name].grad is None)
+        if parameter.grad is not None:
+            torch.testing.assert_close(found[name].grad, parameter.grad)
+    own = {name for name in found if name.startswith("noise_network.")}
+    assert own == found.keys() - dict(plain.named_parameters()).keys()
+    assert any(found[name].grad.abs().sum() > 0 for name in own)
+    learned = {id(each) for each in loss.critic_parameters()}
+    assert all(id(found[name]) in learned for name in own)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_trace_writes_the_same_gain(kind):
+    loss = make_of(kind, signals=["information_gain", "action_gradient"])
+    eager, traced = make_batch(weighted=True), make_batch(weighted=True)
+    torch.manual_seed(0)
+    loss.losses(eager, defer_gradient=False)
+    torch.manual_seed(0)
+    differentiate_at_once(loss, traced)
+    torch.testing.assert_close(traced["signals"], eager["signals"])
+
+
+def test_a_critic_whose_last_layer_gives_more_than_q_is_rejected():
+    class Summed(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = nn.Linear(7, 3)
+
+        def forward(self, observation, action):
+            return self.layer(torch.cat((observation, action), -1)).sum(-1, keepdim=True)
+
+    keys = ["observation", "action"], ["state_action_value"]
+    critic = TensorDictModule(Summed(), *keys)
+    with pytest.raises(ValueError, match="whose last linear layer has one output, got Linear"):
+        make_ddpg_loss(make_actor(5, 2), critic, signals=["information_gain"])
+    assert make_ddpg_loss(make_actor(5, 2), critic).noise_network is None
+
+
+def noisy_share(method, *, rows=1_000, updates=300):
+    """Share of the noisier half of transitions in the batches of a bandit with equal means."""
+    torch.manual_seed(0)
+    generator = seeded(0)
+    observation = torch.rand(rows, 2, generator=generator) * 2 - 1
+    noisy = observation[:, 0] > 0
+    reward = torch.where(noisy, 2.0, 0.3) * torch.randn(rows, generator=generator)
+    end = torch.ones(rows, 1, dtype=torch.bool)
+    after = {"observation": observation, "done": end, "terminated": end}
+    action = torch.zeros(rows, 1)
+    replay = make_replay(method, capacity=rows, batch_size=64, generator=generator)
+    replay.buffer.extend(
+        TensorDict(
+            {
+                "observation": observation,
+                "action": action,
+                "next": {**after, "reward": reward.unsqueeze(-1)},
+            },
+            [rows],
+        )
+    )
+    networks = make_actor(2, 1, width=32), make_critic(2, 1, width=32)
+    learner = DDPGLearner(make_ddpg_loss(*networks, **loss_options(method)), critic_lr=1e-3)
+    found = []
+    for _ in range(updates):
+        for draw in replay.select(replay.buffer):
+            found.append(noisy[draw.batch["index"]].float().mean().item())
+            learner.update(draw)
+            replay.buffer.update_tensordict_priority(draw.batch)
+    later = found[updates // 3 :]
+    return sum(later) / len(later)
+
+
+def test_the_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypatch):
+    assert noisy_share("per") > 0.7
+    assert 0.4 < noisy_share("uper") < 0.57
+    # Without the noise in its denominator it does as PER.
+    monkeypatch.setattr(
+        base,
+        "information_gain_priority",
+        lambda error, quantiles, *, least_noise: information_gain_priority(
+            error, torch.zeros_like(quantiles), least_noise=least_noise
+        ),
+    )
+    assert noisy_share("uper") > 0.6
