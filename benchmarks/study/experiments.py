@@ -12,6 +12,7 @@ from benchmarks.study.protocol import (
     SPARSE,
     TEST,
     Table,
+    arms_of,
     pairs_of,
     seeds_of,
 )
@@ -57,15 +58,60 @@ APART = (
     Arm("apart", (*BY_PRIORITY, "method.selection=apart")),
 )
 """The critic learns from rows of high priority, the actor from others: by the inverse, or any."""
+HINDSIGHT = Arm("hindsight", ("method.hindsight=4",))
+"""Goals in hindsight beside the priorities of a method: as many as the method ``her`` has."""
+NOISE = Arm("noise", ("environment.reward_noise=2",))
+"""Rewards with a standard deviation of 2 in a third of the states."""
 
 
 def experiments(root: Path) -> tuple[Table, ...]:
     """The tables of the experiments."""
-    return (_apart(root), _strength(root))
+    return (_hindsight(root), _noise(root), _apart(root), _strength(root))
 
 
 def _of(folder: Path, methods: tuple[str, ...], *arms: Arm) -> Comparison:
     return Comparison(folder, methods, SPARSE, seeds_of(20), ("td3",), arms or (PLAIN,), DRIVEN)
+
+
+def _hindsight(root: Path) -> Table:
+    folder, at = root / "experiments", "experiments/td3"
+    plain = ("uniform", "per", "mpfa_per")
+    fused = tuple(f"{at}/{method}/{HINDSIGHT.name}" for method in plain[1:])
+    return Table(
+        "L",
+        "Hindsight: does learning for goals that were reached do more than priorities?",
+        (_of(folder, (*plain, "her")), _of(folder, plain[1:], HINDSIGHT)),
+        (*pairs_of(at, "her-uniform", "her-per", "her-mpfa_per"), (fused[0], f"{at}/her")),
+        (
+            *((with_goals, f"{at}/{method}") for with_goals, method in zip(fused, plain[1:])),
+            (fused[1], f"{at}/her"),
+            (fused[1], fused[0]),
+            *pairs_of(at, "per-uniform", "mpfa_per-uniform", "mpfa_per-per"),
+        ),
+        {
+            "goals as they were": arms_of(at, *plain),
+            "and in hindsight": (f"{at}/her", *fused),
+        },
+        note=NOTE,
+    )
+
+
+def _noise(root: Path) -> Table:
+    folder, at = root / "experiments", "experiments/td3"
+    methods = ("uniform", "per", "mpfa_per", "mpfa_plus", "uper")
+    return Table(
+        "I",
+        "Noisy rewards: which priorities do they mislead?",
+        (_of(folder, methods, NOISE),),
+        pairs_of(at, "uper-per", "mpfa_per-uniform", "per-uniform", suffix=f"/{NOISE.name}"),
+        pairs_of(
+            at,
+            *("uper-uniform", "mpfa_plus-uniform", "mpfa_per-per", "uper-mpfa_per"),
+            suffix=f"/{NOISE.name}",
+        ),
+        {"noisy rewards": arms_of(at, *methods, suffix=f"/{NOISE.name}")},
+        note=NOTE,
+    )
 
 
 def _apart(root: Path) -> Table:
