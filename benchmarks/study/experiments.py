@@ -83,7 +83,10 @@ def _hindsight(root: Path) -> Table:
         (_of(folder, (*plain, "her")), _of(folder, plain[1:], HINDSIGHT)),
         (*pairs_of(at, "her-uniform", "her-per", "her-mpfa_per"), (fused[0], f"{at}/her")),
         (
-            *((with_goals, f"{at}/{method}") for with_goals, method in zip(fused, plain[1:])),
+            *(
+                (with_goals, f"{at}/{method}")
+                for with_goals, method in zip(fused, plain[1:], strict=True)
+            ),
             (fused[1], f"{at}/her"),
             (fused[1], fused[0]),
             *pairs_of(at, "per-uniform", "mpfa_per-uniform", "mpfa_per-per"),
