@@ -134,7 +134,7 @@ TASK_PAGES = [
     "vector.md",
     "worlds.md",
 ]
-ELSEWHERE = ["methods/README.md", "methods/mpfa_per.md", "torchrl_trainer.md"]
+ELSEWHERE = ["methods/README.md", "methods/mpfa_per.md", "torchrl_trainer.md", "tuning.md"]
 """Pages whose code is run by the tests of what they are about."""
 
 BOX = """<sdf><world name="w"><model name="m"><static>1</static><link name="l"><collision name="c">

@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.run.running import prepare_process
 from training.settings.command_line import composed
@@ -37,16 +38,17 @@ def measure(overrides: Sequence[str], seconds: float) -> tuple[float, float]:
     (settings,) = composed([*overrides, "tracking=off"])
     prepare_process(settings)
     with tempfile.TemporaryDirectory() as folder:
-        run = TrainingRun(settings, Path(folder))
         looks: list[tuple[float, int, int]] = []
 
-        def look() -> None:
-            if run.updates:
-                looks.append((time.perf_counter(), run.actions, run.updates))
-            if len(looks) > _WARM + 1 and looks[-1][0] - looks[_WARM][0] > seconds:
-                run.stop.signal = 0
+        class Look(Hook):
+            def on_iteration(self, run: TrainingRun) -> None:
+                if run.updates:
+                    looks.append((time.perf_counter(), run.actions, run.updates))
+                if len(looks) > _WARM + 1 and looks[-1][0] - looks[_WARM][0] > seconds:
+                    run.stop.ask()
 
-        run.train(look)
+        run = TrainingRun(settings, Path(folder), hooks=[Look()])
+        run.train()
         run.close()
     first, last = looks[_WARM], looks[-1]
     taken = last[0] - first[0]

@@ -30,6 +30,7 @@ from benchmarks.study.protocol import SPARSE
 from mpfa_envs import RandomMirror
 from torchrl_mpfa import EntropyFusion, SignalSampler, TD3Learner
 from training.comparison.report import table
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.command_line import composed
 from training.settings.train import register
@@ -107,13 +108,13 @@ def rows_of(method: str, seed: int) -> Iterator[Row]:
         own = ("learner=td3", "learner.compile=false", "evaluation.every=0", f"method={method}")
         (settings,) = composed([*SPARSE, *own, f"seed={seed}", f"run_dir={folder}"])
         found: list[Row] = []
-        run = TrainingRun(settings, Path(folder))
 
-        def look() -> None:
-            if run.actions in MARKS:
-                found.append(measure(run))
+        class Look(Hook):
+            def on_iteration(self, run: TrainingRun) -> None:
+                if run.actions in MARKS:
+                    found.append(measure(run))
 
-        if not run.train(look):
+        if not TrainingRun(settings, Path(folder), hooks=[Look()]).train():
             sys.exit("stopped: the run in progress is not kept")
     yield from found
 

@@ -17,6 +17,7 @@ from benchmarks.values.frozen import FrozenBuffer, as_stored
 from benchmarks.values.learning import BATCH, FrozenPolicyLearner, make_frozen_learner
 from torchrl_mpfa.methods import METHODS
 from training.run.driving import TRANSITION
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.command_line import composed
 from training.settings.train import register
@@ -70,20 +71,26 @@ SOURCES_OF_ALL = tuple(
 """The runs of all buffers."""
 
 
+class _StopAfter(Hook):
+    """Stops a run after so many actions."""
+
+    def __init__(self, actions: int) -> None:
+        self._actions = actions
+
+    def on_iteration(self, run: TrainingRun) -> None:
+        if run.actions >= self._actions:
+            run.stop.ask()
+
+
 def capture(source: Source) -> FrozenBuffer:
     """Train a run, stop it, and find the values of its policy."""
     with tempfile.TemporaryDirectory() as folder:
         own = ("learner=td3", "evaluation.every=0", f"method={source.method}")
         settings = (*REWARDS[source.reward], *own, f"seed={source.seed}", f"run_dir={folder}")
         (asked,) = composed(settings)
-        run = TrainingRun(asked, Path(folder))
+        run = TrainingRun(asked, Path(folder), hooks=[_StopAfter(TIMES[source.time])])
         run.entries = _ENTRIES
-
-        def stop_in_time() -> None:
-            if run.actions >= TIMES[source.time]:
-                run.stop.ask()
-
-        run.train(stop_in_time)
+        run.train()
         keys = [*TRANSITION, *_ENTRIES]
         rows = as_stored(run.buffer.storage[: len(run.buffer)].select(*keys))
         env = run.robots.environment(run.schedule.world)

@@ -1,4 +1,4 @@
-"""How a run ends early: Ctrl-C, a scheduler, a closed terminal, or a parent that is gone."""
+"""How a run ends early: Ctrl-C, a scheduler, a closed terminal, a parent gone, or a hook."""
 
 from __future__ import annotations
 
@@ -20,23 +20,32 @@ class Stop:
 
     Args:
         answer: What it says to the first one.
+
+    Examples:
+        >>> stop = Stop()
+        >>> bool(stop), stop.ask(), bool(stop), stop.exit_status
+        (False, None, True, 0)
     """
 
     def __init__(self, answer: str = "stopping and saving") -> None:
         self.answer = answer
         self.signal: int | None = None
+        """Number of the signal, 0 if the program itself asked, None if nobody did."""
 
     def __bool__(self) -> bool:
         return self.signal is not None
 
     @property
     def exit_status(self) -> int:
-        """As shells have it: 128 and the number of the signal."""
-        return 128 + (self.signal or 0)
+        """As shells have it: 128 and the number of the signal; 0 if there was none."""
+        return 128 + self.signal if self.signal else 0
 
-    def ask(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
-        """Ask to stop; a handler of signals."""
-        if self.signal is not None:
+    def ask(self, number: int = 0, frame: FrameType | None = None) -> None:
+        """Ask to stop, without a number from within the program; a handler of signals."""
+        if number == 0:
+            self.signal = self.signal or 0
+            return
+        if self.signal:
             raise KeyboardInterrupt
         self.signal = number
         name = signal.Signals(number).name

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from training.run.checkpoints import read_checkpoint
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.train import (
     GROUPS,
@@ -77,6 +78,13 @@ def rows(run: TrainingRun) -> list[dict[str, object]]:
     return [{k: v for k, v in asdict(r).items() if k != "seconds"} for r in run.records]
 
 
+class Look(Hook):
+    """Calls a function after each iteration."""
+
+    def __init__(self, look: Callable[[TrainingRun], object]) -> None:
+        self.on_iteration = look  # type: ignore[assignment, method-assign]
+
+
 def train(
     folder: Path,
     settings: TrainSettings,
@@ -86,8 +94,8 @@ def train(
 ) -> TrainingRun:
     """Train to the end, or until ``look`` stops it after an iteration."""
     folder.mkdir(parents=True, exist_ok=True)
-    run = TrainingRun(settings, folder, state)
-    run.train(lambda: look(run))
+    run = TrainingRun(settings, folder, state, [Look(look)])
+    run.train()
     run.close()
     return run
 

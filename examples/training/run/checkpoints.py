@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from torchrl_mpfa.saving import load_safely
 from training.files import CHECKPOINT
+from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
+
+if TYPE_CHECKING:
+    from training.run.loop import TrainingRun
 
 FORMAT = 5
 """5: many robots, in the middle of their episodes."""
@@ -30,6 +36,55 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
     if found != FORMAT:
         raise ValueError(f"{file} has format {found}, this version reads {FORMAT}")
     return dict(state)
+
+
+def state_of(run: TrainingRun) -> dict[str, Any]:
+    """A run's state: everything that its next iteration depends on, and its records."""
+    return {
+        "format": FORMAT,
+        "settings": asdict(run.settings),
+        "wandb": run.tracker.run_id,
+        "schedule": run.schedule.state_dict(),
+        "updates": run.updates,
+        "waiting": run.waiting // run.settings.robots,
+        "waiting_actions": run.waiting % run.settings.robots,
+        "random": random_state(run.settings.device),
+        "robots": run.robots.state_dict(),
+        "learner": run.learner.state_dict(),
+        "buffer": run.buffer.state_dict(),
+        "explorer": run.explorer.state_dict(),
+        "curiosity": None if run.curiosity is None else run.curiosity.checkpoint(),
+        "best": None if run.best is None else dict(run.best.state_dict()),
+        "records": [asdict(record) for record in run.records],
+        "evaluations": [asdict(record) for record in run.evaluations],
+        "assessments": [asdict(record) for record in run.assessments],
+        "assessment": None if run.assessment is None else run.assessment.state_dict(),
+        "log": run.log.state_dict(),
+    }
+
+
+def restore(run: TrainingRun, state: dict[str, Any]) -> None:
+    """Take over everything but where the robots are, which depends on how they go on."""
+    run.schedule.load_state_dict(state["schedule"])
+    run.updates = state["updates"]
+    run.waiting = state.get("waiting", 0) * run.settings.robots
+    run.waiting += state.get("waiting_actions", 0)
+    run.learner.load_state_dict(state["learner"])
+    run.buffer.load_state_dict(state["buffer"])
+    run.explorer.load_state_dict(state["explorer"])
+    if run.curiosity is not None:
+        run.curiosity.restore(state["curiosity"])
+    if state["best"] is not None:
+        run.best = copy.deepcopy(run.learner.policy)
+        run.best.load_state_dict(state["best"])
+    run.records = [EpisodeRecord(**record) for record in state["records"]]
+    run.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
+    if run.assessment is not None:
+        run.assessments = [AssessmentRecord(**record) for record in state["assessments"]]
+        run.assessment.load_state_dict(state["assessment"], run.learner.policy)
+    if "log" in state:  # A checkpoint may be older than the rows.
+        run.log.load_state_dict(state["log"])
+    set_random_state(run.settings.device, state["random"])
 
 
 def random_state(device: str) -> Any:

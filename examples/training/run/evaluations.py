@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import time
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 from tensordict.nn import TensorDictModule
 
 from mpfa_envs import Policy, WorldTask, run_tasks, world_tasks
 from training.environments import env_arguments
 from training.evaluating import Drivable, filtered
-from training.records import EvaluationRecord
+from training.records import EvaluationRecord, last_best
 from training.run.assembly import policy_layers
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
+
+if TYPE_CHECKING:
+    from training.run.loop import TrainingRun
 
 SEED = 1
 """Of the pairs of start and goal: others than those of ``evaluate.py``."""
@@ -35,6 +39,17 @@ def exported_policy(
         },
         env_arguments=env_arguments(settings.environment),
     )
+
+
+def kept_policy(run: TrainingRun) -> Policy:
+    """The policy of a run: the last one, that which did best, or that which was kept."""
+    policy, episodes, steps = run.learner.policy, run.schedule.episodes, run.actions
+    if run.settings.evaluation.choose and run.best is not None:
+        record = last_best(run.evaluations)
+        policy, episodes, steps = run.best, record.episode, record.total_steps
+    if run.assessment is not None and run.assessment.kept is not None:
+        policy, (episodes, steps) = run.assessment.kept, run.assessment.kept_at
+    return exported_policy(policy, run.settings, episodes=episodes, steps=steps)
 
 
 def evaluate_policy(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from training.records import EpisodeRecord, as_table
 from training.run.assembly import method_of
 from training.run.checkpoints import read_checkpoint
 from training.run.compiling import prepare_compiler
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
 from training.settings.checks import check_settings
 from training.settings.resuming import changed, check_lawful, check_single
@@ -66,12 +68,13 @@ def outside_cause(error: Exception) -> str | None:
     return None
 
 
-def start(settings: TrainSettings, folder: Path) -> int:
+def start(settings: TrainSettings, folder: Path, hooks: Sequence[Hook] = ()) -> int:
     """Train anew.
 
     Args:
         settings: The settings, checked.
         folder: Of the run.
+        hooks: What is called on the way.
 
     Returns:
         Exit status: 0, or 128 and the number of the signal that stopped the run.
@@ -90,7 +93,7 @@ def start(settings: TrainSettings, folder: Path) -> int:
                 )
             prepare_process(settings)
             settings = replace(settings, run_dir=str(folder))
-            training = TrainingRun(settings, folder)
+            training = TrainingRun(settings, folder, hooks=hooks)
             # Only now: a setting that the parts refuse leaves the old run in its place.
             files.set_aside(folder)
             write_settings(settings, folder / files.SETTINGS)
@@ -99,7 +102,7 @@ def start(settings: TrainSettings, folder: Path) -> int:
         return _train(training)
 
 
-def resume(folder: Path, overrides: list[Override]) -> int:
+def resume(folder: Path, overrides: list[Override], hooks: Sequence[Hook] = ()) -> int:
     """Go on with a run where its checkpoint was written."""
     with ExitStack() as held:
         with refusing():
@@ -119,7 +122,7 @@ def resume(folder: Path, overrides: list[Override]) -> int:
                 print(after_the_end(folder))
                 return 0
             prepare_process(settings)
-            training = TrainingRun(settings, folder, state)
+            training = TrainingRun(settings, folder, state, hooks)
             # A run that was finished is not, once it is asked for more.
             (folder / files.STATUS).unlink(missing_ok=True)
             write_settings(settings, folder / files.SETTINGS)
@@ -144,6 +147,8 @@ def _train(training: TrainingRun) -> int:
     try:
         finished = training.train()
     except KeyboardInterrupt:
+        # Whoever asked before, this is what ends it.
+        training.stop.signal = training.stop.signal or signal.SIGINT
         finished = False
     except Exception as error:
         failure = outside_cause(error)

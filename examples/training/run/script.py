@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from training.files import check_folder
+from training.run.hooks import Hook
 from training.run.running import Refused, resume, start
 from training.settings.command_line import composed, parse_overrides
 from training.settings.train import as_settings, register
@@ -26,8 +27,16 @@ def refuse(error: Exception) -> NoReturn:
     raise SystemExit(REFUSED)
 
 
-def train(arguments: list[str]) -> None:
-    """Check the command line, which Hydra reads as well, then train."""
+def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
+    """Check the command line, which Hydra reads as well, then train.
+
+    Args:
+        arguments: The settings, ``sys.argv[1:]``.
+        hooks: What is called on the way; each run of a sweep calls the same ones.
+
+    Raises:
+        SystemExit: Unless the exit status is 0; ``train.py`` lists the others.
+    """
     register()
     try:
         overrides = parse_overrides(arguments)
@@ -45,18 +54,16 @@ def train(arguments: list[str]) -> None:
     except ValueError as error:
         refuse(error)
     if resumes:
-        _end_with(lambda: resume(Path(str(folders[-1])), overrides))
+        _end_with(lambda: resume(Path(str(folders[-1])), overrides, hooks))
     elif len(runs) == 1 and not any(text.startswith(("-", "hydra")) for text in arguments):
-        _end_with(lambda: start(runs[0], Path(runs[0].run_dir)))
+        _end_with(lambda: start(runs[0], Path(runs[0].run_dir), hooks))
     else:
         # Sweeps, and whatever else Hydra can; it composes the settings once more.
-        hydra.main(version_base="1.3", config_path=None, config_name="train")(_run)()
+        def run(config: DictConfig) -> None:
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            _end_with(lambda: start(as_settings(config), folder, hooks))
 
-
-def _run(config: DictConfig) -> None:
-    """One run, in the folder that Hydra found for it."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    _end_with(lambda: start(as_settings(config), folder))
+        hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()
 
 
 def _end_with(run: Callable[[], int]) -> None:

@@ -1,58 +1,44 @@
-"""What a policy does in worlds that it has not met, as a tracker shows it."""
+"""What a run's policy does in worlds that it has not met, as its tracker shows it."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
-from mpfa_envs import Policy, save_policy
+from mpfa_envs import save_policy
 from mpfa_envs.evaluation.results import EpisodeResult
-from torchrl_mpfa import Learner
 from training import files
 from training.evaluating import drive
 from training.pictures import EPISODE, TRAJECTORIES, VALUES, write_pictures
 from training.records import as_table
-from training.run.evaluations import SEED
-from training.run.tracking import Tracker
+from training.run.evaluations import SEED, kept_policy
 from training.run.values import values_of
-from training.settings.train import TrainSettings
+
+if TYPE_CHECKING:
+    from training.run.loop import TrainingRun
 
 
-def show_policy(
-    tracker: Tracker,
-    settings: TrainSettings,
-    policy: Policy,
-    learner: Learner,
-    *,
-    folder: Path,
-    actions: int,
-) -> float:
-    """Log the paths of a policy, an episode, Q over a room, a table of episodes, and the policy.
+def show_policy(run: TrainingRun) -> None:
+    """Log the paths of a run's policy, an episode, Q over a room, a table of episodes, the policy.
 
-    Args:
-        tracker: Where it is logged; nothing is done unless it shows pictures.
-        settings: Of the run; the worlds are those of its evaluations.
-        policy: The policy, without noise; it is saved in the folder.
-        learner: Whose critic values its actions.
-        folder: Of the run.
-        actions: Of all robots so far.
-
-    Returns:
-        How long it took [s].
+    The worlds are those of the run's evaluations. Nothing is done unless pictures are asked for
+    and a log can show them. The clock of the run, which shows how long it trains, stands still.
     """
-    if settings.tracking.pictures_every is None or not tracker.shows:
-        return 0.0
-    begun, wanted = time.perf_counter(), settings.evaluation
-    save_policy(policy, folder / files.POLICY, overwrite=True)
+    settings = run.settings
+    if settings.tracking.pictures_every is None or not run.tracker.shows:
+        return
+    begun, wanted, policy = time.perf_counter(), settings.evaluation, kept_policy(run)
+    file = run.folder / files.POLICY
+    save_policy(policy, file, overwrite=True)
     [drives] = drive(
         policy, [wanted.world], episodes=wanted.episodes, seed=SEED, physics=None, progress=False
     )
-    values = values_of(learner, policy, settings)
+    values = values_of(run.learner, policy, settings)
     with TemporaryDirectory() as place:
         made = Path(place)
         write_pictures(policy, [drives], made, values=values)
@@ -62,6 +48,5 @@ def show_policy(
             "policy/episode": made / EPISODE,
             "policy/episodes": as_table(drives.results, EpisodeResult),
         }
-        card = policy.card
-        tracker.log_policy(entries, file=folder / files.POLICY, card=card, actions=actions)
-    return time.perf_counter() - begun
+        run.tracker.log_policy(entries, file=file, card=policy.card, actions=run.actions)
+    run.robots.seconds -= time.perf_counter() - begun

@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_mpfa import SignalReplayBuffer
 from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
+from training.run.hooks import Hook
 from training.run.loggers import CSVLog, Log, TensorboardLog
 from training.settings.train import TrackingSettings, TrainSettings
 
 if TYPE_CHECKING:
+    from training.run.loop import TrainingRun
     from training.run.wandb_log import WandbLog
 
 
-class Tracker:
+class Tracker(Hook):
     """The logs of a run; every name is explained in ``docs/metrics.md``.
 
     Args:
@@ -52,7 +53,7 @@ class Tracker:
         if wanted.tensorboard:
             self._logs.append(TensorboardLog(folder, actions=actions))
 
-    def log_episode(self, record: EpisodeRecord) -> None:
+    def on_episode(self, run: TrainingRun, record: EpisodeRecord) -> None:
         """Log one episode."""
         entries: dict[str, Any] = {
             f"train/{name}": float(getattr(record, name))
@@ -64,24 +65,20 @@ class Tracker:
         entries["time/steps_per_second"] = record.total_steps / max(record.seconds, 1e-9)
         self._log(entries, record.total_steps)
 
-    def log_evaluation(self, record: EvaluationRecord) -> None:
+    def on_evaluation(self, run: TrainingRun, record: EvaluationRecord) -> None:
         """Log an evaluation."""
         rates = ("success", "collision", "timeout", "spl")
         entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
         self._log(entries, record.total_steps)
 
-    def log_assessment(self, record: AssessmentRecord) -> None:
+    def on_assessment(self, run: TrainingRun, record: AssessmentRecord) -> None:
         """Log an assessment."""
         names = ("episodes", "least", "kept")
         entries = {f"assessment/{name}": float(getattr(record, name)) for name in names}
         self._log(entries, record.total_steps)
 
-    def log_update(
-        self,
-        step: int,
-        losses: dict[str, torch.Tensor],
-        buffer: SignalReplayBuffer,
-        batch: TensorDictBase,
+    def on_update(
+        self, run: TrainingRun, losses: dict[str, torch.Tensor], batch: TensorDictBase
     ) -> None:
         """Log losses, values, and what the priorities are made of."""
         if not self._logs:
@@ -89,15 +86,15 @@ class Tracker:
         entries: dict[str, Any] = {
             f"loss/{name}": value.float().mean().item() for name, value in losses.items()
         }
-        for name, value in buffer.stats().items():
+        for name, value in run.buffer.stats().items():
             if isinstance(value, int | float) and not isinstance(value, bool):
                 entries[f"replay/{name}"] = value
         if "priority_weight" in batch.keys():  # noqa: SIM118 - a TensorDict iterates over rows
-            entries["replay/beta"] = buffer.sampler.beta
+            entries["replay/beta"] = run.buffer.sampler.beta
             entries["priorities/importance_weight"] = batch["priority_weight"].detach().cpu()
             for name, value in batch["signals"].items():
                 entries[f"priorities/{name}"] = value.detach().cpu()
-        self._log(entries, step)
+        self._log(entries, run.actions)
 
     @property
     def shows(self) -> bool:

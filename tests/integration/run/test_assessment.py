@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from mpfa_envs import load_policy
-from tests.integration.tiny_runs import assert_same_run, go_on, tiny, train, weights_of
+from tests.integration.tiny_runs import Look, assert_same_run, go_on, tiny, train, weights_of
 from training.records import read_table
 from training.run import loop
 from training.run.assessment import Assessment, AssessmentSettings
@@ -44,7 +44,7 @@ class Watched:
 
     def __init__(self, folder: Path, settings: TrainSettings) -> None:
         folder.mkdir(exist_ok=True)
-        run = self.run = TrainingRun(settings, folder)
+        run = self.run = TrainingRun(settings, folder, hooks=[Look(self._note)])
         self.rows: list[Any] = []
         self.weights, self.updates = [weights_of(run.learner.policy)], [0]
         extend = run.buffer.extend
@@ -54,12 +54,12 @@ class Watched:
             return extend(rows)
 
         run.buffer.extend = extended  # type: ignore[method-assign]
-        run.train(self._note)
+        run.train()
         run.close()
 
-    def _note(self) -> None:
-        self.weights.append(weights_of(self.run.learner.policy))
-        self.updates.append(self.run.updates)
+    def _note(self, run: TrainingRun) -> None:
+        self.weights.append(weights_of(run.learner.policy))
+        self.updates.append(run.updates)
 
 
 def oracle(watched: Watched) -> tuple[list[int], list[tuple[int, bool, float]]]:

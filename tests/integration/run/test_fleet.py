@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.integration.tiny_runs import OVERRIDES, tiny, train
+from tests.integration.tiny_runs import OVERRIDES, Look, tiny, train
 from training import files
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
@@ -73,15 +73,15 @@ def test_a_run_on_ray_loses_a_worker_keeps_its_files_and_goes_on_anywhere(tmp_pa
     ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
     settings = on_ray(640)
     try:
-        run = TrainingRun(settings, tmp_path)
         killed: list[int] = []
 
-        def kill() -> None:
+        def kill(run: TrainingRun) -> None:
             if run.actions >= 256 and not killed:
                 killed.append(run.actions)
                 ray.kill(run.robots._collector.remote_collectors[1])
 
-        assert run.train(kill)
+        run = TrainingRun(settings, tmp_path, hooks=[Look(kill)])
+        assert run.train()
         assert killed
         assert run.robots.losses == 1
         assert len(run.buffer) == 100

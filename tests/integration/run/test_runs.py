@@ -23,10 +23,11 @@ from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.records import read_table
-from training.run import loop
+from training.run import progress, saving
 from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
 from training.run.running import Refused, resume, start
+from training.run.saving import save
 from training.settings.command_line import composed, parse_overrides
 from training.settings.resuming import changed
 from training.settings.train import LAST_SEED
@@ -70,8 +71,8 @@ def test_a_run_is_not_finished_before_all_of_it_is_saved(
     assert begin(job.path, episodes=1) == 0
     assert job.is_trained()
     with monkeypatch.context() as patch:
-        patch.setattr(loop, lost, full)
-        patch.setattr(loop, "_TELL_EVERY", 0.0)
+        patch.setattr(saving, lost, full)
+        patch.setattr(progress, "_TELL_EVERY", 0.0)
         with pytest.raises(OSError, match="no space"):
             go_on(job.path, STAGES.format(2))
     status = job.status()
@@ -321,9 +322,9 @@ def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
 ) -> None:
     def interrupted(run: TrainingRun) -> bool:
         if saved:
-            run.save()
-        run.stop.ask()
-        run.stop.ask()
+            save(run)
+        run.stop.ask(signal.SIGINT)
+        run.stop.ask(signal.SIGINT)
         raise AssertionError("the second signal stops at once")
 
     monkeypatch.setattr(TrainingRun, "train", interrupted)

@@ -30,9 +30,11 @@ from torchrl_mpfa.saving import save_atomically
 from training.files import CHECKPOINT
 from training.noise import noisy_states
 from training.records import EvaluationRecord
-from training.run import loop
+from training.run import checkpoints, loop
 from training.run.checkpoints import random_state, read_checkpoint, set_random_state
+from training.run.hooks import Hook
 from training.run.loop import TrainingRun
+from training.run.saving import save
 from training.settings.train import GROUPS, Stage, TrainSettings
 
 
@@ -241,9 +243,9 @@ def test_a_checkpoint_has_the_random_numbers_of_the_device_that_it_runs_on(
 ) -> None:
     run = TrainingRun(tiny(), tmp_path)
     asked: list[str] = []
-    monkeypatch.setattr(loop, "random_state", lambda device: asked.append(device))
+    monkeypatch.setattr(checkpoints, "random_state", lambda device: asked.append(device))
     run.settings.device = "cuda:0"
-    run.save()
+    save(run)
     run.close()
     assert asked == ["cuda:0"]
 
@@ -301,17 +303,15 @@ def test_an_update_that_raises_leaves_a_checkpoint_that_goes_on(tmp_path: Path) 
 def test_networks_that_an_error_broke_are_not_saved(tmp_path: Path) -> None:
     settings = tiny()
     settings.checkpoint_every = 20
-    failing = TrainingRun(settings, tmp_path)
 
-    def fail() -> None:
-        if failing.actions == 35:
-            for weight in failing.learner.loss.parameters():
+    def fail(run: TrainingRun) -> None:
+        if run.actions == 35:
+            for weight in run.learner.loss.parameters():
                 weight.data.fill_(math.nan)
             raise RuntimeError("something broke")
 
     with pytest.raises(RuntimeError, match="something broke"):
-        failing.train(fail)
-    failing.close()
+        train(tmp_path, settings, fail)
     assert read_checkpoint(tmp_path)["schedule"]["actions"] == 20
     assert rows(go_on(tmp_path, settings)) == rows(train(tmp_path / "whole", tiny()))
 
@@ -369,14 +369,14 @@ def test_the_log_has_what_critic_and_actor_gave_whoever_learned_last(
 ) -> None:
     settings = tiny(method)
     settings.tracking.log_every = 1
-    run = TrainingRun(settings, tmp_path)
     logged = []
 
-    def log(step: int, values: Any, buffer: Any, batch: Any) -> None:
-        logged.append({"loss_value", "loss_actor", "td_error"} <= set(values))
-        assert "td_error" in batch["signals"].keys()  # noqa: SIM118
+    class Log(Hook):
+        def on_update(self, run: TrainingRun, losses: Any, batch: Any) -> None:
+            logged.append({"loss_value", "loss_actor", "td_error"} <= set(losses))
+            assert "td_error" in batch["signals"].keys()  # noqa: SIM118
 
-    run.tracker.log_update = log  # type: ignore[method-assign]
+    run = TrainingRun(settings, tmp_path, hooks=[Log()])
     run.train()
     run.close()
     assert logged

@@ -105,12 +105,13 @@ def test_a_run_that_was_killed_and_goes_on_has_every_row_once(tmp_path: Path) ->
     settings.environment.max_steps, settings.tracking.log_every = 25, 3
     settings.checkpoint_every = 20
     train(tmp_path / "whole", settings)
-    part = TrainingRun(settings, tmp_path)
-    saved = part.save
-    # Nothing that comes after 44 actions is written, as if it had been killed there.
-    part.save = lambda: saved() if part.actions < 45 else None  # type: ignore[method-assign]
-    part.train(lambda: part.actions >= 50 and part.stop.ask())
-    part.close()
+
+    def kill(run: TrainingRun) -> None:
+        if run.actions == 50:
+            raise SystemExit("as if killed: nothing is saved")
+
+    with pytest.raises(SystemExit):
+        train(tmp_path, settings, kill)
     assert of_run(tmp_path)["total_steps"].tolist() == list(range(3, 41, 3))
     go_on(tmp_path, settings)
     pd.testing.assert_frame_equal(of_run(tmp_path), of_run(tmp_path / "whole"))
