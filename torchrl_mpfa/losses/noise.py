@@ -35,7 +35,7 @@ def with_quantiles(critic: TensorDictModule) -> TensorDictModule:
     like = {"device": last.weight.device, "dtype": last.weight.dtype}
     place, _, attribute = name.rpartition(".")
     has_bias = last.bias is not None
-    wider = nn.Linear(last.in_features, QUANTILES, bias=has_bias, **like)  # type: ignore[arg-type]
+    wider = nn.Linear(last.in_features, QUANTILES, bias=has_bias, **like)
     setattr(network.get_submodule(place), attribute, wider)
     for module in network.modules():
         if callable(reset := getattr(module, "reset_parameters", None)):

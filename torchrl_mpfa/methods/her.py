@@ -6,7 +6,7 @@ After Andrychowicz et al. (2017), "Hindsight experience replay", https://arxiv.o
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -160,7 +160,7 @@ class HindsightGoals(Transform):
 
     def _take(self, ended: Tensor) -> list[TensorDictBase]:
         """Take the episodes with these numbers out of those under way."""
-        rows = torch.cat(self._pending)
+        rows = cast(TensorDictBase, torch.cat(self._pending))
         numbers = rows[self._episode_key].reshape(-1)
         self._pending = [rows[~torch.isin(numbers, ended)]]
         return [rows[numbers == number] for number in ended.tolist()]
@@ -173,7 +173,8 @@ class HindsightGoals(Transform):
         """The transitions of the episodes under way, by key."""
         if not self._pending:
             return {}
-        return dict(torch.cat(self._pending).items(include_nested=True, leaves_only=True))
+        rows = cast(TensorDictBase, torch.cat(self._pending))
+        return dict(rows.items(include_nested=True, leaves_only=True))
 
     def set_extra_state(self, state: dict[Any, Tensor]) -> None:
         """Go on from what :meth:`get_extra_state` gave."""

@@ -43,7 +43,16 @@ def test_the_tables_have_the_runs_that_were_planned() -> None:
     }
     assert list(arms) == ["C", "D", "A", "B", "L", "I", "J", "H"]
     assert {name: len(labels) for name, labels in arms.items()} == {
-        **{"C": 25 + 8 + 1, "D": 3 + 6 + 6 + 4, "A": 13 + 3 + 1 + 3, "B": 2 * 8, "L": 6, "I": 5, "J": 3, "H": 12}
+        **{
+            "C": 25 + 8 + 1,
+            "D": 3 + 6 + 6 + 4,
+            "A": 13 + 3 + 1 + 3,
+            "B": 2 * 8,
+            "L": 6,
+            "I": 5,
+            "J": 3,
+            "H": 12,
+        }
     }
     # Volume 32 of D are arms of C.
     assert {"sparse/td3/lap", "sparse/td3/geometric"} <= arms["C"] & arms["D"]
