@@ -94,8 +94,8 @@ def information_gain_priority(
     Examples:
         >>> quantiles = torch.tensor([[-1.0, 1.0], [-3.0, 3.0]])
         >>> gain = information_gain_priority(torch.tensor([[1.0, 3.0], [1.0, 3.0]]), quantiles)
-        >>> gain.exp().square().tolist()  # 1 + 1 / 1 and 1 + 9 / 9
-        [2.0, 2.0]
+        >>> [round(each, 3) for each in gain.tolist()]  # ln(1 + 1 / 1) / 2 and ln(1 + 9 / 9) / 2
+        [0.347, 0.347]
     """
     epistemic = td_error.square().mean(0)
     aleatoric = quantiles.var(-1, correction=0).clamp_min(least_noise**2)
