@@ -134,7 +134,10 @@ TASK_PAGES = [
     "vector.md",
     "worlds.md",
 ]
-ELSEWHERE = ["methods/README.md", "methods/mpfa_per.md", "torchrl_trainer.md", "tuning.md"]
+ELSEWHERE = [
+    *("methods/README.md", "methods/mpfa_per.md", "methods/her.md"),
+    *("torchrl_trainer.md", "tuning.md", "values.md"),
+]
 """Pages whose code is run by the tests of what they are about."""
 
 BOX = """<sdf><world name="w"><model name="m"><static>1</static><link name="l"><collision name="c">

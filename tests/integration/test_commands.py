@@ -24,6 +24,7 @@ import torchrl_sac
 import torchrl_trainer
 from benchmarks.speed import environment, scaling, worlds
 from benchmarks.study.__main__ import COMMANDS
+from benchmarks.values import __main__ as values
 from training.settings.command_line import parse_overrides
 from training.worlds import parse_worlds
 
@@ -52,6 +53,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "benchmarks.speed.environment": environment.main,
     "benchmarks.speed.scaling": scaling.main,
     "benchmarks.speed.worlds": worlds.main,
+    "benchmarks.values": values.main,
     **{
         f"benchmarks.study {name}": import_module(f"benchmarks.study.{module}").main
         for name, (module, _) in COMMANDS.items()
@@ -101,7 +103,7 @@ def understand(words: Sequence[str]) -> None:
         return
     sys.argv = [script, *arguments]
     with pytest.raises(Parsed) as found:
-        MAINS[script](*[arguments] * script.startswith("benchmarks.study"))
+        MAINS[script](*[arguments] * script.startswith(("benchmarks.study", "benchmarks.values")))
     options = found.value.args[0]
     if script == "compare":
         parse_overrides(options.overrides)

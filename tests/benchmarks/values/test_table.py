@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +68,15 @@ def test_methods_are_compared_on_a_buffer(walk: FrozenBuffer, monkeypatch) -> No
     assert found["units"].tolist() == [2]
     with pytest.raises(ValueError, match="against must be one of the methods, uniform, got 'per'"):
         compare(["uniform"], [walk])
+
+
+def test_the_ten_lines_of_the_page_compare_a_signal_of_ones_own(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(running, "learn", partial(learn, marks=(4, 8)))
+    text = (FOLDER.parents[1] / "values.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    exec(code.replace("seeds=range(6)", "seeds=range(2)"), names := {})
+    assert list(names["found"].index) == ["mine"]
+    assert "rmse_low" in capsys.readouterr().out
 
 
 def test_trainings_that_have_rows_are_not_made_again(
