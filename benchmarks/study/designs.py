@@ -71,7 +71,7 @@ def tables(root: Path, *, most: int | None = None) -> dict[str, Table]:
 
     Examples:
         >>> [len(table.comparisons) for table in tables(Path("runs/study")).values()]
-        [4, 6, 8, 1, 2, 1, 2, 4]
+        [4, 6, 8, 1, 2, 1, 2, 4, 2]
     """
     if most is not None and most < 1:
         raise ValueError(f"most must be at least 1, got {most}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.study.protocol import (
+    DENSE,
     SPARSE,
     TEST,
     Table,
@@ -60,13 +61,17 @@ APART = (
 """The critic learns from rows of high priority, the actor from others: by the inverse, or any."""
 HINDSIGHT = Arm("hindsight", ("method.hindsight=4",))
 """Goals in hindsight beside the priorities of a method: as many as the method ``her`` has."""
+LEARNABLE = Arm("learnable", ("environment.learnable_worlds=true",))
+"""Worlds of the kinds in which half of the episodes succeed, in place of all kinds alike."""
+IN_MAZES = Evaluation(("mazes:test",), 100, "kinematic")
+"""Where the success of table K is measured."""
 NOISE = Arm("noise", ("environment.reward_noise=2",))
 """Rewards with a standard deviation of 2 in a third of the states."""
 
 
 def experiments(root: Path) -> tuple[Table, ...]:
     """The tables of the experiments."""
-    return (_hindsight(root), _noise(root), _apart(root), _strength(root))
+    return (_hindsight(root), _noise(root), _apart(root), _strength(root), _worlds(root))
 
 
 def _of(folder: Path, methods: tuple[str, ...], *arms: Arm) -> Comparison:
@@ -158,4 +163,24 @@ def _strength(root: Path) -> Table:
             for strength, share in EFFECTIVE.items()
         },
         note=NOTE,
+    )
+
+
+def _worlds(root: Path) -> Table:
+    folder, at = root / "experiments/dense", "experiments/dense/td3/mpfa_per"
+    plain, chosen = at, f"{at}/{LEARNABLE.name}"
+    arms = (PLAIN, LEARNABLE)
+    return Table(
+        "K",
+        "Worlds, not transitions: does it pay to train where half of the episodes succeed?",
+        tuple(
+            Comparison(folder, ("mpfa_per",), DENSE, seeds_of(10), ("td3",), (arm,), IN_MAZES)
+            for arm in arms
+        ),
+        ((chosen, plain),),
+        (),
+        {"worlds": (plain, chosen)},
+        primary="success",
+        kinds=IN_MAZES.words,
+        note="Success is that of the last policy on exact arcs, in mazes.",
     )

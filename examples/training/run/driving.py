@@ -25,6 +25,7 @@ from training.noise import noisy_rewards
 from training.records import EpisodeRecord
 from training.run.checkpoints import as_arrays, as_tensors
 from training.run.exploration import Explorer
+from training.run.learnable import LearnableWorlds
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
 
@@ -59,6 +60,8 @@ class Robots:
         self._filter = FilteredRobots(settings)
         parts = TaskConfig(**env_arguments(settings.environment)).observation_slices
         self._distance = parts["goal_distance"].start
+        wanted = settings.environment.learnable_worlds
+        self._learnable = LearnableWorlds() if wanted else None
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
@@ -87,6 +90,8 @@ class Robots:
                 hindsight=self.settings.method.hindsight > 0,
             )
             self._world = world
+            if self._learnable is not None:
+                vector_of(self._env).choose_worlds(self._learnable.choose)
         return self._env
 
     def begin(self, world: str, explorer: Explorer, *, seed: int) -> None:
@@ -129,6 +134,8 @@ class Robots:
             records of the episodes that ended.
         """
         assert self._env is not None and self._state is not None
+        # Robots whose episode ends are in their next worlds after the step.
+        worlds = [] if self._learnable is None else vector_of(self._env).worlds
         state, self._state = self._env.step_and_maybe_reset(
             self._act(explorer, self._state, actions, entries)
         )
@@ -138,6 +145,10 @@ class Robots:
         records = self._note(
             state["next"], self._everyone, explorer, episode=episode, total_steps=total
         )
+        if self._learnable is not None:
+            ended = state["next", "done"].squeeze(-1).nonzero().squeeze(-1).tolist()
+            for robot, record in zip(ended, records, strict=True):
+                self._learnable.note(worlds[robot].name, success=record.success)
         rows = state.select(*TRANSITION, *entries)
         if self.settings.environment.reward_noise:
             rows["next", "reward"] = noisy_rewards(
@@ -230,12 +241,15 @@ class Robots:
             "begun": self._begun,
             "seconds": self.elapsed(),
             "given_up": self.given_up,
+            "learnable": None if self._learnable is None else self._learnable.state_dict(),
         }
 
     def recall(self, state: dict[str, Any]) -> None:
         """Take over what counts for the whole run, and which episodes were under way."""
         self.seconds = state["seconds"]
         self.given_up = state.get("given_up", 0)
+        if self._learnable is not None:
+            self._learnable.load_state_dict(state["learnable"])
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
         if "numbers" in state:
             self._numbers, self._begun = state["numbers"].clone(), state["begun"]

@@ -164,6 +164,7 @@ def _check_ray(settings: TrainSettings) -> None:
         ("assessment.episodes", settings.assessment.episodes, 0),
         ("method.update_block", settings.method.update_block, 1),
         ("environment.reward_noise", settings.environment.reward_noise, 0),
+        ("environment.learnable_worlds", settings.environment.learnable_worlds, False),
     ):
         if value != only:
             raise ValueError(f"{name} must be {only} with ray.workers={workers}, got {value}")
@@ -212,6 +213,11 @@ def _check_stages(settings: TrainSettings) -> None:
             )
         if bool(stage.actions) != bool(stages[0].actions):
             raise ValueError(f"{where} must count what the others count, episodes or actions")
+        if settings.environment.learnable_worlds and stage.world != "mixed":
+            raise ValueError(
+                f"{where}.world must be mixed with environment.learnable_worlds=true, "
+                f"got {stage.world}"
+            )
         _check_world(f"{where}.world", stage.world, settings)
 
 

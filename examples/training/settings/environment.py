@@ -56,6 +56,9 @@ class EnvironmentSettings:
     """Longest way of a sampled task [m]; null: as it comes."""
     episodes_per_world: int = setting(1, at_least(1))
     """Episodes of a robot in a world of a generator before it gets another one."""
+    learnable_worlds: bool = False
+    """Choose the generators and difficulties of new ``mixed`` worlds in proportion to p (1 - p), p
+    the success there in the last episodes."""
     memory: str = "none"
     """``map``: the robot makes a map of what its lidar met and senses the way to the goal that is
     open on it; ``none``: it senses what is before it alone."""
