@@ -22,6 +22,7 @@ import report
 import stable_baselines
 import torchrl_sac
 import torchrl_trainer
+import tune
 from benchmarks.speed import environment, scaling, worlds
 from benchmarks.study.__main__ import COMMANDS
 from training.settings.command_line import parse_overrides
@@ -49,6 +50,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "stable_baselines": stable_baselines.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
+    "tune": tune.main,
     "benchmarks.speed.environment": environment.main,
     "benchmarks.speed.scaling": scaling.main,
     "benchmarks.speed.worlds": worlds.main,
@@ -105,6 +107,8 @@ def understand(words: Sequence[str]) -> None:
     options = found.value.args[0]
     if script == "compare":
         parse_overrides(options.overrides)
+    if script == "tune":
+        parse_overrides(options.settings)
     if script in ("compare", "evaluate"):
         known = [word for word in options.worlds if not word.endswith(".yaml")]
         assert len(parse_worlds(known)) >= len(known)

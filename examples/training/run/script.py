@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from training.files import check_folder
 from training.run.running import Refused, resume, start
 from training.settings.command_line import composed, parse_overrides
+from training.settings.from_file import with_lines
 from training.settings.train import as_settings, register
 
 REFUSED = 2
@@ -50,6 +51,7 @@ def train(arguments: list[str]) -> None:
         _end_with(lambda: start(runs[0], Path(runs[0].run_dir)))
     else:
         # Sweeps, and whatever else Hydra can; it composes the settings once more.
+        sys.argv[1:] = with_lines(arguments)
         hydra.main(version_base="1.3", config_path=None, config_name="train")(_run)()
 
 
