@@ -7,12 +7,12 @@
     python examples/tune.py --ray HEAD:6379                       on all machines of a Ray cluster
 
 Settings are of all trials, before the options or after ``--``. Optuna's TPE suggests what is tried
-next from what was found; a trial that is worse than half of the others after as many evaluations is
-pruned. It can be stopped or killed at any moment and continued by the same command, or with more
+next from what was found; a trial that is worse than half of those at their end were after as many
+evaluations is pruned. It can be stopped or killed at any moment and continued by the same command, or with more
 ``--trials``: what is done stays done, and what was under way goes on from its last checkpoint.
 
-A trial of the default 50,000 actions takes some one and a half minutes of a core, and a seventh of
-that is its share if it is pruned early. The files in the folder:
+A trial of the default 50,000 actions takes some one and a half minutes of a core, one that is
+pruned at its third evaluation a third of that. The files in the folder:
 
     best.yaml    the best settings so far: train.py settings=runs/tune/best.yaml learner=td3
     search.png   the trials, and how much each setting mattered (from ten trials at their end)

@@ -115,8 +115,13 @@ def understand(words: Sequence[str]) -> None:
 
 
 def test_every_command_on_the_pages_is_understood(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # What a search leaves is read with the command line.
+    best = tmp_path / "runs/tune/best.yaml"
+    best.parent.mkdir(parents=True)
+    best.write_text("learner.tau: 0.01\n")
+    monkeypatch.chdir(tmp_path)
     parse = argparse.ArgumentParser.parse_args
 
     def parsed(self: argparse.ArgumentParser, *arguments: Any) -> None:

@@ -20,6 +20,8 @@ from tests.integration.comparison.test_compare import InThisProcess, alive, desc
 from tests.integration.tiny_runs import OVERRIDES
 from training import figures, files
 from training.comparison import execution
+from training.comparison.arms import parse_arm
+from training.comparison.jobs import Job
 from training.comparison.workers import Lost
 from training.records import read_table, write_table
 from training.settings.command_line import composed
@@ -152,6 +154,9 @@ def test_train_reads_the_best_settings_and_its_command_line_wins(
     assert settings.learner.tau == best["learner.tau"]
     assert settings.method.batch_size == best["method.batch_size"]
     assert (settings.learner.name, settings.method.name) == ("td3", "mpfa_per")
+    # And an arm of a comparison may have them.
+    arm = parse_arm(f"tuned:settings={folder / search.BEST}")
+    assert Job("ddpg", "per", 0, tmp_path, arm).asked(()).learner.tau == best["learner.tau"]
     (settings,) = composed(["learner.tau=0.5", f"settings={folder / search.BEST}"])
     assert settings.learner.tau == 0.5
     assert settings.method.batch_size == best["method.batch_size"]
