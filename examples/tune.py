@@ -8,14 +8,15 @@
 
 Settings are of all trials, before the options or after ``--``. Optuna's TPE suggests what is tried
 next from what was found; a trial that is worse than half of those at their end were after as many
-evaluations is pruned. It can be stopped or killed at any moment and continued by the same command, or with more
-``--trials``: what is done stays done, and what was under way goes on from its last checkpoint.
+evaluations is pruned. It can be stopped or killed at any moment and continued by the same command,
+or with more ``--trials``: what is done stays done, and what was under way goes on from its last
+checkpoint.
 
 A trial of the default 50,000 actions takes some one and a half minutes of a core, one that is
 pruned at its third evaluation a third of that. The files in the folder:
 
     best.yaml    the best settings so far: train.py settings=runs/tune/best.yaml learner=td3
-    search.png   the trials, and how much each setting mattered (from ten trials at their end)
+    search.png   the trials, and how much each setting mattered (from ten trials on)
     trials.csv   a row for each trial
     study.db     Optuna's study "tune", for optuna-dashboard or scripts of your own
     trial-NNNN/  the runs of a trial

@@ -80,5 +80,5 @@ def plot_search(
     if importances:
         names = list(importances)[::-1]
         axes[1].barh(names, [importances[name] for name in names], color=look(0)["color"])
-        axes[1].set(xlabel="importance (PED-ANOVA, ended trials)")
+        axes[1].set(xlabel="importance (PED-ANOVA)")
     finish(figure, axes, path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -17,7 +16,7 @@ import optuna
 import pandas as pd
 import yaml
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial, TrialState, create_trial
 from tqdm import tqdm
 
 from torchrl_mpfa.saving import write_text_atomically
@@ -39,8 +38,8 @@ _MOST_FAILURES = 3
 """Trials that may fail one after another, as others would for the same cause."""
 _UNPRUNED_TRIALS, _UNPRUNED_EVALUATIONS = 5, 3
 """The first trials, which are what others are compared with, and the first evaluations of each."""
-_FOR_IMPORTANCES = 5
-"""Trials at their end, and best ones of them, that importances are told by."""
+_BEST_TRIALS = 5
+"""Trials at least whose settings are compared with those of all, as PED-ANOVA's authors advise."""
 
 
 @dataclass(frozen=True)
@@ -372,13 +371,15 @@ def write_results(study: optuna.Study, plan: Plan, folder: Path) -> None:
 
 
 def _importances(study: optuna.Study) -> dict[str, float]:
-    """Share of each setting in what the best trials have in common, empty for few trials."""
-    count = len(study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
-    if count < 2 * _FOR_IMPORTANCES:
+    """How far the best trials differ from all of them by each setting; empty for few trials."""
+    # Optuna leaves out pruned trials, by which an important setting is told: they are not the best.
+    trials = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE, TrialState.PRUNED])
+    if len(trials) < 2 * _BEST_TRIALS:
         return {}
-    top = max(0.1, _FOR_IMPORTANCES / count)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return get_param_importances(
-            study, evaluator=PedAnovaImportanceEvaluator(target_quantile=top)
+    whole = optuna.create_study(direction="maximize")
+    for each in trials:
+        whole.add_trial(
+            create_trial(params=each.params, distributions=each.distributions, value=each.value)
         )
+    best = PedAnovaImportanceEvaluator(target_quantile=max(0.1, _BEST_TRIALS / len(trials)))
+    return get_param_importances(whole, evaluator=best)

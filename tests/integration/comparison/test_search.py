@@ -115,9 +115,14 @@ def trials_of(folder: Path) -> pd.DataFrame:
 
 
 def test_a_search_finds_what_does_best_and_prunes_what_does_badly(
-    tmp_path: Path, ranges: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    ranges: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder = tmp_path / "tune"
+    folder, plotted = tmp_path / "tune", []
+    monkeypatch.setattr(search, "plot_search", lambda *arguments, **_: plotted.append(arguments))
+    ranges.write_text(f"{RANGES}learner.gamma: {{low: 0.9, high: 0.99}}\n")
     assert tune.main(command(folder, ranges, trials=40)) == 0
     found = trials_of(folder)
     assert len(found) == 40
@@ -138,6 +143,10 @@ def test_a_search_finds_what_does_best_and_prunes_what_does_badly(
     for number in pruned.index:
         rows = read_table(folder / f"trial-{number:04}/td3-per-3000" / files.EVALUATIONS)
         assert 3 <= len(rows) < len(STEPS)
+    # Gamma matters nothing here, and the batch little.
+    ((table, importances, path),) = plotted
+    assert len(table) == 40 and path == folder / search.PICTURE
+    assert max(importances.values()) == importances["learner.tau"] > 0.6
     # What is over can not go on, and takes no room.
     assert not list(folder.rglob(files.CHECKPOINT))
     assert str(folder / search.BEST) in capsys.readouterr().out
