@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -126,9 +127,9 @@ def test_a_search_finds_what_does_best_and_prunes_what_does_badly(
     assert tune.main(command(folder, ranges, trials=40)) == 0
     found = trials_of(folder)
     assert len(found) == 40
-    # Of values that are sampled at random a tenth is as near.
-    near = found["learner.tau"].between(BEST_TAU / 1.41, BEST_TAU * 1.41)
-    assert near[20:].mean() >= 0.3
+    # Of values that are sampled at random half are more than 0.7 off.
+    off = np.log10(found["learner.tau"] / BEST_TAU).abs()
+    assert off[20:].median() < 0.4
     best = found.loc[found.query("state == 'COMPLETE'")["value"].idxmax()]
     assert best["learner.tau"] == pytest.approx(BEST_TAU, rel=0.15)
     # The area of a straight line is half of its height.
@@ -171,7 +172,7 @@ def test_train_reads_the_best_settings_and_its_command_line_wins(
     assert settings.method.batch_size == best["method.batch_size"]
 
 
-@pytest.mark.parametrize("looks", [3, 27, 44])
+@pytest.mark.parametrize("looks", [3, 44])
 def test_a_search_that_broke_off_goes_on_to_the_trials_that_it_would_have_had(
     looks: int, tmp_path: Path, ranges: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,23 +189,23 @@ def test_a_search_that_broke_off_goes_on_to_the_trials_that_it_would_have_had(
 
     monkeypatch.setattr(execution, "LocalWorker", Breaks)
     with pytest.raises(RuntimeError, match="the machine is gone"):
-        tune.main(command(tmp_path / "broken", ranges, trials=14))
+        tune.main(command(tmp_path / "broken", ranges, trials=12))
     done = len(Pretends.begun)
-    assert 0 < done < 14
-    assert tune.main(command(tmp_path / "broken", ranges, trials=14)) == 0
+    assert 0 < done < 12
+    assert tune.main(command(tmp_path / "broken", ranges, trials=12)) == 0
     # The one that was under way has gone on; those that were done are left alone.
     assert Pretends.begun[done] == Pretends.begun[done - 1]
-    assert len(set(Pretends.begun)) == 14 == len(Pretends.begun) - 1
-    assert tune.main(command(tmp_path / "whole", ranges, trials=14)) == 0
+    assert len(set(Pretends.begun)) == 12 == len(Pretends.begun) - 1
+    assert tune.main(command(tmp_path / "whole", ranges, trials=12)) == 0
     assert trials_of(tmp_path / "broken").equals(trials_of(tmp_path / "whole"))
 
     # More trials are those that a longer search would have had; no trial is made again.
     Pretends.begun.clear()
-    assert tune.main(command(tmp_path / "whole", ranges, trials=14)) == 0
+    assert tune.main(command(tmp_path / "whole", ranges, trials=12)) == 0
     assert not Pretends.begun
-    assert tune.main(command(tmp_path / "whole", ranges, trials=16)) == 0
-    assert len(Pretends.begun) == 2
-    assert tune.main(command(tmp_path / "longer", ranges, trials=16)) == 0
+    assert tune.main(command(tmp_path / "whole", ranges, trials=13)) == 0
+    assert len(Pretends.begun) == 1
+    assert tune.main(command(tmp_path / "longer", ranges, trials=13)) == 0
     assert trials_of(tmp_path / "whole").equals(trials_of(tmp_path / "longer"))
 
 
