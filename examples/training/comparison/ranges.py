@@ -162,9 +162,10 @@ def _numbers(name: str, written: Mapping[Any, Any], *, whole: bool) -> Range:
     for word in written:
         if word not in ("low", "high", "log"):
             raise ValueError(f"{name}: {unknown('word', word, ['low', 'high', 'log'])}")
-    low, high, log = written.get("low"), written.get("high"), written.get("log", False)
+    ends: list[Any] = [written.get("low"), written.get("high")]
+    (low, high), log = ends, written.get("log", False)
     kind = "whole numbers" if whole else "numbers"
-    right = [_is_number(end) and (isinstance(end, int) or not whole) for end in (low, high)]
+    right = [_is_number(end) and (isinstance(end, int) or not whole) for end in ends]
     if not all(right) or not low < high:
         raise ValueError(f"{name} must have {kind} low < high, got low={low}, high={high}")
     if not isinstance(log, bool) or (log and low <= 0):
