@@ -349,7 +349,7 @@ def test_a_killed_search_leaves_no_training_behind_and_goes_on_to_the_same_trial
         stderr=subprocess.DEVNULL,
     )
     run = tmp_path / "killed/trial-0001/ddpg-mpfa_per-3000"
-    deadline = time.monotonic() + 300
+    deadline = time.monotonic() + 600
     while not (run / files.CHECKPOINT).exists():
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)
