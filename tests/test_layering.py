@@ -146,6 +146,10 @@ MESSAGES = {"geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs", "std_ms
         ),
         ({"wandb"}, {"examples/training/run/wandb_log.py"}),
         (
+            {"optuna"},
+            {"examples/training/comparison/ranges.py", "examples/training/comparison/search.py"},
+        ),
+        (
             {"rclpy", *MESSAGES},
             {"envs/mpfa_envs/ros/policy_node.py", "envs/mpfa_envs/ros/robot_node.py"},
         ),

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from benchmarks.study.protocol import Table, label_of
 from benchmarks.study.remaining import parts_left
 from training import files
 from training.comparison.jobs import Comparison, Evaluation, Job
-from training.records import read_table
+from training.records import area_under, read_table
 from training.worlds import family
 
 GOAL = 0.9
@@ -75,12 +74,6 @@ def scores_of(rows: Rows, table: Table) -> dict[str, pd.DataFrame]:
             "success": success.get(arm, {}).get(seed, math.nan),
         }
     return {arm: pd.DataFrame.from_dict(runs, "index") for arm, runs in found.items()}
-
-
-def area_under(steps: pd.Series, values: pd.Series) -> float:
-    """Mean height of a curve that starts at zero, over its steps."""
-    x, y = np.concatenate(([0.0], steps)), np.concatenate(([0.0], values))
-    return float(np.trapezoid(y, x) / x[-1])
 
 
 def by_run(table: pd.DataFrame) -> Iterator[tuple[str, int, pd.DataFrame]]:

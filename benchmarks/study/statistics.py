@@ -30,7 +30,7 @@ from benchmarks.study.intervals import (
 )
 from benchmarks.study.permutation import least_p
 from benchmarks.study.power import MOST, runs_needed
-from benchmarks.study.rows import GOAL, area_under
+from benchmarks.study.rows import GOAL
 from mpfa_envs.evaluation.results import Interval
 from training.comparison.report import (
     ARM,
@@ -43,6 +43,7 @@ from training.comparison.report import (
     table,
     write_report,
 )
+from training.records import area_under
 
 _DIFFERENCES = (0.02, 0.05)
 

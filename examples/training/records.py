@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from torchrl_mpfa.saving import write_text_atomically
 
 # Imported where a table is made: it takes half a second, which a run's start need not wait.
@@ -92,6 +94,12 @@ def as_table(rows: Sequence[Any], kind: type[Any]) -> pd.DataFrame:
 
     columns = [entry.name for entry in fields(kind)]
     return pd.DataFrame([asdict(row) for row in rows], columns=columns)
+
+
+def area_under(steps: pd.Series[Any], values: pd.Series[Any]) -> float:
+    """Mean height of a curve that starts at zero, over its steps."""
+    x, y = np.concatenate(([0.0], steps)), np.concatenate(([0.0], values))
+    return float(np.trapezoid(y, x) / x[-1])
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:

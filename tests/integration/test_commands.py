@@ -22,6 +22,7 @@ import report
 import stable_baselines
 import torchrl_sac
 import torchrl_trainer
+import tune
 from benchmarks.speed import environment, scaling, worlds
 from benchmarks.study.__main__ import COMMANDS
 from benchmarks.values import __main__ as values
@@ -50,6 +51,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "stable_baselines": stable_baselines.main,
     "torchrl_sac": torchrl_sac.main,
     "torchrl_trainer": torchrl_trainer.main,
+    "tune": tune.main,
     "benchmarks.speed.environment": environment.main,
     "benchmarks.speed.scaling": scaling.main,
     "benchmarks.speed.worlds": worlds.main,
@@ -107,14 +109,21 @@ def understand(words: Sequence[str]) -> None:
     options = found.value.args[0]
     if script == "compare":
         parse_overrides(options.overrides)
+    if script == "tune":
+        parse_overrides(options.settings)
     if script in ("compare", "evaluate"):
         known = [word for word in options.worlds if not word.endswith(".yaml")]
         assert len(parse_worlds(known)) >= len(known)
 
 
 def test_every_command_on_the_pages_is_understood(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # What a search leaves is read with the command line.
+    best = tmp_path / "runs/tune/best.yaml"
+    best.parent.mkdir(parents=True)
+    best.write_text("learner.tau: 0.01\n")
+    monkeypatch.chdir(tmp_path)
     parse = argparse.ArgumentParser.parse_args
 
     def parsed(self: argparse.ArgumentParser, *arguments: Any) -> None:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from training.figures import plot_evaluations, plot_learning_curve
+from training.figures import plot_evaluations, plot_learning_curve, plot_search
 
 BLUE, ORANGE, GRAY = (0, 114, 178), (230, 159, 0), (128, 128, 128)
 
@@ -97,3 +97,26 @@ def test_the_eighth_arm_has_the_color_of_the_first_and_another_line(tmp_path: Pa
     first, eighth = (blue[rows, 300:500].any(0).mean() for rows in (slice(300, 480), slice(300)))
     assert first == 1.0
     assert 0.4 < eighth < 0.9
+
+
+def test_the_picture_of_a_search_has_its_trials_the_best_so_far_and_what_mattered(
+    tmp_path: Path,
+) -> None:
+    states = ["COMPLETE", "PRUNED", "COMPLETE", "COMPLETE"]
+    trials = pd.DataFrame(
+        {"number": range(4), "value": [0.2, 0.05, 0.8, 0.4], "state": states}, dtype=object
+    )
+    path = tmp_path / "search.png"
+    plot_search(trials, {"tau": 0.9, "gamma": 0.1}, path, objective="area")
+    bars = colored(path, BLUE)
+    half = bars.shape[1] // 2
+    # The best so far rises and stays where it is.
+    best = colored(path, ORANGE)[:, :half]
+    assert heights(best, quarter=1) < 0.5 < heights(best, quarter=3)
+    # The first importance is on top, and its bar the longer one.
+    rows = bars[:, half:].sum(1)
+    upper, lower = rows[: len(rows) // 2].max(), rows[len(rows) // 2 :].max()
+    assert upper > 6 * lower > 0
+    plot_search(trials, {}, tmp_path / "few.png", objective="area")
+    with Image.open(tmp_path / "few.png") as few, Image.open(path) as both:
+        assert 2 * few.width == both.width

@@ -17,6 +17,7 @@ import export
 import play
 import report
 import train
+import tune
 from mpfa_envs.policies.files import policy_file
 from training import files
 
@@ -35,6 +36,21 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "flipped.npz").write_bytes(flipped)
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "damaged.yaml").write_text("room: [1, 2\n")
+    for name, line in {
+        "typo": "learner.tua: {low: 0.001, high: 0.01}",
+        "over": "learner.gamma: {low: 0.9, high: 1.5}",
+        "swapped": "learner.tau: {low: 0.1, high: 0.01}",
+        "zero": "learner.tau: {low: 0, high: 0.01, log: true}",
+        "whole": "updates: {low: 1.5, high: 4}",
+        "lowest": "learner.tau: {lowest: 0.001, high: 0.01}",
+        "flag": "learner.layer_norm: {low: 0, high: 1}",
+        "single": "learner.tau: [0.01]",
+        "choice": "method: [per, unifrom]",
+        "judge": "evaluation.episodes: [10, 20]",
+        "value": "learner.tau: 0.01",
+        "list": "- learner.tau",
+    }.items():
+        (tmp_path / f"{name}.yaml").write_text(f"{line}\n")
     contents = {
         "rows": b"a,b\n1\n2,3,4\n",
         "bytes": bytes(range(128, 255)),
@@ -131,6 +147,50 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
             "--folder study --methods per --seeds 0",
             "settings.json is damaged: remove it, and the run is made anew",
         ),
+        (compare.main, "-- settings=typo.yaml", "typo.yaml: unknown setting 'learner.tua'"),
+        (train.main, "settings=nowhere", "^train.py: there is no file nowhere$"),
+        (train.main, "settings=damaged.yaml", "damaged.yaml is no YAML: "),
+        (train.main, "settings=list.yaml", "list.yaml must have a line NAME: VALUE for each"),
+        (train.main, "settings=value.yaml settings=typo.yaml", "settings must be one file, got"),
+        (
+            train.main,
+            "settings=typo.yaml",
+            r"^train.py: typo.yaml: unknown setting 'learner.tua': did you mean 'learner.tau'\?$",
+        ),
+        (tune.main, "--ranges nowhere", "there is no file nowhere"),
+        (tune.main, "--ranges damaged.yaml", "damaged.yaml is no YAML: "),
+        (
+            tune.main,
+            "--ranges typo.yaml",
+            r"typo.yaml: unknown setting 'learner.tua': did you mean 'learner.tau'\?$",
+        ),
+        (tune.main, "--ranges over.yaml", r"over.yaml: learner.gamma must be in \[0, 1\], got 1.5"),
+        (tune.main, "--ranges swapped.yaml", "numbers low < high, got low=0.1, high=0.01"),
+        (tune.main, "--ranges zero.yaml", "learner.tau: log must be true, with low above 0, or"),
+        (tune.main, "--ranges whole.yaml", "updates must have whole numbers low < high, got low"),
+        (tune.main, "--ranges lowest.yaml", "unknown word 'lowest': did you mean 'low'"),
+        (
+            tune.main,
+            "--ranges flag.yaml",
+            r"learner.layer_norm must be \[VALUE, VALUE, ...\], each",
+        ),
+        (tune.main, "--ranges single.yaml", "each once, or {low: NUMBER, high: NUMBER} got"),
+        (tune.main, "--ranges choice.yaml", "'unifrom' of 'method': did you mean 'uniform'"),
+        (tune.main, "--ranges judge.yaml", "evaluation.episodes cannot be searched"),
+        (tune.main, "updates=4", "tune.yaml: updates is given to all trials"),
+        (tune.main, "lerner=td3", "unknown setting 'lerner': did you mean 'learner'"),
+        (tune.main, "learner", "'learner' is not NAME=VALUE"),
+        (tune.main, "seed=3", "seed is what the search gives each run"),
+        (tune.main, "robots=8,16", "a search takes one value for each setting"),
+        (tune.main, "evaluation.every=0", "evaluation.every must be from 1 to the 50000 actions"),
+        (
+            tune.main,
+            "evaluation.world=test evaluation.choose=false",
+            "evaluation.world must not be of a test, got test",
+        ),
+        (tune.main, "--folder file", A_FILE),
+        (tune.main, "--trials 0", "--trials must be at least 1, got 0"),
+        (tune.main, "--seeds 1 1", "--seeds has 1 twice"),
         (report.main, "nowhere", "nowhere: no episodes.csv with rows, which compare.py writes"),
         (report.main, "study", "study: no episodes.csv with rows, which compare.py writes"),
         (report.main, "run study/../run", "is named twice: its runs count once"),

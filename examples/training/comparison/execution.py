@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Protocol
 
 from tqdm import tqdm
 
@@ -18,7 +19,7 @@ JOBS = 2
 """Runs at a time on one machine."""
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
-_MOST_LOSSES = 10
+MOST_LOSSES = 10
 """Workers that may be lost under a run, which may be what takes them down."""
 
 
@@ -39,19 +40,43 @@ class Running:
         job.path.mkdir(parents=True, exist_ok=True)
         self.log = job.path / "output.log"
         self.bar = tqdm(desc=job.name, unit="episode", position=position, leave=False)
-        worker.start(commands.pop(0), self.log)
+        self._start()
+
+    def _start(self) -> None:
+        """Have the next command begin."""
+        command = self._commands.pop(0)
+        self._evaluates = command[0].endswith("evaluate.py")
+        self.worker.start(command, self.log)
 
     def ended(self) -> int | None:
         """Exit status of the last command, or of one that failed; None while it runs."""
         status = self.job.status()
         self.bar.total, self.bar.n = status.get("total"), status.get("done", 0)
         self.bar.unit = status.get("unit", "it")
-        self.bar.set_postfix_str(status.get("summary", "") if self._commands else "evaluation")
+        self.bar.set_postfix_str("evaluation" if self._evaluates else status.get("summary", ""))
         exit_status = self.worker.ended()
         if exit_status == 0 and self._commands:
-            self.worker.start(self._commands.pop(0), self.log)
+            self._start()
             return None
         return exit_status
+
+
+class Work(Protocol):
+    """Runs that workers make: true while there is something to do."""
+
+    def __bool__(self) -> bool: ...
+
+    def begin(self) -> None:
+        """Have the workers that have nothing to do begin the next ones, or end."""
+        ...
+
+    def look(self) -> None:
+        """Take note of those that have ended."""
+        ...
+
+    def stop(self) -> None:
+        """Have all of them save and end."""
+        ...
 
 
 class Runs:
@@ -128,8 +153,8 @@ class Runs:
     def _lost(self, job: Job, error: Lost) -> None:
         """Have a run go on elsewhere."""
         self._losses[job] += 1
-        if self._losses[job] > _MOST_LOSSES:
-            self._fail(job, f"lost {_MOST_LOSSES} workers: {error}")
+        if self._losses[job] > MOST_LOSSES:
+            self._fail(job, f"lost {MOST_LOSSES} workers: {error}")
             return
         tqdm.write(f"{job.name}: its worker is gone, goes on at its last checkpoint: {error}")
         # Once it has begun anew, it has the settings that are asked for.
@@ -177,9 +202,9 @@ def make_runs(
         waiting = [job for job in jobs if job in others or not job.is_evaluated(wanted)]
         print(f"{len(jobs)} runs, {len(jobs) - len(waiting)} of them done, in {comparison.folder}")
         most = min(most or (JOBS if ray is None else len(waiting)), len(waiting))
-        with _workers(ray if waiting else None, most) as workers:
+        with workers_of(ray if waiting else None, most) as workers:
             runs = Runs(waiting, comparison.settings, wanted, anew=set(others), workers=workers)
-            stop = _run_all(runs)
+            stop = run_all(runs)
         if stop:
             return stop.exit_status
         collect(jobs, wanted, comparison.folder)
@@ -187,7 +212,7 @@ def make_runs(
 
 
 @contextmanager
-def _workers(address: str | None, count: int) -> Iterator[list[Worker]]:
+def workers_of(address: str | None, count: int) -> Iterator[list[Worker]]:
     """Workers on this machine, or on a cluster."""
     if address is None:
         yield [LocalWorker() for _ in range(count)]
@@ -203,8 +228,8 @@ def _workers(address: str | None, count: int) -> Iterator[list[Worker]]:
         raise ValueError(f"--ray {address}: {error}") from error
 
 
-def _run_all(runs: Runs) -> Stop:
-    """Train and evaluate, some at a time; whether all was stopped."""
+def run_all(runs: Work) -> Stop:
+    """Do all of it, some runs at a time; whether it was stopped."""
     stop = Stop("saving the runs; the same command continues them")
     with stop.listening():
         try:

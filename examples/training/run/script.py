@@ -15,6 +15,7 @@ from training.files import check_folder
 from training.run.hooks import Hook
 from training.run.running import Refused, resume, start
 from training.settings.command_line import composed, parse_overrides
+from training.settings.from_file import with_lines
 from training.settings.train import as_settings, register
 
 REFUSED = 2
@@ -63,6 +64,7 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
             folder = Path(HydraConfig.get().runtime.output_dir)
             _end_with(lambda: start(as_settings(config), folder, hooks))
 
+        sys.argv[1:] = with_lines(arguments)
         hydra.main(version_base="1.3", config_path=None, config_name="train")(run)()
 
 

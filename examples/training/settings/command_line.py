@@ -15,6 +15,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from training.settings.checks import check_settings
+from training.settings.from_file import lines_of
 from training.settings.resuming import choices_of
 from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
 
@@ -35,12 +36,22 @@ def known_settings(settings: Any = TrainSettings, prefix: str = "") -> Iterator[
 
 
 def parse_overrides(arguments: Sequence[str]) -> list[Override]:
-    """The settings on a command line."""
+    """The settings on a command line, those of its file first."""
+    file, lines = lines_of(arguments)
     texts = [
         text
         for before, text in pairwise(["", *arguments])
-        if not text.startswith("-") and before not in _WITH_A_WORD
+        if not text.startswith("-") and before not in _WITH_A_WORD and text != f"settings={file}"
     ]
+    try:
+        of_file = _parsed(lines)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    return [*of_file, *_parsed(texts)]
+
+
+def _parsed(texts: Sequence[str]) -> list[Override]:
+    """Settings whose names and choices there are."""
     parser = OverridesParser.create()
     parsed = []
     for text in texts:

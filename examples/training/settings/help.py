@@ -8,6 +8,7 @@ from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from training.settings.from_file import with_lines
 from training.settings.train import GROUPS, register
 
 _TEXT = """{usage}
@@ -28,7 +29,7 @@ def help_text(usage: str, arguments: Sequence[str] = ()) -> str:
         ValueError: If there is no such setting or choice.
     """
     register()
-    given = [text for text in arguments if not text.startswith("-")]
+    given = [text for text in with_lines(arguments) if not text.startswith("-")]
     try:
         with initialize_config_module("training.settings", version_base="1.3"):
             settings = compose("train", given)

@@ -302,7 +302,7 @@ def test_a_run_whose_worker_is_gone_goes_on_at_its_last_checkpoint(
 
     # A run that takes down whatever it runs on is given up.
     commands.clear()
-    monkeypatch.setattr(execution, "_MOST_LOSSES", 2)
+    monkeypatch.setattr(execution, "MOST_LOSSES", 2)
     monkeypatch.setattr(execution, "LocalWorker", OnWorkersThatFail)
     assert compare.main(comparison(tmp_path / "never", methods=("per",))) == 1
     assert "ddpg-per-0: failed, lost 2 workers" in capsys.readouterr().out

@@ -6,6 +6,7 @@ from copy import deepcopy
 from dataclasses import asdict, fields, is_dataclass
 from functools import reduce
 from itertools import zip_longest
+from pathlib import Path
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -15,6 +16,7 @@ from torchrl_mpfa.methods.assembly import WORDS
 from training.run.assembly import make_learner
 from training.settings.checks import OF_A_METHOD, check_settings
 from training.settings.command_line import composed, parse_overrides
+from training.settings.from_file import with_lines
 from training.settings.resuming import changed
 from training.settings.rules import rules_of, settings_by_name
 from training.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings
@@ -69,6 +71,25 @@ def test_tracking_is_one_place_or_several(
         # A run that goes on is logged where it is told, not where it was.
         before = asdict(TrainSettings(tracking=TrackingSettings(tensorboard=True)))
         assert changed(before, parse_overrides(words)).tracking == found
+
+
+def test_a_file_of_settings_gives_way_to_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    stages = "[{world: A, actions: 500}]"
+    file.write_text(
+        f"learner: td3\nlearner.tau: 1e-3\nlearner.lr_power: null\nlearner.layer_norm: false\n"
+        f"method.signals: [reward, td_error]\ncurriculum.stages: {stages}\n"
+    )
+    found = one(f"settings={file}", "learner.lr_power=2", "learner.tau=0.25")
+    words = ("learner=td3", "learner.tau=0.25", "learner.lr_power=2", "learner.layer_norm=false")
+    words += ("method.signals=[reward,td_error]", f"curriculum.stages={stages}")
+    assert found == one(*words)
+    assert found.learner.tau == 0.25 and found.curriculum.stages == [Stage("A", actions=500)]
+    # A choice of a group leaves the other lines as they are, as on a command line.
+    assert one(f"settings={file}", "learner=sac").learner.tau == 1e-3
+    assert with_lines(["-m", f"settings={file}", "seed=0,1", "learner=sac"])[:2] == [
+        *("-m", "learner.tau=0.001")
+    ]
 
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac"])

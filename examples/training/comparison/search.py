@@ -1,0 +1,386 @@
+"""A search of settings: Optuna says what to try, workers train it, and a folder keeps it all."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pandas as pd
+import yaml
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.trial import FrozenTrial, TrialState, create_trial
+from tqdm import tqdm
+
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.comparison.arms import Arm
+from training.comparison.execution import JOBS, MOST_LOSSES, Running, run_all, workers_of
+from training.comparison.jobs import Job
+from training.comparison.ranges import Ranges, as_lines, fixed_settings
+from training.comparison.workers import Lost, Worker
+from training.figures import plot_search
+from training.records import area_under, read_table, write_table
+from training.settings.train import TrainSettings
+
+STUDY = "study.db"
+BEST = "best.yaml"
+TRIALS = "trials.csv"
+PICTURE = "search.png"
+_MOST_FAILURES = 3
+"""Trials that may fail one after another, as others would for the same cause."""
+_UNPRUNED_TRIALS, _UNPRUNED_EVALUATIONS = 5, 3
+"""The first trials, which are what others are compared with, and the first evaluations of each."""
+_BEST_TRIALS = 5
+"""Trials at least whose settings are compared with those of all, as PED-ANOVA's authors advise."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a search asks for, the same whenever it goes on."""
+
+    settings: tuple[str, ...]
+    """Of all trials, as on the command line of ``train.py``."""
+    ranges: Ranges
+    seeds: tuple[int, ...]
+    """A trial is a run with each of them."""
+    objective: str = "area"
+    """``area`` under the curve of greedy success in validation, or the ``last`` success."""
+    sampler_seed: int = 0
+
+    @cached_property
+    def fixed(self) -> TrainSettings:
+        """The settings of all trials."""
+        return fixed_settings(self.settings)
+
+    @cached_property
+    def evaluations(self) -> int:
+        """Evaluations of a trial; 0 if its runs count episodes, so that nobody knows."""
+        actions = sum(stage.actions for stage in self.fixed.curriculum.stages)
+        return len(self.seeds) * (actions // self.fixed.evaluation.every)
+
+    def score(self, curves: Sequence[pd.DataFrame]) -> float:
+        """The mean over the runs of a trial, by their evaluations so far."""
+        if self.objective == "last":
+            return float(np.mean([curve["success"].iloc[-1] for curve in curves]))
+        return float(np.mean([area_under(each["total_steps"], each["success"]) for each in curves]))
+
+    def as_json(self) -> dict[str, Any]:
+        """What is kept of it, to know it again."""
+        ranges = {name: asdict(each) for name, each in self.ranges.items()}
+        kept: dict[str, Any] = {"settings": sorted(self.settings), "ranges": ranges}
+        kept |= {"seeds": self.seeds, "objective": self.objective}
+        kept["sampler seed"] = self.sampler_seed
+        return dict(json.loads(json.dumps(kept)))
+
+    def sampler(self, number: int) -> optuna.samplers.TPESampler:
+        """What suggests a trial; a search that goes on has the trials that it would have had."""
+        (seed,) = np.random.SeedSequence((self.sampler_seed, number)).generate_state(1)
+        return optuna.samplers.TPESampler(seed=int(seed))
+
+
+class Trial:
+    """The runs of a trial, the same settings with each seed, one after another.
+
+    Args:
+        trial: Optuna's, new or under way.
+        plan: Of the search.
+        folder: Of the search.
+        reported: Evaluations that Optuna knows already.
+    """
+
+    def __init__(self, trial: optuna.Trial, plan: Plan, folder: Path, *, reported: int = 0) -> None:
+        self.trial, self.plan = trial, plan
+        # A trial that is under way has the values that it had.
+        values = {name: each.suggest(trial, name) for name, each in plan.ranges.items()}
+        own = dict(line.split("=", 1) for line in (*plan.settings, *as_lines(values)))
+        learner = own.pop("learner", plan.fixed.learner.name)
+        method = own.pop("method", plan.fixed.method.name)
+        # What an evaluation has found is known once it is saved.
+        own["checkpoint_every"] = str(plan.fixed.evaluation.every)
+        arm = Arm("", tuple(f"{name}={text}" for name, text in own.items()))
+        self.path = folder / f"trial-{trial.number:04}"
+        self.jobs = [Job(learner, method, seed, self.path, arm) for seed in plan.seeds]
+        self.losses = 0
+        self._known, self._seen = reported, max(reported - 1, 0)
+
+    @property
+    def left(self) -> Job | None:
+        """Its first run that is not at its end."""
+        return next((job for job in self.jobs if not job.is_trained()), None)
+
+    def curves(self, most: int | None = None) -> list[pd.DataFrame]:
+        """Evaluations of its runs, the first ones only if so many are asked for."""
+        found = []
+        for job in self.jobs:
+            table = read_table(job.path / files.EVALUATIONS).iloc[:most]
+            most = None if most is None else most - len(table)
+            found += [table] * (len(table) > 0)
+        return found
+
+    def is_hopeless(self) -> bool:
+        """Report evaluations that are new, and tell whether most trials were better by then."""
+        for step in range(self._seen + 1, sum(map(len, self.curves())) + 1):
+            self._seen = step
+            if step > self._known:
+                self.trial.report(self.plan.score(self.curves(step)), step)
+            # One that is at its end has cost all that it can.
+            if step != self.plan.evaluations and self.trial.should_prune():
+                return True
+        return False
+
+
+class Search:
+    """The trials of a search, some of them on their way at a time.
+
+    Args:
+        study: Optuna's.
+        plan: What it asks for.
+        folder: Where the trials go.
+        trials: How many there shall be.
+        workers: What makes their runs.
+    """
+
+    def __init__(
+        self,
+        study: optuna.Study,
+        plan: Plan,
+        folder: Path,
+        *,
+        trials: int,
+        workers: Sequence[Worker],
+    ) -> None:
+        self.study, self.plan, self.folder = study, plan, folder
+        self.trials, self.workers = trials, workers
+        self.running: dict[int, tuple[Trial, Running]] = {}
+        """By the number of their worker."""
+        known = study.get_trials(deepcopy=False)
+        self._asked = len(known)
+        self._waiting = [self._again(each) for each in known if not each.state.is_finished()]
+        self.failures = 0
+        """Trials that failed, one after another."""
+        done = self._asked - len(self._waiting)
+        self._bar = tqdm(
+            desc="trials", total=max(trials, self._asked), initial=done, unit="trial", smoothing=0
+        )
+
+    def _again(self, found: FrozenTrial) -> Trial:
+        """A trial that was under way when the search was stopped or killed."""
+        self.study.sampler = self.plan.sampler(found.number)
+        trial = optuna.Trial(self.study, found._trial_id)
+        return Trial(trial, self.plan, self.folder, reported=len(found.intermediate_values))
+
+    def _ask(self) -> Trial:
+        """A new trial."""
+        self.study.sampler = self.plan.sampler(self._asked)
+        self._asked += 1
+        return Trial(self.study.ask(), self.plan, self.folder)
+
+    @property
+    def _has_more(self) -> bool:
+        """Whether there is a trial to begin or to go on with."""
+        new = self._asked < self.trials and self.failures < _MOST_FAILURES
+        return bool(self._waiting) or new
+
+    def __bool__(self) -> bool:
+        return self._has_more or bool(self.running)
+
+    def begin(self) -> None:
+        """Have the workers that have nothing to do begin the next runs, or end."""
+        for number, worker in enumerate(self.workers):
+            if number in self.running:
+                continue
+            job: Job | None = None
+            while job is None and self._has_more:
+                trial = self._waiting.pop(0) if self._waiting else self._ask()
+                job = trial.left
+                if job is None:
+                    self._end(trial, TrialState.COMPLETE)
+            if job is None:
+                worker.stop()
+                worker.wait()
+            elif worker.ready():
+                run = Running(job, [job.trains(())], worker=worker, position=number + 1)
+                run.bar.set_description(f"{trial.path.name}/{job.name}")
+                self.running[number] = trial, run
+            else:
+                self._waiting.insert(0, trial)
+
+    def look(self) -> None:
+        """Report what was evaluated, and take note of runs that have ended."""
+        for number, (trial, run) in list(self.running.items()):
+            try:
+                status = run.ended()
+            except Lost as error:
+                self._lost(trial, error)
+            else:
+                hopeless = trial.is_hopeless()
+                if status is None and not hopeless:
+                    continue
+                if hopeless:
+                    if status is None:
+                        run.worker.stop()
+                        run.worker.wait()
+                    self._end(trial, TrialState.PRUNED)
+                elif status == 0:
+                    # To be ended, or to go on with its next seed.
+                    self._waiting.insert(0, trial)
+                else:
+                    self._end(trial, TrialState.FAIL, f"see {run.log}")
+            run.bar.close()
+            del self.running[number]
+
+    def _lost(self, trial: Trial, error: Lost) -> None:
+        """Have a run go on elsewhere."""
+        trial.losses += 1
+        if trial.losses > MOST_LOSSES:
+            self._end(trial, TrialState.FAIL, f"lost {MOST_LOSSES} workers: {error}")
+            return
+        tqdm.write(
+            f"{trial.path.name}: its worker is gone, goes on at its last checkpoint: {error}"
+        )
+        self._waiting.insert(0, trial)
+
+    def _end(self, trial: Trial, state: TrialState, why: str = "") -> None:
+        """Tell Optuna how a trial ended, and keep its settings if they are the best."""
+        curves = trial.curves()
+        if state == TrialState.COMPLETE and not curves:
+            state, why = TrialState.FAIL, "no run was long enough for an evaluation"
+        value = self.plan.score(curves) if state == TrialState.COMPLETE else None
+        ended = self.study.tell(trial.trial, value, state=state)
+        self.failures = self.failures + 1 if state == TrialState.FAIL else 0
+        if state == TrialState.FAIL:
+            said = f"failed, {why}"
+        else:
+            # What it would take to go on is most of its size.
+            for job in trial.jobs:
+                (job.path / files.CHECKPOINT).unlink(missing_ok=True)
+            said = f"{self.plan.objective} {ended.value:.3f}"
+        tqdm.write(f"{trial.path.name}: {said}{', pruned' * (state == TrialState.PRUNED)}")
+        self._bar.update()
+        best = best_of(self.study)
+        if best is not None:
+            self._bar.set_postfix_str(f"best {best.value:.3f}")
+            write_best(best, self.plan, self.folder / BEST)
+
+    def stop(self) -> None:
+        """Have all runs save and end."""
+        for worker in self.workers:
+            worker.stop()
+        for worker in self.workers:
+            worker.wait()
+        for bar in (*(run.bar for _, run in self.running.values()), self._bar):
+            bar.close()
+
+
+def run_search(
+    plan: Plan, folder: Path, *, trials: int, most: int | None = None, ray: str | None = None
+) -> int:
+    """Make the trials that are missing, and keep what they found.
+
+    Args:
+        plan: What is searched.
+        folder: Of the search, begun or new.
+        trials: How many there shall be in it, whatever became of them.
+        most: How many at a time; None: :data:`JOBS`, or on a cluster as many as there are.
+        ray: Address of a Ray cluster, empty for the one that there is; None: on this machine.
+
+    Returns:
+        Exit status: 1 if the last trials failed, 128 and the number of the signal that stopped it.
+
+    Raises:
+        ValueError: If the folder holds another search, or Ray cannot be used.
+        FolderInUse: If another process searches there.
+    """
+    with _study(plan, folder) as study:
+        left = max(trials - sum(t.state.is_finished() for t in study.get_trials(deepcopy=False)), 0)
+        print(f"{trials} trials, {trials - left} of them done, in {folder}")
+        most = min(most or (JOBS if ray is None else left), left)
+        with workers_of(ray if left else None, most) as workers:
+            search = Search(study, plan, folder, trials=trials, workers=workers)
+            stop = run_all(search)
+        write_results(study, plan, folder)
+    if stop:
+        return stop.exit_status
+    return int(search.failures > 0)
+
+
+@contextmanager
+def _study(plan: Plan, folder: Path) -> Iterator[optuna.Study]:
+    """The study of a folder, which nobody else writes in."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    with files.lock(folder):
+        file = folder / STUDY
+        if not file.exists() and any(folder.glob("trial-*")):
+            raise ValueError(f"{folder} has trials, but not their {STUDY}: name another --folder")
+        storage = optuna.storages.RDBStorage(f"sqlite:///{file}")
+        try:
+            study = optuna.create_study(
+                storage=storage,
+                study_name="tune",
+                direction="maximize",
+                load_if_exists=True,
+                pruner=optuna.pruners.MedianPruner(_UNPRUNED_TRIALS, _UNPRUNED_EVALUATIONS),
+            )
+            asked = plan.as_json()
+            found = study.user_attrs.get("plan", asked)
+            for name, value in asked.items():
+                if found.get(name) != value:
+                    raise ValueError(
+                        f"{folder} holds a search with other {name}, {found.get(name)}, asked for "
+                        f"is {value}: name another --folder"
+                    )
+            study.set_user_attr("plan", asked)
+            yield study
+        finally:
+            storage.remove_session()
+            storage.engine.dispose()
+
+
+def best_of(study: optuna.Study) -> FrozenTrial | None:
+    """The trial with the highest value of those that came to their end."""
+    ended = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+    return max(ended, key=lambda trial: trial.value or 0.0, default=None)
+
+
+def write_best(best: FrozenTrial, plan: Plan, path: Path) -> None:
+    """Keep settings as a file of ``train.py``."""
+    command = shlex.join([f"settings={path}", *plan.settings])
+    head = (
+        f"# trial {best.number}: {plan.objective} {best.value:.4f} in validation, as trained by\n"
+    )
+    head += f"#     python examples/train.py {command}\n"
+    write_text_atomically(head + yaml.safe_dump(best.params, sort_keys=False), path)
+
+
+def write_results(study: optuna.Study, plan: Plan, folder: Path) -> None:
+    """Write a row for each trial, and a picture of how they went and of what mattered."""
+    table = study.trials_dataframe(attrs=("number", "value", "state", "duration", "params"))
+    if table.empty:
+        return
+    table = table.rename(columns=lambda name: name.removeprefix("params_"))
+    write_table(table, folder / TRIALS)
+    if table["value"].notna().any():
+        plot_search(table, _importances(study), folder / PICTURE, objective=plan.objective)
+
+
+def _importances(study: optuna.Study) -> dict[str, float]:
+    """How far the best trials differ from all of them by each setting; empty for few trials."""
+    # Optuna leaves out pruned trials, by which an important setting is told: they are not the best.
+    trials = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE, TrialState.PRUNED])
+    if len(trials) < 2 * _BEST_TRIALS:
+        return {}
+    whole = optuna.create_study(direction="maximize")
+    for each in trials:
+        whole.add_trial(
+            create_trial(params=each.params, distributions=each.distributions, value=each.value)
+        )
+    best = PedAnovaImportanceEvaluator(target_quantile=max(0.1, _BEST_TRIALS / len(trials)))
+    return get_param_importances(whole, evaluator=best)

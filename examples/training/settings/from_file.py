@@ -1,0 +1,71 @@
+"""Settings in a file, ``settings=FILE``: a line ``NAME: VALUE`` for each, as ``tune.py`` writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+_WORD = "settings="
+
+
+def lines_of(arguments: Sequence[str]) -> tuple[str, list[str]]:
+    """The file of settings that a command line names, and what it adds to that command line.
+
+    Returns:
+        The file, empty without one, and its settings but for those that the command line has.
+
+    Raises:
+        ValueError: If it names several files, or one that cannot be read.
+    """
+    files = [text.removeprefix(_WORD) for text in arguments if text.startswith(_WORD)]
+    if len(files) > 1:
+        raise ValueError(f"settings must be one file, got {' and '.join(files)}")
+    if not files:
+        return "", []
+    given = {text.partition("=")[0] for text in arguments}
+    found = read_names(Path(files[0]))
+    return files[0], [f"{n}={as_text(value)}" for n, value in found.items() if n not in given]
+
+
+def with_lines(arguments: Sequence[str]) -> list[str]:
+    """A command line with the settings of a file in the place of the file."""
+    _, lines = lines_of(arguments)
+    return [word for text in arguments for word in (lines if text.startswith(_WORD) else [text])]
+
+
+def read_names(path: Path) -> dict[str, Any]:
+    """A YAML file whose keys are the whole names of settings.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    try:
+        found = OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, YAMLError, OmegaConfBaseException, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(found, dict) or not found:
+        raise ValueError(f"{path} must have a line NAME: VALUE for each setting")
+    return {str(name): value for name, value in found.items()}
+
+
+def as_text(value: Any) -> str:
+    """A value as on the command line; a word stands there as it is.
+
+    Examples:
+        >>> as_text([{"world": "A", "actions": 500}]), as_text(None), as_text(1e-4)
+        ('[{world:A,actions:500}]', 'null', '0.0001')
+    """
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(as_text, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{name}:{as_text(each)}" for name, each in value.items()) + "}"
+    return str(value)
