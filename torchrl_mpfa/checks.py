@@ -36,12 +36,13 @@ def seeded_generator(
     return generator
 
 
-def generator_on(device: torch.device, source: torch.Generator) -> torch.Generator:
+def generator_on(device: torch.device, source: torch.Generator | None) -> torch.Generator | None:
     """A generator for one call: itself on its own device, elsewhere a new one that it seeds.
 
     All state is in the source, so that a state saved beside a GPU loads where there is none.
     """
-    return source if source.device == device else seeded_generator(source, device)
+    own = source is None or source.device == device
+    return source if own else seeded_generator(source, device)
 
 
 def check(rule: Rule, **values: Any) -> None:

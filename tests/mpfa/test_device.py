@@ -263,3 +263,18 @@ def test_priorities_of_zero_are_not_sampled_from_there():
     buffer.update_priority(torch.arange(2), torch.zeros(2))
     with pytest.raises(RuntimeError, match="every priority must be positive"):
         buffer.sample()
+
+
+@pytest.mark.parametrize("first", [DEVICE, CPU])
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_folder_of_one_device_loads_on_the_other(first, count, second_device, tmp_path):
+    if second_device is not None:
+        pytest.skip("files are not mapped to what stands for a GPU")
+    second = CPU if first == DEVICE else DEVICE
+    saved, loaded = make_there(device=first), make_there(device=second, count=count)
+    give_signals(saved, torch.arange(BATCH))
+    saved.dumps(tmp_path / "dump")
+    loaded.loads(tmp_path / "dump")
+    assert loaded.sample()["observation"].device == loaded.sampler.device == second
+    assert same(loaded.sampler.priorities().cpu(), saved.sampler.priorities().cpu())
+    assert same(loaded.storage.signal_table.rows.cpu(), saved.storage.signal_table.rows.cpu())

@@ -100,7 +100,7 @@ class GeometricSampler(NewestSampler):
         along = index if isinstance(index, tuple) else (index,)
         around = len(storage) if len(along) == 1 else storage._len_along_dim0
         where = along[0].device
-        generator = None if storage._rng is None else generator_on(where, storage._rng)
+        generator = generator_on(where, storage._rng)
         share = torch.rand(batch_size, generator=generator, dtype=torch.double, device=where)
         rate = -math.expm1(-self.recency / around)
         age = geometric_age(share, rate=rate, count=around)

@@ -344,7 +344,6 @@ class TreeSampler(SavedTrees):
 
     def _random(self) -> dict[str, Any]:
         """The device, and a generator on it for the random numbers of one call."""
-        assert self._rng is not None
         return {"device": self.device, "generator": generator_on(self.device, self._rng)}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
@@ -362,7 +361,11 @@ class TreeSampler(SavedTrees):
     def _fresh_priority(self) -> float | Tensor:
         """Priority of a fresh transition, eps included; a GPU is not waited for."""
         first = 1.0 + self._eps
-        if isinstance(self._max_tree, Leaves) and self._max_priority_within_buffer and self._alpha:
+        if (
+            isinstance(self._max_tree, MinLeaves)
+            and self._max_priority_within_buffer
+            and self._alpha
+        ):
             highest = -self._max_tree.query(0, self._max_capacity)
             return highest.where(highest >= 0, first)
         known = self._highest_priority()

@@ -51,6 +51,7 @@ class SignalStorageMixin:
     _allow_nonfinite: Sequence[NestedKey] = ()
     _schema: Schema | None = None
     _all_slots: Tensor | None = None
+    _rng: torch.Generator | None
 
     def check(self, data: Any) -> tuple[Tensor | None, Pairs | None]:
         """Check transitions that are about to be written; nothing is changed.
@@ -152,7 +153,7 @@ class SignalStorageMixin:
     def _rand_given_ndim(self, batch_size: int) -> Any:
         """Slots sampled uniformly, as TorchRL does, which asks for a generator on the device."""
         kept, device = self._rng, getattr(self, "device", None)
-        if kept is None or not isinstance(device, torch.device):
+        if not isinstance(device, torch.device):
             return super()._rand_given_ndim(batch_size)  # type: ignore[misc]
         self._rng = generator_on(device, kept)
         try:

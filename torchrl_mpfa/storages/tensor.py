@@ -39,6 +39,8 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         ['td_error', 'action_gradient', 'reward']
     """
 
+    _storage: Any
+
     def __init__(
         self,
         max_size: int,
