@@ -272,7 +272,9 @@ class PositiveDecay:
         """Factor of Eq. (23) for each transition, by the chosen reading of j, shape ``[B]``."""
         if self.position == "count":
             return decay_factor(batch.replay_count, sharpness=self.sharpness)
-        by_place = _factors_by_place(priority.numel(), self.sharpness, priority.dtype)
+        by_place = _factors_by_place(
+            priority.numel(), self.sharpness, priority.dtype, priority.device
+        )
         if self.position == "batch":
             return by_place
         order = priority.argsort(descending=True, stable=True)
@@ -280,7 +282,9 @@ class PositiveDecay:
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
         """Decay the positive transitions above the threshold, shape ``[B]``."""
-        threshold = decay_threshold(priority).item()
+        mean = decay_threshold(priority)
+        # A number is faster on the CPU; a GPU would be waited for.
+        threshold = mean.item() if mean.is_cpu else mean
         decayed = priority * self.factors(priority, batch)
         positive = is_positive(batch.reward, self.positive_above, mean=batch.mean_reward)
         # The mean of equal numbers may be rounded to below them.
@@ -289,6 +293,9 @@ class PositiveDecay:
 
 
 @lru_cache(maxsize=64)
-def _factors_by_place(count: int, sharpness: float, dtype: torch.dtype) -> Tensor:
+def _factors_by_place(
+    count: int, sharpness: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     """Factors of places 1 to ``count``: the same for every batch of that size."""
-    return decay_factor(torch.arange(1, count + 1, dtype=dtype), sharpness=sharpness)
+    places = torch.arange(1, count + 1, dtype=dtype, device=device)
+    return decay_factor(places, sharpness=sharpness)

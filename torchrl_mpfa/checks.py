@@ -30,11 +30,23 @@ COUNT_OR_ZERO: Rule = (
 )
 
 
-def seeded_generator() -> torch.Generator:
-    """A new generator, seeded by the global one so that ``torch.manual_seed`` rules it."""
-    generator = torch.Generator()
-    generator.manual_seed(int(torch.randint(2**62, ())))
+def seeded_generator(
+    source: torch.Generator | None = None, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """A new generator on a device, seeded by another one, by default that of PyTorch."""
+    generator = torch.Generator(device)
+    where = "cpu" if source is None else source.device
+    generator.manual_seed(int(torch.randint(2**62, (), generator=source, device=where)))
     return generator
+
+
+def generator_on(device: torch.device, source: torch.Generator | None) -> torch.Generator | None:
+    """A generator for one call: itself on its own device, elsewhere a new one that it seeds.
+
+    All state is in the source, so that a state saved beside a GPU loads where there is none.
+    """
+    own = source is None or source.device == device
+    return source if own else seeded_generator(source, device)
 
 
 def check(rule: Rule, **values: Any) -> None:
@@ -69,6 +81,8 @@ def check_counts(**counts: Any) -> None:
 def bounds(values: Tensor) -> tuple[float, float]:
     """Lowest and highest value; both NaN if any is."""
     low, high = values.aminmax()
+    if not values.is_cpu:
+        low, high = torch.stack((low, high)).cpu()  # Waits for the device once.
     # Comparing tensors would cost five times what comparing numbers does.
     return low.item(), high.item()
 

@@ -62,7 +62,7 @@ def binary_entropy(first: Tensor, second: Tensor) -> Tensor:
     # xlogy has the limit 0 log 0 = 0 built in; dividing by log 2 makes it bits. The entropy of a
     # certain event is -(1 log 1) = -0.0, and adding 0.0 takes that sign away.
     shares = torch.stack((first, second))
-    return -torch.special.xlogy(shares, shares).sum() / torch.log(shares.new_tensor(2.0)) + 0.0
+    return -torch.special.xlogy(shares, shares).sum() / torch.log(shares.new_full((), 2.0)) + 0.0
 
 
 def _split_entropy(reward: Tensor, level: float) -> Tensor:
@@ -229,7 +229,7 @@ def checked_weights(
     if weights.shape != (len(names),):
         raise ValueError(f"fusion must give {len(names)} weights, got shape {[*weights.shape]}")
     check_finite("weights of the fusion", weights)
-    return weights.to(torch.double)
+    return weights.to(table.rows.device, torch.double)
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,8 @@ class ScaledFusion:
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """Weights divided by the means of the signals, shape ``[K]``."""
         weights = self.fusion.weights(names, table, index)
-        signals = table.rows[: table.size, [table.column[name] for name in names]]
+        places = torch.tensor([table.column[name] for name in names])
+        signals = table.rows[: table.size, places]
         mean = signals.nanmean(0).to(weights.dtype)
         # A signal that is zero everywhere, or known of no transition yet, has no scale.
-        return weights / torch.where(mean > 0, mean, 1.0)
+        return weights.to(mean.device) / torch.where(mean > 0, mean, 1.0)

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from benchmarks.speed import (
     environment,
+    leaves,
     loss,
     method_steps,
     replay,
@@ -74,6 +75,7 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "sample_update_1e6": measure_sample_update_1e6,
     "sample_16x256": replay.measure_sample_16x256,
     "iteration_4x256": replay.measure_iteration_4x256,
+    "leaves": leaves.measure,
     "update_growth": replay.measure_growth,
     "extend_one": replay.measure_extend_one,
     "extend_16": replay.measure_extend_16,

@@ -11,7 +11,17 @@ from typing import Any
 
 import pytest
 
-from benchmarks.speed import method_steps, replay, run, scaling, start, timing, training, vector
+from benchmarks.speed import (
+    leaves,
+    method_steps,
+    replay,
+    run,
+    scaling,
+    start,
+    timing,
+    training,
+    vector,
+)
 from benchmarks.speed.timing import Entry, Timing, entry
 from torchrl_mpfa.methods import METHODS
 from training.settings.train import register
@@ -38,6 +48,12 @@ def test_replay_is_compared_with_that_of_torchrl(measure) -> None:
     assert ours["name"] == "small"
     assert ours["baseline"] == stock["name"] == "small_torchrl"
     assert stock["ratio"] is None
+
+
+def test_leaves_are_compared_with_trees_where_the_machine_has_them() -> None:
+    entries = leaves.measure(quick=True)
+    check_schema(entries)
+    assert [found["baseline"] for found in entries] == [None, "trees_1e5", None, "trees_1e6"]
 
 
 def test_growth_is_the_time_of_the_largest_buffer_over_that_of_the_smallest(

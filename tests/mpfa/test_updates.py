@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from tests.mpfa.second_device import DEVICE
 from tests.mpfa.transitions import same, seeded
 from torchrl_mpfa import (
     DDPGLearner,
@@ -54,9 +55,9 @@ def make_learner(**options):
     return DDPGLearner(make_ddpg_loss(actor, critic, **options), actor_lr=1e-2, critic_lr=1e-2)
 
 
-def make_buffer(count=MANY, **options):
+def make_buffer(count=MANY, *, device="cpu", **options):
     buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(count),
+        storage=SignalTensorStorage(count, device=device),
         sampler=MPFASampler(count, **options),
         batch_size=BATCH,
         generator=seeded(3),
@@ -284,18 +285,21 @@ def test_batches_are_prepared_before_the_learner_gets_them(updates):
 
 
 @pytest.mark.parametrize("updates", [1, 3])
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an accelerator")
-def test_batches_go_to_the_device_of_the_learner_and_signals_come_back(updates):
-    learner, buffer = Counting(), make_buffer()
+@pytest.mark.parametrize(("home", "away"), [("cpu", DEVICE), (DEVICE, DEVICE), (DEVICE, "cpu")])
+@pytest.mark.usefixtures("second_device")
+def test_batches_go_to_the_device_of_the_learner_and_signals_come_back(updates, home, away):
+    home, away = torch.device(home), torch.device(away)
+    learner, buffer = Counting(), make_buffer(device=home)
     _, batch = run_updates(
         buffer,
         learner,
         updates=updates,
-        prepare=lambda draw: replace(draw, batch=draw.batch.to("cuda")),
+        prepare=lambda draw: replace(draw, batch=draw.batch.to(away)),
     )
-    assert all(each.device.type == "cuda" for each in learner.batches)
-    assert batch.device.type == "cpu"
+    assert all(each.device == away for each in learner.batches)
+    assert batch.device == home
     table = buffer.storage.signal_table
+    assert table.rows.device == buffer.sampler.priorities().device == home
     assert bool((table.rows[batch["index"], table.column["td_error"]] == updates).all())
 
 

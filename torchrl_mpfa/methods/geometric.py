@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import NOT_NEGATIVE, check
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, generator_on
 from torchrl_mpfa.samplers.newest import NewestSampler
 
 
@@ -99,7 +99,9 @@ class GeometricSampler(NewestSampler):
             return index, info
         along = index if isinstance(index, tuple) else (index,)
         around = len(storage) if len(along) == 1 else storage._len_along_dim0
-        share = torch.rand(batch_size, generator=storage._rng, dtype=torch.double)
+        where = along[0].device
+        generator = generator_on(where, storage._rng)
+        share = torch.rand(batch_size, generator=generator, dtype=torch.double, device=where)
         rate = -math.expm1(-self.recency / around)
         age = geometric_age(share, rate=rate, count=around)
         along[0].copy_((self.newest[0] - age) % around)

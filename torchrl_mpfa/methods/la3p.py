@@ -18,7 +18,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import check
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.slots import set_leaves
+from torchrl_mpfa.samplers.slots import leaves_of, set_leaves
 from torchrl_mpfa.saved import wrong
 from torchrl_mpfa.selection import SampledBatch
 
@@ -57,7 +57,7 @@ class LA3PSampler(SignalSampler):
 
     def _init(self) -> None:
         super()._init()
-        self._inverse_tree = type(self._sum_tree)(self._max_capacity)
+        self._inverse_tree = self._another(self._sum_tree)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         super()._write_leaves(slots, leaf)
@@ -104,18 +104,18 @@ class LA3PSampler(SignalSampler):
         else:
             tree = self._inverse_tree if self._part == "inverse" else self._sum_tree
             index = self._proportional(tree, size, count)
-        return index, torch.ones(count)
+        return index, torch.ones(count, device=self.device)
 
     def batch_weights(self, size: int) -> Tensor:
         """All 1, see :meth:`TreeSampler.batch_weights`."""
-        return torch.ones(size, dtype=torch.double)
+        return torch.ones(size, dtype=torch.double, device=self.device)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
         super().load_state_dict(state_dict)
         slots = self._priorities.isfinite().nonzero().squeeze(1)
         if len(slots):
-            set_leaves(slots, 1.0 / state_dict["_sum_tree"][slots], self._inverse_tree)
+            set_leaves(slots, 1.0 / leaves_of(self._sum_tree, slots), self._inverse_tree)
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
         """Reject a state that does not fit, before anything changes."""

@@ -58,7 +58,7 @@ class MWSampler(SignalSampler):
 
     def _init(self) -> None:
         super()._init()
-        self._spent = torch.zeros(self._max_capacity, dtype=torch.bool)
+        self._spent = torch.zeros(self._max_capacity, dtype=torch.bool, device=self.device)
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
         if not learned:
@@ -74,16 +74,15 @@ class MWSampler(SignalSampler):
         super()._write_leaves(slots, leaf)
         spent = slots[self._spent[slots]]
         if len(spent):
-            set_leaves(spent, torch.zeros(len(spent), dtype=torch.double), self._sum_tree)
+            set_leaves(spent, leaf.new_zeros(len(spent)), self._sum_tree)
             # The lowest share of those that can be sampled is what weights are relative to.
-            none = torch.full((len(spent),), _NO_LEAF, dtype=torch.double)
-            set_leaves(spent, none, self._min_tree)
+            set_leaves(spent, leaf.new_full((len(spent),), _NO_LEAF), self._min_tree)
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         left = size - int(self._spent[:size].sum())
         if left >= batch_size:
             return super()._sample_slots(size, batch_size)
-        return self._uniform(size, batch_size), torch.ones(batch_size)
+        return self._uniform(size, batch_size), torch.ones(batch_size, device=self.device)
 
     def _entries(self) -> list[Entry]:
         return [

@@ -75,7 +75,7 @@ class RankPERSampler(SignalSampler):
     def _init(self) -> None:
         super()._init()
         # Priorities at the last sorting, negated, so that they rise with the rank.
-        self._order = torch.empty(0, dtype=torch.double)
+        self._order = torch.empty(0, dtype=torch.double, device=self.device)
         self._written = 0
 
     def _leaf(self, priority: Tensor) -> Tensor:

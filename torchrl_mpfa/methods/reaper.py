@@ -63,7 +63,8 @@ def reliability(
         [0.125, 0.375, 0.5]
     """
     # In a ring buffer, rows are in the order of their times but for the place where it wraps.
-    order = torch.arange(len(time)) if bool((time.diff() > 0).all()) else time.argsort()
+    rising = bool((time.diff() > 0).all())
+    order = torch.arange(len(time), device=time.device) if rising else time.argsort()
     order = order[episode[order].argsort(stable=True)]
     _, number, lengths = torch.unique_consecutive(
         episode[order], return_inverse=True, return_counts=True
@@ -111,7 +112,7 @@ class ReaPERSampler(SignalSampler):
         """
         super().mark_update(index, storage=storage)
         if hasattr(storage, "signal_table"):
-            table, slots = self.bind(storage), as_slots(index, storage)
+            table, slots = self.bind(storage), as_slots(index, storage).to(self.device)
             last = table.rows[slots, table.column[ENDED.name]] > 0
             if last.any():
                 self._rely(table, slots[last])
@@ -132,7 +133,7 @@ class ReaPERSampler(SignalSampler):
         stale = super().update_signals(
             index, signals, storage=storage, written_at=written_at, batches=batches
         )
-        table, slots = self.bind(storage), as_slots(index, storage)
+        table, slots = self.bind(storage), as_slots(index, storage).to(self.device)
         self._rely(table, slots[slots < table.size])
         return stale
 
@@ -158,7 +159,7 @@ class ReaPERSampler(SignalSampler):
         errors = torch.where(errors.isnan(), priority - self._eps, errors)
         numbers = _numbers(episode)
         sums = torch.bincount(numbers, weights=errors)
-        ended, touched = torch.zeros(2, len(sums), dtype=torch.bool)
+        ended, touched = torch.zeros(2, len(sums), dtype=torch.bool, device=sums.device)
         ended[numbers[last.nonzero().squeeze(1)]] = True
         touched[numbers[slots]] = True
         totals = torch.where(ended, sums, sums[ended].max() if ended.any() else 0.0)
@@ -177,7 +178,7 @@ class ReaPERSampler(SignalSampler):
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
         super()._retransform_priority_trees(old_alpha, new_alpha)
         if self._table is not None and self._table.size:
-            self._rely(self._table, torch.arange(self._table.size))
+            self._rely(self._table, torch.arange(self._table.size, device=self.device))
 
 
 def _numbers(episode: Tensor) -> Tensor:

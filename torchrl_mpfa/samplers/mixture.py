@@ -61,6 +61,7 @@ class MixtureSampler(SignalSampler):
                 self._alpha,
                 self._beta,
                 0.0,
+                device=self.device,
                 max_priority_within_buffer=self._max_priority_within_buffer,
             )
             for signal in self.signals
@@ -70,7 +71,8 @@ class MixtureSampler(SignalSampler):
     def shares(self) -> Tensor:
         """Share of each signal in a batch, in the order of their columns, shape ``[K]``."""
         if self._weighing is None:
-            return torch.full((len(self._names),), 1.0 / len(self._names), dtype=torch.double)
+            equal = torch.full((len(self._names),), 1.0 / len(self._names), dtype=torch.double)
+            return equal.to(self.device)
         return self._weighing.weights / self._weighing.weights.sum()
 
     def _write(self, slots: Tensor, priority: Tensor, *, learned: bool) -> None:
@@ -97,8 +99,9 @@ class MixtureSampler(SignalSampler):
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         shares = self.shares
-        chosen = torch.multinomial(shares, batch_size, replacement=True, generator=self._rng)
-        index = torch.empty(batch_size, dtype=torch.long)
+        generator = self._random()["generator"]
+        chosen = torch.multinomial(shares, batch_size, replacement=True, generator=generator)
+        index = torch.empty(batch_size, dtype=torch.long, device=self.device)
         trees = [self._parts[name] for name in self._names]
         totals, lowest = self._sums(shares, size)
         if not (min(totals) > 0 and lowest > 0):
@@ -117,7 +120,8 @@ class MixtureSampler(SignalSampler):
         """See :meth:`TreeSampler.batch_weights`."""
         shares = self.shares
         totals, lowest = self._sums(shares, size)
-        probability = self._probability(torch.arange(size), shares, totals)
+        slots = torch.arange(size, device=self.device)
+        probability = self._probability(slots, shares, totals)
         return importance_weights(probability, beta=self._beta, lowest=lowest)
 
     def _sums(self, shares: Tensor, size: int) -> tuple[list[float], float]:
@@ -132,7 +136,7 @@ class MixtureSampler(SignalSampler):
 
     def _probability(self, index: Tensor, shares: Tensor, totals: list[float]) -> Tensor:
         """Probability of slots, shape ``[B]``."""
-        probability = torch.zeros(len(index), dtype=torch.double)
+        probability = torch.zeros(len(index), dtype=torch.double, device=self.device)
         for share, name, total in zip(shares.tolist(), self._names, totals, strict=True):
             leaf = leaves_of(self._parts[name]._sum_tree, index)
             probability += leaf * (share / total)

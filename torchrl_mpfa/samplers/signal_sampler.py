@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
-from torchrl_mpfa.checks import NOT_NEGATIVE, bounds, check, check_finite
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
@@ -21,7 +21,7 @@ from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.saved import Entry, count, exactly, finite, number
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.spelling import unknown
-from torchrl_mpfa.storages.table import SignalTable, by_batch, signal_table_of
+from torchrl_mpfa.storages.table import Columns, SignalTable, by_batch, signal_table_of
 
 _USE = "Use SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
 # With a sixteenth a row that is learned from costs as much as sixteen that are read, at any
@@ -65,7 +65,7 @@ class SignalSampler(TreeSampler):
         reduction: As in TorchRL.
         max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
             transition *in the buffer* was given by an update; if false, the highest ever.
-        device: Device of the trees; TorchRL's published wheels have those of the CPU alone.
+        device: As in :class:`~torchrl_mpfa.samplers.TreeSampler`.
         signals: The signals to fuse, as objects or names.
         fusion: How they are weighted, see :class:`~torchrl_mpfa.Fusion`.
         adjustments: What is done to the fused priorities, in order.
@@ -98,7 +98,7 @@ class SignalSampler(TreeSampler):
         dtype: torch.dtype = torch.float,
         reduction: str = "max",
         max_priority_within_buffer: bool = False,
-        device: torch.device | str | None = "cpu",
+        device: torch.device | str | None = None,
         *,
         signals: Sequence[Signal | str] = ("td_error",),
         fusion: Fusion | None = None,
@@ -132,7 +132,7 @@ class SignalSampler(TreeSampler):
         ]
         self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
         self._names = [s.name for s in self.signals]
-        self._columns: slice | list[int] = []
+        self._columns: Columns = slice(0)
         self._table: SignalTable | None = None
         self._warned: set[str] = set()
         super().__init__(
@@ -234,7 +234,7 @@ class SignalSampler(TreeSampler):
                 not finite, or the slots are not so many equal batches.
             TypeError: If the storage keeps no signals, or the index holds anything but integers.
         """
-        table, slots = self.bind(storage), as_slots(index, storage)
+        table, slots = self.bind(storage), as_slots(index, storage).to(self.device)
         if slots.numel() == 0:
             return 0
         rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
@@ -250,13 +250,12 @@ class SignalSampler(TreeSampler):
                 weighing = self._weigh(table, one, weighing)  # Eqs. (15)-(20).
                 adjusted.append(self._fused(table, of_one, one, weighing))  # Eqs. (21)-(24).
         priority = adjusted[0] if len(adjusted) == 1 else torch.cat(adjusted)
+        if (last := last_of_each(slots)) is not None:
+            slots, rows, priority = (each.index_select(0, last) for each in (slots, rows, priority))
         highest = self._checked(priority, "adjusted priorities")
 
         # Nothing has changed so far, so that a call that raises leaves everything as it was.
         self._weighing = weighing
-        if (last := last_of_each(slots)) is not None:
-            slots, rows, priority = (each.index_select(0, last) for each in (slots, rows, priority))
-            highest = bounds(priority)[1]
         table.rows.index_copy_(0, slots, rows)
         self._set(slots, priority, highest)  # Eq. (8).
         return stale
@@ -322,13 +321,15 @@ class SignalSampler(TreeSampler):
     def bind(self, storage: Storage) -> SignalTable:
         """Take the signals of a storage, which must be those of the sampler, as those to fuse."""
         table = signal_table_of(storage, self.signals, self._max_capacity)
+        self._maybe_init_from_storage(storage)
         if table is not self._table:
             weights, before = self.weights, self._weighing
             self._names = sorted((s.name for s in self.signals), key=table.column.__getitem__)
             places = [table.column[name] for name in self._names]
             # Neighbouring columns are read as a view, which is much faster than by a list.
             neighbours = places == list(range(places[0], places[0] + len(places)))
-            self._columns = slice(places[0], places[-1] + 1) if neighbours else places
+            others = torch.tensor(places).to(self.device)
+            self._columns = slice(places[0], places[-1] + 1) if neighbours else others
             if before is not None:
                 self._weighing = replace(before, weights=self._ordered(weights))
             self._table = table
@@ -386,7 +387,7 @@ class SignalSampler(TreeSampler):
             "_mean_reward": last.mean_reward,
         }
         if any(self._counting):
-            state["_counted"] = [None if v is None else v.clone() for v in last.counted]
+            state["_counted"] = [None if v is None else v.clone().cpu() for v in last.counted]
             state["_counted_writes"] = last.counted_writes
             state["_learned_since"] = last.learned_since
         return state
@@ -423,9 +424,12 @@ class SignalSampler(TreeSampler):
                 self._ordered(state_dict["_weights"]),
                 state_dict["_mean_reward"],
                 state_dict["_weighed_at"],
-                tuple(state_dict.get("_counted", ())),
+                tuple(
+                    v if v is None else v.to(self.device) for v in state_dict.get("_counted", ())
+                ),
                 *(state_dict.get(name, 0) for name in ("_counted_writes", "_learned_since")),
             )
 
     def _ordered(self, weights: Mapping[str, float]) -> Tensor:
-        return torch.tensor([weights[name] for name in self._names], dtype=torch.double)
+        ordered = torch.tensor([weights[name] for name in self._names], dtype=torch.double)
+        return ordered.to(self.device)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torchrl.data import Storage
 
+from torchrl_mpfa.samplers.leaves import Leaves
+
 _ORDERED = 2048
 """Rows up to which writing by index keeps their order."""
 
@@ -25,8 +27,8 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
     if isinstance(index, tuple):
         index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
     if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
-        return index.cpu()
-    slots = torch.as_tensor(index, device="cpu")
+        return index
+    slots = torch.as_tensor(index)
     if slots.numel() == 0:
         return slots.new_empty(0, dtype=torch.long)
     # A mask would be read as slots 0 and 1.
@@ -45,7 +47,7 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
     places = slots.reshape(-1, len(shape))
     # TorchRL's writers mark with -1 what was not stored.
     skipped = (places == -1).all(-1)
-    wrong = ((places < 0) | (places >= torch.tensor(shape))).any(-1) & ~skipped
+    wrong = ((places < 0) | (places >= places.new_tensor(shape))).any(-1) & ~skipped
     if bool(wrong.any()):
         raise IndexError(
             f"index must be within the storage's shape {[*shape]}, got {places[wrong][0].tolist()}"
@@ -59,8 +61,13 @@ def as_slots(index: Any, storage: Any = None) -> Tensor:
 def last_of_each(slots: Tensor) -> Tensor | None:
     """Last position of each slot, by slot, shape ``[U]``; None if all can be written as they are.
 
-    A slot that is written twice keeps its last value; index writes of many rows leave it open.
+    A slot that is written twice keeps its last value; index writes of many rows leave it open. On
+    another device than the CPU it is the last position of the slot at each position, ``[B]``: how
+    many slots there are is not waited for.
     """
+    if not slots.is_cpu:
+        ordered, position = slots.sort(stable=True)
+        return position[torch.searchsorted(ordered, slots, right=True) - 1]
     count = len(slots)
     if count <= _ORDERED:
         return None
@@ -75,6 +82,8 @@ def last_of_each(slots: Tensor) -> Tensor | None:
 
 def leaves_of(tree: Any, slots: Tensor) -> Tensor:
     """Leaves of slots, shape ``[B]``."""
+    if isinstance(tree, Leaves):
+        return tree[slots]
     # Given a tensor, the binding first tries it as a number, and spends ten times as long on the
     # error as on the leaves. Of an array it reads the memory from the start, without strides.
     return torch.from_numpy(tree[slots.contiguous().numpy()])
@@ -82,6 +91,8 @@ def leaves_of(tree: Any, slots: Tensor) -> Tensor:
 
 def set_leaves(slots: Tensor, leaf: Tensor, *trees: Any) -> None:
     """Write leaves of slots, shape ``[B]``; of a slot that appears twice, the last one counts."""
-    places, values = slots.contiguous().numpy(), leaf.contiguous().numpy()
+    flat = isinstance(trees[0], Leaves)
+    places = slots if flat else slots.contiguous().numpy()
+    values = leaf if flat else leaf.contiguous().numpy()
     for tree in trees:
         tree[places] = values

@@ -31,17 +31,20 @@ class SavedTrees(PrioritizedSampler):
     """Attributes that are saved as they are."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next batches depend on; tensors and plain values only."""
-        slots = torch.arange(self._max_capacity)
+        """Everything that the next batches depend on; tensors and plain values only.
+
+        Tensors are on the CPU, so that a state loads on any device.
+        """
+        slots = torch.arange(self._max_capacity, device=self.device)
         return {
             "_schema_version": self._STATE_SCHEMA_VERSION,
             "_format": FORMAT,
             "_kind": self.KIND,
             "_max_capacity": self._max_capacity,
             **{name: _copy(getattr(self, name)) for name in self.SAVED},
-            "_learned": leaves_of(self._max_tree, slots) <= 0,
-            "_sum_tree": leaves_of(self._sum_tree, slots),
-            "_min_tree": leaves_of(self._min_tree, slots),
+            "_learned": leaves_of(self._max_tree, slots).cpu() <= 0,
+            "_sum_tree": leaves_of(self._sum_tree, slots).cpu(),
+            "_min_tree": leaves_of(self._min_tree, slots).cpu(),
         }
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
@@ -92,14 +95,16 @@ class SavedTrees(PrioritizedSampler):
         self.check_state(state_dict)
         self._init()
         for name in self.SAVED:
-            setattr(self, name, _copy(state_dict[name]))
+            setattr(self, name, _copy(state_dict[name], self.device))
         # Leaves that were never written hold what the tree takes for nothing; only the others
         # are written back, and inner nodes follow from the leaves alone.
         slots = self._priorities.isfinite().nonzero().squeeze(1)
         if len(slots):
             for name in ("_sum_tree", "_min_tree"):
-                set_leaves(slots, state_dict[name][slots], getattr(self, name))
-        learned = (state_dict["_learned"] & self._priorities.isfinite()).nonzero().squeeze(1)
+                leaf = state_dict[name].to(self.device)[slots]
+                set_leaves(slots, leaf, getattr(self, name))
+        known = state_dict["_learned"].to(self.device) & self._priorities.isfinite()
+        learned = known.nonzero().squeeze(1)
         if len(learned):
             set_leaves(learned, -self._priorities[learned], self._max_tree)
 
@@ -164,8 +169,8 @@ class SavedValues(RandomSampler):
         self.load_state_dict(self.check_dump(path))
 
 
-def _copy(value: Any) -> Any:
-    return value.clone() if isinstance(value, Tensor) else value
+def _copy(value: Any, device: torch.device | str = "cpu") -> Any:
+    return value.to(device, copy=True) if isinstance(value, Tensor) else value
 
 
 def check_sampler(state: Any, entries: Iterable[Entry]) -> None:

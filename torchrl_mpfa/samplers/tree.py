@@ -16,9 +16,11 @@ from torchrl_mpfa.checks import (
     check_counts,
     check_finite,
     check_index,
+    generator_on,
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
+from torchrl_mpfa.samplers.leaves import Leaves, MinLeaves, SumLeaves
 from torchrl_mpfa.samplers.slots import (
     as_slots,
     in_dimensions_of,
@@ -29,6 +31,9 @@ from torchrl_mpfa.samplers.slots import (
 from torchrl_mpfa.samplers.states import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
+_CPU = torch.device("cpu")
+_LOG_POSITIVE = math.log(1e-200)
+"""A leaf with a logarithm above this is not rounded to zero, whatever a sampler makes of it."""
 _ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
 
 
@@ -52,7 +57,8 @@ class TreeSampler(SavedTrees):
         reduction: As in TorchRL.
         max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
             transition *in the buffer* was given by an update; if false, the highest ever.
-        device: Device of the trees; TorchRL's published wheels have those of the CPU alone.
+        device: Device of priorities and sampled slots; by default that of the storage. Where it is
+            not the CPU, passes over all priorities take the place of segment trees.
         stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
             priority, as the PER paper does, in place of ``B`` independent ones.
 
@@ -78,7 +84,7 @@ class TreeSampler(SavedTrees):
         dtype: torch.dtype = torch.float,
         reduction: str = "max",
         max_priority_within_buffer: bool = False,
-        device: torch.device | str | None = "cpu",
+        device: torch.device | str | None = None,
         *,
         stratified: bool = False,
     ) -> None:
@@ -89,6 +95,7 @@ class TreeSampler(SavedTrees):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.stratified = stratified
         self._weight_dtype = dtype
+        self._follows = device is None
         super().__init__(
             max_capacity,
             float(alpha),
@@ -97,24 +104,55 @@ class TreeSampler(SavedTrees):
             dtype,
             reduction,
             max_priority_within_buffer,
-            device,
+            # With its number, as storages have it.
+            None if device is None else torch.empty(0, device=device).device,
         )
 
+    @property
+    def device(self) -> torch.device:
+        """Device of priorities and sampled slots."""
+        return self._device or _CPU
+
+    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
+        """Move to the device of a storage, once it is known."""
+        device = getattr(storage, "device", None)
+        if device == self.device or not isinstance(device, torch.device):
+            return
+        if not self._follows:
+            raise ValueError(
+                f"device must be that of the storage, {device}, or None, got {self.device}"
+            )
+        state, self._device = self.state_dict(), device
+        self._init()
+        self.load_state_dict(state)
+
     def _init(self) -> None:
-        # TorchRL chooses its trees by the dtype, of which only the single one works there.
-        self.dtype = torch.double
-        try:
-            super()._init()
-        finally:
-            self.dtype = self._weight_dtype
+        if self.device.type == "cpu":
+            # TorchRL chooses its trees by the dtype, of which only the single one works there.
+            self.dtype = torch.double
+            try:
+                super()._init()
+            finally:
+                self.dtype = self._weight_dtype
+        else:
+            self._sum_tree = SumLeaves(self._max_capacity, self.device)
+            self._min_tree = MinLeaves(self._max_capacity, self.device)
         # TorchRL finds the highest priority in the buffer by reading every leaf. A minimum tree
         # over the negated priorities has it at its root. It leaves out fresh transitions: they
         # would hand on the highest priority that they were given, and one outlier would stay.
-        self._max_tree = type(self._min_tree)(self._max_capacity)
+        self._max_tree = self._another(self._min_tree)
         # Priorities with eps, before alpha; NaN where nothing was written.
-        self._priorities = torch.full((self._max_capacity,), torch.nan, dtype=torch.double)
+        self._priorities = torch.full(
+            (self._max_capacity,), torch.nan, dtype=torch.double, device=self.device
+        )
         self._highest: float | None = None
         self._highest_slot: int | None = None
+        self._positive = False
+
+    def _another(self, tree: Any) -> Any:
+        """An empty tree of the same kind."""
+        where = (self.device,) if isinstance(tree, Leaves) else ()
+        return type(tree)(self._max_capacity, *where)
 
     @property
     def alpha(self) -> float:
@@ -170,7 +208,7 @@ class TreeSampler(SavedTrees):
             return None, None
         if not self._max_priority_within_buffer or self._alpha == 0:
             return max(highest - self._eps, 0.0), self._highest_slot
-        leaves = leaves_of(self._max_tree, torch.arange(self._max_capacity))
+        leaves = leaves_of(self._max_tree, torch.arange(self._max_capacity, device=self.device))
         return max(highest - self._eps, 0.0), int(leaves.argmin())
 
     @_max_priority.setter
@@ -235,6 +273,7 @@ class TreeSampler(SavedTrees):
 
     def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
         """Slots along the flattened storage and their weights, each of shape ``[B]``."""
+        self._maybe_init_from_storage(storage)
         if self._rng is None:
             # TorchRL would fall back on NumPy's global generator, which torch.manual_seed
             # does not reach.
@@ -248,12 +287,16 @@ class TreeSampler(SavedTrees):
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
         """Slots and their weights, each of shape ``[B]``, out of the first ``size`` slots."""
-        total, lowest = self._sum_tree.query(0, size), self._min_tree.query(0, size)
-        if not (total > 0 and lowest > 0):
-            raise RuntimeError(
-                f"every priority must be positive to sample, got a sum of {total} and a lowest "
-                f"of {lowest}: raise eps, or give the buffer its sampler before its data"
-            )
+        lowest = self._min_tree.query(0, size)
+        if not self._positive:
+            total = self._sum_tree.query(0, size)
+            if not bool((total > 0) & (lowest > 0)):
+                raise RuntimeError(
+                    f"every priority must be positive to sample, got a sum of {total} and a lowest "
+                    f"of {lowest}: raise eps, or give the buffer its sampler before its data"
+                )
+            # A GPU is waited for once, and again after a priority that may be too low.
+            self._positive = isinstance(self._sum_tree, Leaves)
         index = self._proportional(self._sum_tree, size, batch_size)
         leaf = leaves_of(self._sum_tree, index)
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
@@ -273,7 +316,7 @@ class TreeSampler(SavedTrees):
             >>> sampler.batch_weights(2).tolist()
             [1.0, 0.5]
         """
-        leaf = leaves_of(self._sum_tree, torch.arange(size))
+        leaf = leaves_of(self._sum_tree, torch.arange(size, device=self.device))
         weight = importance_weights(leaf, beta=self._beta, lowest=self._min_tree.query(0, size))
         return torch.where(leaf > 0, weight, torch.nan)
 
@@ -281,7 +324,7 @@ class TreeSampler(SavedTrees):
         """Slots sampled uniformly, shape ``[B]``."""
         if self.stratified:
             return self._mass(batch_size).mul_(size).long().clamp_max_(size - 1)
-        return torch.randint(size, (batch_size,), generator=self._rng)
+        return torch.randint(size, (batch_size,), **self._random())
 
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
         """Slots sampled in proportion to the leaves of a tree of sums, shape ``[B]``."""
@@ -292,22 +335,41 @@ class TreeSampler(SavedTrees):
 
     def _mass(self, batch_size: int) -> Tensor:
         """Shares of the total priority to look up, in [0, 1), shape ``[B]``."""
-        mass = torch.rand(batch_size, generator=self._rng, dtype=torch.double)
+        random = self._random()
+        mass = torch.rand(batch_size, dtype=torch.double, **random)
         if not self.stratified:
             return mass
         # In random order: a batch sorted by slot would tell its place in it by its age.
-        return mass.add_(torch.randperm(batch_size, generator=self._rng)).div_(batch_size)
+        return mass.add_(torch.randperm(batch_size, **random)).div_(batch_size)
+
+    def _random(self) -> dict[str, Any]:
+        """The device, and a generator on it for the random numbers of one call."""
+        return {"device": self.device, "generator": generator_on(self.device, self._rng)}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give fresh transitions the highest priority, or raise as :meth:`update_priority`."""
-        slots = check_index(as_slots(index, storage), self._max_capacity)
+        self._maybe_init_from_storage(storage)
+        slots = check_index(as_slots(index, storage), self._max_capacity).to(self.device)
         if len(slots) == 0:
             return
-        highest = self._highest_priority()
-        priority = 1.0 + self._eps if highest is None else highest
+        priority = self._fresh_priority()
         if self._highest is None:
-            self._highest, self._highest_slot = priority, int(slots[0])
-        self._write(slots, torch.full(slots.shape, priority, dtype=torch.double), learned=False)
+            self._highest, self._highest_slot = float(priority), int(slots[0])
+        fresh = slots.new_empty(slots.shape, dtype=torch.double).fill_(priority)
+        self._write(slots, fresh, learned=False)
+
+    def _fresh_priority(self) -> float | Tensor:
+        """Priority of a fresh transition, eps included; a GPU is not waited for."""
+        first = 1.0 + self._eps
+        if (
+            isinstance(self._max_tree, MinLeaves)
+            and self._max_priority_within_buffer
+            and self._alpha
+        ):
+            highest = -self._max_tree.query(0, self._max_capacity)
+            return highest.where(highest >= 0, first)
+        known = self._highest_priority()
+        return first if known is None else known
 
     def add(self, index: Tensor | int) -> None:
         """Nothing to do: the tree of highest priorities forgets an overwritten slot by itself."""
@@ -333,8 +395,9 @@ class TreeSampler(SavedTrees):
             RuntimeError: If ``priority`` has not one number a slot.
             ValueError: If a priority is negative or not finite, or so high that sums overflow.
         """
-        slots = as_slots(index, storage)
-        value = torch.as_tensor(priority, device="cpu").detach()
+        self._maybe_init_from_storage(storage)
+        slots = as_slots(index, storage).to(self.device)
+        value = torch.as_tensor(priority, device=self.device).detach()
         if value.numel() not in (1, slots.numel()):
             raise RuntimeError(
                 "priority should be a number or an iterable of the same length as index. Got "
@@ -370,6 +433,7 @@ class TreeSampler(SavedTrees):
         low, high = bounds(priority)
         if not (low >= 0 and high < math.inf):
             check_finite(name, priority)
+        self._positive &= low > 0 and self._alpha * math.log(low) > _LOG_POSITIVE
         if high > 0 and self._alpha * math.log(high) + math.log(self._max_capacity) > _LOG_LARGEST:
             raise ValueError(f"priority must not be so high that sums overflow, got {high}")
         return high

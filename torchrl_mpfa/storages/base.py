@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from torchrl_mpfa.checks import generator_on
 from torchrl_mpfa.dumps import open_dump, seal_dump
 from torchrl_mpfa.saved import Entry, check_entries, exactly
 from torchrl_mpfa.saving import load_safely, save_atomically
@@ -19,6 +20,7 @@ from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_
 from torchrl_mpfa.storages.states import (
     check_data_state,
     check_length,
+    of_any_device,
     read_metadata,
     rows_of_data,
     signals_of_data,
@@ -49,6 +51,7 @@ class SignalStorageMixin:
     _allow_nonfinite: Sequence[NestedKey] = ()
     _schema: Schema | None = None
     _all_slots: Tensor | None = None
+    _rng: torch.Generator | None
 
     def check(self, data: Any) -> tuple[Tensor | None, Pairs | None]:
         """Check transitions that are about to be written; nothing is changed.
@@ -102,6 +105,7 @@ class SignalStorageMixin:
             raise
         if self.max_size > self.signal_table.capacity:
             self.signal_table.grow(self.max_size)
+        self._settle_device()
         table, slots = self.signal_table, self._slots(cursor)
         table.write(slots, table.blank(len(slots)) if rows is None else rows)
         table.size = len(self)  # type: ignore[arg-type]
@@ -139,6 +143,23 @@ class SignalStorageMixin:
                 entry.copy_(before)
             raise
         self.signal_table.rewrite(rows)
+
+    def _settle_device(self) -> None:
+        """Move the signals to the device of the data, once it is known."""
+        device = self.device  # type: ignore[attr-defined]
+        if device != self.signal_table.device and isinstance(device, torch.device):
+            self.signal_table.to(device)
+
+    def _rand_given_ndim(self, batch_size: int) -> Any:
+        """Slots sampled uniformly, as TorchRL does, which asks for a generator on the device."""
+        kept, device = self._rng, getattr(self, "device", None)
+        if not isinstance(device, torch.device):
+            return super()._rand_given_ndim(batch_size)  # type: ignore[misc]
+        self._rng = generator_on(device, kept)
+        try:
+            return super()._rand_given_ndim(batch_size)  # type: ignore[misc]
+        finally:
+            self._rng = kept
 
     def _check_known(self, rows: Tensor) -> None:
         """Reject rows of the signal table that lack an entry that the sampler needs."""
@@ -300,7 +321,8 @@ class SignalStorageMixin:
         signals = self._checked_signals(state_dict)
         if state_dict.get(_CLOCK) is not self.signal_table.clock:
             self.signal_table.stop_clock()
-        super().load_state_dict(state_dict)  # type: ignore[misc]
+        data = of_any_device(state_dict["_storage"])
+        super().load_state_dict({**state_dict, "_storage": data})  # type: ignore[misc]
         self._schema = None
         self.signal_table.load_state_dict(signals)
 
@@ -350,8 +372,8 @@ def _as_index(cursor: Any, capacity: int) -> Tensor:
     if isinstance(cursor, slice):
         return torch.arange(*cursor.indices(capacity))
     if isinstance(cursor, Tensor) and cursor.dtype is torch.bool:
-        return cursor.nonzero().squeeze(1).cpu()
-    return torch.as_tensor(cursor, dtype=torch.long, device="cpu").reshape(-1)
+        return cursor.nonzero().squeeze(1)
+    return torch.as_tensor(cursor, dtype=torch.long).reshape(-1)
 
 
 def _as_batch(data: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +67,16 @@ def check_data_state(
         free = name in may or not like.is_floating_point()
         entries.append(entry if free else replace(entry, holds=finite))
     check_entries("storage", saved, entries)
+
+
+def of_any_device(data: Any) -> Any:
+    """Saved data without the name of their device, for which another device rejects them."""
+    told = getattr(data, "_metadata", None)
+    if told is None:
+        return data
+    copied = OrderedDict(data)
+    copied._metadata = {name: {**each, "device": None} for name, each in told.items()}  # type: ignore[attr-defined]
+    return copied
 
 
 def signals_of_data(table: SignalTable, data: Any, length: int) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from torchrl_mpfa.saved import Entry, check_entries, count, exactly
 from torchrl_mpfa.signals import Signal, as_signals
 
 Priority = Callable[[Tensor], Tensor] | None
-Columns = slice | list[int]
+Columns = slice | Tensor
 
 
 class SignalTable:
@@ -54,6 +54,7 @@ class SignalTable:
     ) -> None:
         made = as_signals(signals)
         self.capacity = capacity
+        self.device = torch.device("cpu")
         self.in_memory = file is None
         self.learned = [s for s in made if s.known_at == "update"]
         self.written = [s for s in made if s.known_at == "write"]
@@ -89,6 +90,10 @@ class SignalTable:
         count, self.clock[0] = self.writes, -1
         self.clock = [count]
 
+    def to(self, device: torch.device) -> None:
+        """Move to the device of the data."""
+        self.rows, self.device = self.rows.to(device), device
+
     def clear(self) -> None:
         """Forget every slot; the count of writes goes on, so that earlier batches stay stale."""
         self.rows.copy_(self._blank)
@@ -97,7 +102,7 @@ class SignalTable:
 
     def grow(self, capacity: int) -> None:
         """Add slots at the end; only for a table in memory."""
-        more = self._blank.expand(capacity - self.capacity, -1)
+        more = self.blank(capacity - self.capacity, self.device)
         self.rows, self.capacity = torch.cat([self.rows, more]), capacity
 
     @property
@@ -110,14 +115,17 @@ class SignalTable:
         """Signed rewards of the filled slots, shape ``[size]``."""
         return self.rows[: self.size, self.reward_column]
 
-    def blank(self, count: int) -> Tensor:
+    def blank(self, count: int, device: torch.device | str = "cpu") -> Tensor:
         """Rows of transitions of which nothing is known, not yet written."""
-        return self._blank.expand(count, -1).clone()
+        return self._blank.to(device).expand(count, -1).clone()
 
     def read(self, data: Any, count: int) -> Tensor:
-        """Rows for new transitions, checked and not yet written; NaN for entries that they lack."""
-        rows = self.blank(count)
+        """Rows for new transitions, checked and not yet written; NaN for entries that they lack.
+
+        They are on the device of the data, whose checks then wait for no other one.
+        """
         reward = _column(data, self.reward_key, "reward", count)
+        rows = self.blank(count, "cpu" if reward is None else reward.device)
         if reward is not None:
             rows[:, self.reward_column] = reward
         for signal in self.written:
@@ -140,7 +148,7 @@ class SignalTable:
         for name, priority_of in learned.items():
             if name not in signals:
                 raise KeyError(f"signal {name!r} is missing, got {sorted(signals)}")
-            value = signals[name].detach()
+            value = signals[name].detach().to(rows.device)
             if value.numel() != count or value.is_complex():
                 raise ValueError(
                     f"signal {name!r} must have one real number per transition, got {value.dtype} "
@@ -213,10 +221,12 @@ class SignalTable:
             self.writes += count - self.capacity
             index, rows = index[-self.capacity :], rows[-self.capacity :]
             count = self.capacity
+        index, rows = index.to(self.device), rows.to(self.device)
         if count == 1:
             rows[0, self.time_column] = self.writes
         else:
-            rows[:, self.time_column] = torch.arange(self.writes, self.writes + count)
+            times = torch.arange(self.writes, self.writes + count, device=self.device)
+            rows[:, self.time_column] = times
         self.rows[index] = rows
         self.writes += count
 
@@ -226,14 +236,18 @@ class SignalTable:
         What the learner gave stays until its next update; a row that changes counts as a write.
         """
         known = [*(self.column[s.name] for s in self.written), self.reward_column]
-        before, after = self.rows[: self.size, known], rows[:, known]
+        before, after = self.rows[: self.size, known], rows[:, known].to(self.device)
         same = (before == after) | (before.isnan() & after.isnan())
         self.rows[: self.size, known] = after
         self.writes += int((~same.all(1)).sum())
 
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
-        np.add.at(self.rows.numpy()[:, self.count_column], index.numpy(), 1.0)
+        if self.rows.is_cpu:
+            np.add.at(self.rows.numpy()[:, self.count_column], index.numpy(), 1.0)
+        else:
+            one = torch.ones(len(index), dtype=torch.double, device=self.device)
+            self.rows.select(1, self.count_column).index_add_(0, index, one)
 
     def written_at(self, index: Tensor) -> Tensor:
         """Time of writing of each slot, as a count of writes, shape ``[B]``."""
@@ -250,7 +264,7 @@ class SignalTable:
             "names": list(self.names),
             "size": self.size,
             "writes": self.writes,
-            "rows": self.rows[: self.size].clone(),
+            "rows": self.rows[: self.size].to("cpu", copy=True),
         }
 
     def check_state(self, state: dict[str, Any]) -> None:
@@ -355,9 +369,9 @@ def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
             f"{name} at {key!r} must have one real number per transition, got {value.dtype} of "
             f"shape {[*value.shape]} for {count} transitions"
         )
-    flat = value.detach().reshape(count).to("cpu", torch.double)
-    low, high = flat.aminmax()
-    if not (low.item() > -math.inf and high.item() < math.inf):
+    flat = value.detach().reshape(count).to(torch.double)
+    low, high = bounds(flat)
+    if not (low > -math.inf and high < math.inf):
         bad = flat[~flat.isfinite()][0].item()
         raise ValueError(f"{name} at {key!r} must be finite, got {bad}")
     return flat

@@ -39,6 +39,8 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         ['td_error', 'action_gradient', 'reward']
     """
 
+    _storage: Any
+
     def __init__(
         self,
         max_size: int,
@@ -61,6 +63,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
             self.initialized
             and self.ndim == 1
             and isinstance(index, Tensor)
+            and index.is_cpu
             and index.ndim == 1
             and len(index) > 0
             and index.dtype is torch.long
@@ -74,17 +77,22 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore data and signals, or raise as :meth:`check_state` does."""
         super().load_state_dict(state_dict)
-        self._settle_device()
+        self._settle_loaded()
 
     def loads(self, path: str | Path) -> None:
         """Restore data and signals from a folder, or raise as :meth:`check_state` does."""
         super().loads(path)
-        self._settle_device()
+        self._settle_loaded()
 
-    def _settle_device(self) -> None:
-        # TorchRL finds the device "auto" out at the first write, which a restored storage has had.
-        if self.initialized and getattr(self, "device", None) == "auto":
-            self.device = self._device_of_tensors() or torch.device("cpu")
+    def _settle_loaded(self) -> None:
+        found = self._device_of_tensors() if self.initialized else None
+        if getattr(self, "device", None) == "auto":
+            # TorchRL finds it out at the first write, which a restored storage has had.
+            self.device = (found or torch.device("cpu")) if self.initialized else "auto"
+        elif found not in (None, self.device):
+            # What was saved beside another device.
+            self._storage = self._storage.to(self.device)
+        self._settle_device()
 
     def _device_of_tensors(self) -> torch.device | None:
         """Device of all entries; None if one is no tensor, such as a text: TorchRL reads those."""
