@@ -124,7 +124,7 @@ class MixtureSampler(SignalSampler):
         probability = self._probability(slots, shares, totals)
         return importance_weights(probability, beta=self._beta, lowest=lowest)
 
-    def _sums(self, shares: Tensor, size: int) -> tuple[list[float], float]:
+    def _sums(self, shares: Tensor, size: int) -> tuple[list[Any], Any]:
         """Sum of each signal's leaves, and a bound of the lowest probability."""
         trees = [self._parts[name] for name in self._names]
         totals = [part._sum_tree.query(0, size) for part in trees]
@@ -134,7 +134,7 @@ class MixtureSampler(SignalSampler):
         )
         return totals, lowest
 
-    def _probability(self, index: Tensor, shares: Tensor, totals: list[float]) -> Tensor:
+    def _probability(self, index: Tensor, shares: Tensor, totals: list[Any]) -> Tensor:
         """Probability of slots, shape ``[B]``."""
         probability = torch.zeros(len(index), dtype=torch.double, device=self.device)
         for share, name, total in zip(shares.tolist(), self._names, totals, strict=True):
