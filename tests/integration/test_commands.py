@@ -106,7 +106,8 @@ def understand(words: Sequence[str]) -> None:
     if script == "compare":
         parse_overrides(options.overrides)
     if script in ("compare", "evaluate"):
-        known = [word for word in options.worlds if not word.endswith(".yaml")]
+        files = ".yaml", ".zip"
+        known = [word for word in options.worlds if not word.endswith(files)]
         assert len(parse_worlds(known)) >= len(known)
 
 
