@@ -178,6 +178,7 @@ def array(values: object) -> Callable[[Path], object]:
         (array([[0, 0, 0]]), r"path_110.npy: must have shape \[N, 2\], got \[1, 3\]"),
         (array(np.empty((0, 2))), r"must have shape \[N, 2\], got \[0, 2\]"),
         (array([[0.0, math.nan]]), "must have cells from 0 to 99"),
+        (array([[-1, 0]]), "must have cells from 0 to 99"),
         (array([[0, 100]]), "must have cells from 0 to 99"),
         (array([["a", "b"]]), "must be an array of numbers"),
         (array([[{}, {}]]), "path_110.npy: is no array: Object arrays"),
