@@ -143,7 +143,8 @@ def load_barn(archive: str | os.PathLike[str]) -> Iterator[tuple[World, float]]:
             root = zipfile.Path(path)
         except (OSError, zipfile.BadZipFile) as error:
             raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    places = [root, *sorted(root.iterdir(), key=str)]
+    inside: list[Path | zipfile.Path] = [*root.iterdir()]
+    places = [root, *sorted(inside, key=str)]
     folder = next((place for place in places if (place / "path_files").is_dir()), root)
     files = folder / "world_files" if (folder / "world_files").is_dir() else folder
     numbers = [n for n in range(_PUBLISHED) if (files / f"world_{n}.world").is_file()]
