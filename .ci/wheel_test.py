@@ -33,7 +33,7 @@ from tensordict import TensorDict
 
 import mpfa_envs
 import torchrl_mpfa
-from mpfa_envs import evaluate, load_policy, make_navigation_env, summarize
+from mpfa_envs import POLICIES, evaluate, load_policy, make_navigation_env, summarize
 from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
 
 installed, version = Path(sys.argv[1]).resolve(), sys.argv[2]
@@ -63,7 +63,9 @@ batch["signals"] = TensorDict(
 buffer.update_tensordict_priority(batch)
 print("weights of the signals:", buffer.sampler.weights)
 
-policy = load_policy("td3-paper")
+shipped = {name: load_policy(name) for name in POLICIES}
+print("shipped policies:", ", ".join(shipped))
+policy = shipped["td3-paper"]
 results = evaluate(policy, "rooms-100", episodes=10, physics="kinematic")
 print("success of the shipped policy:", summarize(results)["success"])
 assert sum(result.success for result in results) >= 8, results

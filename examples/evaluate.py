@@ -70,6 +70,8 @@ _DOCUMENTED = (
     *("path_length", "plan_s", "decision_s"),
 )
 _COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
+_BARN = {"barn_score": "{:.3f}"}
+"""What there is on the task of that benchmark."""
 _LENGTHS = {"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"}
 _ENCOUNTERS = {
     "walker_distance": "{:.3f}",
@@ -107,8 +109,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--worlds",
         nargs="+",
         default=["test"],
-        help="names, world files, spans (rooms:100-109), splits (bars:test), barn, or all "
-        "(default: test)",
+        help="names, world files, spans (rooms:100-109), splits (bars:test), barn, barn:PATH "
+        "of its archive, or all (default: test)",
     )
     parser.add_argument(
         "--episodes", type=int, help="for each (default: 200 in a world, 400 for a generator)"
@@ -208,7 +210,7 @@ def output_folder(options: argparse.Namespace) -> Path:
 def printed(summary: pd.DataFrame) -> str:
     """The table on the screen: estimates, and the interval of success."""
     table = summary[["world", "episodes"]].copy()
-    for name, form in {**_COLUMNS, **_LENGTHS, **_MILLISECONDS, **_ENCOUNTERS}.items():
+    for name, form in {**_COLUMNS, **_BARN, **_LENGTHS, **_MILLISECONDS, **_ENCOUNTERS}.items():
         if name in summary:
             shown, scale = (name, 1.0) if name not in _MILLISECONDS else (f"{name[:-2]}_ms", 1e3)
             values = (scale * summary[name]).map(form.format)
@@ -223,7 +225,7 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     def entries(row: Mapping[str, Any]) -> dict[str, Any]:
         # JSON has no NaN, which the time is where no episode succeeds.
-        values = ((name, float(row[name])) for name in _DOCUMENTED)
+        values = ((name, float(row[name])) for name in (*_DOCUMENTED, *_BARN) if name in row)
         kept = {name: None if math.isnan(value) else value for name, value in values}
         return {"episodes": int(row["episodes"]), **kept}
 

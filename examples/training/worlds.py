@@ -13,7 +13,9 @@ _LONGEST = 60
 """Characters of a label, without the number that is put in place of the rest."""
 _MOST_WORLDS = 10_000
 """Worlds of a span at most."""
-_OF_MANY = re.compile(r"([a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
+_ARCHIVE = "barn:"
+"""What the path of the benchmark's archive follows."""
+_OF_MANY = re.compile(r"(barn300|[a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
 
 
 def parse_worlds(words: Sequence[str]) -> list[str]:
@@ -21,8 +23,9 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
 
     Args:
         words: Names of worlds, paths of world files, spans of a generator's worlds,
-            ``bars:test`` or ``bars:validation``, the worlds of a split, and ``all``, the test
-            worlds of every generator of worlds in which nothing moves.
+            ``bars:test`` or ``bars:validation``, the worlds of a split, ``barn`` and ``barn:PATH``,
+            those of the benchmark, and ``all``, the test worlds of every generator of worlds in
+            which nothing moves.
 
     Returns:
         Names and paths, each of which there is.
@@ -64,7 +67,11 @@ def family(name: str) -> str:
     Examples:
         >>> [family(name) for name in ("bars-test-7", "rooms-7", "barn-3", "test", "my-room")]
         ['bars:test', 'rooms', 'barn', 'test', 'my-room']
+        >>> [family(name) for name in ("barn300-5", "barn:BARN_dataset.zip")]
+        ['barn300', 'barn300']
     """
+    if name.startswith(_ARCHIVE):
+        return "barn300"
     found = _OF_MANY.fullmatch(name)
     if found is None:
         return name
@@ -78,11 +85,13 @@ def is_of_a_test(word: str) -> bool:
         >>> [is_of_a_test(word) for word in ("test", "bars:test", "bars-test-3", "barn", "bars-3")]
         [True, True, True, True, False]
     """
-    return family(word) in ("test", "barn") or family(word).endswith(":test")
+    return family(word) in ("test", "barn", "barn300") or family(word).endswith(":test")
 
 
 def world_name(world: str) -> str:
     """A world as part of a file's name: that of a world file without folder and ending."""
+    if world.startswith(_ARCHIVE):
+        return "barn300"
     name = Path(world).stem if Path(world).suffix else world
     return re.sub(r"[^\w.-]", "_", name.replace(":", "-"))
 
@@ -95,8 +104,10 @@ def worlds_label(words: Sequence[str]) -> str:
         'test+rooms-100-109'
     """
     label = "+".join(world_name(word) for word in words)
-    if len(label) <= _LONGEST and not any(Path(word).suffix for word in words):
+    if len(label) <= _LONGEST and not any(
+        Path(word).suffix or word.startswith(_ARCHIVE) for word in words
+    ):
         return label
-    # Two world files may have one name, in two folders.
+    # Two files may have one name, in two folders.
     digest = hashlib.sha256("\n".join(words).encode()).hexdigest()[:8]
     return f"{label[:_LONGEST]}-{digest}"

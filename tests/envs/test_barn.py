@@ -1,14 +1,36 @@
 from __future__ import annotations
 
 import math
+import shutil
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mpfa_envs import NavigationEnv
+import mpfa_envs
+from mpfa_envs import (
+    NavigationEnv,
+    WorldFileError,
+    evaluate,
+    load_policy,
+    run_tasks,
+    summarize,
+    world_tasks,
+)
+from mpfa_envs.evaluation.results import barn_score
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world
+from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world, barn_worlds, load_barn
+
+SAMPLE = Path(mpfa_envs.__file__).parent / "data" / "barn" / "barn_sample.npz"
+WORLD = "<sdf version='1.6'><world name='default'>MODELS</world></sdf>"
+MODEL = (
+    "<model name='unit_cylinder'><static>1</static><pose frame=''>AT 0 0 0 0</pose>"
+    "<link name='link'><collision name='collision'><geometry><cylinder><radius>0.075</radius>"
+    "<length>1</length></cylinder></geometry></collision></link></model>\n"
+)
 
 
 def test_there_are_twenty_worlds_from_open_to_narrow() -> None:
@@ -42,3 +64,158 @@ def test_a_world_is_found_by_its_name() -> None:
     assert info["distance"] == 10.0 and info["heading"] == pytest.approx(math.pi / 2)
     _, info = env.reset(seed=0)
     assert info["y"] < -2.5 and env.task is not None and env.task.goal[1] > 3.5
+
+
+def publish(folder: Path, indices: Iterable[int] = (0, 7), worlds: str = "world_files") -> Path:
+    """Write some of the twenty worlds as the benchmark publishes them."""
+    (folder / worlds).mkdir(parents=True, exist_ok=True)
+    (folder / "path_files").mkdir(exist_ok=True)
+    with np.load(SAMPLE, allow_pickle=False) as sample:
+        for index in indices:
+            number = BARN_WORLDS[index]
+            np.save(folder / "path_files" / f"path_{number}.npy", sample[f"path_{number}"])
+            places = sample[f"cyl_{number}"].tolist()
+            models = "".join(MODEL.replace("AT", f"{x:.6f} {y:.6f}") for x, y in places)
+            text = WORLD.replace("MODELS", models)
+            (folder / worlds / f"world_{number}.world").write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("form", ["folder", "in a folder", "challenge", "zip"])
+def test_the_archive_has_the_worlds_and_paths_that_come_with_the_package(
+    tmp_path: Path, form: str
+) -> None:
+    worlds = "." if form == "challenge" else "world_files"
+    archive = publish(tmp_path / "all" / "BARN_dataset", range(20), worlds)
+    if form == "in a folder":
+        archive = archive.parent
+    elif form == "zip":
+        archive = Path(shutil.make_archive(str(tmp_path / "barn"), "zip", archive.parent))
+    found = list(load_barn(archive))
+    assert [world.name for world, _ in found] == [f"barn300-{number}" for number in BARN_WORLDS]
+    for (world, length), (expected, expected_length) in zip(found, barn_worlds(), strict=True):
+        assert length == expected_length
+        assert (world.size, world.start_regions) == (expected.size, expected.start_regions)
+        assert world.goal_regions == expected.goal_regions
+        places = [(c.x, c.y, c.radius) for c in world.cylinders]
+        wanted = [(c.x, c.y, c.radius) for c in expected.cylinders]
+        assert np.array(places) == pytest.approx(np.array(wanted), abs=1e-3)
+
+
+@pytest.mark.parametrize("index", range(20))
+def test_a_reference_path_leads_between_the_cylinders_from_the_start_to_the_goal(
+    index: int,
+) -> None:
+    """The formula of the benchmark's own script, cell by cell."""
+    number, radius = BARN_WORLDS[index], 0.075
+    with np.load(SAMPLE, allow_pickle=False) as sample:
+        cells, cylinders = sample[f"path_{number}"], sample[f"cyl_{number}"]
+    points = [(-2.25, 3.0)]
+    for column, row in cells.tolist():
+        points.append(
+            (column * 2 * radius - radius - 30 * 2 * radius, row * 2 * radius + radius + 5)
+        )
+        assert min(math.dist(points[-1], other) for other in cylinders.tolist()) > 0.3
+    points.append((-2.25, 13.0))
+    steps = list(pairwise(points))
+    assert list(barn_worlds())[index][1] == pytest.approx(sum(math.dist(*step) for step in steps))
+
+
+def test_the_task_of_an_archive_is_driven_and_scored(tmp_path: Path) -> None:
+    archive = publish(tmp_path / "BARN_dataset")
+    word = f"barn:{archive}"
+    tasks = world_tasks(word)
+    assert [task.world.name for task in tasks] == ["barn300-5", "barn300-110"]
+    assert {(task.task, task.max_steps) for task in tasks} == {(barn_task(), 1000)}
+    assert [task.world.name for task in world_tasks(word, episodes=1)] == ["barn300-5"]
+    here = [world_tasks("barn")[index] for index in (0, 7)]
+    policy = load_policy("td3-rooms")
+    results = evaluate(policy, word, physics="kinematic")
+    expected = run_tasks(policy, here, **{**policy.env_arguments, "physics": "kinematic"})
+    assert [each.time_s for each in results] == [each.time_s for each in expected]
+    for result, task in zip(results, tasks, strict=True):
+        assert task.reference_path is not None
+        assert result.barn_score == barn_score(
+            result.success, time_s=result.time_s, reference_path=task.reference_path
+        )
+    slow = evaluate(policy, word, physics="kinematic", robot="burger")
+    assert all(each.barn_score in (0.0, 0.125) for each in slow)  # At 0.22 m/s.
+    summary = summarize([*results, *evaluate(policy, "A", episodes=1, physics="kinematic")])
+    assert summary["barn_score"].value == pytest.approx(
+        np.mean([result.barn_score for result in results])
+    )
+
+
+def test_the_score_is_that_of_the_challenge() -> None:
+    # Optimal times of 5 s: its eighth from 40 s on, its fourth up to 20 s.
+    times = {0.1: 0.25, 19.9: 0.25, 20.0: 0.25, 25.0: 0.2, 32.0: 5 / 32, 40.0: 0.125, 99.0: 0.125}
+    for time, score in times.items():
+        assert barn_score(True, time_s=time, reference_path=10.0) == pytest.approx(score)
+        assert barn_score(False, time_s=time, reference_path=10.0) == 0.0
+
+
+def damaged(change: Callable[[Path], object], tmp_path: Path) -> Path:
+    archive = publish(tmp_path / "BARN_dataset")
+    change(archive)
+    return archive
+
+
+def world_110(text: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / "world_files" / "world_110.world").write_text(text)
+
+
+def array(values: object) -> Callable[[Path], object]:
+    return lambda folder: np.save(folder / "path_files" / "path_110.npy", values, allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (shutil.rmtree, "neither a folder nor an archive"),
+        (lambda folder: shutil.rmtree(folder / "world_files"), "has no world of BARN"),
+        (lambda folder: shutil.rmtree(folder / "path_files"), "path_5.npy: cannot|no world of"),
+        (lambda folder: (folder / "path_files/path_110.npy").unlink(), "path_110.npy: cannot be"),
+        (array([[0, 0, 0]]), r"path_110.npy: must have shape \[N, 2\], got \[1, 3\]"),
+        (array(np.empty((0, 2))), r"must have shape \[N, 2\], got \[0, 2\]"),
+        (array([[0.0, math.nan]]), "must have cells from 0 to 99"),
+        (array([[-1, 0]]), "must have cells from 0 to 99"),
+        (array([[0, 100]]), "must have cells from 0 to 99"),
+        (array([["a", "b"]]), "must be an array of numbers"),
+        (array([[{}, {}]]), "path_110.npy: is no array: Object arrays"),
+        (
+            lambda folder: (folder / "path_files/path_110.npy").write_bytes(b"0" * 2_000_000),
+            "path_110.npy: cannot be read: .* 1000000 bytes",
+        ),
+        (world_110("<sdf><world>"), "world_110.world:1: is not XML"),
+        (
+            world_110(WORLD.replace("MODELS", MODEL.replace("AT", "90 0"))),
+            "world_110.world: .* must lie in",
+        ),
+        (
+            world_110(WORLD.replace("MODELS", MODEL.replace("AT", "nan 0"))),
+            "world_110.world:1: pose must be 6 numbers",
+        ),
+    ],
+)
+@pytest.mark.parametrize("zipped", [False, True])
+def test_an_archive_that_is_no_archive_is_rejected_by_the_name_of_the_file(
+    tmp_path: Path, change: Callable[[Path], object], message: str, zipped: bool
+) -> None:
+    archive = damaged(change, tmp_path)
+    if zipped and archive.exists():
+        archive = Path(shutil.make_archive(str(archive), "zip", archive.parent, archive.name))
+    with pytest.raises(WorldFileError, match=message):
+        world_tasks(f"barn:{archive}")
+
+
+def test_a_damaged_zip_is_rejected(tmp_path: Path) -> None:
+    archive = publish(tmp_path / "BARN_dataset")
+    path = Path(shutil.make_archive(str(archive), "zip", archive.parent, archive.name))
+    content = path.read_bytes()
+    place = content.index(b"world_110.world") + 200
+    path.write_bytes(content[:place] + bytes(50) + content[place + 50 :])
+    with pytest.raises(WorldFileError, match=r"world_110\.world: cannot be read"):
+        world_tasks(f"barn:{path}")
+    path.write_bytes(content[:1000])
+    with pytest.raises(WorldFileError, match=r"BARN_dataset\.zip: cannot be read"):
+        world_tasks(f"barn:{path}")

@@ -112,7 +112,8 @@ def understand(words: Sequence[str]) -> None:
     if script == "tune":
         parse_overrides(options.settings)
     if script in ("compare", "evaluate"):
-        known = [word for word in options.worlds if not word.endswith(".yaml")]
+        files = ".yaml", ".zip"
+        known = [word for word in options.worlds if not word.endswith(files)]
         assert len(parse_worlds(known)) >= len(known)
 
 

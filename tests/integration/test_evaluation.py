@@ -22,7 +22,7 @@ from training.records import read_table
 from training.run.assembly import make_learner
 from training.run.evaluations import exported_policy
 from training.settings.train import GROUPS, TrainSettings
-from training.worlds import parse_worlds, worlds_label
+from training.worlds import is_of_a_test, parse_worlds, worlds_label
 
 SHIPPED = "td3-paper"
 
@@ -207,6 +207,30 @@ def test_the_table_tells_of_walkers_where_there_are_any(
     assert summary["intrusion_time"].notna().tolist() == [True, False, True]
     header = next(line for line in capsys.readouterr().out.splitlines() if "min_clearance" in line)
     assert header.split()[-3:] == ["walker_distance", "intrusion_time", "time_to_collision"]
+
+
+def test_the_table_has_the_score_of_barn_where_its_task_is_driven(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    how = ["--episodes", "1", "--no-pictures", "--output", str(run / "barn")]
+    summary = evaluate.main([str(run), "--worlds", "barn", "A", *how])
+    assert summary["barn_score"].notna().tolist() == [True, False, True]
+    header = next(line for line in capsys.readouterr().out.splitlines() if "barn_score" in line)
+    assert header.split().index("barn_score") == header.split().index("spl") + 1
+    document = json.loads((run / "barn" / "evaluation.json").read_text())
+    assert document["worlds"]["barn"]["barn_score"] == document["barn_score"]
+    assert "barn_score" not in document["worlds"]["A"]
+
+
+def test_an_archive_of_barn_that_there_is_not_is_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        evaluate.parse([SHIPPED, "--worlds", f"barn:{tmp_path / 'none.zip'}"])
+    assert "none.zip: is neither a folder nor an archive of BARN" in capsys.readouterr().err
+    words = (["barn"], ["barn:a/BARN_dataset"], ["barn:b/BARN_dataset"], ["barn300-5"])
+    assert len({worlds_label(each) for each in words}) == 4
+    assert all(is_of_a_test(word) for each in words for word in each)
 
 
 def test_a_time_that_there_is_not_is_null_in_the_document() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+import warnings
+from functools import cache
+from itertools import count
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import gymnasium
 import numpy as np
@@ -23,6 +26,11 @@ if TYPE_CHECKING:
     from mpfa_envs.sensing.lidar import Lidar
     from mpfa_envs.worlds.task import Task
     from mpfa_envs.worlds.world import World
+
+
+_TURNS: Final = 100
+"""After so many steps of an environment, between any two of which others stepped twice or more,
+it is one of many that take turns."""
 
 
 class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
@@ -91,6 +99,10 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         **kwargs: Further arguments of :class:`~mpfa_envs.VectorNavigationEnv`, the fields of
             :class:`~mpfa_envs.TaskConfig` above all: ``NavigationEnv(world="D", **PAPER_TASK)``.
 
+    Warns:
+        UserWarning: If several of one process take turns, as those of
+            ``gymnasium.make_vec(..., vectorization_mode="sync")`` do: together they are faster.
+
     Raises:
         ImportError: If there is no PyBullet and physics is ``"wheels"``.
         ValueError: If an argument is out of its range, or a world has no task; nothing is built
@@ -133,6 +145,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self.action_space = self.robots.single_action_space
         self._running = False
         self._window: Window | None = None
+        self._last_step = self._turns = 0
 
     @property
     def config(self) -> TaskConfig:
@@ -235,9 +248,18 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         observations, rewards, *ends, infos = self.robots.step(np.asarray(action)[None])
         terminated, truncated = (bool(ended[0]) for ended in ends)
         self._running = not (terminated or truncated)
+        self._count_turns()
         if self.render_mode == "human":
             self.render()
         return observations[0], float(rewards[0]), terminated, truncated, _first(infos)
+
+    def _count_turns(self) -> None:
+        """Warn where environments take turns; one for training and one for tests do not."""
+        now = next(_steps)
+        self._turns = self._turns + 1 if now - self._last_step > 2 else 0
+        self._last_step = now
+        if self._turns >= _TURNS:
+            _warn_of_turns()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Render the room from above.
@@ -269,6 +291,21 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             self._window.close()
             self._window = None
         self.robots.close()
+
+
+_steps = count(1)
+"""Numbers of the steps of all environments in this process."""
+
+
+@cache  # Once in a process.
+def _warn_of_turns() -> None:
+    """Name what is faster than many single environments."""
+    warnings.warn(
+        "several NavigationEnv take turns, and each is simulated alone: gymnasium.make_vec(..., "
+        'vectorization_mode="vector_entry_point"), its default for these ids, or '
+        "VectorNavigationEnv simulates them together, several times as fast",
+        stacklevel=4,
+    )
 
 
 def _first(infos: dict[str, Any]) -> dict[str, Any]:

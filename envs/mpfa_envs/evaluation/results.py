@@ -11,6 +11,8 @@ import numpy as np
 
 ENCOUNTERS = ("walker_distance", "intrusion_time", "time_to_collision")
 """Measures of encounters with walkers in the info of an environment and in a result."""
+_JACKAL_SPEED = 2.0
+"""Top speed of the robot of the BARN benchmark [m/s]."""
 _LEVEL = 0.95
 _RESAMPLES = 2000
 
@@ -48,6 +50,8 @@ class EpisodeResult:
     time_to_collision: float | None = None
     """Least time after which robot and walker would have touched had both kept their velocities, at
     most 10 s [s]."""
+    barn_score: float | None = None
+    """Score of the BARN Challenge, see :func:`barn_score`; None where its task is not driven."""
 
     @property
     def outcome(self) -> Literal["success", "collision", "timeout"]:
@@ -75,6 +79,31 @@ def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
     return success * shortest_path / max(path_length, shortest_path)
 
 
+def barn_score(success: bool, *, time_s: float, reference_path: float) -> float:
+    """Score of the BARN Challenge of 2022, of one episode.
+
+    ``s = 1[success] OT / clip(AT, 4 OT, 8 OT)``: AT is the actual time, and OT the optimal time,
+    that of the benchmark's robot, a Jackal, on the reference path at its top speed of 2 m/s (Xiao
+    et al. 2022, https://doi.org/10.1109/MRA.2022.3213466). Later challenges have 2 OT in place of
+    4 OT.
+
+    Args:
+        success: Whether the goal was reached.
+        time_s: Simulated time [s].
+        reference_path: Length of the benchmark's reference path [m], which is positive.
+
+    Returns:
+        0 for a failure, else 1/8 to 1/4; 1/4 for a mean speed along the reference path of 0.5 m/s
+        or more.
+
+    Examples:
+        >>> [barn_score(True, time_s=time, reference_path=10.0) for time in (19.0, 25.0, 60.0)]
+        [0.25, 0.2, 0.125]
+    """
+    optimal = reference_path / _JACKAL_SPEED
+    return success * optimal / min(max(time_s, 4 * optimal), 8 * optimal)
+
+
 @dataclass(frozen=True)
 class Interval:
     """An estimate with its 95 % interval."""
@@ -97,7 +126,8 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
 
     Returns:
         Estimates by name; success, collision and timeout sum to one. Means of encounters with
-        walkers are among them if there were any, over the episodes with walkers.
+        walkers are among them if there were any, over the episodes with walkers, and so is BARN's
+        score, over the episodes of its task.
 
     Raises:
         ValueError: If there are no results.
@@ -117,7 +147,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
         "plan_s": bootstrap([result.plan_s for result in results], rng),
         "decision_s": bootstrap([result.decision_s for result in results], rng),
     }
-    for name in ENCOUNTERS:
+    for name in (*ENCOUNTERS, "barn_score"):
         values = [getattr(result, name) for result in results]
         if met := [value for value in values if value is not None]:
             summary[name] = bootstrap(met, rng)

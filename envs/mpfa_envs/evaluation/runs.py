@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, spl
+from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, spl
 from mpfa_envs.planners.dynamic_window import DynamicWindow
 from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
@@ -345,7 +345,8 @@ def _result(
     decision_s: float,
 ) -> EpisodeResult:
     """Read the result of a task that a robot has driven."""
-    world = tasks[number].world
+    world, reference = tasks[number].world, tasks[number].reference_path
+    time_s = float(info["sim_time"][robot])
     driven, shortest = float(info["path_length"][robot]), float(info["shortest_path"][robot])
     success = bool(info["success"][robot])
     return EpisodeResult(
@@ -353,7 +354,7 @@ def _result(
         success=success,
         collision=bool(info["collision"][robot]),
         timeout=bool(info["timeout"][robot]),
-        time_s=float(info["sim_time"][robot]),
+        time_s=time_s,
         path_length=driven,
         shortest_path=shortest,
         min_clearance=float(info["min_clearance"][robot]),
@@ -361,6 +362,7 @@ def _result(
         plan_s=plan_s,
         decision_s=decision_s,
         world=world.name,
+        barn_score=reference and barn_score(success, time_s=time_s, reference_path=reference),
         **({name: float(info[name][robot]) for name in ENCOUNTERS} if world.walkers else {}),
     )
 

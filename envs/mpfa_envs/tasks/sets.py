@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import Any, Final, NamedTuple, cast, get_args
 
 from mpfa_envs.checks import check_count
@@ -11,7 +12,7 @@ from mpfa_envs.generators import GENERATORS, Split, generator_tasks
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.tasks.sampling import evaluation_pairs
-from mpfa_envs.worlds.barn import BARN_WORLDS, barn_task, barn_world
+from mpfa_envs.worlds.barn import barn_task, barn_worlds, load_barn
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 
@@ -36,6 +37,8 @@ class WorldTask(NamedTuple):
     """Time limit in steps of 0.1 s, whatever the environment's; None: that of the environment."""
     seed: int | None = None
     """Seed of walkers and noise; None: the number of the task among those that are driven."""
+    reference_path: float | None = None
+    """Length of BARN's reference path, by which its score is computed [m]; None without one."""
 
     def limit(self, env_arguments: Mapping[str, Any]) -> dict[str, int]:
         """The time limit as an argument of an environment; nothing where that has its own.
@@ -67,10 +70,12 @@ def world_tasks(
         name: A world, as in :class:`~mpfa_envs.NavigationEnv`, with tasks of
             ``evaluation_pairs``; ``"bars:test"`` or ``"bars:validation"``, the
             worlds of that split of a generator, four tasks in each, of
-            ``generator_tasks``; or ``"barn"``, the benchmark's own task in its
-            twenty worlds.
-        episodes: Number of tasks; None: 200 in a world, 400 in the worlds of a generator, 20 in
-            those of the benchmark. The first tasks of a longer list are those of a shorter one.
+            ``generator_tasks``; or the benchmark's own task: ``"barn"`` in the
+            twenty worlds that come with the package, ``"barn:PATH"`` in those of its
+            archive, which :func:`~mpfa_envs.worlds.barn.load_barn` reads.
+        episodes: Number of tasks; None: 200 in a world, 400 in the worlds of a generator, one in
+            each world of the benchmark. The first tasks of a longer list are those of a shorter
+            one.
         seed: Seed of the tasks in a world; those of a generator are fixed.
         robot: Whose radius counts in a world; those of a generator are for a TurtleBot2.
 
@@ -79,6 +84,7 @@ def world_tasks(
 
     Raises:
         ValueError: If nothing has that name, or a number is out of its range.
+        WorldFileError: If a file is no world, or there is no archive of the benchmark.
 
     Examples:
         >>> from mpfa_envs import world_tasks
@@ -87,11 +93,15 @@ def world_tasks(
     """
     if episodes is not None:
         check_count("episodes", episodes)
-    if name == "barn":
+    if isinstance(name, str) and (name == "barn" or name.startswith("barn:")):
         # The robot starts at one pose in all of them: more episodes would be the same ones again.
-        worlds = map(barn_world, range(len(BARN_WORLDS)))
-        tasks = [WorldTask(world, barn_task(), BARN_MAX_STEPS) for world in worlds][:episodes]
-        return _numbered(tasks)
+        worlds = barn_worlds() if name == "barn" else load_barn(name.partition(":")[2])
+        return _numbered(
+            [
+                WorldTask(world, barn_task(), BARN_MAX_STEPS, reference_path=length)
+                for world, length in islice(worlds, episodes)
+            ]
+        )
     if isinstance(name, str) and name.partition(":")[0] in GENERATORS:
         generator, _, split = name.partition(":")
         if split not in get_args(Split)[1:]:

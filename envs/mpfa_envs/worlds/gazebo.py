@@ -20,7 +20,7 @@ from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon, Shape
 from mpfa_envs.worlds.world import World
 from mpfa_envs.worlds.yaml_nodes import WorldFileError, read_number
 
-_LARGEST_FILE: Final = 20_000_000
+LARGEST_FILE: Final = 20_000_000
 """Longest text that is read [bytes]."""
 _DEEPEST: Final = 100
 """Greatest depth of nested elements."""
@@ -103,7 +103,19 @@ def load_gazebo_world(
             obstacles do not fit in the room.
     """
     path = Path(path)
-    root = _parse(path, _read(path))
+    return read_gazebo_world(_read(path), str(path), size=size, center=center, height=height)
+
+
+def read_gazebo_world(
+    text: bytes,
+    path: str,
+    *,
+    size: tuple[float, float] | None,
+    center: tuple[float, float] | None,
+    height: float = 0.5,
+) -> World:
+    """Read the text of a file; ``path`` names it in errors, and the world."""
+    root = _parse(path, text)
     world = root.first("world") if root.tag == "sdf" else None
     if world is None:
         raise WorldFileError(f"{path}:{root.line}: must be an sdf element with a world in it")
@@ -115,7 +127,7 @@ def load_gazebo_world(
     reader.left_out["actors"] += sum(1 for _ in world.all("actor"))
     left_out = [f"{count} {what}" for what, count in reader.left_out.items() if count]
     if left_out:
-        warnings.warn(f"{path}: left out {', '.join(left_out)}", stacklevel=2)
+        warnings.warn(f"{path}: left out {', '.join(left_out)}", stacklevel=3)
     if not reader.shapes and size is None:
         raise WorldFileError(f"{path}:{world.line}: has no obstacle, and so no size")
     try:
@@ -127,17 +139,17 @@ def load_gazebo_world(
 def _read(path: Path) -> bytes:
     """Read a file, decompressed if it ends in .gz, up to the largest size."""
     try:
-        content = read_file(path, _LARGEST_FILE)
+        content = read_file(path, LARGEST_FILE)
         if path.suffix.lower() == ".gz":
-            content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(_LARGEST_FILE + 1)
+            content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(LARGEST_FILE + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    if len(content) > _LARGEST_FILE:
-        raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
+    if len(content) > LARGEST_FILE:
+        raise WorldFileError(f"{path}: has more than {LARGEST_FILE} bytes")
     return content
 
 
-def _parse(path: Path, text: bytes) -> _Element:
+def _parse(path: str, text: bytes) -> _Element:
     """Read the elements; a document type, which could define entities, is rejected."""
     parser = expat.ParserCreate()
     parser.buffer_text = True  # Else each line end is a separate piece.
@@ -177,7 +189,7 @@ def _parse(path: Path, text: bytes) -> _Element:
 class _Reader:
     """Collects the obstacles of one file, and counts the parts left out."""
 
-    def __init__(self, path: Path, height: float) -> None:
+    def __init__(self, path: str, height: float) -> None:
         self._path = path
         self._height = height
         self.shapes: list[Shape] = []
@@ -296,7 +308,7 @@ def _turned_box(pose: _Pose, width: float, depth: float) -> Box | Polygon:
 
 
 def _room(
-    path: Path,
+    path: str,
     shapes: list[Shape],
     size: tuple[float, float] | None,
     center: tuple[float, float] | None,
@@ -318,7 +330,7 @@ def _room(
         size = (math.ceil(2e3 * half_width) / 1e3, math.ceil(2e3 * half_depth) / 1e3)
         size = (size[0] + 1e-3, size[1] + 1e-3)
     moved = [_moved(shape, -x, -y) for shape in shapes]
-    name = path.name.split(".")[0]
+    name = os.path.basename(path).split(".")[0]
     return World(
         name=name,
         size=size,
