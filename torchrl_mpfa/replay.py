@@ -44,9 +44,10 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     ``buffer["next", "reward"] = ...``) counts in the next update of its transition's priority.
 
     With ``prefetch=N`` a thread samples ``N`` batches ahead, while the learner has another one.
-    Writes, updates and :meth:`anneal` wait for those that are being sampled. So they count in the
-    ``N + 1``-th batch from then on, and in a loop of one thread one seed gives the same batches.
-    Saving, loading, :meth:`empty`, a new transform and another batch size drop those in the queue.
+    Writes (all but ``update_if_present``), updates and :meth:`anneal` wait for those that are being
+    sampled. So they count in the ``N + 1``-th batch from then on, and in a loop of one thread one
+    seed gives the same batches. Saving, loading, :meth:`empty`, a new transform and another batch
+    size drop those in the queue.
 
     Args:
         generator: Source of all randomness of the buffer; by default a new one, seeded by
