@@ -43,6 +43,12 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     A reward that is written in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``,
     ``buffer["next", "reward"] = ...``) counts in the next update of its transition's priority.
 
+    With ``prefetch=N`` a thread samples ``N`` batches ahead, while the learner has another one.
+    Writes (all but ``update_if_present``), updates and :meth:`anneal` wait for those that are being
+    sampled. So they count in the ``N + 1``-th batch from then on, and in a loop of one thread one
+    seed gives the same batches. Saving, loading, :meth:`empty`, a new transform and another batch
+    size drop those in the queue.
+
     Args:
         generator: Source of all randomness of the buffer; by default a new one, seeded by
             ``torch.manual_seed``. Its state is saved with the buffer.
@@ -51,9 +57,9 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none, or ``generator`` is no
             generator.
-        ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` not 0, or capacity or
-            signals of sampler and storage differ; or, where signals are fused, if ``priority_key``
-            is where one is read, or ``sample_unit`` makes sequences.
+        ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` negative or without
+            ``batch_size``, or capacity or signals of sampler and storage differ; or, where signals
+            are fused, if ``priority_key`` is where one is read, or ``sample_unit`` makes sequences.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -80,11 +86,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         if (batch_size := kwargs.get("batch_size")) is not None:
             check_counts(batch_size=batch_size)
         if prefetch := kwargs.get("prefetch"):
-            raise ValueError(
-                f"prefetch must be 0, got {prefetch}: batches that are sampled ahead know nothing "
-                "of the writes and updates before them, and one seed would not always give the "
-                "same batches"
-            )
+            check_counts(prefetch=prefetch)
         if not isinstance(generator, torch.Generator | None):
             raise TypeError(f"generator must be a torch.Generator, got {generator!r}")
         # TorchRL sets it once the parts are made, which have to agree with it.
@@ -138,6 +140,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             ValueError: If an entry has another shape or dtype than in the storage, or a number is
                 not finite; nothing is changed.
         """
+        self._wait_for_queue()
         if not self._checks or not isinstance(tensordicts, TensorDictBase):
             return super().extend(tensordicts, update_priority=update_priority)
         data = self._transform.inv(tensordicts)
@@ -196,6 +199,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             ValueError: See :meth:`extend`; or if ``data`` has no dimension of environments.
         """
         if not self._checks:
+            self._wait_for_queue()
             return super().add(data)
         if data.ndim < self.dim_extend:
             raise ValueError(
@@ -205,15 +209,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         # Where there are several environments, time comes after them.
         index = self.extend(data.unsqueeze(self.dim_extend))
         return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
-
-    def empty(self, empty_write_count: bool = True) -> None:
-        """Forget all transitions.
-
-        Args:
-            empty_write_count: As in TorchRL.
-        """
-        with self._replay_lock, self._write_lock:
-            super().empty(empty_write_count)
 
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
         data, info = super()._sample(batch_size)
@@ -252,9 +247,10 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             check_counts(batch_size=batch_size)
         if isinstance(self.sampler, PrioritizedSampler):
             self._count_batch()
-        if return_info or include_info is not None or not self._fuses:
-            return super().sample(batch_size, return_info, include_info)
-        return ReplayBuffer.sample(self, batch_size)
+        with self._queue_of(batch_size):
+            if return_info or include_info is not None or not self._fuses:
+                return super().sample(batch_size, return_info, include_info)
+            return ReplayBuffer.sample(self, batch_size)
 
     def _count_batch(self) -> None:
         """Warn of a training loop that never updates priorities."""
@@ -271,6 +267,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def update_priority(self, index: Any, priority: Any) -> None:
         """Set priorities directly, as in TorchRL."""
+        self._wait_for_queue()
         super().update_priority(index, priority)
         self._unreturned = 0
 
@@ -303,6 +300,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 if value is None:
                     raise KeyError(_MISSING.format(name=signal.name, key=signal.key))
                 signals[signal.name] = value
+        self._wait_for_queue()
         with self._replay_lock, self._write_lock:
             stale = self._sampler.update_signals(
                 index,
@@ -311,7 +309,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 written_at=data.get("written_at", None),
                 batches=batches,
             )
-        self.stale_updates += stale
+            self.stale_updates += stale
         self._unreturned = 0
 
     def anneal(self, beta: float, fraction: float) -> None:
@@ -322,8 +320,10 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             fraction: How much of the training is done, from 0 to 1.
         """
         if self._fuses:
-            self._sampler.beta = beta
-            self._sampler.anneal(fraction)
+            self._wait_for_queue()
+            with self._replay_lock:
+                self._sampler.beta = beta
+                self._sampler.anneal(fraction)
 
     def rewards(self) -> Tensor:
         """Rewards of all transitions, shape ``[N]``."""
@@ -348,9 +348,11 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def stats(self) -> dict[str, Any]:
         """TorchRL's counters, and the sampler's statistics of signals and batch."""
-        found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
-        if self.initialized and self._fuses:
-            found.update(self._sampler.stats(self._storage))
+        self._wait_for_queue()
+        with self._replay_lock:
+            found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
+            if self.initialized and self._fuses:
+                found.update(self._sampler.stats(self._storage))
         return found
 
     def check_state(self, state_dict: dict[str, Any]) -> None:
@@ -427,9 +429,3 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         if self._checks and cursor is not None and len(self._storage):
             around = self._storage._len_along_dim0
             self._storage._set_last_cursor((cursor - 1) % around)
-
-    def _dump_prefetch_state(self, path: Path, prefetch_state: dict[str, Any]) -> None:
-        """Nothing: TorchRL would pickle it, and what is pickled can execute anything."""
-
-    def _load_prefetch_state(self, path: Path) -> None:
-        """Nothing: TorchRL would unpickle it."""

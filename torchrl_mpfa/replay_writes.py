@@ -12,15 +12,20 @@ from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.transforms import MultiStepTransform
 
+from torchrl_mpfa.replay_queue import QueueReplayBuffer
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.schema import as_path
 
 
-def _followed(write: Callable[..., Any], told: Callable[..., tuple[Any, Any]]) -> Any:
+def _followed(
+    write: Callable[..., Any], told: Callable[..., tuple[Any, Any]], *, waits: bool = True
+) -> Any:
     """A write in place, of certain entries in certain slots, that the signals follow."""
 
     @wraps(write)
-    def followed(self: TensorDictReplayBuffer, *args: Any, **kwargs: Any) -> Any:
+    def followed(self: QueueReplayBuffer, *args: Any, **kwargs: Any) -> Any:
+        if waits:
+            self._wait_for_queue()
         if not isinstance(self.storage, SignalStorageMixin):
             return write(self, *args, **kwargs)
         with self._replay_lock, self.storage.rewriting(*told(*args, **kwargs)):
@@ -37,13 +42,16 @@ def _chosen(data: Any, clone: bool = False, *, keys_to_update: Any = None) -> tu
 _Buffer = TensorDictReplayBuffer
 
 
-class FollowedReplayBuffer(TensorDictReplayBuffer):
+class FollowedReplayBuffer(QueueReplayBuffer):
     """TorchRL's buffer with signals in its storage that follow every write in place."""
 
     set_ = _followed(_Buffer.set_, lambda key, value: ({key: value}, slice(None)))
     set_at_ = _followed(_Buffer.set_at_, lambda key, value, index: ({key: value}, index))
     update_ = _followed(_Buffer.update_, _chosen)
-    update_if_present = _followed(_Buffer.update_if_present, lambda patch, **_: (patch, None))
+    # TorchRL puts it in the order of the batches itself, and these may wait for it.
+    update_if_present = _followed(
+        _Buffer.update_if_present, lambda patch, **_: (patch, None), waits=False
+    )
     _set_places = _followed(_Buffer.__setitem__, lambda index, value: (value, index))
 
     def __setitem__(self, index: Any, value: Any) -> None:
@@ -53,9 +61,12 @@ class FollowedReplayBuffer(TensorDictReplayBuffer):
         value itself in the storage.
         """
         if not isinstance(self.storage, SignalStorageMixin) or not isinstance(index, str | tuple):
+            self._wait_for_queue()
             super().__setitem__(index, value)
         elif isinstance(index, str) or all(isinstance(word, str) for word in index):
             self.set_(index, self._transpose(value) if self.dim_extend > 0 else value)
+        elif len(index) == 1:
+            self[index[0]] = value
         else:
             self._set_places(index, value)
 
@@ -67,12 +78,14 @@ class FollowedReplayBuffer(TensorDictReplayBuffer):
     def append_transform(self, transform: Any, *, invert: bool = False) -> Any:
         """Add a transform at the end, as in TorchRL."""
         _warn_of_steps_past_the_end(transform)
-        return super().append_transform(transform, invert=invert)
+        with self._without_queue():
+            return super().append_transform(transform, invert=invert)
 
     def insert_transform(self, index: int, transform: Any, *, invert: bool = False) -> Any:
         """Add a transform at a place, as in TorchRL."""
         _warn_of_steps_past_the_end(transform)
-        return super().insert_transform(index, transform, invert=invert)
+        with self._without_queue():
+            return super().insert_transform(index, transform, invert=invert)
 
 
 def _warn_of_steps_past_the_end(transform: Any) -> None:
