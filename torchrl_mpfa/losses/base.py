@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
@@ -35,7 +33,8 @@ from torchrl_mpfa.losses.functional import (
     scale_rewards,
     trusted_loss,
 )
-from torchrl_mpfa.losses.noise import last_layer, quantile_loss, with_quantiles
+from torchrl_mpfa.losses.keys import DEFAULT_SIGNALS, KNOWN_SIGNALS, VALUE, check_importance
+from torchrl_mpfa.losses.noise import LEAST_NOISE, last_layer, quantile_loss, with_quantiles
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import (
     action_gradient_priority,
@@ -43,29 +42,9 @@ from torchrl_mpfa.priorities import (
     td_error_priority,
 )
 from torchrl_mpfa.selection import Trains
-from torchrl_mpfa.signals import ACTION_GRADIENT, INFORMATION_GAIN, SIGNALS_KEY, TD_ERROR
+from torchrl_mpfa.signals import ACTION_GRADIENT, INFORMATION_GAIN, TD_ERROR
 
-VALUE = "value"
-"""Name of the signal that is Q itself, which may be negative."""
-DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
-_SIGNALS = (*DEFAULT_SIGNALS, VALUE, INFORMATION_GAIN.name)
-LEAST_NOISE = 0.05
-"""Standard deviation below which a target counts as certain, in units of the reward: without noise
-the errors of a network would otherwise be infinitely informative."""
 _ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
-
-
-@dataclass
-class SignalKeys:
-    """Keys that a loss of this package reads or writes beside those of TorchRL's loss."""
-
-    action: NestedKey = "action"
-    preactivation: NestedKey = "preactivation"
-    td_error_signal: NestedKey = TD_ERROR.key
-    action_gradient_signal: NestedKey = ACTION_GRADIENT.key
-    value_signal: NestedKey = (SIGNALS_KEY, VALUE)
-    information_gain_signal: NestedKey = INFORMATION_GAIN.key
-    bend: NestedKey = "bend"
 
 
 class SignalLoss:
@@ -133,9 +112,9 @@ class SignalLoss:
     ) -> None:
         # Before TorchRL's constructor changes the networks.
         check_networks(actor_network, critic_network, critic_name=self._critic_name)
-        unknown = [name for name in signals if name not in _SIGNALS]
+        unknown = [name for name in signals if name not in KNOWN_SIGNALS]
         if unknown:
-            raise ValueError(f"signals must be among {_SIGNALS}, got {unknown}")
+            raise ValueError(f"signals must be among {KNOWN_SIGNALS}, got {unknown}")
         check_importance(importance)
         if kwargs.get("loss_function", "l2") not in DISTANCES:
             raise ValueError(
@@ -468,9 +447,3 @@ class SignalLoss:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_bound": None, "_deferred": None}
-
-
-def check_importance(importance: str) -> None:
-    """Reject a use of importance weights that there is not."""
-    if importance not in ("critic", "torchrl", "none"):
-        raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")

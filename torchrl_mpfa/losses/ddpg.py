@@ -12,9 +12,10 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, check
-from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import call
 from torchrl_mpfa.losses.functional import smoothed_action, smoothing_noise
+from torchrl_mpfa.losses.keys import SignalKeys
 from torchrl_mpfa.networks.bounds import given_bounds
 
 

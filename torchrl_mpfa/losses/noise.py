@@ -8,6 +8,9 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+LEAST_NOISE = 0.05
+"""Standard deviation below which a target counts as certain, in units of the reward: without noise
+the errors of a network would otherwise be infinitely informative."""
 QUANTILES = 16
 """Quantiles of a target that the network learns."""
 

@@ -13,9 +13,10 @@ from torchrl.objectives import SACLoss, ValueEstimators
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
-from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.base import SignalLoss
 from torchrl_mpfa.losses.calling import Tensors, read_inputs
 from torchrl_mpfa.losses.functional import least_value, soft_value
+from torchrl_mpfa.losses.keys import SignalKeys
 from torchrl_mpfa.networks import StochasticActor
 
 

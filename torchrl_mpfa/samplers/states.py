@@ -1,4 +1,4 @@
-"""Saving and loading of a sampler; a state that does not fit is rejected before it is loaded."""
+"""Saving, loading and moving of a sampler; a state that does not fit is rejected beforehand."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.data import RandomSampler
+from torchrl.data import RandomSampler, Storage
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from torchrl_mpfa.samplers.leaves import Leaves
 from torchrl_mpfa.samplers.slots import leaves_of, set_leaves
 from torchrl_mpfa.saved import Entry, check_entries, exactly, number, wrong
 from torchrl_mpfa.saving import load_safely, save_atomically
@@ -21,7 +22,7 @@ FORMAT = 2
 
 
 class SavedTrees(PrioritizedSampler):
-    """The part of :class:`~torchrl_mpfa.samplers.TreeSampler` that saves and loads."""
+    """The part of :class:`~torchrl_mpfa.samplers.TreeSampler` that saves, loads and moves."""
 
     KIND = "proportional"
     """The sampler that a saved state must be of."""
@@ -29,6 +30,32 @@ class SavedTrees(PrioritizedSampler):
         *("_alpha", "_beta", "_eps", "_highest", "_highest_slot", "_priorities"),
     )
     """Attributes that are saved as they are."""
+    _device: torch.device | None
+    _follows: bool
+    """Whether the device is that of the storage, whatever it is."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device of priorities and sampled slots."""
+        return self._device or torch.device("cpu")
+
+    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
+        """Move to the device of a storage, once it is known."""
+        device = getattr(storage, "device", None)
+        if device == self.device or not isinstance(device, torch.device):
+            return
+        if not self._follows:
+            raise ValueError(
+                f"device must be that of the storage, {device}, or None, got {self.device}"
+            )
+        state, self._device = self.state_dict(), device
+        self._init()
+        self.load_state_dict(state)
+
+    def _another(self, tree: Any) -> Any:
+        """An empty tree of the same kind."""
+        where = (self.device,) if isinstance(tree, Leaves) else ()
+        return type(tree)(self._max_capacity, *where)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on; tensors and plain values only.

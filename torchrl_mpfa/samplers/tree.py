@@ -31,7 +31,6 @@ from torchrl_mpfa.samplers.slots import (
 from torchrl_mpfa.samplers.states import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
-_CPU = torch.device("cpu")
 _LOG_POSITIVE = math.log(1e-200)
 """A leaf with a logarithm above this is not rounded to zero, whatever a sampler makes of it."""
 _ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
@@ -108,24 +107,6 @@ class TreeSampler(SavedTrees):
             None if device is None else torch.empty(0, device=device).device,
         )
 
-    @property
-    def device(self) -> torch.device:
-        """Device of priorities and sampled slots."""
-        return self._device or _CPU
-
-    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
-        """Move to the device of a storage, once it is known."""
-        device = getattr(storage, "device", None)
-        if device == self.device or not isinstance(device, torch.device):
-            return
-        if not self._follows:
-            raise ValueError(
-                f"device must be that of the storage, {device}, or None, got {self.device}"
-            )
-        state, self._device = self.state_dict(), device
-        self._init()
-        self.load_state_dict(state)
-
     def _init(self) -> None:
         if self.device.type == "cpu":
             # TorchRL chooses its trees by the dtype, of which only the single one works there.
@@ -148,11 +129,6 @@ class TreeSampler(SavedTrees):
         self._highest: float | None = None
         self._highest_slot: int | None = None
         self._positive = False
-
-    def _another(self, tree: Any) -> Any:
-        """An empty tree of the same kind."""
-        where = (self.device,) if isinstance(tree, Leaves) else ()
-        return type(tree)(self._max_capacity, *where)
 
     @property
     def alpha(self) -> float:
