@@ -1,6 +1,6 @@
 """TD3 with a GRU on sixteen robots that have no map, from prioritized slices of their drives.
 
-    python examples/recurrent_td3.py               a few minutes
+    python examples/recurrent_td3.py               about two minutes
     python examples/recurrent_td3.py --forgetful   the same networks, whose memory is always empty
 
 A robot that sees only what is in front of it cannot know that it has been in a pocket before.
