@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from torchrl_mpfa.samplers import MixtureSampler as MixtureSampler
     from torchrl_mpfa.samplers import MPFASampler as MPFASampler
     from torchrl_mpfa.samplers import SignalSampler as SignalSampler
+    from torchrl_mpfa.samplers import SignalSliceSampler as SignalSliceSampler
     from torchrl_mpfa.signals import ACTION_GRADIENT as ACTION_GRADIENT
     from torchrl_mpfa.signals import MPFA_SIGNALS as MPFA_SIGNALS
     from torchrl_mpfa.signals import REWARD as REWARD
@@ -58,7 +59,7 @@ _NAMES = {
     "moving_fusion": "ScaledFusion ScheduledFusion",
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
     "replay": "SignalReplayBuffer",
-    "samplers": "MixtureSampler MPFASampler SignalSampler",
+    "samplers": "MixtureSampler MPFASampler SignalSampler SignalSliceSampler",
     "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",
     "storages": "SignalMemmapStorage SignalTensorStorage",
     "updates": "run_updates",

@@ -101,9 +101,13 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             if not isinstance(self._sample_unit, Transition | None):
                 raise ValueError(
                     "sample_unit must be None with a sampler that fuses signals, got "
-                    f"{type(self._sample_unit).__name__}: signals belong to single transitions"
+                    f"{type(self._sample_unit).__name__}: signals belong to single transitions, "
+                    "and SignalSliceSampler samples slices of them"
                 )
+            if self._batch_size is not None:
+                self._sampler.check_batch_size(self._batch_size)
             self._storage.needs_signals = True
+            self._storage.needed_keys = self._sampler.needed_keys
         if self._checks:
             self._storage.strict = True
 

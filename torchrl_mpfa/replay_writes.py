@@ -13,6 +13,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.transforms import MultiStepTransform
 
 from torchrl_mpfa.replay_queue import QueueReplayBuffer
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.schema import as_path
 
@@ -29,7 +30,10 @@ def _followed(
         if not isinstance(self.storage, SignalStorageMixin):
             return write(self, *args, **kwargs)
         with self._replay_lock, self.storage.rewriting(*told(*args, **kwargs)):
-            return write(self, *args, **kwargs)
+            written = write(self, *args, **kwargs)
+        if isinstance(self.sampler, SignalSampler):
+            self.sampler.reread(self.storage)
+        return written
 
     return followed
 

@@ -18,6 +18,7 @@ import ddpg
 import evaluate
 import export
 import play
+import recurrent_td3
 import report
 import stable_baselines
 import torchrl_sac
@@ -47,6 +48,7 @@ MAINS: dict[str, Callable[[], object]] = {
     "evaluate": evaluate.main,
     "export": export.main,
     "play": play.main,
+    "recurrent_td3": recurrent_td3.main,
     "report": report.main,
     "stable_baselines": stable_baselines.main,
     "torchrl_sac": torchrl_sac.main,

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
-from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_finite
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts, check_finite
 from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
@@ -164,13 +165,25 @@ class SignalSampler(TreeSampler):
         if isinstance(self.fusion, Annealed):
             self.fusion.anneal(fraction)
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
+    @property
+    def needed_keys(self) -> list[NestedKey]:
+        """Entries that transitions must have beside reward and signals."""
+        return []
+
+    def check_batch_size(self, batch_size: int) -> None:
+        """Reject a batch size that cannot be sampled."""
+        check_counts(batch_size=batch_size)
+
+    def reread(self, storage: Storage) -> None:
+        """Take note of a write in place; nothing to do, as signals lie in the storage."""
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[Any, Tensor]]:
         """Sample slots by Eq. (8), and count a replay for each.
 
         As :meth:`TreeSampler.sample`; ``"written_at"``, shape ``[B]``, tells overwritten slots.
         """
         slots, weight = self._sampled(storage, batch_size)
-        info = {"priority_weight": weight}
+        info: dict[Any, Tensor] = {"priority_weight": weight}
         for place, adjust in self._telling:
             counted = () if self._weighing is None else self._weighing.counted
             info |= adjust.entries(counted[place] if counted else None, len(slots))

@@ -48,6 +48,8 @@ class SignalStorageMixin:
     strict = False
     #: Set by a buffer whose sampler fuses: a write without reward or signal is rejected.
     needs_signals = False
+    #: Set by the same buffer: further entries that its sampler reads.
+    needed_keys: Sequence[NestedKey] = ()
     _allow_nonfinite: Sequence[NestedKey] = ()
     _schema: Schema | None = None
     _all_slots: Tensor | None = None
@@ -71,6 +73,9 @@ class SignalStorageMixin:
         """
         if not is_tensor_collection(data):
             return None, None
+        for key in self.needed_keys:
+            if data.get(key, None) is None:
+                raise KeyError(f"the transitions lack {key!r}, which the sampler reads")
         lead = min(self.ndim, data.ndim)
         pairs = None
         if isinstance(data, TensorDictBase):

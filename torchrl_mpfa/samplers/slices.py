@@ -1,0 +1,303 @@
+"""Slices of trajectories, sampled by the fused priorities of their steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Storage
+
+from torchrl_mpfa.checks import check_counts, check_index
+from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.slots import as_slots, leaves_of, set_leaves
+from torchrl_mpfa.saved import Entry, exactly
+from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.storages.table import SignalTable
+
+SlicePriority = Literal["mean", "start"]
+"""What the priority of a slice is: the mean over its steps, or that of its first one."""
+_TRAJ_IDS = ("collector", "traj_ids")
+_SETTINGS = ("slice_len", "slice_priority", "strict_length")
+"""What a saved sampler must have been made with."""
+_AT_ONCE = 65_536
+"""Slices that are looked at in one pass, which bounds the memory that this takes."""
+
+
+class SignalSliceSampler(SignalSampler):
+    r"""Slices of trajectories, sampled in proportion to priorities that are fused from signals.
+
+    :class:`SignalSampler` for recurrent networks, with the words of TorchRL's
+    :class:`~torchrl.data.replay_buffers.PrioritizedSliceSampler`. Each step has its signals and
+    its priority, as without slices: the loss writes signals for every step of a batch, and
+    fusion and adjustments work on them. Eqs. (8) and (10) then hold for slices, whose priority is
+    that of R2D2 without its maximum, or of TorchRL::
+
+        mean     p_i = (p'_i + ... + p'_(i+L-1)) / L
+        start    p_i = p'_i
+
+    A slice of a storage ``[T, E]`` is of one environment. None has steps of two trajectories, and
+    none joins the newest steps of a full buffer to the oldest: such a start has the probability 0.
+
+    Kapturowski et al. (2019), https://openreview.net/forum?id=r1lyTjAqYX
+
+    Args:
+        *args: As :class:`SignalSampler`, in its order.
+        slice_len: Steps ``L`` of a slice. A batch has ``batch_size / L`` slices.
+        slice_priority: ``"mean"`` or ``"start"``, as above.
+        strict_length: Whether all slices have ``L`` steps; if false, those that begin closer than
+            that to the end of a trajectory are sampled, too, and are shorter.
+        end_key: Where the last step of a trajectory is marked.
+        traj_key: Number of the trajectory of each step: a slice also ends where it changes. By
+            default that of TorchRL's collectors, ``("collector", "traj_ids")``, where it is stored.
+        truncated_key: Where the batch marks the last step of each slice, ``[B, 1]``, as well as
+            under ``"done"`` beside it, for estimators of values; None: nowhere.
+        **kwargs: As :class:`SignalSampler`.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
+        >>> buffer = SignalReplayBuffer(
+        ...     storage=SignalTensorStorage(100, ndim=2),
+        ...     sampler=SignalSliceSampler(100, 0.6, 0.4, slice_len=4),
+        ...     batch_size=8,
+        ... )
+        >>> step = torch.arange(10.0).expand(2, 10).unsqueeze(-1)  # [environments, steps, 1]
+        >>> after = {"reward": step, "done": step == 5}
+        >>> index = buffer.extend(TensorDict({"step": step, "next": after}, [2, 10]))
+        >>> slices = buffer.sample().reshape(2, 4)
+        >>> slices["step"].diff(dim=1).unique().tolist()
+        [1.0]
+        >>> slices["next", "truncated"].squeeze(-1).tolist()[0]
+        [False, False, False, True]
+    """
+
+    KIND = "slices"
+    SAVED = (*SignalSampler.SAVED, *_SETTINGS, "_joined", "_stride")
+
+    def __init__(
+        self,
+        *args: Any,
+        slice_len: int,
+        slice_priority: SlicePriority = "mean",
+        strict_length: bool = True,
+        end_key: NestedKey = ("next", "done"),
+        traj_key: NestedKey | None = None,
+        truncated_key: NestedKey | None = ("next", "truncated"),
+        **kwargs: Any,
+    ) -> None:
+        check_counts(slice_len=slice_len)
+        if slice_priority not in get_args(SlicePriority):
+            raise ValueError(unknown("slice_priority", slice_priority, get_args(SlicePriority)))
+        self.slice_len = slice_len
+        self.slice_priority: SlicePriority = slice_priority
+        self.strict_length = strict_length
+        self.end_key, self.traj_key = end_key, traj_key
+        self.truncated_key = truncated_key
+        super().__init__(*args, **kwargs)
+        if slice_len > self._max_capacity:
+            raise ValueError(
+                f"slice_len must be at most max_capacity, {self._max_capacity}, got {slice_len}"
+            )
+
+    def _init(self) -> None:
+        super()._init()
+        # Whether the step after each slot is the next of its trajectory, and lies one stride on.
+        self._joined = torch.zeros(self._max_capacity, dtype=torch.bool)
+        self._stride = 1
+        self._lengths = torch.empty(0, dtype=torch.long)
+
+    @property
+    def needed_keys(self) -> list[NestedKey]:
+        """Entries that transitions must have."""
+        return [self.end_key, *([] if self.traj_key is None else [self.traj_key])]
+
+    @property
+    def divisible(self) -> bool:
+        """See :attr:`TreeSampler.divisible`."""
+        return super().divisible and self.strict_length
+
+    def check_batch_size(self, batch_size: int) -> None:
+        """Reject a batch that is not of whole slices."""
+        super().check_batch_size(batch_size)
+        if batch_size % self.slice_len:
+            raise ValueError(
+                f"batch_size must be a multiple of slice_len, {self.slice_len}, got {batch_size}"
+            )
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[Any, Tensor]]:
+        """Sample slices by Eq. (8), one after the other, and count a replay for each step.
+
+        Args:
+            storage: The storage to sample from.
+            batch_size: ``B``, a multiple of the length of a slice.
+
+        Returns:
+            As :meth:`SignalSampler.sample`, with an entry for each step, ``B`` of them with
+            ``strict_length``; the steps of a slice share its ``"priority_weight"``.
+
+        Raises:
+            RuntimeError: If no trajectory in the storage is as long as a slice.
+            ValueError: If ``batch_size`` is not of whole slices.
+        """
+        index, info = super().sample(storage, batch_size)
+        if self.truncated_key is None:
+            return index, info
+        last = torch.zeros(int(self._lengths.sum()), 1, dtype=torch.bool)
+        last[self._lengths.cumsum(0) - 1] = True
+        path = (
+            self.truncated_key if isinstance(self.truncated_key, tuple) else (self.truncated_key,)
+        )
+        done_key = (*path[:-1], "done")
+        done = _column(storage, done_key, as_slots(index, storage), default=last)
+        return index, {**info, self.truncated_key: last, done_key: last | done}
+
+    def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
+        self.check_batch_size(batch_size)
+        size = len(storage)
+        if size and self._sum_tree.query(0, size) == 0:
+            raise RuntimeError(
+                f"no trajectory in the buffer has {self.slice_len} steps that follow each other: "
+                f"write longer ones, with {self.end_key!r} true only where one ends; those of "
+                "several environments go to a storage with ndim=2"
+            )
+        starts, weight = super()._sampled(storage, batch_size // self.slice_len)
+        slots, inside = self._windows(starts, self._joined, self._stride)
+        self._lengths = inside.sum(1)
+        return slots[inside], weight.repeat_interleave(self._lengths)
+
+    def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
+        starts = super()._proportional(tree, size, batch_size)
+        # Rounding can end at a leaf of 0 beside the one that was meant.
+        while len(wrong := (leaves_of(tree, starts) == 0).nonzero().squeeze(1)):
+            starts[wrong] = super()._proportional(tree, size, len(wrong))
+        return starts
+
+    def bind(self, storage: Storage) -> SignalTable:
+        """See :meth:`SignalSampler.bind`; what a new storage holds is cut into trajectories."""
+        before = self._table
+        table = super().bind(storage)
+        if table is not before and table.size:
+            self.reread(storage)
+        return table
+
+    def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
+        """Give new steps the highest priority, and take note of where trajectories end.
+
+        Raises:
+            ValueError: If there is no storage, where the ends are read.
+        """
+        if storage is None:
+            raise ValueError("storage must be given, which tells where trajectories end, got None")
+        slots = check_index(as_slots(index, storage), self._max_capacity)
+        if len(slots) == 0:
+            return
+        self.bind(storage)
+        self._join(slots, storage)
+        super().mark_update(index, storage=storage)
+        if self.slice_priority == "start":  # Slices that begin before these steps have changed too.
+            self._refresh(self._starts_around(slots))
+
+    def reread(self, storage: Storage) -> None:
+        """Read again where trajectories end, after a write in place."""
+        slots = torch.arange(self._max_capacity)
+        self._join(slots, storage)
+        self._refresh(slots)
+
+    def _join(self, slots: Tensor, storage: Any) -> None:
+        """Find out which slots, or those before them, the next step of a trajectory follows."""
+        table = super().bind(storage)
+        if table.size == 0:
+            return
+        shape = getattr(storage, "_total_shape", None) if storage.ndim > 1 else None
+        self._stride = 1 if shape is None else math.prod(shape[1:])
+        slots = torch.cat([slots - self._stride, slots]) % self._max_capacity
+        following = (slots + self._stride) % self._max_capacity
+        # Of times of writing: what follows was written with or right after this, not a round ago.
+        times = table.rows[:, table.time_column]
+        joined = times[following] - times[slots] == self._stride
+        joined &= ~_column(storage, self.end_key, slots).squeeze(1)
+        key = _TRAJ_IDS if self.traj_key is None else self.traj_key
+        one = torch.zeros(len(slots), 1, dtype=torch.bool)
+        ids = [_column(storage, key, each, default=one) for each in (slots, following)]
+        self._joined[slots] = joined & (ids[0] == ids[1]).squeeze(1)
+
+    def _windows(self, starts: Tensor, joined: Tensor, stride: int) -> tuple[Tensor, Tensor]:
+        """Slots of slices and which of them belong to the same trajectory, both ``[S, L]``."""
+        slots = starts.unsqueeze(1) + stride * torch.arange(self.slice_len)
+        slots %= self._max_capacity
+        inside = torch.ones(slots.shape, dtype=torch.bool)
+        inside[:, 1:] = joined[slots[:, :-1]].cumprod(1).bool()
+        return slots, inside
+
+    def _starts_around(self, slots: Tensor) -> Tensor:
+        """Starts of all slices that these slots can be in, shape ``[S]``."""
+        if len(slots) * self.slice_len >= self._max_capacity:
+            return torch.arange(self._max_capacity)
+        starts = slots.unsqueeze(1) - self._stride * torch.arange(self.slice_len)
+        return (starts % self._max_capacity).unique()
+
+    def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
+        # Not the leaves of the steps: those of the slices that the steps are in.
+        self._refresh(self._starts_around(slots) if self.slice_priority == "mean" else slots)
+
+    def _refresh(self, starts: Tensor) -> None:
+        """Write the leaves of slices as they are now, by their starts, shape ``[S]``."""
+        starts = starts[self._priorities[starts].isfinite()]
+        for part in starts.split(_AT_ONCE):
+            priority, whole = self._of_slices(part, self._priorities, self._joined, self._stride)
+            leaf = self._leaf(priority)
+            set_leaves(part, leaf.where(whole, 0.0), self._sum_tree)
+            # What cannot be sampled is not the lowest.
+            set_leaves(part, leaf.where(whole, math.inf), self._min_tree)
+
+    def _of_slices(
+        self, starts: Tensor, priorities: Tensor, joined: Tensor, stride: int
+    ) -> tuple[Tensor, Tensor]:
+        """Priorities of slices, and whether they are long enough, both of shape ``[S]``."""
+        slots, inside = self._windows(starts, joined, stride)
+        length = inside.sum(1)
+        whole = (length == self.slice_len) | (not self.strict_length)
+        if self.slice_priority == "start":
+            return priorities[starts], whole
+        return priorities[slots].where(inside, 0.0).sum(1) / length, whole
+
+    def _entries(self) -> list[Entry]:
+        slots = self._max_capacity
+        return [
+            *super()._entries(),
+            *(exactly(name, getattr(self, name)) for name in _SETTINGS),
+            Entry(
+                "_stride",
+                lambda value: type(value) is int and value >= 1 and slots % value == 0,
+                f"a divisor of {slots}",
+            ),
+            Entry("_joined", dtype=torch.bool, shape=(slots,)),
+        ]
+
+    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
+        rest = [state[name] for name in ("_priorities", "_joined", "_stride")]
+        found = []
+        for part in written.nonzero().squeeze(1).split(_AT_ONCE):
+            priority, whole = self._of_slices(part, *rest)
+            found.append(priority.pow(state["_alpha"]).where(whole, 0.0))
+        return torch.cat(found) if found else torch.empty(0, dtype=torch.double)
+
+
+def _column(
+    storage: Any, key: NestedKey, slots: Tensor, *, default: Tensor | None = None
+) -> Tensor:
+    """An entry of stored steps on the CPU, ``[B, 1]``; of several numbers the highest."""
+    entry = storage._storage.get(key, None)
+    if entry is None:
+        if default is None:
+            raise KeyError(f"the transitions have no {key!r}, which tells where trajectories end")
+        return default
+    chosen: Tensor = entry.flatten(0, storage.ndim - 1)[slots.to(entry.device)]
+    return chosen.reshape(len(slots), -1).amax(1, keepdim=True).cpu()
