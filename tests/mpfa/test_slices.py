@@ -386,6 +386,11 @@ def test_arguments_that_cannot_be_are_rejected_by_name(options, words):
         make_slices(**options)
 
 
+def test_another_device_than_the_cpu_is_rejected():
+    with pytest.raises(ValueError, match="device must be that of a storage on the CPU, got meta"):
+        SignalSliceSampler(8, 0.6, 0.4, slice_len=2, device="meta")
+
+
 def test_a_batch_that_is_not_of_whole_slices_is_rejected():
     buffer = filled(batch_size=None)
     with rejected(buffer, ValueError, "batch_size must be a multiple of slice_len, 4, got 10"):

@@ -58,7 +58,7 @@ class SignalSliceSampler(SignalSampler):
         **kwargs: As :class:`SignalSampler`.
 
     Raises:
-        ValueError: If an argument is out of its range.
+        ValueError: If an argument is out of its range, or the storage is not on the CPU.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -107,6 +107,8 @@ class SignalSliceSampler(SignalSampler):
             )
 
     def _init(self) -> None:
+        if self.device.type != "cpu":
+            raise ValueError(f"device must be that of a storage on the CPU, got {self.device}")
         super()._init()
         # Whether the step after each slot is the next of its trajectory, and lies one stride on.
         self._joined = torch.zeros(self._max_capacity, dtype=torch.bool)
