@@ -12,7 +12,7 @@ from torch import nn
 from tests.mpfa.losses import KINDS, differentiate_at_once, make_batch, make_of
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import DDPGLearner, make_actor, make_critic, make_ddpg_loss
-from torchrl_mpfa.losses import noise
+from torchrl_mpfa.losses import base, noise
 from torchrl_mpfa.losses.noise import QUANTILES, quantile_loss
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.priorities import information_gain_priority
@@ -182,7 +182,7 @@ def test_the_noisier_half_is_sampled_more_often_by_per_and_not_by_uper(monkeypat
     assert 0.4 < noisy_share("uper") < 0.57
     # Without the noise in its denominator it does as PER.
     monkeypatch.setattr(
-        noise,
+        base,
         "information_gain_priority",
         lambda error, quantiles, *, least_noise: information_gain_priority(
             error, torch.zeros_like(quantiles), least_noise=least_noise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import ast
 import json
 from collections.abc import Iterator
@@ -288,7 +289,7 @@ def test_a_signal_lets_the_run_that_is_under_way_end_and_begins_no_other(
 
     def make(run: Run) -> None:
         begun.append(run.name)
-        stops[0].ask()
+        stops[0].ask(signal.SIGINT)
 
     monkeypatch.setattr(script, "Stop", stop)
     monkeypatch.setattr(script, "make", make)
