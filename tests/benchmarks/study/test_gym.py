@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import ast
 import json
+import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
