@@ -129,6 +129,7 @@ TASK_PAGES = [
     "maps.md",
     "moving.md",
     "noise.md",
+    "pictures.md",
     "planners.md",
     "policies.md",
     "vector.md",

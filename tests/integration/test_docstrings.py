@@ -25,5 +25,6 @@ def test_the_examples_of_a_module_give_what_they_say(name: str) -> None:
 
 def test_there_are_examples_to_run() -> None:
     finder = doctest.DocTestFinder()
-    found = finder.find(import_module("benchmarks.study.protocol"))
+    modules = [import_module(f"benchmarks.study.{name}") for name in ("designs", "protocol")]
+    found = [each for module in modules for each in finder.find(module)]
     assert sum(bool(each.examples) for each in found) >= 3

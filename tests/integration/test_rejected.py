@@ -182,7 +182,11 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (tune.main, "learner", "'learner' is not NAME=VALUE"),
         (tune.main, "seed=3", "seed is what the search gives each run"),
         (tune.main, "robots=8,16", "a search takes one value for each setting"),
-        (tune.main, "evaluation.every=0", "evaluation.every must be from 1 to the 50000 actions"),
+        (
+            tune.main,
+            "evaluation.every=0 evaluation.choose=false",
+            "evaluation.every must be from 1 to the 50000 actions",
+        ),
         (
             tune.main,
             "evaluation.world=test evaluation.choose=false",

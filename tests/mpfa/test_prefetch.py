@@ -283,8 +283,10 @@ def test_an_error_in_the_thread_is_raised_where_the_batch_is_taken():
         buffer.sample()
     fail.clear()
     assert len(buffer.sample()) == 4
+    buffer._wait_for_queue()
     fail.set()
     buffer.sample()
+    buffer._wait_for_queue()
     fail.clear()
     buffer.load_state_dict(buffer.state_dict())
     assert len(buffer.sample()) == 4
