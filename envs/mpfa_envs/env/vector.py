@@ -146,13 +146,10 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         return list(self._batch.worlds)
 
     def choose_worlds(self, choose: KindChoice) -> None:
-        """Have the generator and difficulty of each new world chosen, for a curriculum.
-
-        Worlds that robots drive in stay until their next ones; the choice is no part of the state.
+        """Have generator and difficulty of each new world chosen; this is no part of the state.
 
         Args:
-            choose: From a robot's source of randomness to a name in
-                :data:`~mpfa_envs.GENERATORS` and a difficulty from 0 to 1.
+            choose: From a robot's source of randomness to a generator's name and a difficulty.
 
         Raises:
             ValueError: If the worlds are no generator's.
@@ -202,11 +199,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
     @property
     def moments(self) -> NDArray[np.float64]:
-        """What a goal in hindsight needs of the present, ``[N, 9 + rays]``.
-
-        Position (x, y), the room's size, pose and speeds by odometry, and the range of each ray [m,
-        m/s, rad], of which a ray that met a walker has the greatest, as in the robot's map.
-        """
+        """What a goal in hindsight needs of the present, ``[N, 9 + rays]`` [m, m/s, rad]."""
         return self._batch.moments()
 
     @property
