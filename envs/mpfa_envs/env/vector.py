@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -169,13 +168,6 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
     def worlds_rejected(self) -> int:
         """Number of worlds of the generator that were replaced, as they had no task."""
         return self._source.rejected
-
-    @property
-    def worlds_refused(self) -> int:
-        """Old name of :attr:`worlds_rejected`, which stays for one version."""
-        message = "worlds_refused is now worlds_rejected"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        return self.worlds_rejected
 
     @property
     def tasks(self) -> list[Task | None]:
