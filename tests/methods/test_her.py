@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from tests.methods.replays import seeded
 from torchrl_mpfa.methods import make_replay
-from torchrl_mpfa.methods.her import HindsightGoals, final_goal, future_goals
+from torchrl_mpfa.methods.her import HindsightGoals, future_goals
 
 ROBOTS = 3
 
@@ -107,10 +107,9 @@ def make_her(method="her", *, generator=0, **settings):
     return replay.buffer, relabel
 
 
-@pytest.mark.parametrize("strategy", ["future", "final"])
 @pytest.mark.parametrize("together", [1, 7])
-def test_what_is_stored_is_what_plain_loops_store(strategy, together):
-    buffer, relabel = make_her(goals=2, strategy=strategy)
+def test_what_is_stored_is_what_plain_loops_store(together):
+    buffer, relabel = make_her(goals=2)
     robots, calls = Drive(), []
     for _ in range(42 // together):
         # A rollout has the rows of one robot after those of another.
@@ -127,11 +126,8 @@ def test_what_is_stored_is_what_plain_loops_store(strategy, together):
     ended = [number for rows in calls for number, *_, done in rows if done]
     assert len(relabel.steps) == len(ended) >= 20
     for number, steps in zip(ended, relabel.steps, strict=True):
-        if strategy == "final":
-            assert steps == [lengths[number] - 1]
-        else:
-            assert len(set(steps)) == len(steps) == min(2, lengths[number])
-            assert set(steps) <= set(range(lengths[number]))
+        assert len(set(steps)) == len(steps) == min(2, lengths[number])
+        assert set(steps) <= set(range(lengths[number]))
     assert set(buffer.storage[:].keys(True, True)) == {
         *("observation", "action", "index"),
         *(("next", name) for name in ("observation", "reward", "done", "terminated")),
@@ -144,12 +140,11 @@ def test_goals_are_each_step_s_outcome_as_often():
         counts[future_goals(10, 3, generator)] += 1
     assert counts.sum() == 12_000
     torch.testing.assert_close(counts / 4000, torch.full((10,), 0.3), rtol=0, atol=0.03)
-    assert final_goal(10, 3).tolist() == [9]
 
 
 @pytest.mark.parametrize("method", ["per", "mpfa_per"])
 def test_rows_in_hindsight_have_priorities_of_their_own(method):
-    buffer, _ = make_her(method, goals=1, strategy="final")
+    buffer, _ = make_her(method, goals=1)
     robots = Drive()
     while len(buffer) < 40:
         buffer.extend(as_tensordict(robots.step()))
@@ -204,7 +199,6 @@ def test_a_row_without_what_goals_need_is_rejected_before_anything_changes(missi
     ("settings", "message"),
     [
         ({"goals": 0}, "goals must be an integer from 1 to 2147483647, got 0"),
-        ({"strategy": "finl"}, "unknown strategy 'finl': did you mean 'final'"),
     ],
 )
 def test_goals_that_cannot_be_are_rejected(settings, message):
@@ -217,8 +211,6 @@ def test_goals_that_cannot_be_are_rejected(settings, message):
     [
         ("her", {"hindsight": -1}, "hindsight must be an integer from 0"),
         ("her", {"hindsight": True}, "hindsight must be an integer from 0"),
-        ("her", {"hindsight_strategy": "past"}, "hindsight_strategy 'past'"),
-        ("per", {"hindsight_strategy": "final"}, "hindsight_strategy must be 'future' with"),
         ("reaper", {"hindsight": 2}, "reliability must be 0.0 with hindsight=2"),
     ],
 )

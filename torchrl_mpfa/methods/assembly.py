@@ -19,7 +19,6 @@ from torchrl_mpfa.methods.catalogue import METHODS, Method, check_ranges
 from torchrl_mpfa.methods.cer import CERSampler
 from torchrl_mpfa.methods.geometric import GeometricSampler
 from torchrl_mpfa.methods.halves import uniform_halves
-from torchrl_mpfa.methods.her import STRATEGIES
 from torchrl_mpfa.methods.hvper import (
     RELATIVE_ERROR,
     RELATIVE_VALUE,
@@ -80,7 +79,6 @@ WORDS: dict[str, set[str]] = {
     "importance": {"critic", "torchrl", "none"},
     "loss_function": {"l2", "smooth_l1", "pal"},
     "optimizer": {"adam", "radam"},
-    "hindsight_strategy": set(STRATEGIES),
 }
 """The words of each setting that is a word."""
 
@@ -241,7 +239,6 @@ def unused_settings(method: Method) -> Iterator[tuple[str, Any, str]]:
         (named, "boost", not method.boost, ("boost_factor", "boost_target", "boost_bound")),
         (named, "decay", not method.decay, ("decay_sharpness", "decay_position")),
         (named, "curiosity", not method.curiosity, ("curiosity_scale",)),
-        (default, "hindsight", not method.hindsight, ("hindsight_strategy",)),
         # It adds up the errors of an episode's own rows.
         (default, "hindsight", method.hindsight > 0, ("reliability",)),
     ):

@@ -129,9 +129,6 @@ class Method:
     """eta of that bonus."""
     hindsight: int = _within(COUNT_OR_ZERO, 0)
     """Goals for which each episode is learned from once more (HER); 0: none."""
-    hindsight_strategy: str = "future"
-    """Which of its outcomes are goals: ``future``, those of steps at random, or ``final``, its
-    last."""
 
 
 RANGES: dict[str, Rule] = {

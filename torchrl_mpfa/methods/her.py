@@ -5,7 +5,6 @@ After Andrychowicz et al. (2017), "Hindsight experience replay", https://arxiv.o
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 import torch
@@ -15,7 +14,6 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.spelling import unknown
 
 
 class Relabel(Protocol):
@@ -57,23 +55,6 @@ def future_goals(length: int, goals: int, generator: torch.Generator | None = No
     return torch.randperm(length, generator=generator)[:goals]
 
 
-def final_goal(length: int, goals: int, generator: torch.Generator | None = None) -> Tensor:
-    """The last step of an episode, whatever the other arguments are.
-
-    Examples:
-        >>> final_goal(3, 4)
-        tensor([2])
-    """
-    return torch.tensor([length - 1])
-
-
-STRATEGIES: dict[str, Callable[[int, int, torch.Generator | None], Tensor]] = {
-    "future": future_goals,
-    "final": final_goal,
-}
-"""Choices of the steps whose outcomes are goals."""
-
-
 class HindsightGoals(Transform):
     """Writes each episode that has ended once more to a replay buffer, for other goals.
 
@@ -86,15 +67,14 @@ class HindsightGoals(Transform):
 
     Args:
         relabel: Gives an episode other goals, say ``mpfa_envs.GoalRelabeling``.
-        goals: Goals of an episode ``K``.
-        strategy: ``"future"``: the goals are what was reached after steps at random, each a goal of
-            all that came before it; ``"final"``: one, what was reached last.
+        goals: Goals of an episode ``K``: what was reached after steps at random, each a goal of all
+            that came before it.
         episode_key: Where the number of the episode is, ``[..., 1]``.
         generator: Source of the choice of goals; None: PyTorch's own. Its state is not part of the
             buffer's.
 
     Raises:
-        ValueError: If ``goals`` is not a positive integer, or ``strategy`` is unknown.
+        ValueError: If ``goals`` is not a positive integer.
 
     Examples:
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -108,7 +88,8 @@ class HindsightGoals(Transform):
         ...             each["goal"] = goal.expand(len(each), 1)
         ...         return torch.cat(rows).exclude("place")
         >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100))
-        >>> buffer = buffer.append_transform(HindsightGoals(ReachPlace(), strategy="final"))
+        >>> goals = HindsightGoals(ReachPlace(), goals=3)
+        >>> buffer = buffer.append_transform(goals)
         >>> episode = TensorDict(
         ...     {
         ...         "episode": torch.zeros(3, 1, dtype=torch.long),
@@ -119,8 +100,8 @@ class HindsightGoals(Transform):
         ...     [3],
         ... )
         >>> index = buffer.extend(episode)
-        >>> buffer[:]["goal"].flatten()
-        tensor([9., 9., 9., 3., 3., 3.])
+        >>> buffer[:]["goal"].flatten().sort().values
+        tensor([1., 2., 2., 3., 3., 3., 9., 9., 9.])
     """
 
     def __init__(
@@ -128,15 +109,12 @@ class HindsightGoals(Transform):
         relabel: Relabel,
         *,
         goals: int = 4,
-        strategy: str = "future",
         episode_key: str = "episode",
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         check_counts(goals=goals)
-        if strategy not in STRATEGIES:
-            raise ValueError(unknown("strategy", strategy, STRATEGIES))
-        self.goals, self.strategy, self.generator = goals, strategy, generator
+        self.goals, self.generator = goals, generator
         self._relabel, self._episode_key = relabel, episode_key
         self._pending: list[TensorDictBase] = []
 
@@ -166,7 +144,7 @@ class HindsightGoals(Transform):
         return [rows[numbers == number] for number in ended.tolist()]
 
     def _in_hindsight(self, episode: TensorDictBase) -> TensorDictBase:
-        steps = STRATEGIES[self.strategy](len(episode), self.goals, self.generator)
+        steps = future_goals(len(episode), self.goals, self.generator)
         return self._relabel(episode.exclude(self._episode_key), steps)
 
     def get_extra_state(self) -> dict[Any, Tensor]:

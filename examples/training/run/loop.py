@@ -133,10 +133,7 @@ class TrainingRun:
         self.assessment = Assessment(wanted) if wanted.episodes else None
         if method.hindsight:
             relabel = GoalRelabeling(self._task)
-            goals = HindsightGoals(
-                relabel, goals=method.hindsight, strategy=method.hindsight_strategy
-            )
-            self.buffer.append_transform(goals)
+            self.buffer.append_transform(HindsightGoals(relabel, goals=method.hindsight))
             self.entries += relabel.entries
         if settings.environment.mirror:
             pairs = WHEEL_PAIRS if is_discrete(settings.learner) else None
