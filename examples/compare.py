@@ -31,7 +31,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import training.extra  # noqa: F401
 
@@ -39,7 +38,7 @@ import training.extra  # noqa: F401
 from torchrl_mpfa.spelling import unknown
 from training import files
 from training.comparison.arms import check_free, parse_arms
-from training.comparison.execution import JOBS, make_runs
+from training.comparison.execution import add_options, make_runs
 from training.comparison.jobs import TESTED, Comparison, Evaluation
 from training.environments import check_physics
 from training.settings.train import GROUPS, register
@@ -60,19 +59,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.add_argument(
             f"--{name}", nargs="+", type=kind, default=default, help=f"{text} (default: {shown})"
         )
-    parser.add_argument(
-        "--folder", type=Path, default=Path("runs/compare"), help="(default: runs/compare)"
-    )
-    parser.add_argument(
-        "--jobs", type=int, help=f"runs at a time (default: {JOBS}; with --ray as many as fit)"
-    )
-    parser.add_argument(
-        "--ray",
-        nargs="?",
-        const="",
-        metavar="ADDRESS",
-        help="run on a Ray cluster (default: that of RAY_ADDRESS, or of this machine)",
-    )
+    add_options(parser, folder="runs/compare", what="runs")
     parser.add_argument("--worlds", nargs="+", default=TESTED.words, help="(default: test)")
     parser.add_argument(
         "--episodes", type=int, default=TESTED.episodes, help="for each (default: 200)"

@@ -37,7 +37,7 @@ import training.extra  # noqa: F401
 
 # isort: split
 from training import files
-from training.comparison.execution import JOBS
+from training.comparison.execution import add_options
 from training.comparison.ranges import read_ranges
 from training.settings.train import register
 
@@ -57,9 +57,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--trials", type=int, default=40, help="in all (default: 40)")
     parser.add_argument(
-        "--folder", type=Path, default=Path("runs/tune"), help="(default: runs/tune)"
-    )
-    parser.add_argument(
         "--seeds",
         nargs="+",
         type=int,
@@ -73,16 +70,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="area under the curve of success, or success of the last policy (default: area)",
     )
     parser.add_argument("--sampler-seed", type=int, default=0, help="of what is suggested")
-    parser.add_argument(
-        "--jobs", type=int, help=f"trials at a time (default: {JOBS}; with --ray as many as fit)"
-    )
-    parser.add_argument(
-        "--ray",
-        nargs="?",
-        const="",
-        metavar="ADDRESS",
-        help="run on a Ray cluster (default: that of RAY_ADDRESS, or of this machine)",
-    )
+    add_options(parser, folder="runs/tune", what="trials")
     options = parser.parse_args(arguments)
     for name, least in (("trials", 1), ("jobs", 1), ("sampler_seed", 0)):
         value = getattr(options, name)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Protocol
 
 from tqdm import tqdm
@@ -21,6 +23,23 @@ _PAUSE = 0.3
 """Between two looks at the runs [s]."""
 MOST_LOSSES = 10
 """Workers that may be lost under a run, which may be what takes them down."""
+
+
+def add_options(parser: argparse.ArgumentParser, *, folder: str, what: str) -> None:
+    """Where a script makes its runs or trials, and how many at a time."""
+    parser.add_argument("--folder", type=Path, default=Path(folder), help=f"(default: {folder})")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        help=f"{what} at a time (default: {JOBS}; with --ray as many as fit)",
+    )
+    parser.add_argument(
+        "--ray",
+        nargs="?",
+        const="",
+        metavar="ADDRESS",
+        help="run on a Ray cluster (default: that of RAY_ADDRESS, or of this machine)",
+    )
 
 
 class Running:
