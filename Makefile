@@ -150,5 +150,7 @@ $(STAMP): pyproject.toml
 	$(if $(strip $(TORCH_INSTALL_ARGS)),@$(BIN)/python -m pip uninstall -qq -y torch)
 	$(if $(strip $(TORCH_INSTALL_ARGS)),$(BIN)/python -m pip install $(TORCH_INSTALL_ARGS))
 	$(if $(strip $(TORCH_INSTALL_ARGS)),@printf '%s\n' '$(subst ','\'',$(TORCH_INSTALL_ARGS))' > $(TORCH))
+	@# Pip before 23.1, which comes with Python 3.10, does not find versions that fit each other.
+	@$(BIN)/python -m pip install -q 'pip>=23.1'
 	$(BIN)/python -m pip install -e ".[dev]"
 	@touch $(STAMP)
