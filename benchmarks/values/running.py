@@ -98,7 +98,8 @@ def make_rows(
     ):
         tasks = {pool.submit(_train, folder, *each): len(each[-1]) for each in left}
         for task in as_completed(tasks):
-            rows = pd.concat([rows, pd.DataFrame(task.result())], ignore_index=True)
+            found = pd.DataFrame(task.result())
+            rows = found if rows.empty else pd.concat([rows, found], ignore_index=True)
             ordered = rows.sort_values([*_RUN, "updates"], kind="stable")
             text = ordered.to_csv(index=False, float_format=f"%.{_DIGITS}g", lineterminator="\n")
             path.parent.mkdir(parents=True, exist_ok=True)

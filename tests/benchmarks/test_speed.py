@@ -186,6 +186,7 @@ def test_a_step_is_made_of_methods_that_store_or_choose_in_a_way_of_their_own(na
         step()
 
 
+@pytest.mark.slow
 def test_robots_among_walkers_are_compared_with_robots_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -204,6 +205,7 @@ def test_robots_among_walkers_are_compared_with_robots_alone(
     assert found["vector_kinematic"]["ratio"] is None
 
 
+@pytest.mark.slow
 def test_a_run_is_measured_once_it_updates() -> None:
     register()
     tiny = ["learner.width=8", "method.batch_size=32", "exploration.random_steps=16"]

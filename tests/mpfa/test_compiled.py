@@ -125,7 +125,7 @@ def test_a_program_takes_the_same_forty_steps(name, options):
     assert_alike(*learners)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", ["ddpg", "td3", pytest.param("sac", marks=pytest.mark.slow)])
 def test_batches_for_one_of_both_move_that_one_alone(name):
     learners = make_pair(name)
     for seed in range(6):
@@ -135,10 +135,16 @@ def test_batches_for_one_of_both_move_that_one_alone(name):
     assert_alike(*learners)
 
 
-@pytest.mark.parametrize("name", ["ddpg", "td3"])
-@pytest.mark.parametrize("through_file", [False, True])
-@pytest.mark.parametrize("to_compiled", [False, True])
-@pytest.mark.parametrize("updates", [0, 4])
+@pytest.mark.parametrize(
+    ("name", "through_file", "to_compiled", "updates"),
+    [  # Each value of one with each of another.
+        ("ddpg", False, False, 0),
+        ("ddpg", True, True, 4),
+        ("td3", False, True, 4),
+        ("td3", True, False, 4),
+        ("td3", True, True, 0),
+    ],
+)
 def test_a_checkpoint_of_either_goes_on_in_the_other(
     name, through_file, to_compiled, updates, tmp_path
 ):

@@ -50,8 +50,6 @@ def test_learners_of_equal_settings_share_programs_and_learn_as_each_alone(name)
     "options",
     [
         {"gamma": 0.5},
-        {"reward_scale": 0.1},
-        {"importance": "none"},
         {"loss_function": "smooth_l1"},
         {"networks": make_networks(width=17)},
         {"networks": make_networks(layer_norm=False)},

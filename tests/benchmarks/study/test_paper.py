@@ -67,6 +67,7 @@ def paper_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_all_figures_and_tables_are_made_of_what_there_is(
     paper_runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ DOCS = Path(__file__).parents[3] / "docs"
 ANIMATION = DOCS / "images/pictures/episode.gif"
 
 
+@pytest.mark.slow
 def test_the_animation_of_the_readme_ends_in_the_goal() -> None:
     policy = load_policy(pictures.SHIPPED)
     number, task = pictures.filmed(policy)

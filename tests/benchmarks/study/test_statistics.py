@@ -230,7 +230,9 @@ def test_rates_that_are_equal_but_for_rounding_are_ties() -> None:
         assert improvement_interval(a, b, paired=paired, rng=np.random.default_rng(0)).value == 0.5
 
 
-@pytest.mark.parametrize(("runs", "chance"), [(10, 0.64), (20, 0.76)])
+@pytest.mark.parametrize(
+    ("runs", "chance"), [(10, 0.64), pytest.param(20, 0.76, marks=pytest.mark.slow)]
+)
 def test_the_interval_of_improvement_covers_the_truth(runs: int, chance: float) -> None:
     rng = np.random.default_rng(15)
     # Two normal runs, of which the first is better by a gap with this chance.

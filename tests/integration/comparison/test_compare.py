@@ -233,11 +233,9 @@ def descendants(process: int) -> list[int]:
     return [found for n in map(int, children) for found in (n, *descendants(n))]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
-@pytest.mark.parametrize(
-    ("number", "status"),
-    [(signal.SIGKILL, -9), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGKILL, -9), (signal.SIGTERM, 143)])
 def test_a_killed_comparison_leaves_no_training_behind_and_goes_on_to_the_same_rows(
     number: int, status: int, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

@@ -139,6 +139,7 @@ def test_a_worker_that_is_killed_is_lost_once_and_replaced(
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="children are listed in /proc")
+@pytest.mark.slow
 def test_a_comparison_whose_worker_is_killed_gives_the_rows_of_one_that_is_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
