@@ -189,8 +189,6 @@ def test_the_code_of_the_tutorial_runs_without_a_warning(folder: Path) -> None:
 @pytest.mark.parametrize("page", [*HOWTO, *TASK_PAGES])
 @pytest.mark.usefixtures("folder")
 def test_the_code_of_a_page_runs_in_its_order(page: str) -> None:
-    if page in TASK_PAGES:
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     names = run(page, EPISODES.get(page, {}))
     if page in HOWTO and "buffer" in names:
         # The last buffer of a page was learned from.

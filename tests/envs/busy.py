@@ -41,7 +41,5 @@ POLITE = replace(
 
 def needs(arguments: dict[str, Any]) -> None:
     """Skip a test whose arguments need a package that is not installed."""
-    if arguments.get("physics") == "wheels":
-        pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     if POLITE in list(arguments["world"]):
         pytest.importorskip("pyrvo", reason="an extra")

@@ -31,7 +31,6 @@ def test_a_kinematic_copy_drives_the_same_episode_independently(
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
 
 
-@pytest.mark.usefixtures("wheels")
 @pytest.mark.parametrize("duplicate", COPIES, ids=["copy", "pickle"])
 def test_a_copy_on_wheels_is_rejected(duplicate: Callable) -> None:
     for make in MAKERS:

@@ -248,7 +248,6 @@ def test_pursuit_turns_on_the_spot_to_a_point_beside_the_robot() -> None:
         assert left == -right and side * right > 0.0
 
 
-@pytest.mark.usefixtures("wheels")
 def test_the_follower_reaches_goals_on_wheels() -> None:
     results = evaluate(make_planner("dijkstra"), "D", episodes=4, physics="wheels")
     assert sum(result.success for result in results) >= 3

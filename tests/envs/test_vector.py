@@ -127,7 +127,6 @@ def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments:
     theirs.close()
 
 
-@pytest.mark.usefixtures("wheels")
 def test_robots_that_share_a_server_part_slowly() -> None:
     ours, theirs = make(40, physics="wheels"), make(8, physics="wheels")
     tasks = [Task((0.0, -3.0, 0.3 * i), (0.0, 3.0)) for i in range(8)]

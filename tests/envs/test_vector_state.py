@@ -88,7 +88,6 @@ def test_what_follows_is_the_same_to_the_bit(case: dict[str, Any]) -> None:
     other.close()
 
 
-@pytest.mark.usefixtures("wheels")
 def test_wheels_are_restored_at_the_start_of_an_episode_too() -> None:
     env, other = (VectorNavigationEnv(2, world="A", physics="wheels") for _ in range(2))
     env.reset(seed=1)
@@ -229,7 +228,6 @@ def test_a_state_without_measurable_paths_is_rejected_before_any_change() -> Non
     assert (other.worlds, other.tasks) == (worlds, tasks)
 
 
-@pytest.mark.usefixtures("wheels")
 def test_wheels_stay_where_they_are_without_what_they_have_driven() -> None:
     env = VectorNavigationEnv(2, world="B", physics="wheels")
     env.reset(seed=0)

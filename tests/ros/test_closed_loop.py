@@ -61,7 +61,6 @@ def test_on_exact_arcs_it_succeeds_as_in_the_environment(tmp_path: Path) -> None
 
 
 def test_twenty_drives_on_wheels_succeed_as_in_the_environment(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
     found = ends(tmp_path, "wheels", 20, rays=54, world="test")
     assert [end == "arrived" for end in found] == in_the_environment("wheels", 20, "test")
 
