@@ -59,6 +59,8 @@ APART = (
     Arm("apart", (*BY_PRIORITY, "method.selection=apart")),
 )
 """The critic learns from rows of high priority, the actor from others: by the inverse, or any."""
+TOGETHER = Arm("together", (*BY_PRIORITY, "method.selection=together"))
+"""The actor learns from rows of high priority too: added once the two above had won."""
 HINDSIGHT = Arm("hindsight", ("method.hindsight=4",))
 """Goals in hindsight beside the priorities of a method: as many as the method ``her`` has."""
 LEARNABLE = Arm("learnable", ("environment.learnable_worlds=true",))
@@ -124,14 +126,18 @@ def _noise(root: Path) -> Table:
 
 def _apart(root: Path) -> Table:
     folder, at = root / "experiments", "experiments/td3"
-    control = f"{at}/uniform_halves"
+    control, arms = f"{at}/uniform_halves", (*APART, TOGETHER)
     return Table(
         "J",
         "Critic and actor apart: does it pay that each has its own batches?",
-        (_of(folder, ("uniform_halves",)), _of(folder, ("la3p",), *APART)),
+        (_of(folder, ("uniform_halves",)), _of(folder, ("la3p",), *arms)),
         tuple((f"{at}/la3p/{arm.name}", control) for arm in APART),
-        pairs_of(at, "la3p/apart-la3p/inverse"),
-        {"Critic and actor apart": (*(f"{at}/la3p/{arm.name}" for arm in APART), control)},
+        pairs_of(
+            at,
+            *("la3p/inverse-la3p/together", "la3p/apart-la3p/together"),
+            *("la3p/together-uniform_halves", "la3p/apart-la3p/inverse"),
+        ),
+        {"Critic and actor apart": (*(f"{at}/la3p/{arm.name}" for arm in arms), control)},
         note=NOTE,
     )
 

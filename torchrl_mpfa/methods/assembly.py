@@ -26,7 +26,7 @@ from torchrl_mpfa.methods.hvper import (
     value_schedule,
 )
 from torchrl_mpfa.methods.klper import KLPERSelection
-from torchrl_mpfa.methods.la3p import LA3PSampler, Part, la3p_batches
+from torchrl_mpfa.methods.la3p import ACTOR_PARTS, LA3PSampler, la3p_batches
 from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
@@ -65,8 +65,7 @@ _PRIORITIZED: dict[str, type[SignalSampler]] = {
     "prioritized": SignalSampler,
     "rank": RankPERSampler,
     "capped": MWSampler,
-    "split": LA3PSampler,
-    "apart": LA3PSampler,
+    **dict.fromkeys(ACTOR_PARTS, LA3PSampler),
 }
 _OF_PRIORITIES = ("combination", "floor_quantile", "priority_floor", "replay_penalty")
 WORDS: dict[str, set[str]] = {
@@ -256,7 +255,7 @@ def entries_of(method: Method) -> tuple[str, ...]:
 
 def has_one_batch_a_step(method: Method) -> bool:
     """Whether what samples one batch for each update, and no more, trains by the method."""
-    own = {"split", "apart", "halves", "near_policy"}
+    own = {*ACTOR_PARTS, "halves", "near_policy"}
     return method.selection not in own and method.candidates == 1
 
 
@@ -332,8 +331,8 @@ def make_selection(
     """The selection of a method."""
     if method.selection == "halves":
         return uniform_halves
-    if method.selection in ("split", "apart"):
-        part: Part = "inverse" if method.selection == "split" else "uniform"
+    if method.selection in ACTOR_PARTS:
+        part = ACTOR_PARTS[method.selection]
         return partial(la3p_batches, actor=part, squared=method.loss_function == "l2")
     if method.selection == "near_policy" and policy is not None:
         return ReFERSelection(policy, far_share=method.far_share, cutoff=method.far_cutoff)

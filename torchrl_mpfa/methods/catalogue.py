@@ -68,8 +68,8 @@ class Method:
     selection: str = "prioritized"
     """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
     ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P),
-    ``apart`` (the same, but the actor's part is uniform), ``halves`` (two updates on uniform
-    halves) or ``near_policy`` (ReF-ER)."""
+    ``apart`` and ``together`` (the same, but the actor's part is uniform, or by priority),
+    ``halves`` (two updates on uniform halves) or ``near_policy`` (ReF-ER)."""
     far_share: float = _within(SHARE, 0.1)
     """Share of transitions that may be far from the policy before ``near_policy`` holds it."""
     far_cutoff: float = _within(POSITIVE, 4.0)
@@ -115,8 +115,8 @@ class Method:
     importance: str = "critic"
     """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
     loss_function: str = "l2"
-    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``; of ``split``
-    and ``apart``, ``l2``, or else PAL for the uniform part and Huber for the other."""
+    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``; of LA3P's
+    parts, ``l2``, or else PAL for the uniform part and Huber for the other."""
     target_average: int = _within(COUNT, 1)
     """Critics of which the target is the mean, one more kept at each end of an episode."""
     optimizer: str = "adam"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor
@@ -23,6 +23,12 @@ from torchrl_mpfa.saved import wrong
 from torchrl_mpfa.selection import SampledBatch
 
 Part = Literal["uniform", "prioritized", "inverse"]
+ACTOR_PARTS: Final[dict[str, Part]] = {
+    "split": "inverse",
+    "apart": "uniform",
+    "together": "prioritized",
+}
+"""Part that the actor learns from alone, by the selection of a method; ``split`` is LA3P."""
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _TINY = torch.finfo(torch.double).tiny
 

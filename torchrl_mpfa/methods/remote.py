@@ -19,6 +19,7 @@ from torchrl_mpfa.methods.assembly import (
     make_selection,
 )
 from torchrl_mpfa.methods.catalogue import Method
+from torchrl_mpfa.methods.la3p import ACTOR_PARTS
 from torchrl_mpfa.replay import SignalReplayBuffer
 
 
@@ -142,4 +143,4 @@ def make_ray_replay(
 
 def can_be_remote(method: Method) -> bool:
     """Whether a method asks no more of its buffer than batches, and of transitions the usual."""
-    return method.selection not in ("split", "apart", "near_policy") and not entries_of(method)
+    return method.selection not in (*ACTOR_PARTS, "near_policy") and not entries_of(method)

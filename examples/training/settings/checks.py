@@ -16,6 +16,7 @@ from torchrl_mpfa.checks import Rule
 from torchrl_mpfa.methods import Method, can_be_remote
 from torchrl_mpfa.methods.assembly import WORDS, unused_settings
 from torchrl_mpfa.methods.catalogue import RANGES
+from torchrl_mpfa.methods.la3p import ACTOR_PARTS
 from training.environments import check_physics, make_training_env, task_arguments
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
@@ -178,7 +179,7 @@ def _check_values_alone(settings: TrainSettings) -> None:
     distances = ("l2", "smooth_l1") if algorithm == "dqn" else ("l2",)
     for name, wrong in (
         ("signals", any(signal not in own for signal in method.signals)),
-        ("selection", method.selection in ("split", "apart", "halves", "near_policy")),
+        ("selection", method.selection in (*ACTOR_PARTS, "halves", "near_policy")),
         ("candidates", method.candidates > 1),
         ("target_average", method.target_average > 1),
         ("loss_function", method.loss_function not in distances),
