@@ -137,7 +137,7 @@ def _apart(root: Path) -> Table:
             *("la3p/inverse-la3p/together", "la3p/apart-la3p/together"),
             *("la3p/together-uniform_halves", "la3p/apart-la3p/inverse"),
         ),
-        {"Critic and actor apart": (*(f"{at}/la3p/{arm.name}" for arm in arms), control)},
+        {"Critic and actor apart": (control, *(f"{at}/la3p/{arm.name}" for arm in arms))},
         note=NOTE,
     )
 

@@ -227,7 +227,8 @@ def _panels(table: Table, *, tall: float = _SIZE[1], sharex: bool = False) -> tu
     for axis in axes[1:number] if sharex else ():
         axis.sharex(axes[0])
     for axis, title in zip(axes, table.panels, strict=False):
-        axis.set_title(title)
+        # A centered one, wider than its panel, would be cut at the edge of the figure.
+        axis.set_title(title, loc="right")
     for axis in axes[number:]:
         axis.remove()
     return figure, axes[:number]

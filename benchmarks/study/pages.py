@@ -15,7 +15,7 @@ from benchmarks.study.tables import study_tables
 from torchrl_mpfa.saving import write_text_atomically
 
 _TITLES = {
-    "curves": "Mean of the runs and its 95 % interval, over actions, beside uniform replay in gray",
+    "curves": "Mean of the runs and its 95 % interval; gray: what an arm is compared with",
     "profiles": "Share of runs above each value of the primary measure; bands: three arms",
     "arms": "The primary measure of each run, with mean and 95 % interval of each arm",
     "volumes": "Area by replay volume and method; gray: not run, or too few to compare",

@@ -14,6 +14,7 @@ from benchmarks.study.designs import KEY, OF_VOLUMES
 from benchmarks.study.figures import (
     looks_of,
     mean_curve,
+    plot_arms,
     plot_curves,
     plot_profiles,
     plot_volumes,
@@ -73,6 +74,15 @@ def test_the_band_of_a_profile_ends_with_its_runs(tmp_path: Path) -> None:
     band = (pixels[..., 2] - pixels[..., 0] > 15) & (pixels.min(-1) > 150)
     columns = np.flatnonzero(band[:-60].sum(0) > 8)
     assert columns.max() < 0.5 * band.shape[1]
+
+
+def test_a_title_wider_than_its_panel_is_whole(tmp_path: Path) -> None:
+    arms = tuple(f"s/td3/per/{'long' * 6}_{name}" for name in "ab")
+    titles = ("effective sample of 80%", "effective sample of 50%")
+    table = replace(small_table(tmp_path), panels=dict.fromkeys(titles, arms))
+    plot_arms(table, {arm: pd.DataFrame({"area": [0.1, 0.3]}) for arm in arms}, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as picture:
+        assert np.asarray(picture.convert("L"))[:, -3:].min() == 255
 
 
 def test_where_a_method_is_better_than_uniform_replay_the_map_is_blue(tmp_path: Path) -> None:
