@@ -67,8 +67,8 @@ demo: $(STAMP) ## Train DDPG with MPFA-PER for a minute, and evaluate it in unse
 train: $(STAMP) ## Train with a new room each episode (minutes); REGIME=paper: the paper's task (tens of minutes)
 	$(BIN)/python examples/train.py regime=$(REGIME) $(PHYSICS) $(ARGS)
 
-paper: $(STAMP) ## Make the paper's figures and tables from runs/paper, and name missing runs
-	$(BIN)/python -m benchmarks.study paper runs/paper $(ARGS)
+paper: $(STAMP) ## Write docs/paper.md and its figures from the kept rows of the paper's runs
+	$(BIN)/python -m benchmarks.paper $(ARGS)
 
 test: $(STAMP) ## Run the tests; SLOW=1 adds the slow ones, ARGS='-k tree' selects
 	$(PYTEST) -n $(WORKERS) --dist worksteal $(if $(filter-out 0,$(SLOW)),-m 'slow or not slow') $(ALSO) $(ARGS)

@@ -1,1 +1,1 @@
-"""Measurements: speed against other libraries, and the study of when prioritized replay helps."""
+"""Measurements: the paper's tables, values from frozen buffers, speed against other libraries."""

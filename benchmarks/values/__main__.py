@@ -4,7 +4,6 @@
     python -m benchmarks.values run               table G: every arm, buffer and seed, three hours
     python -m benchmarks.values run per mpfa_per --seeds 3    two arms, three seeds
     python -m benchmarks.values report            its page and figures
-    python -m benchmarks.values strength          alphas of equal strength, for table H of the study
 
 ``run`` goes on where it was stopped. ``docs/values.md`` tells how to test a signal of one's own.
 """
@@ -24,7 +23,6 @@ from benchmarks.values.capture import capture_all
 from benchmarks.values.frozen import FOLDER, frozen_buffers
 from benchmarks.values.report import missing, write_report
 from benchmarks.values.running import make_rows, read_rows
-from benchmarks.values.strength import equal_alphas
 from torchrl_mpfa.spelling import unknown
 
 ROWS = "rows.csv"
@@ -37,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("command", choices=["capture", "run", "report", "strength"])
+    parser.add_argument("command", choices=["capture", "run", "report"])
     parser.add_argument("arms", nargs="*", metavar="ARM", help="of run (default: all)")
     parser.add_argument("--seeds", type=int, default=5, help="of each arm (default: 5)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
@@ -63,10 +61,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seeds = range(options.seeds)
         arms = options.arms or list(ARMS)
         make_rows(path, arms, seeds, jobs=options.jobs, folder=options.folder)
-        return 0
-    if options.command == "strength":
-        sparse = [each for each in buffers if each.name.startswith("sparse")]
-        print(equal_alphas(sparse).to_string(float_format="%.2f"))
         return 0
     rows = read_rows(path)
     if AGAINST not in set(rows["method"]) or rows["method"].nunique() < 2:

@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase
 
-from benchmarks.study.protocol import DENSE, SPARSE
 from benchmarks.values.frozen import FrozenBuffer, as_stored
 from benchmarks.values.learning import BATCH, FrozenPolicyLearner, make_frozen_learner
 from torchrl_mpfa.methods import METHODS
@@ -22,12 +21,39 @@ from training.run.loop import TrainingRun
 from training.settings.command_line import composed
 from training.settings.train import register
 
-REWARDS = {"sparse": SPARSE, "dense": DENSE}
+_COMMON = (
+    "regime=rooms",
+    "updates=2",
+    "learner.compile=true",
+    "tracking=off",
+    "evaluation.every=2000",
+    "evaluation.world=mixed:validation",
+    "evaluation.episodes=40",
+    "evaluation.choose=false",
+    # The paper's robot, without what the regime has for others.
+    "environment.robot=turtlebot2",
+    "environment.filter=0",
+    "environment.step_cost=0",
+)
+REWARDS = {
+    "sparse": (
+        *_COMMON,
+        "curriculum.stages=[{world: mixed, actions: 24000}]",
+        # With the regime's slower targets nothing is learned from the goal alone in so few actions.
+        "learner.tau=0.01",
+        "learner.gamma=0.97",
+        "environment.progress=none",
+        "environment.max_goal_distance=6",
+        "environment.detour_chance=0",
+    ),
+    "dense": (*_COMMON, "curriculum.stages=[{world: mixed, actions: 40000}]"),
+}
+"""Settings of the runs: the goal and the collision alone are rewarded, or every step is."""
 TIMES = {"early": 6_000, "late": 20_000}
 """Actions after which a run is stopped; each of them is a transition."""
 SOURCES = ("uniform", "per", "mpfa_per")
 _FIRST_SEED = 2_000
-"""Of the runs: none that a table of the study has."""
+"""Of the runs: no page of results has them."""
 _ENTRIES = ("episode", "behavior_mean", "behavior_sigma")
 """What some method asks of transitions beside the usual."""
 _VALUES: dict[str, Any] = {"gamma": 0.97, "tau": 0.01, "compile": False}

@@ -10,8 +10,6 @@ from textwrap import fill
 import numpy as np
 import pandas as pd
 
-from benchmarks.study.intervals import t_interval
-from benchmarks.study.permutation import holm
 from benchmarks.values.arms import AGAINST, ARMS, LEFT_OUT, PAIRS, PLANNED
 from benchmarks.values.capture import REWARDS
 from benchmarks.values.frozen import FrozenBuffer
@@ -20,6 +18,7 @@ from benchmarks.values.statistics import RANKS, differences, paired
 from mpfa_envs.render.charts import finish, look, new_figure
 from torchrl_mpfa.saving import write_text_atomically
 from training.comparison.report import table
+from training.statistics import holm, mean_interval
 
 SHOWN = ("uniform", "mpf_per", "mpfa_per", "mpfa_plus", "mixture", "lap")
 """Arms whose curves are shown."""
@@ -199,7 +198,7 @@ def plot_curves(rows: pd.DataFrame, path: Path) -> None:
         at = [paired(found, column, against=AGAINST, at=mark) for mark in marks]
         axis.axhline(0.0, color="0.5")
         for place, arm in enumerate(name for name in SHOWN if name in at[0]):
-            ends = [t_interval(gaps[arm].dropna().to_numpy()[:, None]) for gaps in at]
+            ends = [mean_interval(gaps[arm].dropna().to_numpy()) for gaps in at]
             mean, low, high = 100 * np.expm1([(e.value, e.low, e.high) for e in ends]).T
             axis.plot(marks, mean, **look(place), label=arm)
             axis.fill_between(marks, low, high, color=look(place)["color"], alpha=0.12, lw=0)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from benchmarks.study.intervals import t_interval
-from benchmarks.study.permutation import flip_p
+from training.statistics import mean_interval, sign_p
 
 _UNITS = 3
 """From so many buffers on the unit is the buffer, below it the training."""
@@ -42,10 +41,10 @@ def paired(rows: pd.DataFrame, column: str, *, against: str, at: int | None = No
 def estimate(gaps: pd.Series, column: str) -> dict[str, float]:
     """Mean of differences, its 95 % interval and p, by Student's t and by permuted signs."""
     known = gaps.dropna().to_numpy()
-    found = t_interval(known[:, None])
+    found = mean_interval(known)
     ends = np.array([found.value, found.low, found.high])
     mean, low, high = np.expm1(ends) if column in ERRORS else ends
-    p = float(flip_p(known[None])[0]) if len(known) > 1 else np.nan
+    p = sign_p(known) if len(known) > 1 else np.nan
     return {column: mean, f"{column}_low": low, f"{column}_high": high, f"{column}_p": p}
 
 

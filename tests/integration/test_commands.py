@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,9 @@ import stable_baselines
 import torchrl_sac
 import torchrl_trainer
 import tune
+from benchmarks import drivers, pictures, sampling
+from benchmarks.paper import __main__ as paper
 from benchmarks.speed import environment, scaling, worlds
-from benchmarks.study.__main__ import COMMANDS
 from benchmarks.values import __main__ as values
 from training.settings.command_line import parse_overrides
 from training.worlds import parse_worlds
@@ -58,10 +58,10 @@ MAINS: dict[str, Callable[[], object]] = {
     "benchmarks.speed.scaling": scaling.main,
     "benchmarks.speed.worlds": worlds.main,
     "benchmarks.values": values.main,
-    **{
-        f"benchmarks.study {name}": import_module(f"benchmarks.study.{module}").main
-        for name, (module, _) in COMMANDS.items()
-    },
+    "benchmarks.paper": paper.main,
+    "benchmarks.drivers": drivers.main,
+    "benchmarks.pictures": pictures.main,
+    "benchmarks.sampling": sampling.main,
 }
 
 
@@ -90,8 +90,6 @@ def commands() -> list[tuple[str, ...]]:
 
 def main_of(words: Sequence[str]) -> tuple[str, list[str]]:
     """The script or module of a command, and what follows it."""
-    if words[:2] == ("-m", "benchmarks.study"):
-        return " ".join(words[1:3]), list(words[3:])
     if words[0] == "-m":
         return words[1], list(words[2:])
     assert (ROOT / words[0]).exists()
@@ -107,7 +105,7 @@ def understand(words: Sequence[str]) -> None:
         return
     sys.argv = [script, *arguments]
     with pytest.raises(Parsed) as found:
-        MAINS[script](*[arguments] * script.startswith(("benchmarks.study", "benchmarks.values")))
+        MAINS[script]()
     options = found.value.args[0]
     if script == "compare":
         parse_overrides(options.overrides)

@@ -11,26 +11,21 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy import stats
 
 from torchrl_mpfa.saving import write_text_atomically
 from training import files
 from training.comparison.jobs import run_name
 from training.figures import Runs, plot_evaluations
 from training.records import read_table
+from training.statistics import Array, difference_interval, mean_interval, permutation_p
 from training.worlds import family
 
 RATES = (0.9, 0.95)
 """Rates of greedy success in validation that the time to is told of."""
 ARM = ("learner", "method", "arm")
-_DEALS = 50_000
-"""Ways to deal the runs to two sides: all of them up to nine runs against nine, else a sample."""
-Array = NDArray[np.float64]
 
 
 def write_report(
@@ -209,23 +204,6 @@ def differences(rows: pd.DataFrame) -> str:
     return table(head, lines) if lines else ""
 
 
-def permutation_p(ours: Array, theirs: Array) -> float:
-    """P of the two-sided permutation test of the difference between means, a number for each run.
-
-    Examples:
-        >>> permutation_p(np.array([3.0, 4.0, 5.0]), np.array([0.0, 1.0, 2.0]))
-        0.1
-    """
-
-    def gap(x: Array, y: Array, axis: int) -> Array:
-        # What is equal but for rounding counts as equal.
-        return np.asarray(abs(x.mean(axis=axis) - y.mean(axis=axis)).round(12))
-
-    how: dict[str, Any] = {"alternative": "greater", "vectorized": True, "rng": 0}
-    found = stats.permutation_test((ours, theirs), gap, n_resamples=_DEALS, **how)
-    return float(found.pvalue)
-
-
 def rate_table(curves: Mapping[str, Mapping[str, pd.DataFrame]]) -> str:
     """Actions and time of training after which validation first had a rate of success."""
     lines = []
@@ -279,11 +257,11 @@ def _interval(ours: Array, theirs: Array | None = None) -> str:
     if not any(np.ptp(each) for each in sides):
         return "none, no spread"
     if theirs is None:
-        low, high = stats.ttest_1samp(ours, 0.0).confidence_interval(0.95)
+        found = mean_interval(ours)
         # A share lies in no other part of it.
-        return f"[{max(low, 0.0):.1%}, {min(high, 1.0):.1%}]"
-    low, high = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
-    return f"[{low:+.3f}, {high:+.3f}]"
+        return f"[{max(found.low, 0.0):.1%}, {min(found.high, 1.0):.1%}]"
+    found = difference_interval(ours, theirs)
+    return f"[{found.low:+.3f}, {found.high:+.3f}]"
 
 
 def _first(found: pd.DataFrame, rate: float, column: str) -> float:

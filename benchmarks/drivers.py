@@ -1,0 +1,110 @@
+"""Learned policies and planners side by side, by their evaluations.
+
+    python -m benchmarks.drivers runs/drivers --keep docs/results/rooms/drivers.csv
+    python -m benchmarks.drivers docs/results/rooms/drivers.csv    the tables of kept rows
+
+Takes what ``compare.py`` and ``evaluate.py`` wrote in the folder, however deep. A row is a driver,
+a seed and a kind of worlds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from torchrl_mpfa.saving import write_text_atomically
+from training import files
+from training.comparison.report import table
+from training.finished import read_json
+from training.records import read_table
+from training.worlds import family
+
+_DRIVER = ["robot", "driver", "filter"]
+_COUNTED = ["success", "collision", "timeout"]
+_NAMES = {"dwa": "`dwa`", "dwa map": "`dwa --memory map`", "ddpg": "DDPG", "td3": "TD3"}
+
+
+def rows_of(folder: Path) -> Iterator[dict[str, Any]]:
+    """The rows of all evaluations in a folder, on any level."""
+    for path in sorted(folder.rglob(files.EPISODES)):
+        asked = read_json(path.parent / files.SETTINGS)
+        if "words" not in asked:  # Episodes of a training.
+            continue
+        run = read_json(path.parents[1] / files.SETTINGS)
+        planner = " ".join(asked[name] for name in ("policy", "memory") if name in asked)
+        driver = {
+            "robot": asked.get("robot") or run["environment"]["robot"],
+            "driver": planner.removesuffix(" none") or asked["card"]["learner"],
+            "seed": asked.get("card", asked)["seed"],
+            "filter": "filter" in asked,
+        }
+        episodes = read_table(path)
+        for kind, found in episodes.groupby(episodes["world"].map(family), sort=False):
+            yield {
+                **driver,
+                "worlds": kind,
+                "episodes": len(found),
+                **found[[*_COUNTED, "spl"]].astype(float).mean(),
+                "time_s": found.loc[found["success"], "time_s"].mean(),
+            }
+
+
+def tables_of(rows: pd.DataFrame) -> str:
+    """Two Markdown tables: success with the lowest of a driver's runs, and SPL and time."""
+    kinds = rows["worlds"].unique()
+    success, ways = [], []
+    for _, runs in rows.groupby(_DRIVER, sort=False):
+        robot, driver, filtered = runs[_DRIVER].iloc[0]
+        cells = [f"`{robot}`", _NAMES.get(driver, f"`{driver}`"), "yes" if filtered else "no"]
+        of = {kind: runs[runs["worlds"] == kind] for kind in kinds}
+        rate = (runs["collision"] * runs["episodes"]).sum() / runs["episodes"].sum()
+        success.append([*cells, *(_lowest(of[kind]["success"]) for kind in kinds), f"{rate:.2%}"])
+        way = (f"{of[kind]['spl'].mean():.3f}, {of[kind]['time_s'].mean():.1f}" for kind in kinds)
+        ways.append([*cells, *way])
+    return "\n\n".join(
+        (
+            table(["robot", "driver", "filter", *kinds, "collisions"], success),
+            table(["robot", "driver", "filter", *kinds], ways),
+        )
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the tables, and keep the rows if asked to."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.drivers",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("path", type=Path, help="folder of evaluations, or a file of kept rows")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="write the rows to a CSV file")
+    options = parser.parse_args(arguments)
+    if not options.path.exists():
+        parser.error(f"there is no {options.path}")
+    rows = read_table(options.path) if options.path.is_file() else _sorted(options.path)
+    if not len(rows):
+        parser.error(f"{options.path} has no evaluations")
+    if options.keep is not None:
+        text = rows.to_csv(index=False, float_format="%.4f", lineterminator="\n")
+        write_text_atomically(text, options.keep)
+    print(tables_of(rows))
+    return 0
+
+
+def _sorted(folder: Path) -> pd.DataFrame:
+    rows = pd.DataFrame(rows_of(folder))
+    return rows if not len(rows) else rows.sort_values([*_DRIVER, "seed"], kind="stable")
+
+
+def _lowest(values: pd.Series) -> str:
+    mean = f"{values.mean():.1%}"
+    return mean if len(values) == 1 else f"{mean} [{values.min():.0%}]"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,205 @@
+"""The page of the paper's tables and figures: sentences, tables and pictures from kept rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os.path import relpath
+from pathlib import Path
+from textwrap import fill
+
+from benchmarks.paper.answers import answers
+from benchmarks.paper.figures import plot_figures
+from benchmarks.paper.published import NAMES, TABLE_2, TABLE_4, neighbors
+from benchmarks.paper.rows import Rows
+from benchmarks.paper.runs import comparisons
+from benchmarks.paper.tables import (
+    OTHER_ARMS,
+    arms_table,
+    comparison_table,
+    measures,
+    trained_table,
+    unseen_table,
+)
+from torchrl_mpfa.saving import write_text_atomically
+
+COMMIT = "a0a3ab5"
+"""Commit that trained and tested every run of the kept rows."""
+_WIDTH = 120
+_CAPTION = "Mean over runs and its 95 % interval; in brackets the number of runs."
+_FIGURES = {
+    5: "Fig. 5: reward per step in map A with MPFA-PER and φ = 2, 3 and 4",
+    8: "Fig. 8: reward per step with parts of the priority",
+    9: "Fig. 9: reward per step with the raise of positive transitions",
+    10: "Fig. 10: reward per step with raise and decay",
+    11: "Fig. 11: reward per step with all parts together",
+    13: "Fig. 13: total reward of every 10,000 steps",
+}
+_WORLDS = """
+The paper's worlds are not published. Ours follow its pictures and its text. So compare methods
+within a column, not our column with the paper's.
+"""
+_SEEN = """
+What was seen before the end: the rows of the seeds 100 to 104 of MPFA-PER, PER and uniform replay,
+and of two or three seeds of the other methods. Nothing was changed after that.
+"""
+_LETTER = """
+To the letter of the paper (`learner=plain`): without the additions that keep DDPG from collapsing,
+with collisions at 0.35 m from the robot's center, and without mirrored batches.
+"""
+_READ = (
+    """
+Each number of ours is the mean over runs with Student's 95 % interval over runs. A run is one seed:
+1,000 training episodes in the worlds A to D, then 200 tests of its last policy in an unseen world,
+on simulated wheels. A test ends with a collision at contact. A test that neither succeeds nor
+collides runs out of time, which the paper's tables do not know. The time is that of the tests that
+reached their goal.
+""",
+    """
+Arms with at least six seeds in common are compared seed by seed, and p is that of the permutation
+test of signs. Other arms are compared by the means of all their runs. *Found with 80 % power* is
+the true difference that a t-test of as many seeds finds with a probability of 80 %, at a level of
+5 % divided by the number of comparisons.
+""",
+    """
+[The study](study.md) has the hypothesis, the planned comparisons and the test. Two things were
+changed before all runs were made. The intervals are Student's in place of a bootstrap's, so that
+other programs compute the same numbers. The arm to the letter has five seeds in place of ten.
+""",
+)
+_MADE = f"""
+Every run was trained and tested at commit {COMMIT}, two runs side by side, one thread each. A run
+takes five to six minutes, and all of them take some eight hours of two cores. The first command
+makes the runs, and continues where it was stopped. The second one makes those of Table 3's times,
+one at a time. The third one writes this page from their rows.
+"""
+_COMMANDS = """\
+    python -m benchmarks.paper run --folder runs/paper
+    python -m benchmarks.paper time --folder runs/paper
+    make paper ARGS='--rows runs/paper/rows --output runs/paper'"""
+_KEPT = "`make paper` alone writes it from [the rows that are kept](results/paper)."
+
+
+def write_page(rows: Rows, page: Path, pictures: Path) -> list[Path]:
+    """Write the page and its figures.
+
+    Args:
+        rows: The kept rows.
+        page: The Markdown file.
+        pictures: Folder of the figures.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        ValueError: If there are no rows.
+    """
+    if not rows.runs:
+        raise ValueError(f"{rows.folder} has no rows: python -m benchmarks.paper run makes them")
+    made = plot_figures(rows, pictures)
+    pictured = [
+        f"![{title}]({Path(relpath(path, page.parent)).as_posix()})\n\n*{title}.* {_CAPTION}"
+        for path in made
+        for title in [_FIGURES[int(path.stem.removeprefix("figure_"))]]
+    ]
+    write_text_atomically(text_of(rows, pictured) + "\n", page)
+    return [page, *made]
+
+
+def text_of(rows: Rows, pictured: Sequence[str]) -> str:
+    """Return the text of the page, of which the figures are given as Markdown."""
+    found = measures(rows)
+    paper = {f"ddpg-{name}": row.success for name, row in {**TABLE_2, **TABLE_4}.items()}
+    planned = [(f"ddpg-{a}", f"ddpg-{b}") for a, b in neighbors()]
+    missing = missing_runs(rows)
+    provisional = (
+        [f"{len(missing)} of the planned runs are missing, so that every number is provisional."]
+        if missing
+        else []
+    )
+    said = [*answers(rows, found), *provisional, _WORLDS, _SEEN]
+    return "\n\n".join(
+        [
+            "# Does the paper's method do what the paper says?",
+            "\n".join(_filled(line, bullet=True) for line in said),
+            "## Table 2: parts of the method in the unseen world",
+            unseen_table(found, TABLE_2),
+            "## Table 3: steps and time of the training",
+            trained_table(rows),
+            "Times are those of runs that had the machine to themselves, one after another.",
+            "## Table 4: other methods in the unseen world",
+            unseen_table(found, TABLE_4),
+            "## Neighbors in the paper's order: the planned comparisons",
+            comparison_table(found, planned, paper),
+            "## Other comparisons, exploratory",
+            comparison_table(found, explored(), paper),
+            "## Uniform replay, and other settings",
+            "Uniform replay, which the paper's tables do not have:",
+            arms_table(found, {NAMES["uniform"]: "ddpg-uniform"}),
+            "The factor φ of the raise, trained in world A alone:",
+            arms_table(found, OTHER_ARMS["φ"]),
+            _filled(_LETTER),
+            arms_table(found, OTHER_ARMS["letter"]),
+            "One robot with one update per action, and sixteen robots with sixteen updates:",
+            arms_table(found, OTHER_ARMS["robots"]),
+            "## Figures",
+            *pictured,
+            "## How to read the tables",
+            *map(_filled, _READ),
+            "## How the rows were made",
+            _filled(_MADE),
+            _COMMANDS,
+            _KEPT,
+            *([_filled(f"Missing: {spans(missing)}.")] if missing else []),
+        ]
+    )
+
+
+def explored() -> list[tuple[str, str]]:
+    """Return the pairs of arms that are compared without a plan."""
+    others = [name for name in NAMES if name != "mpfa_per"]
+    distant = [("mpfa_per", name) for name in others] + [("per", "uniform")]
+    letter = [("mpfa_per", "per"), ("mpfa_per", "uniform"), ("per", "uniform")]
+    return [
+        *((f"ddpg-{a}", f"ddpg-{b}") for a, b in distant if (a, b) not in neighbors()),
+        *((f"plain-{a}-letter", f"plain-{b}-letter") for a, b in letter),
+        *(("ddpg-mpfa_per-phi3", f"ddpg-mpfa_per-phi{phi}") for phi in (2, 4)),
+        *((f"ddpg-{name}-one_robot", f"ddpg-{name}") for name in ("mpfa_per", "per")),
+    ]
+
+
+def missing_runs(rows: Rows) -> list[str]:
+    """Return the names of the planned runs that have no rows."""
+    planned = [job.name for each in comparisons(Path()) for job in each.jobs]
+    return [name for name in planned if name not in rows.runs]
+
+
+def spans(runs: Sequence[str]) -> str:
+    """Return names of runs with the seeds of an arm together.
+
+    Examples:
+        >>> spans(["ddpg-per-103", "ddpg-per-104", "ddpg-mw-102"])
+        'ddpg-per 103, 104; ddpg-mw 102'
+    """
+    seeds: dict[str, list[str]] = {}
+    for run in runs:
+        arm, _, seed = run.rpartition("-")
+        seeds.setdefault(arm, []).append(seed)
+    return "; ".join(
+        f"{arm} {found[0]} to {found[-1]}"
+        if len(found) > 2 and int(found[-1]) - int(found[0]) == len(found) - 1
+        else f"{arm} {', '.join(found)}"
+        for arm, found in seeds.items()
+    )
+
+
+def _filled(text: str, *, bullet: bool = False) -> str:
+    """Break a paragraph into lines."""
+    first, rest = ("- ", "  ") if bullet else ("", "")
+    return fill(
+        " ".join(text.split()),
+        _WIDTH,
+        initial_indent=first,
+        subsequent_indent=rest,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

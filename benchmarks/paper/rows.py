@@ -1,0 +1,132 @@
+"""Kept rows of the paper's runs: compressed files that outlive the folders of the runs.
+
+A folder of rows holds ``tests.csv.gz``, the tests of every run in the unseen world,
+``curves.csv.gz``, its evaluations during training, ``episodes/RUN.csv.gz``, its training episodes,
+and ``times.csv``, training times of runs that had the machine to themselves.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from benchmarks.paper.runs import finished
+from training import files
+from training.comparison.jobs import Job
+from training.records import read_table
+
+FOLDER = Path("docs/results/paper")
+"""Rows of the runs that the page reports."""
+RUN = ["arm", "seed"]
+TESTS = [*RUN, "episode", "success", "collision", "spl", "time_s"]
+CURVES = [*RUN, "total_steps", "success"]
+TIMES = [*RUN, "minutes"]
+EPISODES = ["world", "steps", "total_steps", "reward", "success", "collision"]
+_DIGITS = {"spl": 3, "time_s": 1, "reward": 4, "minutes": 2}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of runs; an arm is called LEARNER-METHOD, or LEARNER-METHOD-NAME if it has a name."""
+
+    folder: Path
+    tests: pd.DataFrame
+    """A row for each run and each pair of start and goal in the unseen world."""
+    curves: pd.DataFrame
+    """Success in validation: a row for each evaluation during training."""
+    times: pd.DataFrame
+    """Training times of runs that had the machine to themselves [min]."""
+
+    @property
+    def runs(self) -> set[str]:
+        """Names of the runs."""
+        found = self.tests[RUN].drop_duplicates().itertuples(index=False, name=None)
+        return {f"{arm}-{seed}" for arm, seed in found}
+
+    def seeds(self, arm: str) -> list[int]:
+        """Return the seeds of the runs of an arm."""
+        return sorted(
+            int(seed) for seed in self.tests.loc[self.tests["arm"] == arm, "seed"].unique()
+        )
+
+    def episodes(self, arm: str) -> dict[int, pd.DataFrame]:
+        """Return the training episodes of each run of an arm, by its seed."""
+        return {
+            seed: read_table(_episodes_file(self.folder, f"{arm}-{seed}"))
+            for seed in self.seeds(arm)
+        }
+
+
+def read_rows(folder: Path) -> Rows:
+    """Read the rows in a folder; a missing file has none."""
+    named = {"tests.csv.gz": TESTS, "curves.csv.gz": CURVES, "times.csv": TIMES}
+    found = [read_table(folder / name) for name in named]
+    tables = [
+        table if len(table) else pd.DataFrame(columns=columns)
+        for table, columns in zip(found, named.values(), strict=True)
+    ]
+    return Rows(folder, *tables)
+
+
+def keep(runs: Path, folder: Path) -> list[str]:
+    """Add the rows of finished runs to those in a folder.
+
+    Args:
+        runs: Folder of the runs.
+        folder: Folder of the rows.
+
+    Returns:
+        The names of the runs whose rows were added.
+    """
+    there = read_rows(folder)
+    new = [found for found in finished(runs) if found[1].name not in there.runs]
+    tests, curves = [there.tests], [there.curves]
+    for comparison, job in new:
+        for tables, path, columns in (
+            (tests, job.results(comparison.evaluation) / files.EPISODES, TESTS),
+            (curves, job.path / files.EVALUATIONS, CURVES),
+        ):
+            tables.append(read_table(path).assign(arm=arm_of(job), seed=job.seed)[columns])
+        trained = read_table(job.path / files.EPISODES)
+        _write(trained[EPISODES], _episodes_file(folder, job.name))
+    if new:
+        # The tests say which runs there are: they are written last.
+        for name, tables in (("curves", curves), ("tests", tests)):
+            table = pd.concat([each for each in tables if len(each)])
+            _write(table.sort_values(RUN, kind="stable"), folder / f"{name}.csv.gz")
+    return [job.name for _, job in new]
+
+
+def keep_time(job: Job, folder: Path) -> None:
+    """Add the training time of a run that had the machine to itself to the rows in a folder."""
+    evaluated = read_table(job.path / files.EVALUATIONS)["seconds"].sum()
+    seconds = read_table(job.path / files.EPISODES)["seconds"].iloc[-1] - evaluated
+    row = pd.DataFrame([[arm_of(job), job.seed, seconds / 60]], columns=TIMES)
+    there = read_rows(folder).times
+    table = pd.concat([there, row]) if len(there) else row
+    _write(table.drop_duplicates(RUN, keep="last").sort_values(RUN), folder / "times.csv")
+
+
+def arm_of(job: Job) -> str:
+    """Return the name of a run without its seed."""
+    return job.name.removesuffix(f"-{job.seed}")
+
+
+def _episodes_file(folder: Path, run: str) -> Path:
+    """Return the file of a run's training episodes."""
+    return folder / "episodes" / f"{run}.csv.gz"
+
+
+def _write(table: pd.DataFrame, path: Path) -> None:
+    """Write a table in one step, the same bytes for the same rows."""
+    flags = table.select_dtypes(bool).columns
+    text = table.astype(dict.fromkeys(flags, int)).round(_DIGITS).to_csv(index=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = text.encode()
+    part = path.with_suffix(".part")
+    part.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
+    os.replace(part, path)

@@ -1,0 +1,76 @@
+"""Runs of which the paper's tables and figures are made, and the commands that make them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.paper.published import NAMES, PHIS
+from training.comparison.arms import Arm
+from training.comparison.jobs import Comparison, Job
+
+SETTINGS = ("regime=paper", "robots=16", "updates=16", "learner.compile=true", "tracking=off")
+"""The paper's task and replay volume, with sixteen robots in the place of one."""
+LETTER = Arm(
+    "letter",
+    ("environment.mirror=false", "environment.clearance=0.17", "exploration.varied=false"),
+)
+"""With ``learner=plain`` the paper to the letter: 0.35 m from the robot's center is a collision."""
+ONE_ROBOT = Arm("one_robot", ("robots=1", "updates=1"))
+CLAIMS = ("mpfa_per", "per", "uniform")
+"""Methods of the arm to the letter."""
+SEEDS = range(100, 110)
+FEW = {"letter": range(100, 105), "one_robot": range(100, 103)}
+"""Seeds of the arms that have fewer."""
+BLOCKS = (SEEDS[:5], SEEDS[5:])
+"""Seeds in the order in which they are made: five of all arms before the next five."""
+
+
+def comparisons(folder: Path, seeds: Sequence[int] = SEEDS) -> list[Comparison]:
+    """Return the comparisons of which all tables and figures are made.
+
+    Args:
+        folder: Folder of the runs.
+        seeds: Seeds of the runs. An arm with fewer seeds has those of them that are its own.
+
+    Examples:
+        >>> [len(each.jobs) for each in comparisons(Path("runs/paper"))]
+        [130, 30, 15, 6]
+    """
+    phis = tuple(Arm(f"phi{phi}", (f"method.boost_factor={phi}",)) for phi in PHIS)
+
+    def few(arm: Arm) -> tuple[int, ...]:
+        return tuple(seed for seed in seeds if seed in FEW[arm.name])
+
+    return [
+        Comparison(folder, tuple(NAMES), SETTINGS, seeds),
+        Comparison(folder / "phi", ("mpfa_per",), (*SETTINGS, "curriculum=A"), seeds, arms=phis),
+        Comparison(folder, CLAIMS, SETTINGS, few(LETTER), ("plain",), (LETTER,)),
+        Comparison(folder, CLAIMS[:2], SETTINGS, few(ONE_ROBOT), arms=(ONE_ROBOT,)),
+    ]
+
+
+def without(comparison: Comparison, kept: set[str]) -> Iterator[Comparison]:
+    """Yield the parts of a comparison, a seed each, whose runs are not among those kept."""
+    for seed in comparison.seeds:
+        one = replace(comparison, seeds=(seed,))
+        by_method: dict[tuple[Arm, ...], list[str]] = {}
+        for method in one.methods:
+            missing = tuple(
+                job.arm for job in one.jobs if job.method == method and job.name not in kept
+            )
+            by_method.setdefault(missing, []).append(method)
+        for arms, methods in by_method.items():
+            if arms:
+                yield replace(one, methods=tuple(methods), arms=arms)
+
+
+def finished(folder: Path) -> list[tuple[Comparison, Job]]:
+    """Return the runs in a folder that are trained and evaluated."""
+    return [
+        (comparison, job)
+        for comparison in comparisons(folder)
+        for job in comparison.jobs
+        if job.is_evaluated(comparison.evaluation)
+    ]

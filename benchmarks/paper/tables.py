@@ -1,0 +1,224 @@
+"""The paper's Tables 2 to 4 with our numbers beside the paper's, and the comparisons of methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.paper.published import NAMES, PHIS, TABLE_3, TESTS, Tested
+from benchmarks.paper.rows import Rows
+from benchmarks.paper.runs import CLAIMS, LETTER, ONE_ROBOT
+from mpfa_envs.evaluation.results import Interval
+from training.comparison.report import table
+from training.statistics import (
+    Array,
+    detectable,
+    difference_interval,
+    holm,
+    mean_interval,
+    permutation_p,
+    sign_p,
+)
+
+FEWEST = 6
+"""Seeds in common from which two arms are compared seed by seed: the least p is 0.03."""
+
+
+def measures(rows: Rows) -> dict[str, pd.DataFrame]:
+    """Return collisions, success and time of each run in the unseen world, by arm and seed.
+
+    The time is the mean of the tests that reached the goal [s].
+    """
+    tests = rows.tests.assign(time=rows.tests["time_s"].where(rows.tests["success"] == 1))
+    found = tests.groupby(["arm", "seed"])[["collision", "success", "time"]].mean()
+    return {str(arm): runs.droplevel("arm") for arm, runs in found.groupby("arm")}
+
+
+def unseen_table(found: Mapping[str, pd.DataFrame], paper: Mapping[str, Tested]) -> str:
+    """Return Table 2 or 4: collisions, success and time in the unseen world."""
+    lines = []
+    for method, row in paper.items():
+        runs = found.get(f"ddpg-{method}")
+        ours = (
+            ["", "", ""]
+            if runs is None
+            else [
+                number(TESTS * runs["collision"], "{:.1f}"),
+                share(runs["success"]),
+                number(runs["time"], "{:.1f}"),
+            ]
+        )
+        theirs = [f"{row.collisions}", f"{row.success:.1%}", f"{row.time:.1f}"]
+        pairs = (cell for both in zip(theirs, ours, strict=True) for cell in both)
+        lines.append([NAMES[method], *pairs, _count(runs)])
+    ours_head = "ours, 95 %"
+    head = ["", f"collisions of {TESTS}: paper", ours_head, "success: paper", ours_head]
+    return table([*head, "time [s]: paper", ours_head, "runs"], lines)
+
+
+def trained_table(rows: Rows) -> str:
+    """Return Table 3: steps and time of the training."""
+    lines = []
+    for method, row in TABLE_3.items():
+        arm = f"ddpg-{method}"
+        steps = pd.Series([each["total_steps"].iloc[-1] for each in rows.episodes(arm).values()])
+        minutes = rows.times.loc[rows.times["arm"] == arm, "minutes"]
+        lines.append(
+            [
+                NAMES[method],
+                f"{row.steps:,}",
+                number(steps, "{:,.0f}"),
+                str(len(steps)),
+                f"{row.minutes:,}",
+                number(minutes, "{:.2f}"),
+                str(len(minutes)),
+            ]
+        )
+    head = ["", "steps: paper", "ours, 95 %", "runs", "time [min]: paper", "ours, 95 %"]
+    return table([*head, "runs alone"], lines)
+
+
+def arms_table(found: Mapping[str, pd.DataFrame], arms: Mapping[str, str]) -> str:
+    """Return success, collisions and time of arms by their names, those without runs left out."""
+    lines = [
+        [
+            name,
+            share(found[arm]["success"]),
+            number(TESTS * found[arm]["collision"], "{:.1f}"),
+            number(found[arm]["time"], "{:.1f}"),
+            _count(found[arm]),
+        ]
+        for name, arm in arms.items()
+        if arm in found
+    ]
+    head = ["", "success, 95 %", f"collisions of {TESTS}, 95 %", "time [s], 95 %", "runs"]
+    return table(head, lines) if lines else "No run is kept yet."
+
+
+OTHER_ARMS = {
+    "φ": {f"φ = {phi}": f"ddpg-mpfa_per-phi{phi}" for phi in PHIS},
+    "letter": {NAMES[name]: f"plain-{name}-{LETTER.name}" for name in CLAIMS},
+    "robots": {
+        f"{NAMES[name]}, {robots}": f"ddpg-{name}{end}"
+        for name in CLAIMS[:2]
+        for robots, end in (("one robot", f"-{ONE_ROBOT.name}"), ("sixteen robots", ""))
+    },
+}
+"""Arms beside the thirteen methods, by their names in the tables."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The difference in success between two arms, tested over runs."""
+
+    ours: str
+    theirs: str
+    seeds: int
+    """Seeds in common, or runs of the arm with fewer if the arms are not paired."""
+    gap: Interval
+    p: float
+    """Of the permutation test."""
+    detectable: float
+    """Difference that a test at its level finds with 80 % power; NaN for arms not paired."""
+
+
+def difference(
+    found: Mapping[str, pd.DataFrame], ours: str, theirs: str, *, tests: int = 1
+) -> Difference | None:
+    """Compare the success of two arms, seed by seed if they have enough seeds in common.
+
+    Args:
+        found: The measures of each run, by arm.
+        ours: An arm.
+        theirs: The arm that is subtracted.
+        tests: Comparisons that are corrected together.
+
+    Returns:
+        The difference; None if an arm has fewer than two runs.
+    """
+    if ours not in found or theirs not in found:
+        return None
+    a, b = found[ours]["success"], found[theirs]["success"]
+    common = a.index.intersection(b.index)
+    if min(len(a), len(b)) < 2:
+        return None
+    if len(common) < FEWEST:
+        x, y = a.to_numpy(), b.to_numpy()
+        fewer = min(len(x), len(y))
+        gap, p = difference_interval(x, y), permutation_p(x, y)
+        return Difference(ours, theirs, fewer, gap, p, math.nan)
+    gaps = (a[common] - b[common]).to_numpy()
+    least = detectable(float(gaps.std(ddof=1)), len(gaps), level=0.05 / tests)
+    return Difference(ours, theirs, len(gaps), mean_interval(gaps), sign_p(gaps), least)
+
+
+def comparison_table(
+    found: Mapping[str, pd.DataFrame],
+    pairs: Sequence[tuple[str, str]],
+    published: Mapping[str, float] | None = None,
+) -> str:
+    """Return a table of comparisons that are corrected for each other by Holm's method.
+
+    Args:
+        found: The measures of each run, by arm.
+        pairs: Arms that are compared.
+        published: The paper's success of some arms.
+    """
+    made = [difference(found, *pair, tests=len(pairs)) for pair in pairs]
+    corrected = holm(np.array([1.0 if each is None else each.p for each in made]))
+    lines = []
+    for pair, each, p in zip(pairs, made, corrected, strict=True):
+        cells = [f"{_name(pair[0])} − {_name(pair[1])}"]
+        if published is not None:
+            known = pair[0] in published and pair[1] in published
+            cells.append(_points(published[pair[0]] - published[pair[1]]) if known else "")
+        if each is None:
+            lines.append([*cells, *[""] * 6])
+            continue
+        ends = f"[{_points(each.gap.low)}, {_points(each.gap.high)}]"
+        least = "" if math.isnan(each.detectable) else f"{100 * each.detectable:.1f}"
+        ps = [f"{each.p:.3f}", f"{p:.3f}"]
+        lines.append([*cells, _points(each.gap.value), ends, *ps, least, f"{each.seeds}"])
+    paper = ["paper [points]"] if published is not None else []
+    head = ["", *paper, "ours [points]", "95 %", "p", f"p corrected for {len(pairs)}"]
+    return table([*head, "found with 80 % power [points]", "seeds"], lines)
+
+
+def number(runs: Iterable[float], form: str) -> str:
+    """Format the mean of counts or times and its 95 % interval, which begins at 0."""
+    values = np.asarray(list(runs), dtype=float)
+    return _mean(values, form, lowest=0.0, highest=math.inf) if len(values) else ""
+
+
+def share(runs: pd.Series) -> str:
+    """Format the mean of shares and its 95 % interval, which ends at 0 and 100 %."""
+    return _mean(runs.to_numpy(dtype=float), "{:.1%}", lowest=0.0, highest=1.0)
+
+
+def _mean(runs: Array, form: str, *, lowest: float, highest: float) -> str:
+    """Format the mean of runs and its 95 % interval within bounds."""
+    found = mean_interval(runs)
+    if math.isnan(found.low):
+        return form.format(found.value)
+    ends = max(found.low, lowest), min(found.high, highest)
+    return f"{form.format(found.value)} [{form.format(ends[0])}, {form.format(ends[1])}]"
+
+
+def _count(runs: pd.DataFrame | None) -> str:
+    return "0" if runs is None else str(len(runs))
+
+
+def _points(value: float) -> str:
+    return f"{100 * value:+.1f}"
+
+
+def _name(arm: str) -> str:
+    """Return the paper's name of an arm's method, with the arm's own name."""
+    _, method, *rest = arm.split("-")
+    kind = {"letter": "to the letter", "one_robot": "one robot"}
+    words = [kind.get(each, each.replace("phi", "φ = ")) for each in rest]
+    return ", ".join([NAMES[method], *words])

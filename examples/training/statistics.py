@@ -1,0 +1,150 @@
+"""Statistics of which the unit is the run: intervals, tests, corrections, power.
+
+The episodes of one policy are not independent: whether the policy found the path around a bar
+decides many of them. So each run counts as one number.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from mpfa_envs.evaluation.results import Interval
+
+Array = NDArray[np.float64]
+_PERMUTATIONS = 50_000
+"""Permutations: all of them up to nine runs against nine or fifteen pairs, else a sample."""
+
+
+def mean_interval(runs: Array) -> Interval:
+    """Return the mean of runs with Student's 95 % interval; NaN ends for one run.
+
+    Args:
+        runs: A number for each run, shape ``[runs]``.
+
+    Examples:
+        >>> found = mean_interval(np.array([1.0, 2.0, 3.0]))
+        >>> round(found.low, 2), found.value, round(found.high, 2)
+        (-0.48, 2.0, 4.48)
+    """
+    middle = float(runs.mean())
+    if len(runs) < 2:
+        return Interval(middle, math.nan, math.nan)
+    reach = float(stats.t.ppf(0.975, len(runs) - 1) * stats.sem(runs))
+    return Interval(middle, middle - reach, middle + reach)
+
+
+def difference_interval(ours: Array, theirs: Array) -> Interval:
+    """Return the difference of two means with Welch's 95 % interval; NaN ends for one run.
+
+    Args:
+        ours: A number for each run, shape ``[runs]``.
+        theirs: A number for each other run, shape ``[other runs]``.
+    """
+    gap = float(ours.mean() - theirs.mean())
+    if min(len(ours), len(theirs)) < 2:
+        return Interval(gap, math.nan, math.nan)
+    if not np.ptp(ours) and not np.ptp(theirs):
+        return Interval(gap, gap, gap)
+    low, high = stats.ttest_ind(ours, theirs, equal_var=False).confidence_interval(0.95)
+    return Interval(gap, float(low), float(high))
+
+
+def permutation_p(ours: Array, theirs: Array) -> float:
+    """Return p of the two-sided permutation test of the difference between means.
+
+    Args:
+        ours: A number for each run, shape ``[runs]``.
+        theirs: A number for each other run, shape ``[other runs]``.
+
+    Examples:
+        >>> permutation_p(np.array([3.0, 4.0, 5.0]), np.array([0.0, 1.0, 2.0]))
+        0.1
+    """
+    if min(len(ours), len(theirs)) == 1:
+        # SciPy takes no single run: each run of all is the single one in turn.
+        runs = np.concatenate([ours, theirs] if len(ours) == 1 else [theirs, ours])
+        gaps = abs(runs - (runs.sum() - runs) / (len(runs) - 1)).round(12)
+        return float((gaps >= gaps[0]).mean())
+
+    def gap(x: Array, y: Array, axis: int) -> Array:
+        # What is equal but for rounding counts as equal.
+        return np.asarray(abs(x.mean(axis=axis) - y.mean(axis=axis)).round(12))
+
+    return _share((ours, theirs), gap, permutation_type="independent")
+
+
+def sign_p(gaps: Array) -> float:
+    """Return p of the two-sided permutation test of the signs of differences.
+
+    Where neither method is better, the difference of a seed may as well have the other sign.
+
+    Args:
+        gaps: The difference of each seed, shape ``[seeds]``.
+
+    Examples:
+        >>> sign_p(np.array([1.0, 2.0, 3.0]))
+        0.25
+    """
+    if len(gaps) == 1:
+        return 1.0
+
+    def size(x: Array, axis: int) -> Array:
+        return np.asarray(abs(x.mean(axis=axis)).round(12))
+
+    return _share((gaps,), size, permutation_type="samples")
+
+
+def _share(samples: tuple[Array, ...], statistic: Any, **options: Any) -> float:
+    """Share of permutations whose statistic is at least that of the samples."""
+    options |= {"alternative": "greater", "vectorized": True, "rng": 0}
+    found = stats.permutation_test(samples, statistic, n_resamples=_PERMUTATIONS, **options)
+    return float(found.pvalue)
+
+
+def holm(p: Array) -> Array:
+    """Correct p-values for their number by Holm's method.
+
+    Args:
+        p: Shape ``[comparisons]``.
+
+    Returns:
+        Corrected values in the same order: where all below 0.05 are called differences, the chance
+        that any of them is none is at most 5 %.
+
+    Examples:
+        >>> holm(np.array([0.01, 0.04, 0.03])).round(2).tolist()
+        [0.03, 0.06, 0.06]
+    """
+    order = np.argsort(p)
+    factors = len(p) - np.arange(len(p))
+    corrected = np.empty(len(p))
+    corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p[order]))
+    return corrected
+
+
+def detectable(deviation: float, seeds: int, *, level: float = 0.05, power: float = 0.8) -> float:
+    """Return the mean difference that a t-test of paired runs finds with some power.
+
+    Args:
+        deviation: Standard deviation of the difference from seed to seed.
+        seeds: Number of seeds.
+        level: Level of the two-sided test.
+        power: Chance to find the difference.
+
+    Examples:
+        >>> round(detectable(1.0, 10), 1)
+        1.0
+    """
+    freedom = seeds - 1
+    bound = stats.t.ppf(1 - level / 2, freedom)
+    low, high = 0.0, 100.0
+    for _ in range(50):
+        shift = (low + high) / 2
+        found = float(stats.nct.sf(bound, freedom, shift))
+        low, high = (low, shift) if found >= power else (shift, high)
+    return deviation * high / math.sqrt(seeds)

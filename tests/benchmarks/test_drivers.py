@@ -1,0 +1,67 @@
+"""Learned policies and planners side by side: rows of evaluations, and the tables of the page."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchmarks import drivers
+
+ROOT = Path(__file__).parents[2]
+
+
+def write_evaluation(folder, successes, **settings):
+    """Episodes of two kinds of worlds; what does not succeed collides."""
+    folder.mkdir(parents=True)
+    rows = pd.DataFrame({"success": successes, "spl": [float(each) for each in successes]})
+    rows["collision"], rows["timeout"], rows["time_s"] = ~rows["success"], False, 9.0
+    rows["world"] = ["bars-test-0", "bars-test-1", "barn-3"]
+    rows.to_csv(folder / "episodes.csv", index=False)
+    (folder / "settings.json").write_text(json.dumps({"words": ["bars:test", "barn"], **settings}))
+
+
+@pytest.fixture
+def evaluations(tmp_path):
+    for seed, successes in ((4, [True, True, True]), (5, [True, False, True])):
+        run = tmp_path / "kobuki" / f"td3-per-{seed}"
+        card = {"learner": "td3", "seed": seed}
+        write_evaluation(run / "evaluation-a", successes, card=card, filter={"clearance": 0.03})
+        robot = json.dumps({"environment": {"robot": "kobuki"}})
+        (run / "settings.json").write_text(robot)
+        (run / "episodes.csv").write_text("episode,world\n0,bars\n")  # Of the training.
+    planner = {"policy": "dwa", "memory": "map", "robot": "burger", "seed": 0}
+    write_evaluation(tmp_path / "dwa", [False, True, True], **planner)
+    return tmp_path
+
+
+def test_every_evaluation_becomes_a_row_for_each_kind_of_worlds(evaluations, capsys):
+    kept = evaluations / "rows.csv"
+    assert drivers.main([str(evaluations), "--keep", str(kept)]) == 0
+    rows = pd.read_csv(kept)
+    columns = ["robot", "driver", "seed", "filter", "worlds", "episodes", "success", "collision"]
+    assert rows[columns].to_numpy().tolist() == [
+        ["burger", "dwa map", 0, False, "bars:test", 2, 0.5, 0.5],
+        ["burger", "dwa map", 0, False, "barn", 1, 1.0, 0.0],
+        ["kobuki", "td3", 4, True, "bars:test", 2, 1.0, 0.0],
+        ["kobuki", "td3", 4, True, "barn", 1, 1.0, 0.0],
+        ["kobuki", "td3", 5, True, "bars:test", 2, 0.5, 0.5],
+        ["kobuki", "td3", 5, True, "barn", 1, 1.0, 0.0],
+    ]
+    printed = capsys.readouterr().out
+    assert "| `kobuki` | TD3 | yes | 75.0% [50%] | 100.0% [100%] | 16.67% |" in printed
+    assert drivers.main([str(kept)]) == 0
+    assert capsys.readouterr().out == printed
+
+
+def test_a_folder_without_evaluations_is_rejected(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        drivers.main([str(tmp_path)])
+    assert f"{tmp_path} has no evaluations" in capsys.readouterr().err
+
+
+def test_the_page_has_the_tables_of_the_kept_rows(capsys):
+    drivers.main([str(ROOT / "docs/results/rooms/drivers.csv")])
+    page = (ROOT / "docs/planners.md").read_text(encoding="utf-8")
+    for table in capsys.readouterr().out.strip().split("\n\n"):
+        assert table in page

@@ -1,0 +1,280 @@
+"""The page of the paper's tables: rows that are kept, numbers made of them, commands."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from scipy import stats
+
+from benchmarks.paper import __main__ as command
+from benchmarks.paper.answers import answers
+from benchmarks.paper.figures import reward_of_blocks, rewards
+from benchmarks.paper.page import missing_runs, spans, write_page
+from benchmarks.paper.published import NAMES, TABLE_2, TABLE_4, neighbors
+from benchmarks.paper.rows import Rows, keep, keep_time, read_rows
+from benchmarks.paper.runs import comparisons, without
+from benchmarks.paper.tables import comparison_table, difference, measures, unseen_table
+from tests.integration.tiny_runs import tiny, train
+from training import files
+from training.comparison.jobs import Job
+from training.records import write_table
+from training.settings.train import GROUPS, Stage
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def made_up(folder: Path, successes: dict[str, list[float]]) -> Rows:
+    """Write rows of runs whose shares of success are given, by arm; return them."""
+    rng = np.random.default_rng(0)
+    tests = []
+    for arm, shares in successes.items():
+        for seed, share in enumerate(shares, start=100):
+            reached = np.arange(200) < round(200 * share)
+            tests.append(
+                pd.DataFrame(
+                    {
+                        "arm": arm,
+                        "seed": seed,
+                        "episode": np.arange(200),
+                        "success": reached.astype(int),
+                        "collision": 1 - reached.astype(int),
+                        "spl": 0.8,
+                        "time_s": rng.uniform(10.0, 30.0, 200),
+                    }
+                )
+            )
+            episodes = pd.DataFrame(
+                {
+                    "world": list("AAABBBCCCDDD"),
+                    "steps": 100,
+                    "total_steps": np.arange(1, 13) * 2500,
+                    "reward": rng.normal(size=12),
+                    "success": 1,
+                    "collision": 0,
+                }
+            )
+            path = folder / "episodes" / f"{arm}-{seed}.csv.gz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            episodes.to_csv(path, index=False)
+    pd.concat(tests).to_csv(folder / "tests.csv.gz", index=False)
+    return read_rows(folder)
+
+
+def test_comparisons_ask_for_every_run_that_is_planned() -> None:
+    planned = [job for each in comparisons(Path("runs/paper")) for job in each.jobs]
+    assert len({job.path for job in planned}) == len(planned) == 130 + 30 + 15 + 6
+    assert set(NAMES) <= set(GROUPS["method"])
+    first = comparisons(Path("runs/paper"), range(100, 105))
+    assert sum(len(each.jobs) for each in first) == 65 + 15 + 15 + 6
+
+
+def test_kept_runs_are_not_asked_for_again() -> None:
+    for comparison in comparisons(Path("runs/paper")):
+        kept = {job.name for job in comparison.jobs[::3]}
+        left = [job for part in without(comparison, kept) for job in part.jobs]
+        assert {job.path for job in left} == {
+            job.path for job in comparison.jobs if job.name not in kept
+        }
+        assert len(left) == len(comparison.jobs) - len(kept)
+
+
+def test_every_planned_run_that_is_kept_has_two_hundred_tests_and_its_episodes() -> None:
+    rows = read_rows(ROOT / "docs/results/paper")
+    assert rows.tests.groupby(["arm", "seed"]).size().eq(200).all()
+    assert rows.curves.groupby(["arm", "seed"]).ngroups == len(rows.runs)
+    for arm in rows.tests["arm"].unique():
+        for episodes in rows.episodes(arm).values():
+            assert len(episodes) >= (100 if "phi" in arm else 1000)
+    planned = {job.name for each in comparisons(Path()) for job in each.jobs}
+    assert rows.runs <= planned
+    assert rows.runs.isdisjoint(missing_runs(rows))
+
+
+def test_page_is_that_of_the_kept_rows(tmp_path: Path) -> None:
+    rows = read_rows(ROOT / "docs/results/paper")
+    write_page(rows, tmp_path / "docs/paper.md", tmp_path / "docs/results/paper")
+    made = (tmp_path / "docs/paper.md").read_text(encoding="utf-8")
+    assert made == (ROOT / "docs/paper.md").read_text(encoding="utf-8")
+    for path in (tmp_path / "docs/results/paper").glob("*.png"):
+        with (
+            Image.open(path) as picture,
+            Image.open(ROOT / "docs/results/paper" / path.name) as kept,
+        ):
+            assert picture.size == kept.size
+            assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 20
+
+
+def test_table_2_has_means_of_runs_and_student_intervals(tmp_path: Path) -> None:
+    rows = made_up(tmp_path, {"ddpg-per": [0.9, 0.8, 0.85], "ddpg-mpfa_per": [0.95]})
+    text = unseen_table(measures(rows), TABLE_2)
+    low, high = stats.t.interval(0.95, 2, 0.85, stats.sem([0.9, 0.8, 0.85]))
+    assert f"| PER | 29 | 30.0 [5.2, 54.8] | 85.5% | 85.0% [{low:.1%}, {high:.1%}] |" in text
+    assert "| MPFA-PER | 19 | 10.0 | 90.5% | 95.0% |" in text
+    assert "| MPF-PER | 21 |  | 89.5% |  | 28.2 |  | 0 |" in text
+
+
+def test_ten_seeds_are_compared_seed_by_seed(tmp_path: Path) -> None:
+    worse = list(np.linspace(0.80, 0.89, 10))
+    better = [share + gap for share, gap in zip(worse, [0.04, 0.06] * 5, strict=True)]
+    rows = made_up(tmp_path, {"ddpg-per": worse, "ddpg-mpfa_per": better})
+    made = difference(measures(rows), "ddpg-mpfa_per", "ddpg-per")
+    assert made is not None
+    assert made.seeds == 10
+    assert made.p == 2 / 2**10
+    assert made.gap.value == pytest.approx(0.05)
+    assert made.gap.high - made.gap.low == pytest.approx(
+        2 * 2.262 * stats.sem([0.04, 0.06] * 5), rel=1e-3
+    )
+    backwards = difference(measures(rows), "ddpg-per", "ddpg-mpfa_per")
+    assert backwards is not None
+    assert backwards.gap.value == pytest.approx(-0.05)
+
+
+def test_five_seeds_are_compared_by_their_means(tmp_path: Path) -> None:
+    rows = made_up(tmp_path, {"ddpg-per": [0.5] * 5, "ddpg-mpfa_per": [0.9] * 5})
+    made = difference(measures(rows), "ddpg-mpfa_per", "ddpg-per")
+    assert made is not None
+    assert made.p == pytest.approx(2 / 252)
+    table = comparison_table(
+        measures(rows),
+        [("ddpg-mpfa_per", "ddpg-per"), ("ddpg-mpfa_per", "ddpg-mw")],
+        {"ddpg-mpfa_per": 0.905, "ddpg-per": 0.855},
+    )
+    assert "| MPFA-PER − PER | +5.0 | +40.0 | [+40.0, +40.0] | 0.008 | 0.016 |  | 5 |" in table
+    assert "| MPFA-PER − MW-MADDPG |  |  |  |  |  |  |  |" in table
+
+
+@pytest.mark.parametrize(
+    ("gap", "sentences"),
+    [
+        (0.05, ["MPFA-PER is better than PER", "The paper's +5 points are inside"]),
+        (
+            0.0,
+            [
+                "MPFA-PER was not seen to be better",
+                "points are excluded",
+                "of one point would take",
+            ],
+        ),
+        (-0.05, ["MPFA-PER is worse than PER", "points are excluded"]),
+    ],
+)
+def test_answers_say_which_differences_the_runs_exclude(
+    tmp_path: Path, gap: float, sentences: list[str]
+) -> None:
+    noise = [0.01, -0.01] * 5
+    arms = {f"ddpg-{name}": [0.85] * 10 for name in NAMES}
+    arms["ddpg-mpfa_per"] = [0.85 + gap + each for each in noise]
+    rows = made_up(tmp_path, arms)
+    text = " ".join(answers(rows, measures(rows)))
+    for sentence in sentences:
+        assert sentence in text
+    assert "0 of the 5 other methods of Table 3 take more training steps" in text
+    assert "The paper's order of the methods is not confirmed." in text
+
+
+def test_order_is_confirmed_where_all_neighbors_differ(tmp_path: Path) -> None:
+    names = ["averaged_ddpg", "per", "hvper", "mw", "ddpg_radam", "td_loss", "td_reward", "klper"]
+    names += ["decay", "raise", "mpf_per", "mpfa_per", "uniform"]
+    noise = np.resize([0.01, -0.01], 10)
+    arms = {f"ddpg-{name}": list(0.3 + 0.05 * i + noise) for i, name in enumerate(names)}
+    rows = made_up(tmp_path, arms)
+    text = " ".join(answers(rows, measures(rows)))
+    assert "The paper's order of the methods is confirmed. Of 11 pairs" in text
+
+
+def test_neighbors_follow_success_and_then_time() -> None:
+    assert neighbors()[0] == ("mpfa_per", "mpf_per")
+    assert ("mw", "hvper") in neighbors()
+    assert len(neighbors()) == len(TABLE_2) + len(TABLE_4) - 2
+
+
+def test_rewards_are_summed_in_whole_blocks_and_averaged_by_map() -> None:
+    episodes = pd.DataFrame(
+        {
+            "world": ["A", "A", "B"],
+            "steps": [10, 20, 5],
+            "total_steps": [9_000, 10_000, 12_000],
+            "reward": [5.0, 40.0, 1.0],
+        }
+    )
+    steps, totals = reward_of_blocks(episodes)
+    assert steps.tolist() == [10_000]
+    assert totals.tolist() == [45.0]
+    ((number, values),) = rewards([episodes], "A")
+    assert number.tolist() == [1, 2]
+    assert values.tolist() == [0.5, (0.5 + 2.0) / 2]
+
+
+def test_spans_name_the_seeds_of_an_arm_together() -> None:
+    assert spans(["a-b-1", "a-b-2", "a-b-3", "c-5", "c-7", "c-8"]) == "a-b 1 to 3; c 5, 7, 8"
+
+
+def test_page_without_rows_names_the_command_that_makes_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        command.main(["--rows", str(tmp_path / "none"), "--output", str(tmp_path)])
+    assert "has no rows: python -m benchmarks.paper run makes them" in capsys.readouterr().err
+    assert not (tmp_path / "paper.md").exists()
+
+
+@pytest.mark.parametrize("words", [["run", "--jobs", "0"], ["paint"]])
+def test_command_line_that_makes_no_sense_is_rejected(words: list[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        command.main(words)
+    assert error.value.code == 2
+
+
+@pytest.mark.slow
+def test_rows_of_a_finished_run_are_kept_once_with_its_time(tmp_path: Path) -> None:
+    comparison = comparisons(tmp_path / "runs", (100,))[0]
+    job: Job = next(job for job in comparison.jobs if job.method == "per")
+    settings = tiny("per", [Stage(world, 1) for world in "ABCD"])
+    settings.evaluation.every, settings.evaluation.episodes = 10, 1
+    train(job.path, settings)
+    rows = tmp_path / "rows"
+    assert keep(tmp_path / "runs", rows) == []
+    tested = job.results(comparison.evaluation)
+    tested.mkdir()
+    write_table(
+        pd.DataFrame(
+            {
+                "episode": range(200),
+                "world": "test",
+                "success": [True] * 150 + [False] * 50,
+                "collision": [False] * 150 + [True] * 50,
+                "spl": 0.51234,
+                "time_s": 12.34,
+            }
+        ),
+        tested / files.EPISODES,
+    )
+    said = {
+        "words": ["test"],
+        "episodes": 200,
+        "seed": 0,
+        "physics": job.physics(comparison.evaluation),
+    }
+    said["sha256"] = files.digest(job.path / files.POLICY)
+    (tested / files.SETTINGS).write_text(json.dumps(said))
+    assert keep(tmp_path / "runs", rows) == ["ddpg-per-100"]
+    kept = read_rows(rows)
+    assert kept.runs == {"ddpg-per-100"}
+    assert kept.tests["success"].mean() == 0.75
+    assert kept.tests["spl"].unique().tolist() == [0.512]
+    assert len(kept.curves)
+    before = (rows / "tests.csv.gz").read_bytes()
+    assert keep(tmp_path / "runs", rows) == []
+    shutil.rmtree(rows)
+    assert keep(tmp_path / "runs", rows) == ["ddpg-per-100"]
+    assert (rows / "tests.csv.gz").read_bytes() == before
+    keep_time(job, rows)
+    keep_time(job, rows)
+    assert read_rows(rows).times["minutes"].between(0.0, 5.0).tolist() == [True]

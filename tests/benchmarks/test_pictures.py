@@ -1,0 +1,52 @@
+"""The pictures of the documentation show what the text beside them says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import pictures
+from mpfa_envs import load_policy
+from mpfa_envs.render import drive_episode
+
+DOCS = Path(__file__).parents[2] / "docs"
+ANIMATION = DOCS / "images/pictures/episode.gif"
+
+
+@pytest.mark.slow
+def test_the_animation_of_the_readme_ends_in_the_goal() -> None:
+    policy = load_policy(pictures.SHIPPED)
+    number, task = pictures.filmed(policy)
+    for moment in drive_episode(policy, task, seed=number, physics=pictures.PHYSICS):
+        if moment.wheels is None:
+            (last,), reached = moment.env.render(), moment.info["success"]
+    assert reached.all()
+    with Image.open(ANIMATION) as animation:
+        animation.seek(animation.n_frames - 1)
+        shown = np.asarray(animation.convert("RGB")).astype(int)
+    # But for the colors of a palette, it is the end of this drive.
+    assert shown.shape == last.shape
+    assert abs(shown - last).mean() < 3.0
+
+
+def test_the_animation_of_the_readme_is_small_enough_for_a_page() -> None:
+    assert ANIMATION.stat().st_size < 3_000_000
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *DOCS.glob("images/*.png"),
+        *(
+            DOCS / f"images/pictures/{name}.png"
+            for name in ("methods", "rooms", "samples", "values")
+        ),
+    ],
+    ids=lambda path: path.stem,
+)
+def test_words_of_13_pixels_can_be_read_in_a_column_of_690(path: Path) -> None:
+    with Image.open(path) as picture:
+        assert 13 * min(690 / picture.width, 1) > 10.5
