@@ -65,8 +65,6 @@ STRENGTHS: dict[str, dict[str, dict[str, Any]]] = {
     "mixture": {"alpha0.3": {"alpha": 0.3}, "alpha1": {"alpha": 1.0}},
 }
 """Kinds of priorities at several strengths."""
-NOISY = ("uniform", "per", "mpfa_per", "mpfa_plus", "uper")
-"""Methods that learn from noisy rewards as well."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +74,6 @@ class Arm:
     method: Method
     mirrored: bool = False
     """Whether half of each batch is mirrored, as in the trainings of the study."""
-    reward_noise: float = 0.0
-    """Standard deviation of noise on the rewards in a third of the states."""
     signals: Mapping[str, SignalFunction] = field(default_factory=dict)
     """Functions that write signals of the method."""
 
@@ -116,13 +112,8 @@ ARMS: dict[str, Arm] = {
         mirrored=True,
         signals={"both_images": both_images},
     ),
-    **{
-        f"{name}/noise": Arm(replace(METHODS[name], name=f"{name}/noise"), reward_noise=2.0)
-        for name in NOISY
-    },
 }
-"""All arms by name: the methods of the catalogue, what is changed of them, mirrored batches,
-and noisy rewards."""
+"""All arms by name: the methods of the catalogue, what is changed of them, and mirrored batches."""
 PLANNED = ("uniform", "mpfa_per", "mpfa_plus", "mpf_per", "mpfa_per/reward", "mpfa_per/td_error")
 """Arms whose difference to :data:`AGAINST` was to be tested before the first run; all others are
 exploratory."""
@@ -136,6 +127,6 @@ PAIRS = (
     ("mixture/alpha1", "per/eps0.005,alpha1.5"),
     ("per/both_images", "per/mirrored"),
     ("la3p", "uniform_halves"),
-    *((f"{name}/noise", "per/noise") for name in NOISY if name != "per"),
+    *((f"{name}/noise", "per/noise") for name in ("uniform", "mpfa_per", "mpfa_plus", "uper")),
 )
 """Other arms that are compared: of about equal effective samples, or with one thing changed."""

@@ -9,19 +9,17 @@ from typing import Any
 
 import torch
 from scipy.stats import spearmanr
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from benchmarks.values.frozen import FrozenBuffer
 from mpfa_envs import RandomMirror
-from mpfa_envs.sensing.observation import observation_slices
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.learners import ActorCriticLearner
 from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
 from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import SIGNALS_KEY
 from torchrl_mpfa.spelling import unknown
-from training.noise import noisy_rewards
 from training.run.assembly import make_learner
 
 BATCH = 256
@@ -186,7 +184,6 @@ def learn(
     *,
     signals: Mapping[str, SignalFunction] | None = None,
     mirrored: bool = False,
-    reward_noise: float = 0.0,
     marks: tuple[int, ...] = MARKS,
     compile: bool = False,
 ) -> Iterator[Measure]:
@@ -199,8 +196,6 @@ def learn(
         seed: Of the critics' first weights and of what is drawn.
         signals: Functions of your own that write the signals of a method.
         mirrored: Mirror half of each batch, as the trainings do that the buffers come from.
-        reward_noise: Standard deviation of noise on the rewards in a third of the states, see
-            :func:`training.noise.noisy_states`; its mean is 0, so that the values stay the same.
         marks: Even numbers of updates after which the critics are looked at.
         compile: Make one program of an update: it takes half a minute once, then half of the time.
 
@@ -231,7 +226,7 @@ def learn(
     else:
         replay = method(buffer, generator)
         learner = make_frozen_learner(buffer, replay.method, seed, signals, compile=compile)
-    replay.buffer.extend(noisy(buffer.rows, reward_noise, seed) if reward_noise else buffer.rows)
+    replay.buffer.extend(buffer.rows)
     if mirrored:
         replay.buffer.append_transform(mirror())
     draws = Draws(buffer.rows["next", "reward"].squeeze(-1) > GOAL)
@@ -251,16 +246,6 @@ def learn(
                 draws.effective,
                 draws.goals,
             )
-
-
-def noisy(rows: TensorDict, deviation: float, seed: int) -> TensorDict:
-    """Transitions with noise on their rewards, the same for each method."""
-    distance = rows["observation"][:, observation_slices(memory="map")["goal_distance"].start]
-    found = rows.clone()
-    found["next", "reward"] = noisy_rewards(
-        rows["next", "reward"], distance, deviation=deviation, seed=(seed,)
-    )
-    return found
 
 
 def mirror(*, chance: float = 0.5) -> RandomMirror:

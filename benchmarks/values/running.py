@@ -115,7 +115,6 @@ def _train(folder: Path, arm: str, seed: int, names: list[str]) -> list[dict[str
         learn,
         signals=made.signals,
         mirrored=made.mirrored,
-        reward_noise=made.reward_noise,
         compile=True,
     )
     found = (train(wanted[name], made.method, seed) for name in names)

@@ -16,7 +16,6 @@ POLICY = "policy.npz"
 SETTINGS = "settings.json"
 EPISODES = "episodes.csv"
 EVALUATIONS = "evaluations.csv"
-ASSESSMENTS = "assessments.csv"
 UPDATES = "updates.csv"
 CURVE = "learning_curve.png"
 HISTOGRAMS = "histograms.png"
@@ -26,7 +25,7 @@ TENSORBOARD = "tensorboard"
 PREVIOUS = "previous"
 """Where the files of a run go that is started anew."""
 _LOCK = ".lock"
-_TABLES = (EPISODES, EVALUATIONS, ASSESSMENTS, UPDATES)
+_TABLES = (EPISODES, EVALUATIONS, UPDATES)
 # The checkpoint first: once it is gone, nothing can go on with the old run.
 _OF_A_RUN = (CHECKPOINT, POLICY, SETTINGS, *_TABLES, CURVE, HISTOGRAMS, STATUS, CSV, TENSORBOARD)
 

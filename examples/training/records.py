@@ -1,4 +1,4 @@
-"""What a run leaves behind in rows: of training episodes, evaluations and assessments."""
+"""What a run leaves behind in rows: of training episodes and evaluations."""
 
 from __future__ import annotations
 
@@ -64,23 +64,6 @@ class EvaluationRecord:
         """Whether none of the others had a higher success, or the same and a higher SPL."""
         mine = (self.success, self.spl)
         return all(mine >= (other.success, other.spl) for other in others)
-
-
-@dataclass
-class AssessmentRecord:
-    """What whole episodes of a policy that was held fixed told of it."""
-
-    total_steps: int
-    episode: int
-    """Training episodes finished."""
-    episodes: int
-    """Episodes that were scored; fewer than wanted if one of them fell below the best."""
-    least: float
-    """Least of their scores."""
-    best: float
-    """That of the policy that was kept until then; -inf without one."""
-    kept: bool
-    """Whether this policy took its place."""
 
 
 def last_best(records: Sequence[EvaluationRecord]) -> EvaluationRecord:

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 WorldChoice: TypeAlias = "str | os.PathLike[str] | World"
 """A built-in world's name, the path of a world file, or a world."""
-KindChoice: TypeAlias = "Callable[[np.random.Generator], tuple[str, float]]"
-"""From a source of randomness to the name of a generator and a difficulty."""
 GENERATED_DIAGONAL: Final = 50.0
 """No room of a generator is longer than this from corner to corner [m]."""
 _WORLDS: Final = 50
@@ -84,8 +82,6 @@ class EpisodeSource:
     ) -> None:
         self.rejected = 0
         """Worlds of the generator that had no task."""
-        self.choose: KindChoice | None = None
-        """Chooses generator and difficulty of each new world; None: those that were given."""
         self._config = config
         least, most = config.min_goal_distance, max_goal_distance
         if isinstance(most, bool) or not isinstance(most, (int, float)) or not most > least:
@@ -243,11 +239,8 @@ class EpisodeSource:
 
     def _new_world(self, rng: np.random.Generator) -> World:
         """The next world of the generator."""
-        name, difficulty = str(self._generator), self._difficulty
-        if self.choose is not None:
-            name, difficulty = self.choose(rng)
         seed = world_seed(self._split, int(rng.integers(10**9)))
-        world = generate_world(name, seed, difficulty=difficulty)
+        world = generate_world(str(self._generator), seed, difficulty=self._difficulty)
         self.check_world(world)
         return world
 

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.config import TaskConfig
-from mpfa_envs.env.episodes import Episode, EpisodeSource, KindChoice, WorldChoice
+from mpfa_envs.env.episodes import Episode, EpisodeSource, WorldChoice
 from mpfa_envs.env.inputs import (
     check_alike,
     read_generators,
@@ -143,26 +143,6 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
     def worlds(self) -> list[World]:
         """The present world of each robot."""
         return list(self._batch.worlds)
-
-    def choose_worlds(self, choose: KindChoice) -> None:
-        """Have generator and difficulty of each new world chosen; this is no part of the state.
-
-        Args:
-            choose: From a robot's source of randomness to a generator's name and a difficulty.
-
-        Raises:
-            ValueError: If the worlds are no generator's.
-
-        Examples:
-            >>> env = VectorNavigationEnv(2, world="mixed", physics="kinematic")
-            >>> env.choose_worlds(lambda rng: ("mazes", 0.5))
-            >>> _ = env.reset(seed=0)
-            >>> {world.name.split("-")[0] for world in env.worlds}
-            {'mazes'}
-        """
-        if self._source.fixed(0) is not None:
-            raise ValueError(f"choose needs worlds of a generator, got {self.worlds[0].name!r}")
-        self._source.choose = choose
 
     @property
     def worlds_rejected(self) -> int:

@@ -14,7 +14,7 @@ import torch
 
 from torchrl_mpfa.saving import load_safely
 from training.files import CHECKPOINT
-from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
+from training.records import EpisodeRecord, EvaluationRecord
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
@@ -57,8 +57,6 @@ def state_of(run: TrainingRun) -> dict[str, Any]:
         "best": None if run.best is None else dict(run.best.state_dict()),
         "records": [asdict(record) for record in run.records],
         "evaluations": [asdict(record) for record in run.evaluations],
-        "assessments": [asdict(record) for record in run.assessments],
-        "assessment": None if run.assessment is None else run.assessment.state_dict(),
         "log": run.log.state_dict(),
     }
 
@@ -79,9 +77,6 @@ def restore(run: TrainingRun, state: dict[str, Any]) -> None:
         run.best.load_state_dict(state["best"])
     run.records = [EpisodeRecord(**record) for record in state["records"]]
     run.evaluations = [EvaluationRecord(**record) for record in state["evaluations"]]
-    if run.assessment is not None:
-        run.assessments = [AssessmentRecord(**record) for record in state["assessments"]]
-        run.assessment.load_state_dict(state["assessment"], run.learner.policy)
     if "log" in state:  # A checkpoint may be older than the rows.
         run.log.load_state_dict(state["log"])
     set_random_state(run.settings.device, state["random"])

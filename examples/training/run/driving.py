@@ -12,20 +12,16 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from mpfa_envs import TaskConfig
 from torchrl_mpfa.methods import Method, Replay, make_replay
 from training.environments import (
     INFO,
     FilteredRobots,
-    env_arguments,
     make_training_env,
     vector_of,
 )
-from training.noise import noisy_rewards
 from training.records import EpisodeRecord
 from training.run.checkpoints import as_arrays, as_tensors
 from training.run.exploration import Explorer
-from training.run.learnable import LearnableWorlds
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
 
@@ -58,10 +54,6 @@ class Robots:
         """Episodes of the run that were under way when another stage began."""
         self._started = time.perf_counter()
         self._filter = FilteredRobots(settings)
-        parts = TaskConfig(**env_arguments(settings.environment)).observation_slices
-        self._distance = parts["goal_distance"].start
-        wanted = settings.environment.learnable_worlds
-        self._learnable = LearnableWorlds() if wanted else None
         self._env: EnvBase | None = None
         self._world: str | None = None
         self._state: TensorDictBase | None = None
@@ -70,8 +62,6 @@ class Robots:
         self._steps = torch.zeros(self.count, dtype=torch.long)
         self._numbers = torch.zeros(self.count, 1, dtype=torch.long)
         """Number of the episode that each robot is in."""
-        self.ended: list[int] = []
-        """Numbers of the episodes that ended with the last action."""
         self._begun = 0
 
     def make_replay(self, method: Method, *, seed: int, **policy: Any) -> Replay:
@@ -90,8 +80,6 @@ class Robots:
                 hindsight=self.settings.method.hindsight > 0,
             )
             self._world = world
-            if self._learnable is not None:
-                vector_of(self._env).choose_worlds(self._learnable.choose)
         return self._env
 
     def begin(self, world: str, explorer: Explorer, *, seed: int) -> None:
@@ -111,11 +99,6 @@ class Robots:
         self._begun += count
         explorer.begin_episodes(begun)
 
-    @property
-    def next_episode(self) -> int:
-        """Number of the first episode in which no action has been taken yet."""
-        return self._begun - int((self._steps == 0).sum())
-
     def drive(
         self, explorer: Explorer, *, actions: int, episode: int, entries: Sequence[NestedKey] = ()
     ) -> tuple[TensorDictBase, list[EpisodeRecord]]:
@@ -134,8 +117,6 @@ class Robots:
             records of the episodes that ended.
         """
         assert self._env is not None and self._state is not None
-        # Robots whose episode ends are in their next worlds after the step.
-        worlds = [] if self._learnable is None else vector_of(self._env).worlds
         state, self._state = self._env.step_and_maybe_reset(
             self._act(explorer, self._state, actions, entries)
         )
@@ -145,20 +126,7 @@ class Robots:
         records = self._note(
             state["next"], self._everyone, explorer, episode=episode, total_steps=total
         )
-        if self._learnable is not None:
-            ended = state["next", "done"].squeeze(-1).nonzero().squeeze(-1).tolist()
-            for robot, record in zip(ended, records, strict=True):
-                self._learnable.note(worlds[robot].name, success=record.success)
-        rows = state.select(*TRANSITION, *entries)
-        if self.settings.environment.reward_noise:
-            rows["next", "reward"] = noisy_rewards(
-                rows["next", "reward"],
-                rows["observation"][:, self._distance],
-                deviation=self.settings.environment.reward_noise,
-                # Of the place in the run, so that a run that goes on needs no other state.
-                seed=(self.settings.seed, actions),
-            )
-        return rows, records
+        return state.select(*TRANSITION, *entries), records
 
     def _note(
         self,
@@ -175,8 +143,7 @@ class Robots:
         done = after["done"].squeeze(-1)
         records: list[EpisodeRecord] = []
         ended = robots[done]
-        self.ended = self._numbers[ended, 0].tolist()
-        if self.ended:
+        if len(ended):
             for row in done.nonzero().squeeze(-1).tolist():
                 robot, number = int(robots[row]), episode + len(records)
                 record = self._record(after[row], robot, episode=number, total_steps=total_steps)
@@ -241,15 +208,12 @@ class Robots:
             "begun": self._begun,
             "seconds": self.elapsed(),
             "given_up": self.given_up,
-            "learnable": None if self._learnable is None else self._learnable.state_dict(),
         }
 
     def recall(self, state: dict[str, Any]) -> None:
         """Take over what counts for the whole run, and which episodes were under way."""
         self.seconds = state["seconds"]
         self.given_up = state.get("given_up", 0)
-        if self._learnable is not None:
-            self._learnable.load_state_dict(state["learnable"])
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
         if "numbers" in state:
             self._numbers, self._begun = state["numbers"].clone(), state["begun"]

@@ -42,13 +42,11 @@ def exported_policy(
 
 
 def kept_policy(run: TrainingRun) -> Policy:
-    """The policy of a run: the last one, that which did best, or that which was kept."""
+    """Return the policy of a run: the last one, or the best in evaluations."""
     policy, episodes, steps = run.learner.policy, run.schedule.episodes, run.actions
     if run.settings.evaluation.choose and run.best is not None:
         record = last_best(run.evaluations)
         policy, episodes, steps = run.best, record.episode, record.total_steps
-    if run.assessment is not None and run.assessment.kept is not None:
-        policy, (episodes, steps) = run.assessment.kept, run.assessment.kept_at
     return exported_policy(policy, run.settings, episodes=episodes, steps=steps)
 
 

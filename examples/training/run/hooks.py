@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
+from training.records import EpisodeRecord, EvaluationRecord
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
@@ -33,9 +33,6 @@ class Hook:
 
     def on_begin(self, run: TrainingRun) -> None:
         """Called before the first iteration, also of a run that is resumed."""
-
-    def on_assessment(self, run: TrainingRun, record: AssessmentRecord) -> None:
-        """Called after a policy was assessed, if ``assessment.episodes`` asks for it."""
 
     def on_update(self, run: TrainingRun, losses: dict[str, Tensor], batch: TensorDictBase) -> None:
         """Called after updates, every ``tracking.log_every`` actions.

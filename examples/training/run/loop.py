@@ -20,9 +20,8 @@ from torchrl_mpfa import run_updates
 from torchrl_mpfa.methods.her import HindsightGoals
 from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
-from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
+from training.records import EpisodeRecord, EvaluationRecord
 from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
-from training.run.assessment import Assessment
 from training.run.checkpoints import restore, set_random_state
 from training.run.compiling import is_compiled
 from training.run.evaluations import evaluate_policy
@@ -93,7 +92,6 @@ class TrainingRun:
         """What hooks are still to be told of the iteration."""
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
-        self.assessments: list[AssessmentRecord] = []
         self._bonus: dict[str, Tensor] = {}
         self.best: TensorDictModule | None = None
         """The policy that did best in the evaluations."""
@@ -129,8 +127,6 @@ class TrainingRun:
         self.select = replay.select
         self.entries: tuple[NestedKey, ...] = replay.entries
         self.log.forget(method.capacity)
-        wanted = settings.assessment
-        self.assessment = Assessment(wanted) if wanted.episodes else None
         if method.hindsight:
             relabel = GoalRelabeling(self._task)
             self.buffer.append_transform(HindsightGoals(relabel, goals=method.hindsight))
@@ -144,9 +140,6 @@ class TrainingRun:
         # However many random numbers the parts were made of, the robots explore alike.
         torch.manual_seed(seed)
         self.robots.begin(self.schedule.world, self.explorer, seed=seed)
-        if self.assessment is not None:
-            self.assessment.begin_stage()
-        self._hold()
 
     # Iterations ------------------------------------------------------------------------------
 
@@ -201,11 +194,9 @@ class TrainingRun:
         self.log.wrote(slots, rows["next", "reward"])
         self.records += records
         self.schedule.count(actions=len(rows), episodes=len(records))
-        self._assess(records)
         if len(self.buffer) >= (self.buffer.batch_size or 0):
             self.waiting += len(rows)
             self._update()
-        self._hold()
         if self.crossed(self.settings.tracking.log_every):
             self.log.add(self.actions, episode=self.schedule.episodes, buffer=self.buffer)
         for record in records:
@@ -231,36 +222,10 @@ class TrainingRun:
         self._begin_stage()
         return True
 
-    def _hold(self) -> None:
-        """Have whole episodes assess the policy as it is, from when it is what acts."""
-        assessment, schedule = self.assessment, self.schedule
-        acts = self.actions >= self.settings.exploration.random_steps
-        if assessment is not None and assessment.over and acts:
-            assessment.begin(
-                self.robots.next_episode,
-                late=schedule.fraction >= self.settings.assessment.early_share,
-                at=(schedule.episodes, schedule.actions),
-            )
-
-    def _assess(self, records: list[EpisodeRecord]) -> None:
-        """Score the episodes that ended, and keep the policy if all of them have ended well."""
-        assessment = self.assessment
-        if assessment is None or assessment.over:
-            return
-        for number, record in zip(self.robots.ended, records, strict=True):
-            assessment.take(number, assessment.score(record))
-        if assessment.over:
-            found = assessment.conclude(
-                self.learner.policy, total_steps=self.actions, episode=self.schedule.episodes
-            )
-            self.assessments.append(found)
-            self._events.append(("on_assessment", found))
-
     def _update(self) -> None:
-        """The updates that are due: of this iteration, or all since the policy was held."""
-        block, assessment = self.settings.method.update_block, self.assessment
+        """The updates that are due, of a block of actions together."""
         due, left = divmod(self.waiting, self.settings.robots)
-        if not due or not (self.crossed(block) if assessment is None else assessment.over):
+        if not due or not self.crossed(self.settings.method.update_block):
             return
         every, begun = self.settings.tracking.log_every, self.actions - self.waiting
         updates = self.settings.updates
@@ -296,11 +261,9 @@ class TrainingRun:
         return draw
 
     def _evaluate(self) -> None:
-        kept = None if self.assessment is None else self.assessment.kept
-        policy = self.learner.policy if kept is None else kept
         found = evaluate_policy(
             self.settings,
-            policy,
+            self.learner.policy,
             total_steps=self.actions,
             episode=self.schedule.episodes,
             trained_for=self.robots.elapsed(),
@@ -308,7 +271,7 @@ class TrainingRun:
         # The clock of the run shows how long it trains.
         self.robots.seconds -= found.seconds
         if found.is_best(self.evaluations):
-            self.best = copy.deepcopy(policy)
+            self.best = copy.deepcopy(self.learner.policy)
         self.evaluations.append(found)
         self._events.append(("on_evaluation", found))
 

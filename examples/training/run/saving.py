@@ -9,7 +9,6 @@ from torchrl_mpfa import Learner
 from torchrl_mpfa.saving import save_atomically
 from training import files
 from training.records import (
-    AssessmentRecord,
     EpisodeRecord,
     EvaluationRecord,
     as_table,
@@ -46,8 +45,6 @@ def save(run: TrainingRun) -> None:
     write_table(as_table(run.records, EpisodeRecord), folder / files.EPISODES)
     if run.evaluations:
         write_table(as_table(run.evaluations, EvaluationRecord), folder / files.EVALUATIONS)
-    if run.assessments:
-        write_table(as_table(run.assessments, AssessmentRecord), folder / files.ASSESSMENTS)
     write_table(run.log.table(), folder / files.UPDATES)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tensordict import TensorDictBase
 
-from training.records import AssessmentRecord, EpisodeRecord, EvaluationRecord
+from training.records import EpisodeRecord, EvaluationRecord
 from training.run.hooks import Hook
 from training.run.loggers import CSVLog, Log, TensorboardLog
 from training.settings.train import TrackingSettings, TrainSettings
@@ -69,12 +69,6 @@ class Tracker(Hook):
         """Log an evaluation."""
         rates = ("success", "collision", "timeout", "spl")
         entries = {f"evaluation/{name}": getattr(record, name) for name in rates}
-        self._log(entries, record.total_steps)
-
-    def on_assessment(self, run: TrainingRun, record: AssessmentRecord) -> None:
-        """Log an assessment."""
-        names = ("episodes", "least", "kept")
-        entries = {f"assessment/{name}": float(getattr(record, name)) for name in names}
         self._log(entries, record.total_steps)
 
     def on_update(

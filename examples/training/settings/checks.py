@@ -76,8 +76,6 @@ def check_settings(settings: TrainSettings) -> None:
             f"evaluation.choose must be false with evaluation.world={settings.evaluation.world}, "
             "got True: nothing may be chosen in the worlds of a test"
         )
-    if settings.assessment.episodes:
-        _check_one_rule(settings)
     _check_ray(settings)
     if is_discrete(settings.learner):
         if settings.learner.compile is True:
@@ -132,19 +130,6 @@ def _check_method(method: Method) -> None:
         )
 
 
-def _check_one_rule(settings: TrainSettings) -> None:
-    """Refuse a second rule of when updates are made, or of which policy is the run's."""
-    for name, value, only in (
-        ("method.update_block", settings.method.update_block, 1),
-        ("evaluation.choose", settings.evaluation.choose, False),
-    ):
-        if value != only:
-            raise ValueError(
-                f"{name} must be {str(only).lower()} with assessment.episodes="
-                f"{settings.assessment.episodes}, got {value}: two rules would make the same choice"
-            )
-
-
 def _check_ray(settings: TrainSettings) -> None:
     """Refuse what needs the robots, or the buffer, in the process that learns."""
     workers = settings.ray.workers
@@ -161,14 +146,11 @@ def _check_ray(settings: TrainSettings) -> None:
             f"ray.workers must be 0 with method={settings.method.name}, got {workers}: it needs "
             "its buffer in the process that learns"
         )
-    for name, value, only in (
-        ("assessment.episodes", settings.assessment.episodes, 0),
-        ("method.update_block", settings.method.update_block, 1),
-        ("environment.reward_noise", settings.environment.reward_noise, 0),
-        ("environment.learnable_worlds", settings.environment.learnable_worlds, False),
-    ):
-        if value != only:
-            raise ValueError(f"{name} must be {only} with ray.workers={workers}, got {value}")
+    if settings.method.update_block != 1:
+        raise ValueError(
+            f"method.update_block must be 1 with ray.workers={workers}, got "
+            f"{settings.method.update_block}"
+        )
 
 
 def _check_values_alone(settings: TrainSettings) -> None:
@@ -214,11 +196,6 @@ def _check_stages(settings: TrainSettings) -> None:
             )
         if bool(stage.actions) != bool(stages[0].actions):
             raise ValueError(f"{where} must count what the others count, episodes or actions")
-        if settings.environment.learnable_worlds and stage.world != "mixed":
-            raise ValueError(
-                f"{where}.world must be mixed with environment.learnable_worlds=true, "
-                f"got {stage.world}"
-            )
         _check_world(f"{where}.world", stage.world, settings)
 
 

@@ -56,9 +56,6 @@ class EnvironmentSettings:
     """Longest way of a sampled task [m]; null: as it comes."""
     episodes_per_world: int = setting(1, at_least(1))
     """Episodes of a robot in a world of a generator before it gets another one."""
-    learnable_worlds: bool = False
-    """Choose the generators and difficulties of new ``mixed`` worlds in proportion to p (1 - p), p
-    the success there in the last episodes."""
     memory: str = "none"
     """``map``: the robot makes a map of what its lidar met and senses the way to the goal that is
     open on it; ``none``: it senses what is before it alone."""
@@ -75,9 +72,5 @@ class EnvironmentSettings:
     (:class:`mpfa_envs.SafetyFilter`); the buffer stores the actions that were carried out. With
     some, a policy learns from long drives and from collisions; with 1, it needs the filter. DQN and
     Q learning, which choose among a few actions, have none."""
-    reward_noise: float = setting(0.0, NOT_NEGATIVE)
-    """Standard deviation of noise on the rewards in the buffer, in the third of the states that
-    are 1 to 2 m, 4 to 5 m and so on from the goal. Records of episodes and evaluations are without
-    it."""
     mirror: bool = True
     """Show the learner half of what it samples in the mirror: left and right are alike."""

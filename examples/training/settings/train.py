@@ -158,23 +158,6 @@ class TrackingSettings:
 
 
 @dataclass
-class AssessmentSettings:
-    """Whether policies are held fixed and assessed, and the best of them kept."""
-
-    episodes: int = setting(0, at_least(0))
-    """Whole episodes that assess a policy before the next updates, 20 in TD7; 0: none do."""
-    early_episodes: int = setting(1, at_least(1))
-    """Episodes that do so in the early part of a run, which fewer of them speed up."""
-    early_share: float = setting(0.15, SHARE)
-    """How much of the run that part is, TD7's 750,000 of 5 million steps."""
-    best_factor: float = setting(0.9, SHARE)
-    """What is left of the best score at its end, as the worst of more episodes is worse."""
-    by: str = setting("outcome", choice("outcome", "return"))
-    """Score of an episode: ``outcome``, what Eq. (25) pays at its end, or ``return``, all of its
-    rewards, as in TD7. Returns grow with path length."""
-
-
-@dataclass
 class RaySettings:
     """Where the robots drive; ``docs/scaling.md`` has what it needs and what it brings."""
 
@@ -257,7 +240,6 @@ class TrainSettings:
     exploration: ExplorationSettings = field(default_factory=ExplorationSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
-    assessment: AssessmentSettings = field(default_factory=AssessmentSettings)
     ray: RaySettings = field(default_factory=RaySettings)
 
 

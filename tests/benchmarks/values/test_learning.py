@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from benchmarks.values import ARMS, FrozenBuffer, critic_values, frozen_buffers, learn
 from benchmarks.values.arms import both_images
 from benchmarks.values.frozen import FOLDER, read_frozen
-from benchmarks.values.learning import Draws, compared, make_frozen_learner, mirror, noisy
+from benchmarks.values.learning import Draws, compared, make_frozen_learner, mirror
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.selection import SampledBatch
 
@@ -55,13 +55,10 @@ def test_the_policy_stays_as_it_was_frozen(walk: FrozenBuffer) -> None:
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_every_arm_of_the_table_learns_from_a_frozen_buffer(arm: str, walk: FrozenBuffer) -> None:
     made = ARMS[arm]
-    buffer = frozen_buffers(FOLDER)[0] if made.mirrored or made.reward_noise else walk
-    how = {
-        "signals": made.signals,
-        "mirrored": made.mirrored,
-        "reward_noise": made.reward_noise,
-    }
-    (found,) = learn(buffer, made.method, 0, marks=(8,), **how)  # type: ignore[arg-type]
+    buffer = frozen_buffers(FOLDER)[0] if made.mirrored else walk
+    (found,) = learn(
+        buffer, made.method, 0, marks=(8,), signals=made.signals, mirrored=made.mirrored
+    )
     assert found.method == arm
     assert math.isfinite(found.rmse) and 0.0 < found.effective < 2.0 and 0.0 <= found.goals < 1.0
 
@@ -171,25 +168,3 @@ def test_mirrored_batches_are_half_of_what_is_learned_from() -> None:
         next(learn(buffer, "uniform", 0, mirrored=each, marks=(4,))) for each in (False, True)
     )
     assert plain.goals == mirrored.goals and plain.rmse != mirrored.rmse
-
-
-def test_noise_is_on_the_rewards_of_a_third_of_the_states_the_same_for_each_method() -> None:
-    buffer = frozen_buffers(FOLDER)[-1]
-    before = buffer.rows.clone()
-    noise = noisy(buffer.rows, 2.0, 5)["next", "reward"] - before["next", "reward"]
-    assert (buffer.rows == before).all()
-    assert noise.equal(noisy(buffer.rows, 2.0, 5)["next", "reward"] - before["next", "reward"])
-    assert not noise.equal(noisy(buffer.rows, 2.0, 6)["next", "reward"] - before["next", "reward"])
-    some = noise[noise != 0]
-    assert 0.28 < len(some) / len(noise) < 0.38
-    assert float(some.std()) == pytest.approx(2.0, rel=0.03)
-    assert abs(float(some.mean())) < 4 * 2.0 / len(some) ** 0.5
-
-
-def test_values_are_harder_to_learn_from_noisy_rewards() -> None:
-    buffer = next(each for each in frozen_buffers(FOLDER) if each.name == "sparse-early-per")
-    plain, noisier = (
-        next(learn(buffer, "uniform", 0, reward_noise=each, marks=(200,))) for each in (0.0, 4.0)
-    )
-    assert noisier.rmse > 1.05 * plain.rmse and noisier.goals == plain.goals
-    assert noisier.returns_rank < plain.returns_rank

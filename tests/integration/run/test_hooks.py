@@ -19,20 +19,19 @@ from training.run import loop
 from training.run.checkpoints import read_checkpoint
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
-from training.settings.train import AssessmentSettings, Stage, TrainSettings
+from training.settings.train import Stage, TrainSettings
 from training.stopping import Stop
 
 PAGE = Path(__file__).parents[3] / "docs" / "tuning.md"
 
 
 def of_all_events() -> TrainSettings:
-    """Two stages of three robots, with updates, evaluations and assessments."""
+    """Two stages of three robots, with updates and evaluations."""
     stages = [Stage("A", actions=60), Stage("B", actions=60)]
     settings = tiny(episodes=stages, robots=3, updates=2)
     settings.tracking.log_every, settings.checkpoint_every = 30, 30
     settings.tracking.csv = True
     settings.evaluation.every, settings.evaluation.episodes = 30, 2
-    settings.assessment = AssessmentSettings(episodes=2)
     return settings
 
 
@@ -45,10 +44,6 @@ class Noted(Hook):
 
     def on_begin(self, run: TrainingRun) -> None:
         self.calls.append(("begin", run.actions))
-
-    def on_assessment(self, run: TrainingRun, record: Any) -> None:
-        assert record is run.assessments[-1]
-        self.calls.append(("assessment", record.total_steps))
 
     def on_update(self, run: TrainingRun, losses: Any, batch: Any) -> None:
         assert losses["loss_value"].isfinite() and len(batch) == run.settings.method.batch_size
@@ -87,9 +82,9 @@ def test_a_hook_is_called_in_the_order_of_a_run_after_the_run_s_own(tmp_path: Pa
     assert [actions for name, actions in calls if name == "evaluation"] == [30, 60, 90, 120]
     assert noted.saved == [30, 60, 90, 120]
     counts = {name: len([each for each, _ in calls if each == name]) for name, _ in calls}
-    assert (counts["episode"], counts["assessment"]) == (len(run.records), len(run.assessments))
-    assert min(counts["episode"], counts["assessment"], counts["update"]) > 1
-    order = ["assessment", "update", "episode", "evaluation", "iteration"]
+    assert counts["episode"] == len(run.records)
+    assert min(counts["episode"], counts["update"]) > 1
+    order = ["update", "episode", "evaluation", "iteration"]
     places = [(actions, order.index(name)) for name, actions in calls[1:-2]]
     assert places == sorted(places)
 

@@ -24,7 +24,6 @@ from training.run.showing import show_policy
 from training.run.tracking import Tracker
 from training.settings.command_line import composed
 from training.settings.train import (
-    AssessmentSettings,
     Stage,
     TrackingSettings,
     TrainSettings,
@@ -309,10 +308,6 @@ def of_evaluations(settings: TrainSettings) -> None:
     settings.tracking.pictures_every = 0
 
 
-def of_assessments(settings: TrainSettings) -> None:
-    settings.assessment = AssessmentSettings(episodes=1)
-
-
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     """The names that runs of all kinds log."""
@@ -330,7 +325,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 
     kinds: list[tuple[str, str, Callable[[TrainSettings], None]]] = [
         ("mpfa_per", "ddpg", of_evaluations),
-        ("hvper", "td3", of_assessments),
+        ("hvper", "td3", nothing),
         ("per", "sac", nothing),
         ("uniform", "ddpg", of_curiosity),
         ("mpfa_per", "dqn", nothing),
@@ -351,9 +346,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 def documented() -> set[str]:
     """The names on the page, as patterns."""
     text = (ROOT / "docs/metrics.md").read_text()
-    names = re.findall(
-        r"`((?:train|time|policy|loss|replay|priorities|evaluation|assessment)/[^`]+)`", text
-    )
+    names = re.findall(r"`((?:train|time|policy|loss|replay|priorities|evaluation)/[^`]+)`", text)
     return {name.replace("SIGNAL", "[a-z_]+") for name in names if not name.endswith("/")}
 
 

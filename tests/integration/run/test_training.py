@@ -14,7 +14,6 @@ import torch
 from torchrl.data import RandomSampler
 
 from mpfa_envs import load_policy
-from mpfa_envs.sensing.observation import OBSERVATION
 from tests.integration.tiny_runs import (
     assert_same_run,
     blocky,
@@ -28,7 +27,6 @@ from torchrl_mpfa import SignalSampler
 from torchrl_mpfa.methods import ALIASES, Method
 from torchrl_mpfa.saving import save_atomically
 from training.files import CHECKPOINT
-from training.noise import noisy_states
 from training.records import EvaluationRecord
 from training.run import checkpoints, loop
 from training.run.checkpoints import random_state, read_checkpoint, set_random_state
@@ -59,19 +57,12 @@ def of_robots(physics: str) -> TrainSettings:
     return settings
 
 
-def noisy(deviation: float = 2.0) -> TrainSettings:
-    settings = of_robots("kinematic")
-    settings.environment.reward_noise = deviation
-    return settings
-
-
 RESUMED = {
     **{f"{name}-ddpg": tiny(name) for name in ("mpfa_per", "averaged_ddpg", "cer", "ddpg_radam")},
     **{f"{name}-ddpg": tiny(name) for name in ("hvper", "klper", "mw", "rank_per")},
     **{f"mpfa_per-{name}": tiny(learner=name) for name in ("td3", "sac", "dqn", "q_learning")},
     "la3p-td3": tiny("la3p", learner="td3"),
     "uper-td3": tiny("uper", learner="td3"),
-    "noise": noisy(),
     # In the middle of the episodes of three robots, and of a block of updates.
     **{f"robots-{physics}": of_robots(physics) for physics in ("kinematic", "wheels")},
     **{f"{name}-blocks": blocky(30, name) for name in ("rud", "reaper", "ref_er")},
@@ -88,25 +79,6 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
     assert all(record.total_steps <= actions for record in part.records)
     assert len(whole.records) > len(part.records)
     assert_same_run(go_on(tmp_path, settings), whole)
-
-
-def test_rewards_are_noisy_in_the_buffer_and_in_some_states_alone(tmp_path: Path) -> None:
-    # The robots act at random, so that they do the same whatever they learn.
-    settings, plain = noisy(), noisy(0.0)
-    for each in (settings, plain):
-        each.exploration.random_steps, each.method.capacity = 1_000, 200
-        each.environment.mirror = False  # What is stored is looked at.
-        each.evaluation.every, each.evaluation.episodes = 45, 2
-    with_noise, without = train(tmp_path / "noisy", settings), train(tmp_path / "plain", plain)
-    assert rows(with_noise) == rows(without)
-    stored = [run.buffer[:] for run in (with_noise, without)]
-    assert stored[0]["observation"].equal(stored[1]["observation"])
-    noise = (stored[0]["next", "reward"] - stored[1]["next", "reward"]).squeeze(-1)
-    where = noisy_states(stored[0]["observation"][:, OBSERVATION["goal_distance"].start])
-    assert 0.1 < where.float().mean() < 0.6
-    assert noise[~where].eq(0).all()
-    assert noise[where].unique().numel() == where.sum()
-    assert noise[where].std() == pytest.approx(2.0, rel=0.4)
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:

@@ -217,12 +217,6 @@ def usual() -> TrainSettings:
         ("evaluation.choose=true evaluation.every=9 evaluation.world=test", "world=test, got True"),
         ("updates=0", "updates must be at least 1, got 0"),
         ("evaluation.every=0", "evaluation.choose needs evaluations: set evaluation.every"),
-        ("assessment.episodes=-1", "assessment.episodes must be at least 0, got -1"),
-        ("assessment.by=spl", "assessment.by must be one of outcome, return, got 'spl'"),
-        (
-            "assessment.episodes=20 evaluation.choose=true evaluation.every=9",
-            "evaluation.choose must be false with assessment.episodes=20, got True",
-        ),
         (
             "environment.progress=none-at-all",
             "environment.progress must be one of .*got 'none-at",
@@ -273,10 +267,6 @@ def test_a_value_that_cannot_be_is_one_sentence_with_its_name(
             r"curriculum.stages\[1\] must count what the others count, episodes or actions",
         ),
         ("curriculum.stages=[{world: bras, actions: 9}]", r"stages\[0\].world.*got 'bras'"),
-        (
-            "assessment.episodes=20 method=rud",
-            "method.update_block must be 1 with assessment.episodes=20, got 1000: two rules",
-        ),
         (
             "method=ddpg method.reliability=0.2",
             "method.reliability must be 0.0 with method.selection=uniform, .* got 0.2",
