@@ -20,6 +20,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_module
 
+from torchrl_mpfa.methods import METHODS
 from training.settings.rules import settings_by_name
 from training.settings.train import GROUPS, Stage, TrainSettings, as_settings, register
 
@@ -38,6 +39,8 @@ def page() -> str:
         f"{introduction}{START}\n| setting | {head}{''.join(_rows())}\n## Learners\n\n"
         "What `learner=NAME` sets other than `learner=ddpg`; `regime=rooms` wins over it.\n"
         f"\n| learner | in rooms | in paper | meaning |\n|---|---|---|---|\n{learners}"
+        "\n## Methods\n\nWhat a method has beyond `method=mpfa_per`, or another default.\n"
+        f"\n| setting | default | methods | meaning |\n|---|---|---|---|\n{_method_rows()}"
     )
 
 
@@ -73,6 +76,23 @@ def _learner_row(learner: str) -> str:
     )
 
 
+def _method_rows() -> str:
+    """A row for each setting and default of the methods that ``mpfa_per`` does not have."""
+    usual = METHODS["mpfa_per"]
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for method, made in METHODS.items():
+        meanings = dict(_meanings(type(made), ""))
+        for entry in fields(made):
+            value = getattr(made, entry.name)
+            if entry.name != "name" and getattr(usual, entry.name, None) != value:
+                row = entry.name, _shown(value), meanings[entry.name]
+                rows.setdefault(row, []).append(f"`{method}`")
+    return "".join(
+        _row(f"method.{name}", value, ", ".join(found), meaning)
+        for (name, value, meaning), found in sorted(rows.items())
+    )
+
+
 @cache
 def _values(regime: str, *overrides: str) -> dict[str, Any]:
     """Every setting of a run that names a regime alone, and the choices of the groups."""
@@ -85,12 +105,13 @@ def _values(regime: str, *overrides: str) -> dict[str, Any]:
 
 def _meanings(settings: Any, prefix: str) -> Iterator[tuple[str, str]]:
     """Names and docstrings of the fields of settings, those of a group after its own."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(settings))).body[0]
-    assert isinstance(tree, ast.ClassDef)
     documented = {}
-    for field, text in zip(tree.body, tree.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            documented[ast.unparse(field.target)] = _text(ast.literal_eval(text.value))
+    for kind in settings.__mro__[-2::-1]:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+        assert isinstance(tree, ast.ClassDef)
+        for field, text in zip(tree.body, tree.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                documented[ast.unparse(field.target)] = _text(ast.literal_eval(text.value))
     for entry in fields(settings):
         name = prefix + entry.name
         if name in ("hydra", "defaults"):

@@ -16,7 +16,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,14 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import RandomSampler
 from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, look, new_figure
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
+from torchrl_mpfa.methods.catalogue import MW
+from torchrl_mpfa.methods.ref_er import ReFERSampler
 from torchrl_mpfa.spelling import unknown
 from training.files import check_folder
 
@@ -104,8 +107,9 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
 
 def samples_uniformly(method: Method) -> bool:
     """Whether there is nothing to see: every transition is sampled as often as any other."""
-    selections = ("uniform", "halves", "near_policy")
-    return method.selection in selections and method.candidates == 1
+    return (
+        type(method.sampler()) in (RandomSampler, ReFERSampler) and method.rows == method.batch_size
+    )
 
 
 def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[str, Array]]:
@@ -122,6 +126,8 @@ def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[s
     torch.manual_seed(0)
     policy = make_actor(OBSERVATION_SIZE, ACTION_SIZE, width=16, final_init=0.5)
     transitions = make_transitions(policy, count=COUNT)
+    if isinstance(method, MW):
+        method = replace(method, replay_cap=REPLAY_CAP)
     replay = make_replay(
         method,
         capacity=COUNT,
@@ -129,7 +135,6 @@ def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[s
         generator=torch.Generator().manual_seed(seed),
         policy=policy,
         sigma=SIGMA,
-        replay_cap=REPLAY_CAP,
     )
     buffer = replay.buffer
     buffer.extend(transitions.data)

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from torchrl_mpfa.networks import make_stochastic_actor as make_stochastic_actor
     from torchrl_mpfa.networks import make_value_network as make_value_network
     from torchrl_mpfa.replay import SignalReplayBuffer as SignalReplayBuffer
-    from torchrl_mpfa.samplers import MixtureSampler as MixtureSampler
     from torchrl_mpfa.samplers import MPFASampler as MPFASampler
     from torchrl_mpfa.samplers import SignalSampler as SignalSampler
     from torchrl_mpfa.samplers import SignalSliceSampler as SignalSliceSampler
@@ -59,7 +58,7 @@ _NAMES = {
     "moving_fusion": "ScaledFusion ScheduledFusion",
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
     "replay": "SignalReplayBuffer",
-    "samplers": "MixtureSampler MPFASampler SignalSampler SignalSliceSampler",
+    "samplers": "MPFASampler SignalSampler SignalSliceSampler",
     "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",
     "storages": "SignalMemmapStorage SignalTensorStorage",
     "updates": "run_updates",

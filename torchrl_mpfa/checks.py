@@ -73,6 +73,18 @@ def check(rule: Rule, **values: Any) -> None:
             raise ValueError(f"{name} must be {wanted}, got {value!r}")
 
 
+def rules_of(kind: type) -> dict[str, Rule]:
+    """Return the rules in the metadata of a dataclass's fields.
+
+    A field has its rule also where a subclass changes its default.
+    """
+    found: dict[str, Rule] = {}
+    for each in reversed(kind.__mro__):
+        for name, entry in vars(each).get("__dataclass_fields__", {}).items():
+            found |= {name: entry.metadata["rule"]} if "rule" in entry.metadata else {}
+    return found
+
+
 def check_counts(**counts: Any) -> None:
     """Reject, by name, anything but an integer from 1 to 2147483647."""
     check(COUNT, **counts)

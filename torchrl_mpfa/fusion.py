@@ -31,7 +31,7 @@ Shapes: ``N`` transitions in the buffer, ``B`` in a batch, ``K`` signals.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
@@ -168,33 +168,6 @@ def fuse(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
         [2.0]
     """
     return torch.mv(signals, weights) + eps
-
-
-def fuse_product(signals: Tensor, weights: Tensor, *, eps: float) -> Tensor:
-    r"""One priority as a product, :math:`p_i = \prod_k (p_i^k + \epsilon)^{w_k / \sum_j w_j}`.
-
-    A weighted geometric mean: high where *all* signals are, where the sum of Eq. (21) is high where
-    one of them is. The scale of a signal is a factor of all priorities, which Eq. (8) divides out.
-
-    Args:
-        signals: Non-negative signals, shape ``[B, K]``.
-        weights: One weight a signal, not all zero, shape ``[K]``.
-        eps: Added to each signal, so that one of zero does not end all replays.
-
-    Returns:
-        Priorities, shape ``[B]``.
-
-    Examples:
-        >>> fuse_product(torch.tensor([[4.0, 9.0]]), torch.tensor([1.0, 1.0]), eps=0.0).tolist()
-        [6.0]
-    """
-    # xlogy leaves out what has no weight, even where it is zero.
-    return torch.special.xlogy(weights / weights.sum(), signals + eps).sum(-1).exp()
-
-
-Combine = Callable[..., Tensor]
-COMBINATIONS: dict[str, Combine] = {"sum": fuse, "product": fuse_product}
-"""Functions from signals and weights to a priority, by name."""
 
 
 @runtime_checkable

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from benchmarks.values.learning import SignalFunction, mirror
 from torchrl_mpfa.learners import ActorCriticLearner
-from torchrl_mpfa.methods import ALIASES, METHODS, Method
+from torchrl_mpfa.methods import ALIASES, METHODS, MPFA, Method, Prioritized, Scaled
+from torchrl_mpfa.methods.catalogue import Adjusted
 
 LEFT_OUT = {
     "rud": "the policy is held anyway: it is uniform replay",
@@ -30,8 +31,6 @@ PARTS: dict[str, dict[str, Any]] = {
     "reward+td_error": {"signals": ["reward", "td_error"]},
     "reward+gradient": {"signals": ["reward", "action_gradient"]},
     "td_error+gradient": {"signals": ["td_error", "action_gradient"]},
-    "equal_weights": {"fusion": "fixed"},
-    "equal_shares": {"fusion": "scaled"},
     "no_boost": {"boost": False},
     "no_decay": {"decay": False},
     "phi2": {"boost_factor": 2.0},
@@ -49,10 +48,13 @@ PARTS: dict[str, dict[str, Any]] = {
     "eq23_count": {"decay_position": "count"},
 }
 """MPFA-PER with one thing changed."""
-MIXTURE = replace(
-    METHODS["mpfa_plus"], name="mixture", signals=["reward", "td_error"], combination="mixture"
+FUSIONS = (
+    Adjusted("mpfa_per/equal_weights", signals=MPFA().signals, boost=True, decay=True),
+    Scaled(
+        "mpfa_per/equal_shares", boost=True, boost_bound="floor", decay=True, positive_above=0.0
+    ),
 )
-"""Half of each batch by the reward, half by the TD error, each by a tree of its own."""
+"""MPFA-PER with other weights."""
 STRENGTHS: dict[str, dict[str, dict[str, Any]]] = {
     # An epsilon of 0.05 is not small beside TD errors of 0.1.
     "per": {
@@ -62,7 +64,6 @@ STRENGTHS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "mpfa_per": {"floor0.2": {"weight_floor": 0.2}, "alpha1": {"alpha": 1.0}},
     "mpfa_plus": {"alpha0.3": {"alpha": 0.3}, "alpha1": {"alpha": 1.0}},
-    "mixture": {"alpha0.3": {"alpha": 0.3}, "alpha1": {"alpha": 1.0}},
 }
 """Kinds of priorities at several strengths."""
 
@@ -99,16 +100,16 @@ ARMS: dict[str, Arm] = {
         for name, method in METHODS.items()
         if name not in LEFT_OUT and name not in ALIASES.values()
     },
-    "mixture": Arm(MIXTURE),
     **_varied(METHODS["mpfa_per"], PARTS),
+    **{each.name: Arm(each) for each in FUSIONS},
     **{
         name: arm
         for base, changes in STRENGTHS.items()
-        for name, arm in _varied({**METHODS, "mixture": MIXTURE}[base], changes).items()
+        for name, arm in _varied(METHODS[base], changes).items()
     },
     "per/mirrored": Arm(replace(METHODS["per"], name="per/mirrored"), mirrored=True),
     "per/both_images": Arm(
-        replace(METHODS["per"], name="per/both_images", signals=["both_images"]),
+        Prioritized("per/both_images", signals=["both_images"]),
         mirrored=True,
         signals={"both_images": both_images},
     ),

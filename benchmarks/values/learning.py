@@ -16,7 +16,7 @@ from benchmarks.values.frozen import FrozenBuffer
 from mpfa_envs import RandomMirror
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.learners import ActorCriticLearner
-from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
+from torchrl_mpfa.methods import METHODS, Method, Prioritized, Replay, make_replay
 from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import SIGNALS_KEY
 from torchrl_mpfa.spelling import unknown
@@ -161,9 +161,12 @@ def make_frozen_learner(
 ) -> FrozenPolicyLearner:
     """Critics from scratch for the policy of a buffer; they write the signals of a method."""
     torch.manual_seed(seed)
-    known = [name for name in method.signals if name not in (signals or {})]
+    if isinstance(method, Prioritized):
+        # What functions of their own write is nothing that the loss has to write.
+        known = [name for name in method.signals if name not in (signals or {})]
+        method = replace(method, signals=known)
     sizes = (buffer.rows[name].shape[-1] for name in ("observation", "action"))
-    learner = make_learner(buffer.learner, replace(method, signals=known), *sizes, compile=compile)
+    learner = make_learner(buffer.learner, method, *sizes, compile=compile)
     assert isinstance(learner, ActorCriticLearner)
     return FrozenPolicyLearner(learner, buffer.policy, signals)
 

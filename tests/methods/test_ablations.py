@@ -1,6 +1,7 @@
 """The paper's ablations, as the settings have them: which weights, which adjustments."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +10,6 @@ from tensordict import TensorDict
 from tests import oracles
 from tests.methods.replays import make_buffer, set_signals
 from torchrl_mpfa.methods import METHODS
-from torchrl_mpfa.methods.assembly import make_sampler, signals_of
 
 REWARDS = [3.0, -1.0, 0.5, 0.5, -2.0, 0.1, 9.0, -0.2]
 ERRORS = [0.2, 1.5, 0.1, 2.0, 0.7, 0.05, 3.0, 1.0]
@@ -18,10 +18,9 @@ SLOPES = [1.0, 0.5, 2.0, 0.1, 0.3, 1.2, 0.4, 0.9]
 
 def priorities_of(name):
     """Priorities of the eight transitions, eps included, after one update of all of them."""
-    method = METHODS[name]
-    method = type(method)(**{**vars(method), "capacity": 8, "batch_size": 4})
-    sampler = make_sampler(method)
-    buffer = make_buffer(sampler, 8, 4, filled=0, signals=signals_of(method))
+    method = replace(METHODS[name], capacity=8, batch_size=4)
+    sampler = method.sampler()
+    buffer = make_buffer(sampler, 8, 4, filled=0, signals=method.kept_signals())
     buffer.extend(TensorDict({"next": {"reward": torch.tensor(REWARDS).unsqueeze(1)}}, [8]))
     set_signals(buffer, td_error=torch.tensor(ERRORS), action_gradient=torch.tensor(SLOPES))
     return sampler.priorities(torch.arange(8)).tolist()

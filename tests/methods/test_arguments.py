@@ -68,7 +68,6 @@ ROWS = [
         for value in (-0.1, math.inf, math.nan)
     ],
     *[(LAPFloor, {"floor": v}, f"floor {NOT_POSITIVE} {v}") for v in (0.0, -1.0, math.inf)],
-    (LAPFloor, {"quantile": 1.5}, r"quantile must be in \[0, 1\], got 1.5"),
     (HVPERPenalty, {"penalty": -1}, f"penalty {NEGATIVE} -1"),
     (HVPERPenalty, {"floor": 0}, f"floor {NOT_POSITIVE} 0"),
     (value_schedule, {"final_share": 2}, r"final_share must be in \[0, 1\], got 2"),

@@ -211,7 +211,7 @@ def test_goals_that_cannot_be_are_rejected(settings, message):
     [
         ("her", {"hindsight": -1}, "hindsight must be an integer from 0"),
         ("her", {"hindsight": True}, "hindsight must be an integer from 0"),
-        ("reaper", {"hindsight": 2}, "reliability must be 0.0 with hindsight=2"),
+        ("reaper", {"hindsight": 2}, "hindsight must be 0 with reaper, which .* got 2"),
     ],
 )
 def test_settings_that_cannot_be_are_rejected(method, settings, message):

@@ -5,7 +5,6 @@ import torch
 
 from tests.methods.replays import assert_shares, make_buffer, make_transitions, seeded, set_signals
 from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.la3p import LA3PSampler, la3p_batches
 from torchrl_mpfa.methods.lap import LAPFloor
 
@@ -86,19 +85,6 @@ def test_both_halves_of_the_critics_batch_update_priorities():
         buffer.update_tensordict_priority(draw.batch)
         leaves = torch.as_tensor(buffer.sampler._sum_tree[draw.batch["index"]])
         torch.testing.assert_close(leaves, torch.full_like(leaves, 7.0**ALPHA))
-
-
-@pytest.mark.parametrize("selection", ["split", "apart", "together"])
-def test_a_method_says_which_part_the_actor_learns_from_alone(selection):
-    errors = torch.rand(15, generator=seeded(3)) * 10
-    settings = {"capacity": 15, "batch_size": 40_000, "selection": selection}
-    replay = make_replay("la3p", **settings, generator=seeded(7))
-    replay.buffer.extend(make_transitions(15))
-    set_signals(replay.buffer, td_error=errors)
-    parts = shares_by_hand(errors.tolist())
-    expected = parts[["apart", "together", "split"].index(selection)]
-    *_, of_actor = replay.select(replay.buffer)
-    assert_shares(of_actor.batch["index"], expected, samples=20_000)
 
 
 def test_what_cannot_be_parted_is_rejected():

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from tests.methods.replays import make_transitions
 from tests.mpfa.transitions import same
 from torchrl_mpfa import ReplayHistory
-from torchrl_mpfa.methods import METHODS, MethodReplayBuffer, can_be_remote, make_ray_replay
+from torchrl_mpfa.methods import METHODS, MethodReplayBuffer, make_ray_replay
 from torchrl_mpfa.methods import make_replay as make_local_replay
 from torchrl_mpfa.methods.remote import RaySignalReplayBuffer
 
@@ -72,7 +72,7 @@ def test_the_histograms_of_a_buffer_elsewhere_are_asked_of_it() -> None:
 
 
 def test_methods_that_look_into_their_buffer_stay_with_it() -> None:
-    assert {name for name in METHODS if not can_be_remote(METHODS[name])} == {
+    assert {name for name in METHODS if not METHODS[name].remote} == {
         "her",
         "la3p",
         "reaper",

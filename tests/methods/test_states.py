@@ -13,9 +13,8 @@ METHODS = ["mpfa_per", "rank_per", "mw", "la3p", "cer", "geometric"]
 
 
 def make_trained(name, *, seed=0, capacity=12):
-    replay = make_replay(
-        name, capacity=capacity, batch_size=4, generator=seeded(seed), replay_cap=2
-    )
+    own = {"replay_cap": 2} if name == "mw" else {}
+    replay = make_replay(name, capacity=capacity, batch_size=4, generator=seeded(seed), **own)
     replay.buffer.extend(make_transitions(9, seed=seed))
     for _ in range(4):
         for draw in replay.select(replay.buffer):

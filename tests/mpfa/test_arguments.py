@@ -8,7 +8,6 @@ import torch
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,
-    MixtureSampler,
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
@@ -50,10 +49,6 @@ def sampler(**given):
 
 def mpfa_sampler(**given):
     return MPFASampler(**{"max_capacity": 8, **given})
-
-
-def mixture(fusion):
-    return MixtureSampler(4, 0.6, 0.4, fusion=fusion)
 
 
 def buffer(**given):
@@ -101,7 +96,6 @@ ROWS = [
     (mpfa_sampler, {"signals": []}, FEW_SIGNALS),
     (mpfa_sampler, {"fusion": object()}, "fusion must have a method 'weights', got object"),
     (mpfa_sampler, {"adjustments": [3]}, "adjustments must be callable, got int"),
-    (sampler, {"combination": "sums"}, "unknown combination 'sums'"),
     (sampler, {"fusion": FixedFusion({"td_eror": 1.0})}, misspelt("'td_eror': did you mean 'td_e")),
     (
         sampler,
@@ -114,7 +108,6 @@ ROWS = [
         misspelt("'rewrd': did you mean 'reward'"),
     ),
     (sampler, {"fusion": ScheduledFusion({"td_error": 1.0}, {"valu": 1.0})}, misspelt("'valu'")),
-    (mixture, {"fusion": ScaledFusion(FixedFusion())}, "fusion of a mixture must not be scaled"),
     (buffer, {"generator": "seed"}, "generator must be a torch.Generator, got 'seed'"),
     *[
         (kind, {"max_size": size}, f"max_size {NO_COUNT} {size}")

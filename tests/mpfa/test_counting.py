@@ -11,7 +11,6 @@ from tests.mpfa.transitions import restore
 from torchrl_mpfa import PositiveBoost, SignalSampler
 from torchrl_mpfa.adjustment import adaptive_boost
 from torchrl_mpfa.methods import METHODS, make_replay
-from torchrl_mpfa.methods.lap import LAPFloor, running_bend
 from torchrl_mpfa.testing import check_adjustment
 
 
@@ -78,12 +77,9 @@ def test_it_is_shown_the_fused_priorities_of_what_is_known():
 
 
 @pytest.mark.parametrize("way", ["state", "folder"])
-@pytest.mark.parametrize(
-    ("name", "settings"), [("mpfa_adaptive", {}), ("lap", {"floor_quantile": 0.5})]
-)
-def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(name, settings, way, tmp_path):
+def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(way, tmp_path):
     def make(seed):
-        replay = make_replay(name, capacity=200, batch_size=8, generator=seeded(seed), **settings)
+        replay = make_replay("mpfa_adaptive", capacity=200, batch_size=8, generator=seeded(seed))
         replay.buffer.extend(make_transitions(200, seed=seed))
         return replay
 
@@ -197,53 +193,8 @@ def test_an_adaptive_boost_favors_rare_goals_over_common_ones():
 
 
 def test_adjustments_that_count_pass_the_checks():
-    for part in (PositiveBoost(target_share=0.5), LAPFloor(quantile=0.5)):
-        check_adjustment(part)
+    check_adjustment(PositiveBoost(target_share=0.5))
     assert METHODS["mpfa_adaptive"].boost_target == 0.5
-
-
-# LAP with a bend that moves.
-
-
-@pytest.mark.parametrize("quantile", [0.01, 0.25, 0.5, 0.9, 1.0])
-def test_the_bend_is_the_least_error_that_is_not_exceeded_by_its_share(quantile):
-    values = torch.rand(37, generator=seeded(5), dtype=torch.double)
-    ordered = sorted(values.tolist())
-    below = [v for v in ordered if sum(o <= v for o in ordered) >= quantile * len(ordered) - 1e-9]
-    data = torch.cat([values, values.new_full((5,), torch.nan)])
-    assert float(running_bend(data, quantile=quantile, otherwise=9.0)) == below[0]
-
-
-def lap_frequencies(scale, **settings):
-    replay = make_replay("lap", capacity=100, batch_size=50_000, generator=seeded(0), **settings)
-    replay.buffer.extend(make_transitions(100))
-    errors = torch.linspace(0.01, 4.0, 100) * scale
-    for _ in range(2):
-        set_signals(replay.buffer, td_error=errors)
-    found = replay.buffer.sample()
-    return torch.bincount(found["index"], minlength=100) / 50_000, found
-
-
-def test_lap_is_uniform_for_small_rewards_unless_its_bend_is_a_quantile():
-    uniform, _ = lap_frequencies(0.01)
-    assert (uniform - 0.01).abs().max() < 0.002
-    small, of_small = lap_frequencies(0.01, floor_quantile=0.5)
-    large, of_large = lap_frequencies(1.0, floor_quantile=0.5)
-    assert (small - large).abs().max() < 0.002
-    assert small[90:].mean() > 1.2 * small[:50].mean()
-    assert (small[:50] - small[:50].mean()).abs().max() < 0.002
-    assert of_large["bend"].unique().tolist() == pytest.approx([2.005], abs=0.03)
-    assert of_small["bend"].unique().tolist() == pytest.approx([0.02005], abs=3e-4)
-
-
-def test_the_bend_is_that_of_the_method_until_errors_are_known():
-    replay = make_replay("lap", capacity=10, batch_size=4, floor_quantile=0.5)
-    replay.buffer.extend(make_transitions(10))
-    assert replay.buffer.sample()["bend"].tolist() == [1.0] * 4
-    assert "bend" not in make_replay("lap", capacity=10).buffer.sampler.state_dict()
-    set_signals(replay.buffer, td_error=torch.zeros(10))
-    set_signals(replay.buffer, td_error=torch.zeros(10))
-    assert 0 < replay.buffer.sample()["bend"][0] < 1e-5
 
 
 def test_what_was_counted_of_later_writes_is_counted_again():

@@ -7,7 +7,6 @@ from tensordict import TensorDict
 from torchrl.data import RandomSampler
 
 from torchrl_mpfa import (
-    MixtureSampler,
     MPFASampler,
     ReplayHistory,
     SignalReplayBuffer,
@@ -40,7 +39,6 @@ def learn(buffer):
     [
         (SignalSampler, {}),
         (RankPERSampler, {}),
-        (MixtureSampler, {"signals": ["reward", "td_error"]}),
         (LA3PSampler, {}),
         (MWSampler, {"replay_cap": 2}),
     ],

@@ -8,7 +8,7 @@ from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64,
 
 from tests.mpfa.second_device import DEVICE, SecondDevice, use_leaves
 from tests.mpfa.transitions import make_transitions, seeded, train_rounds
-from torchrl_mpfa import MixtureSampler, MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
@@ -77,9 +77,6 @@ def test_of_a_slot_that_is_written_twice_the_last_position_counts(places):
 MADE = {
     "mpfa": MPFASampler,
     "stratified": lambda capacity: MPFASampler(capacity, stratified=True),
-    "mixture": lambda capacity: MixtureSampler(
-        capacity, 0.6, 0.4, 0.05, signals=["reward", "td_error"]
-    ),
     "rank": lambda capacity: RankPERSampler(capacity, 0.7, 0.5, signals=["td_error"]),
     "la3p": lambda capacity: LA3PSampler(capacity, 0.4, 0.0, 0.1, signals=["td_error"]),
     "mw": lambda capacity: MWSampler(capacity, 0.6, 0.4, signals=["td_error"], replay_cap=6),

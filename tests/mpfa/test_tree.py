@@ -11,7 +11,6 @@ from torchrl.data.replay_buffers.scheduler import LinearScheduler
 
 from tests import oracles
 from tests.mpfa.transitions import make_transitions, rejected, same, seeded
-from torchrl_mpfa import MixtureSampler
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
 from torchrl_mpfa.samplers import TreeSampler
@@ -245,7 +244,7 @@ def states_of(sampler):
     return {key: value for key, value in sampler.state_dict().items() if key != "_highest_slot"}
 
 
-@pytest.mark.parametrize("kind", [TreeSampler, RankPERSampler, LA3PSampler, MixtureSampler])
+@pytest.mark.parametrize("kind", [TreeSampler, RankPERSampler, LA3PSampler])
 @pytest.mark.parametrize(
     ("name", "value", "error"),
     [

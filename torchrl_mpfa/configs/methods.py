@@ -8,10 +8,8 @@ from typing import Any, get_type_hints
 from torchrl.trainers.algorithms.configs.data import ReplayBufferBaseConfig
 
 from torchrl_mpfa.configs.signatures import field_default
-from torchrl_mpfa.methods import METHODS, Method, Replay, make_replay
-from torchrl_mpfa.methods.assembly import has_one_batch_a_step
+from torchrl_mpfa.methods import METHODS, Replay, make_replay
 from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.selection import one_batch
 
 _PLACE = "torchrl_mpfa.configs.methods"
 _BESIDE = ("storage", "device", "policy", "sigma", "generator")
@@ -19,34 +17,29 @@ _BESIDE = ("storage", "device", "policy", "sigma", "generator")
 
 
 def _config(name: str, target: str) -> type:
-    """A configuration whose defaults are the settings of a method."""
-    method, hints = METHODS[name], get_type_hints(Method)
+    """Make a configuration whose defaults are the settings of a method."""
+    method = METHODS[name]
+    hints = get_type_hints(type(method))
     entries: list[tuple[str, Any, Any]] = []
-    for setting in fields(Method):
-        value = getattr(method, setting.name)
+    for setting in fields(method):
+        value = name if setting.name == "name" else getattr(method, setting.name)
         entries.append((setting.name, hints[setting.name], field_default(value)))
     entries += [(word, Any, "auto" if word == "device" else None) for word in _BESIDE]
     entries += [("_target_", str, f"{_PLACE}.{target}"), ("_convert_", str, "all")]
     title = "".join(part.capitalize() for part in name.split("_"))
     made = make_dataclass(f"{title}Config", entries, bases=(ReplayBufferBaseConfig,))
-    made.__doc__ = f"Configuration of the method ``{name}``; see :class:`Method` for its settings."
+    kind = type(method).__name__
+    made.__doc__ = f"Configuration of the method ``{name}``; see :class:`{kind}` for its settings."
     made.__module__ = __name__
     return made
 
 
-def _make_replay(**settings: Any) -> Replay:
-    beside = {word: settings.pop(word) for word in _BESIDE}
-    return make_replay(Method(**settings), **beside)
+def _make_replay(name: str, **settings: Any) -> Replay:
+    return make_replay(name, **settings)
 
 
-def _make_buffer(**settings: Any) -> SignalReplayBuffer:
-    replay = _make_replay(**settings)
-    if replay.select is not one_batch:
-        raise ValueError(
-            f"method {replay.method.name!r} chooses the batches of a step itself: take replay="
-            f"{replay.method.name} and its select, as a buffer alone would train by another method"
-        )
-    return replay.buffer
+def _make_buffer(name: str, **settings: Any) -> SignalReplayBuffer:
+    return make_replay(name, **settings).buffer
 
 
 METHOD_CONFIGS: dict[tuple[str, str], type] = {
@@ -54,7 +47,7 @@ METHOD_CONFIGS: dict[tuple[str, str], type] = {
     **{
         ("replay_buffer", f"signal_{name}"): _config(name, "_make_buffer")
         for name, method in METHODS.items()
-        if has_one_batch_a_step(method)
+        if method.plain
     },
 }
 """Every method in the group ``replay``, and as a buffer those that sample one batch a step."""

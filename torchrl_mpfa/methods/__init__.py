@@ -1,7 +1,4 @@
-"""Methods that the paper compares with, and newer ones: one file each that needs code of its own.
-
-What is a choice of other parts has no file: it is a few lines of configuration.
-"""
+"""Methods by name: a class for each kind, and a file for each that needs code of its own."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,18 +8,22 @@ if TYPE_CHECKING:
     from torchrl_mpfa.methods.assembly import Replay as Replay
     from torchrl_mpfa.methods.assembly import loss_options as loss_options
     from torchrl_mpfa.methods.assembly import make_replay as make_replay
+    from torchrl_mpfa.methods.base import Method as Method
+    from torchrl_mpfa.methods.base import Prioritized as Prioritized
     from torchrl_mpfa.methods.catalogue import ALIASES as ALIASES
     from torchrl_mpfa.methods.catalogue import METHODS as METHODS
-    from torchrl_mpfa.methods.catalogue import Method as Method
+    from torchrl_mpfa.methods.catalogue import MPFA as MPFA
+    from torchrl_mpfa.methods.catalogue import Scaled as Scaled
+    from torchrl_mpfa.methods.catalogue import method_named as method_named
     from torchrl_mpfa.methods.remote import MethodReplayBuffer as MethodReplayBuffer
     from torchrl_mpfa.methods.remote import RaySignalReplayBuffer as RaySignalReplayBuffer
-    from torchrl_mpfa.methods.remote import can_be_remote as can_be_remote
     from torchrl_mpfa.methods.remote import make_ray_replay as make_ray_replay
 
 _NAMES = {
     "assembly": "Replay loss_options make_replay",
-    "catalogue": "ALIASES METHODS Method",
-    "remote": "MethodReplayBuffer RaySignalReplayBuffer can_be_remote make_ray_replay",
+    "base": "Method Prioritized",
+    "catalogue": "ALIASES METHODS MPFA Scaled method_named",
+    "remote": "MethodReplayBuffer RaySignalReplayBuffer make_ray_replay",
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))

@@ -1,223 +1,480 @@
-"""The methods, each a choice at five places: signals, fusion, adjustment, selection, learner.
+"""Every method by name: a class for each kind of them, and the settings of each.
 
-``docs/methods/`` has a page for each. A method of your own is a :class:`Method` with other
-settings, or one more entry in :data:`METHODS`.
+``docs/methods/`` has a page for each. A method of your own is a subclass of
+:class:`~torchrl_mpfa.methods.Method`, and one more entry in :data:`METHODS`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+import math
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.checks import (
-    BELOW_ONE,
-    COUNT,
-    COUNT_OR_ZERO,
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHARE,
-    Rule,
-    check,
+from torchrl_mpfa.checks import BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Rule
+from torchrl_mpfa.methods.base import SWITCH, Method, Prioritized, one_of, within
+from torchrl_mpfa.spelling import unknown
+
+if TYPE_CHECKING:
+    from torchrl.data import RandomSampler
+
+    from torchrl_mpfa.adjustment import Adjustment
+    from torchrl_mpfa.fusion import Fusion
+    from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+    from torchrl_mpfa.selection import Selection
+    from torchrl_mpfa.signals import Signal
+
+
+LEVEL: Rule = (
+    lambda value: (
+        value == "mean"
+        or (isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value))
+    ),
+    "a finite number or 'mean'",
 )
-
-SWITCH: Rule = (lambda value: isinstance(value, bool), "true or false")
-
-
-def _within(rule: Rule, default: Any) -> Any:
-    """A setting with its range and its default."""
-    return field(default=default, metadata={"rule": rule})
 
 
 @dataclass
-class Method:
-    """MPFA-PER, and what every method can choose.
+class Adjusted(Prioritized):
+    """PER whose priorities of positive transitions are raised and decayed (Eqs. 22-24)."""
 
-    Examples:
-        >>> Method("mine", ["td_error", "novelty"], fusion="scaled", boost=False).alpha
-        0.6
-    """
-
-    name: str = "mpfa_per"
-    """Name of the method."""
-    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
-    """Signals of the priority."""
-    fusion: str = "entropy"
-    """``entropy`` (Eqs. 15-20), ``fixed`` (equal weights), ``scaled`` (equal shares: each signal
-    is divided by its mean) or ``value_schedule`` (HVPER)."""
-    weight_floor: float = _within(BELOW_ONE, 0.0)
-    """Least weight of a signal by ``entropy``: without one the reward alone counts until the first
-    goal; 0: none, as in the paper."""
-    combination: str = "sum"
-    """Combination of the weighted signals: their ``sum`` (Eq. 21) or ``product``, or a
-    ``mixture``: each signal has its own tree, and its share of a batch. The latter two need no
-    scale: ``scaled`` is the same as ``fixed``."""
-    boost: bool = _within(SWITCH, True)
+    boost: bool = within(SWITCH, False)
     """Raise positive transitions, Eq. 22."""
-    decay: bool = _within(SWITCH, True)
-    """Decay positive transitions above the batch mean, Eqs. 23-24."""
-    priority_floor: float = _within(NOT_NEGATIVE, 0.0)
-    """Least priority, in units of the reward (LAP's 1); 0: none."""
-    floor_quantile: float = _within(SHARE, 0.0)
-    """Share of the priorities in the buffer below which the floor, and with it the bend of the
-    loss, moves; 0: the floor is a constant."""
-    replay_penalty: float = _within(NOT_NEGATIVE, 0.0)
-    """Penalty on replays (HVPER); 0: none."""
-    reliability: float = _within(NOT_NEGATIVE, 0.0)
-    """omega of ReaPER: power of how reliable a TD error is; 0: none. It needs ``prioritized`` and
-    no ``mixture``, and transitions must have ``"episode"``."""
-    selection: str = "prioritized"
-    """``prioritized`` (Eq. 8), ``uniform``, ``newest`` (uniform, and the newest transition),
-    ``geometric`` (the older, the less often), ``rank``, ``capped`` (MW), ``split`` (LA3P),
-    ``apart`` and ``together`` (the same, but the actor's part is uniform, or by priority),
-    ``halves`` (two updates on uniform halves) or ``near_policy`` (ReF-ER)."""
-    far_share: float = _within(SHARE, 0.1)
-    """Share of transitions that may be far from the policy before ``near_policy`` holds it."""
-    far_cutoff: float = _within(POSITIVE, 4.0)
-    """C of ``near_policy``: a ratio of densities of 1 + C or its inverse is far."""
-    recency: float = _within(NOT_NEGATIVE, 3.0)
-    """c of ``geometric``: the newest transition is sampled e^c times as often as the oldest."""
-    candidates: int = _within(COUNT, 1)
-    """Batches of which the most on-policy one is trained on (KLPER)."""
-    replay_cap: int = _within(COUNT, 1024)
-    """Replays after which ``capped`` excludes a transition."""
-    capacity: int = _within(COUNT, 100_000)
-    """Transitions that the buffer holds (the paper's Table 1)."""
-    batch_size: int = _within(COUNT, 256)
-    """Transitions in a batch (the paper's Table 1)."""
-    alpha: float = _within(NOT_NEGATIVE, 0.6)
-    """Priority exponent, Eq. 8, and the exponent of PAL."""
-    beta: float = _within(SHARE, 0.4)
-    """Importance exponent at the start, Eq. 10."""
-    beta_end: float = _within(SHARE, 1.0)
-    """Importance exponent at the end; between the two it rises with the episodes."""
-    eps: float = _within(NOT_NEGATIVE, 0.05)
-    """Added to every priority, Eq. 21."""
-    boost_factor: float = _within(POSITIVE, 3.0)
+    boost_factor: float = within(POSITIVE, 3.0)
     """phi of Eq. 22; its upper bound where ``boost_target`` is above 0."""
-    boost_target: float = _within(BELOW_ONE, 0.0)
+    boost_target: float = within(BELOW_ONE, 0.0)
     """Share of the total priority that positive transitions are to have, by a phi that follows how
     rare they are in the buffer; 0: phi is fixed."""
-    boost_bound: str = "floor"
+    boost_bound: str = one_of("floor", "cap", "none")
     """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
-    decay_sharpness: float = _within(POSITIVE, 0.01)
+    decay: bool = within(SWITCH, False)
+    """Decay positive transitions above the batch mean, Eqs. 23-24."""
+    decay_sharpness: float = within(POSITIVE, 0.01)
     """sigma of Eq. 23."""
-    decay_position: str = "batch"
+    decay_position: str = one_of("batch", "rank", "count")
     """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
-    positive_above: Any = 0.0
+    positive_above: Any = field(default=0.0, metadata={"rule": LEVEL})
     """A transition is positive, in Eqs. 17 and 22-24, when its reward is above this: a number, or
     ``mean``, the mean reward of the buffer, for rewards of one sign."""
-    population: str = "buffer"
+
+    def adjustments(self) -> list[Adjustment]:
+        """Make the boost and the decay that are on."""
+        from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
+
+        made: list[Adjustment] = []
+        if self.boost:
+            boost = PositiveBoost(
+                boost=self.boost_factor,
+                bound=self.boost_bound,  # type: ignore[arg-type]
+                positive_above=self.positive_above,
+                target_share=self.boost_target,
+            )
+            made.append(boost)
+        if self.decay:
+            decay = PositiveDecay(
+                sharpness=self.decay_sharpness,
+                position=self.decay_position,  # type: ignore[arg-type]
+                positive_above=self.positive_above,
+            )
+            made.append(decay)
+        return made
+
+
+@dataclass
+class MPFA(Adjusted):
+    """MPFA-PER: signals weighted by information entropy (Eqs. 15-21), raised and decayed."""
+
+    name: str = "mpfa_per"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
+    boost: bool = True
+    decay: bool = True
+    weight_floor: float = within(BELOW_ONE, 0.0)
+    """Least weight of a signal: without one the reward alone counts until the first goal; 0: none,
+    as in the paper."""
+    population: str = one_of("buffer", "batch")
     """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
-    max_priority_within_buffer: bool = _within(SWITCH, True)
-    """Whether a fresh transition gets the highest priority in the buffer, or the highest ever."""
-    stratified: bool = _within(SWITCH, False)
-    """Whether a batch takes one transition from each of equal parts of the total priority."""
-    importance: str = "critic"
-    """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
-    loss_function: str = "l2"
-    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``; of LA3P's
-    parts, ``l2``, or else PAL for the uniform part and Huber for the other."""
-    target_average: int = _within(COUNT, 1)
+
+    def fusion(self) -> Fusion:
+        """Make the fusion by entropy weights."""
+        from torchrl_mpfa.fusion import EntropyFusion
+
+        return EntropyFusion(
+            population=self.population,  # type: ignore[arg-type]
+            positive_above=self.positive_above,
+            floor=self.weight_floor,
+        )
+
+
+@dataclass
+class Scaled(Adjusted):
+    """Signals in equal shares: each is divided by its mean."""
+
+    name: str = "mpfa_plus"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
+    # Signals are in units of their means, of which a floor of 1 is not one.
+    boost_bound: str = "none"
+    # More than a step can bring, and less than a goal.
+    positive_above: Any = 1.0
+
+    def fusion(self) -> Fusion:
+        """Make the fusion in equal shares."""
+        from torchrl_mpfa.moving_fusion import ScaledFusion
+
+        return ScaledFusion(super().fusion())
+
+
+@dataclass
+class MW(Prioritized):
+    """Reward and TD error in equal shares, with a cap on replays (MW-MADDPG)."""
+
+    name: str = "mw"
+    signals: list[str] = field(default_factory=lambda: ["reward", "td_error"])
+    replay_cap: int = within(COUNT, 1024)
+    """Replays after which a transition is excluded."""
+
+    def fusion(self) -> Fusion:
+        """Make the fusion in equal shares."""
+        from torchrl_mpfa.moving_fusion import ScaledFusion
+
+        return ScaledFusion(super().fusion())
+
+    def sampler_kind(self) -> type[SignalSampler]:
+        """Return the sampler with the cap."""
+        from torchrl_mpfa.methods.mw import MWSampler
+
+        return MWSampler
+
+    def sampler_options(self) -> dict[str, Any]:
+        """Return the cap."""
+        return {"replay_cap": self.replay_cap}
+
+
+@dataclass
+class HVPER(Prioritized):
+    """Places of Q value and TD error in the batch, with a schedule and a penalty on replays."""
+
+    name: str = "hvper"
+    signals: list[str] = field(default_factory=lambda: ["relative_value", "relative_td_error"])
+    eps: float = 0.01
+    replay_penalty: float = within(NOT_NEGATIVE, 0.25)
+    """Penalty on replays."""
+
+    def fusion(self) -> Fusion:
+        """Make the fusion with a schedule."""
+        from torchrl_mpfa.methods.hvper import value_schedule
+
+        return value_schedule()
+
+    def adjustments(self) -> list[Adjustment]:
+        """Make the penalty."""
+        from torchrl_mpfa.methods.hvper import HVPERPenalty
+
+        return [HVPERPenalty(penalty=self.replay_penalty, floor=self.eps)]
+
+
+@dataclass
+class RankPER(Prioritized):
+    """PER by rank."""
+
+    name: str = "rank_per"
+    alpha: float = 0.7
+    beta: float = 0.5
+
+    def sampler_kind(self) -> type[SignalSampler]:
+        """Return the sampler by rank."""
+        from torchrl_mpfa.methods.rank_per import RankPERSampler
+
+        return RankPERSampler
+
+
+@dataclass
+class ReaPER(Prioritized):
+    """PER whose TD errors count by how reliable they are; transitions need ``"episode"``."""
+
+    name: str = "reaper"
+    alpha: float = 0.3
+    max_priority_within_buffer: bool = False
+    reliability: float = within(POSITIVE, 0.3)
+    """omega: power of how reliable a TD error is."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.hindsight:
+            raise ValueError(
+                f"hindsight must be 0 with {self.name}, which adds up the errors of an episode's "
+                f"own rows, got {self.hindsight}"
+            )
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The number of the episode."""
+        return ("episode",)
+
+    def kept_signals(self) -> list[Signal]:
+        """Return the signals of the priority, and which episode a transition is of."""
+        from torchrl_mpfa.methods.reaper import ENDED, EPISODE
+
+        return [*self.priority_signals(), EPISODE, ENDED]
+
+    def sampler_kind(self) -> type[SignalSampler]:
+        """Return the sampler that knows reliabilities."""
+        from torchrl_mpfa.methods.reaper import ReaPERSampler
+
+        return ReaPERSampler
+
+    def sampler_options(self) -> dict[str, Any]:
+        """Return the power of the reliability."""
+        return {"exponent": self.reliability}
+
+
+@dataclass
+class LAP(Prioritized):
+    """Priorities with a floor where the Huber loss bends, and no importance weights."""
+
+    name: str = "lap"
+    alpha: float = 0.4
+    eps: float = 0.0
+    max_priority_within_buffer: bool = False
+    importance: str = "none"
+    loss_function: str = "smooth_l1"
+    priority_floor: float = within(POSITIVE, 1.0)
+    """Least priority, in units of the reward."""
+
+    @property
+    def pal_alpha(self) -> float:
+        """Exponent of the loss PAL."""
+        return self.alpha
+
+    def adjustments(self) -> list[Adjustment]:
+        """Make the floor."""
+        from torchrl_mpfa.methods.lap import LAPFloor
+
+        return [LAPFloor(self.priority_floor)]
+
+
+@dataclass
+class LA3P(LAP):
+    """The critic learns from large errors, the actor from small ones, both from a fair share."""
+
+    name: str = "la3p"
+    plain: ClassVar[bool] = False
+    needs_actor: ClassVar[bool] = True
+
+    @property
+    def remote(self) -> bool:
+        """False: its parts depend on each other."""
+        return False
+
+    def sampler_kind(self) -> type[SignalSampler]:
+        """Return the sampler of the parts."""
+        from torchrl_mpfa.methods.la3p import LA3PSampler
+
+        return LA3PSampler
+
+    def selection(self, policy: Any, sigma: Any) -> Selection:
+        """Make the selection of the three parts."""
+        from torchrl_mpfa.methods.la3p import la3p_batches
+
+        return la3p_batches
+
+
+@dataclass
+class PAL(Method):
+    """Uniform replay with LAP's equivalent loss."""
+
+    name: str = "pal"
+    loss_function: str = "pal"
+    alpha: float = within(NOT_NEGATIVE, 0.4)
+    """Exponent of the loss."""
+
+    @property
+    def pal_alpha(self) -> float:
+        """Exponent of the loss PAL."""
+        return self.alpha
+
+
+@dataclass
+class CER(Method):
+    """Uniform replay with the newest transition in every batch."""
+
+    name: str = "cer"
+
+    def sampler(self) -> RandomSampler:
+        """Make the sampler."""
+        from torchrl_mpfa.methods.cer import CERSampler
+
+        return CERSampler()
+
+
+@dataclass
+class Geometric(Method):
+    """Replay by age: the older a transition, the less often."""
+
+    name: str = "geometric"
+    recency: float = within(NOT_NEGATIVE, 3.0)
+    """c: the newest transition is sampled e^c times as often as the oldest."""
+
+    def sampler(self) -> RandomSampler:
+        """Make the sampler."""
+        from torchrl_mpfa.methods.geometric import GeometricSampler
+
+        return GeometricSampler(recency=self.recency)
+
+
+@dataclass
+class UniformHalves(Method):
+    """Two updates on uniform halves of a batch, the control of LA3P."""
+
+    name: str = "uniform_halves"
+    plain: ClassVar[bool] = False
+    needs_actor: ClassVar[bool] = True
+
+    def selection(self, policy: Any, sigma: Any) -> Selection:
+        """Make the selection of the halves."""
+        from torchrl_mpfa.methods.halves import uniform_halves
+
+        return uniform_halves
+
+
+@dataclass
+class KLPER(Method):
+    """The most on-policy one of several uniform batches."""
+
+    name: str = "klper"
+    candidates: int = within(COUNT, 3)
+    """Batches of which the most on-policy one is trained on."""
+    needs: ClassVar[tuple[str, ...]] = ("policy", "sigma")
+    why: ClassVar[str] = "it chooses on-policy batches"
+    plain: ClassVar[bool] = False
+    needs_actor: ClassVar[bool] = True
+
+    @property
+    def rows(self) -> int:
+        """Transitions of all candidates."""
+        return self.batch_size * self.candidates
+
+    def selection(self, policy: Any, sigma: Any) -> Selection:
+        """Make the selection of the nearest candidate."""
+        from torchrl_mpfa.methods.klper import KLPERSelection
+
+        return KLPERSelection(policy, batches=self.candidates, sigma=sigma).select
+
+
+@dataclass
+class ReFER(Method):
+    """Uniform replay of transitions that are near to the policy (ReF-ER)."""
+
+    name: str = "ref_er"
+    far_share: float = within(SHARE, 0.1)
+    """Share of transitions that may be far from the policy before the policy is held."""
+    far_cutoff: float = within(POSITIVE, 4.0)
+    """C: a ratio of densities of 1 + C or its inverse is far."""
+    needs: ClassVar[tuple[str, ...]] = ("policy",)
+    why: ClassVar[str] = "it compares actions with its own"
+    plain: ClassVar[bool] = False
+    needs_actor: ClassVar[bool] = True
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The behavior's action without noise, and its standard deviation."""
+        return (*super().entries, "behavior_mean", "behavior_sigma")
+
+    def sampler(self) -> RandomSampler:
+        """Make the sampler."""
+        from torchrl_mpfa.methods.ref_er import ReFERSampler
+
+        return ReFERSampler()
+
+    def selection(self, policy: Any, sigma: Any) -> Selection:
+        """Make the selection that leaves out what is far."""
+        from torchrl_mpfa.methods.ref_er import ReFERSelection
+
+        return ReFERSelection(policy, far_share=self.far_share, cutoff=self.far_cutoff)
+
+
+@dataclass
+class AveragedDDPG(Method):
+    """Uniform replay, with the mean of earlier critics as the target."""
+
+    name: str = "averaged_ddpg"
+    target_average: int = within(COUNT, 5)
     """Critics of which the target is the mean, one more kept at each end of an episode."""
-    optimizer: str = "adam"
-    """``adam`` or ``radam``."""
-    update_block: int = _within(COUNT, 1)
-    """Actions between two blocks of updates, of which there are as many as otherwise (RUD)."""
-    curiosity: bool = _within(SWITCH, False)
-    """Whether rewards get a bonus for what the robot could not foresee (ICM)."""
-    curiosity_scale: float = _within(POSITIVE, 0.01)
-    """eta of that bonus."""
-    hindsight: int = _within(COUNT_OR_ZERO, 0)
-    """Goals for which each episode is learned from once more (HER); 0: none."""
+    needs_actor: ClassVar[bool] = True
 
 
-RANGES: dict[str, Rule] = {
-    each.name: each.metadata["rule"] for each in fields(Method) if "rule" in each.metadata
-}
-"""The rule of each setting that is a number or a switch."""
+@dataclass
+class Curious(Prioritized):
+    """PER with RAdam, and a bonus for what the robot could not foresee (ICM)."""
 
+    name: str = "ddpg_radam"
+    optimizer: str = "radam"
+    curiosity: float = within(POSITIVE, 0.01)
+    """eta: factor of the bonus."""
+    needs_actor: ClassVar[bool] = True
 
-def check_ranges(method: Method) -> None:
-    """Reject a number or a switch of a method that is out of its range, by name and value."""
-    for name, rule in RANGES.items():
-        check(rule, **{name: getattr(method, name)})
-
-
-_PLAIN: dict[str, Any] = {"fusion": "fixed", "boost": False, "decay": False}
-_PER: dict[str, Any] = {**_PLAIN, "signals": ["td_error"]}
-_UNIFORM: dict[str, Any] = {**_PLAIN, "signals": [], "selection": "uniform"}
-_LAP: dict[str, Any] = {
-    **_PER,
-    "eps": 0.0,
-    "alpha": 0.4,
-    "priority_floor": 1.0,
-    "max_priority_within_buffer": False,
-    "importance": "none",
-    "loss_function": "smooth_l1",
-}
 
 METHODS: dict[str, Method] = {
     # The paper's method, and its ablations.
-    "mpfa_per": Method(),
-    "mpfa_adaptive": Method("mpfa_adaptive", boost_target=0.5, boost_factor=10.0),
-    "mpfa_plus": Method(
-        "mpfa_plus",
-        fusion="scaled",
-        # What one gets with boost=True: signals are in units of their means, of which a floor of 1
-        # is not one.
-        boost=False,
-        boost_bound="none",
-        # More than a step can bring, and less than a goal.
-        positive_above=1.0,
-        decay=False,
-    ),
-    "mpf_per": Method("mpf_per", boost=False, decay=False),
-    "td_reward": Method("td_reward", ["reward", "td_error"], boost=False, decay=False),
-    "td_loss": Method("td_loss", ["td_error", "action_gradient"], boost=False, decay=False),
-    "per": Method("per", **_PER),
-    "raise": Method("raise", **{**_PER, "boost": True}),
-    "decay": Method("decay", **{**_PER, "decay": True}),
+    "mpfa_per": MPFA(),
+    "mpfa_adaptive": MPFA("mpfa_adaptive", boost_target=0.5, boost_factor=10.0),
+    "mpfa_plus": Scaled(),
+    "mpf_per": MPFA("mpf_per", boost=False, decay=False),
+    "td_reward": MPFA("td_reward", signals=["reward", "td_error"], boost=False, decay=False),
+    "td_loss": MPFA("td_loss", signals=["td_error", "action_gradient"], boost=False, decay=False),
+    "per": Prioritized(),
+    "raise": Adjusted("raise", boost=True),
+    "decay": Adjusted("decay", decay=True),
     # What the paper compares with.
-    "ddpg": Method("ddpg", **_UNIFORM),
-    "klper": Method("klper", **_UNIFORM, candidates=3),
-    "averaged_ddpg": Method("averaged_ddpg", **_UNIFORM, target_average=5),
-    "hvper": Method(
-        "hvper",
-        ["relative_value", "relative_td_error"],
-        fusion="value_schedule",
-        boost=False,
-        decay=False,
-        replay_penalty=0.25,
-        eps=0.01,
-    ),
-    "ref_er": Method("ref_er", **{**_UNIFORM, "selection": "near_policy", "importance": "critic"}),
-    "rud": Method("rud", **_UNIFORM, update_block=1000),
-    "ddpg_radam": Method("ddpg_radam", **_PER, optimizer="radam", curiosity=True),
-    "mw": Method(
-        "mw",
-        ["reward", "td_error"],
-        fusion="scaled",
-        boost=False,
-        decay=False,
-        selection="capped",
-    ),
+    "ddpg": Method("ddpg"),
+    "klper": KLPER(),
+    "averaged_ddpg": AveragedDDPG(),
+    "hvper": HVPER(),
+    "ref_er": ReFER(),
+    "rud": Method("rud", update_block=1000),
+    "ddpg_radam": Curious(),
+    "mw": MW(),
     # What else there is today.
-    "rank_per": Method("rank_per", **_PER, selection="rank", alpha=0.7, beta=0.5),
-    "reaper": Method(
-        "reaper", **_PER, reliability=0.3, alpha=0.3, max_priority_within_buffer=False
-    ),
-    "uper": Method("uper", **{**_PER, "signals": ["information_gain"], "eps": 0.01}),
-    "lap": Method("lap", **_LAP),
-    "pal": Method("pal", **_UNIFORM, loss_function="pal", alpha=0.4),
-    "la3p": Method("la3p", **_LAP, selection="split"),
-    "uniform_halves": Method("uniform_halves", **{**_UNIFORM, "selection": "halves"}),
-    "cer": Method("cer", **{**_UNIFORM, "selection": "newest"}),
-    "geometric": Method("geometric", **{**_UNIFORM, "selection": "geometric"}),
-    "her": Method("her", **_UNIFORM, hindsight=4),
+    "rank_per": RankPER(),
+    "reaper": ReaPER(),
+    "uper": Prioritized("uper", signals=["information_gain"], eps=0.01),
+    "lap": LAP(),
+    "pal": PAL(),
+    "la3p": LA3P(),
+    "uniform_halves": UniformHalves(),
+    "cer": CER(),
+    "geometric": Geometric(),
+    "her": Method("her", hindsight=4),
     # Another word for uniform replay, for learners that are not DDPG.
-    "uniform": Method("uniform", **_UNIFORM),
+    "uniform": Method(),
 }
 """Every method by name."""
 
 ALIASES = {"uniform": "ddpg"}
 """Second names, which pages and figures leave out."""
+
+
+def method_named(method: str | Method, **settings: Any) -> Method:
+    """Return a method with some of its settings changed.
+
+    Args:
+        method: A name out of :data:`METHODS`, or a method of your own.
+        **settings: Other values for its settings.
+
+    Raises:
+        TypeError: If ``method`` is neither, or a number is of another type.
+        ValueError: If the method or a setting is unknown, or a value is out of its range.
+
+    Examples:
+        >>> method_named("per", alpha=0.7).alpha
+        0.7
+    """
+    if isinstance(method, str):
+        if method not in METHODS:
+            raise ValueError(unknown("method", method, METHODS))
+        method = METHODS[method]
+    elif not isinstance(method, Method):
+        raise TypeError(f"method must be a name or a Method, got {method!r}")
+    known = [each.name for each in fields(method)]
+    for name in settings:
+        if name not in known:
+            raise ValueError(unknown(f"setting of {method.name}", name, known))
+    return replace(method, **settings)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -23,12 +23,6 @@ from torchrl_mpfa.saved import wrong
 from torchrl_mpfa.selection import SampledBatch
 
 Part = Literal["uniform", "prioritized", "inverse"]
-ACTOR_PARTS: Final[dict[str, Part]] = {
-    "split": "inverse",
-    "apart": "uniform",
-    "together": "prioritized",
-}
-"""Part that the actor learns from alone, by the selection of a method; ``split`` is LA3P."""
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _TINY = torch.finfo(torch.double).tiny
 
@@ -131,9 +125,7 @@ class LA3PSampler(SignalSampler):
             raise wrong("sampler", "_sum_tree", "positive where something was written", 0.0)
 
 
-def la3p_batches(
-    buffer: TensorDictReplayBuffer, *, actor: Part = "inverse", squared: bool = False
-) -> Iterator[SampledBatch]:
+def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
     """The three updates of an LA3P step, in the order of the authors' code.
 
     Critic and actor learn from a uniform part of the batch, with the loss PAL; then the critic from
@@ -142,8 +134,6 @@ def la3p_batches(
 
     Args:
         buffer: The buffer, with an :class:`LA3PSampler` and a batch size.
-        actor: The part that the actor learns from alone; not by the inverse, it is no LA3P.
-        squared: Whether the critic learns with its loss's own distance in place of PAL and Huber.
 
     Yields:
         Three batches.
@@ -157,13 +147,12 @@ def la3p_batches(
         raise TypeError(f"buffer must have an LA3PSampler, got {type(sampler).__name__}")
     if getattr(buffer, "_prefetch", False):
         raise ValueError("prefetch must be None with LA3P, whose parts depend on each other")
-    of_uniform, of_prioritized = (None, None) if squared else ("pal", "smooth_l1")
     with sampler.part("uniform"):
         batch = buffer.sample()
-    yield SampledBatch(batch, loss_function=of_uniform)
+    yield SampledBatch(batch, loss_function="pal")
     with sampler.part("prioritized"):
         batch = buffer.sample()
-    yield SampledBatch(batch, trains="critic", loss_function=of_prioritized, new_step=False)
-    with sampler.part(actor):
+    yield SampledBatch(batch, trains="critic", loss_function="smooth_l1", new_step=False)
+    with sampler.part("inverse"):
         batch = buffer.sample()
     yield SampledBatch(batch, trains="actor", new_step=False)

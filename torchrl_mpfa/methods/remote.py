@@ -10,16 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.data import RayReplayBuffer
 
-from torchrl_mpfa.methods.assembly import (
-    Replay,
-    buffer_parts,
-    entries_of,
-    learned_signals,
-    make_sampler,
-    make_selection,
-)
-from torchrl_mpfa.methods.catalogue import Method
-from torchrl_mpfa.methods.la3p import ACTOR_PARTS
+from torchrl_mpfa.methods.assembly import Replay, buffer_parts, learned_signals
+from torchrl_mpfa.methods.base import Method
 from torchrl_mpfa.replay import SignalReplayBuffer
 
 
@@ -76,8 +68,8 @@ class RaySignalReplayBuffer(RayReplayBuffer):
             replay_buffer_cls=_AloneInProcess,
             remote_config={"num_cpus": 0} if remote_config is None else remote_config,
         )
-        self._rows = method.batch_size * method.candidates
-        self._like = make_sampler(method)
+        self._rows = method.rows
+        self._like = method.sampler()
 
     @property
     def batch_size(self) -> int:
@@ -134,13 +126,8 @@ def make_ray_replay(
         ValueError: If the method chooses by what lies in the buffer, as LA3P and ReF-ER do, or
             needs more of a transition than the usual.
     """
-    if not can_be_remote(method):
+    if not method.remote:
         raise ValueError(f"method {method.name!r} needs its buffer in the process that learns")
     buffer = RaySignalReplayBuffer(method, seed=seed, remote_config=remote_config)
-    select = make_selection(method, policy, sigma)
+    select = method.selection(policy, sigma)
     return Replay(buffer, select, tuple(learned_signals(method)), method)
-
-
-def can_be_remote(method: Method) -> bool:
-    """Whether a method asks no more of its buffer than batches, and of transitions the usual."""
-    return method.selection not in (*ACTOR_PARTS, "near_policy") and not entries_of(method)

@@ -14,7 +14,7 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
 from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts, check_finite
-from torchrl_mpfa.fusion import COMBINATIONS, FixedFusion, Fusion, checked_weights
+from torchrl_mpfa.fusion import FixedFusion, Fusion, checked_weights, fuse
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.positive import is_positive, level_of, one_sided
 from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each
@@ -75,8 +75,6 @@ class SignalSampler(TreeSampler):
             written transition, whatever the capacity.
         stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
             priority, as the PER paper does, in place of ``B`` independent ones.
-        combination: What is made of signals and weights: their ``"sum"`` (Eq. 21), or their
-            ``"product"``, :func:`~torchrl_mpfa.fusion.fuse_product`.
 
     Raises:
         ValueError: If an argument is out of its range, or the fusion names a signal that is not
@@ -106,11 +104,7 @@ class SignalSampler(TreeSampler):
         adjustments: Sequence[Adjustment] = (),
         entropy_refresh: float = 1 / 256,
         stratified: bool = False,
-        combination: str = "sum",
     ) -> None:
-        if combination not in COMBINATIONS:
-            raise ValueError(unknown("combination", combination, COMBINATIONS))
-        self.combination = combination
         check(NOT_NEGATIVE, entropy_refresh=entropy_refresh)
         self.signals = as_signals(signals)
         self.fusion = fusion or FixedFusion(dict.fromkeys([s.name for s in self.signals], 1.0))
@@ -126,11 +120,6 @@ class SignalSampler(TreeSampler):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
         self.entropy_refresh = entropy_refresh
         self._counting = [counts_buffer(each) for each in self.adjustments]
-        self._telling = [
-            (place, each)
-            for place, each in enumerate(self.adjustments)
-            if self._counting[place] and hasattr(each, "entries")
-        ]
         self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
         self._names = [s.name for s in self.signals]
         self._columns: Columns = slice(0)
@@ -184,9 +173,6 @@ class SignalSampler(TreeSampler):
         """
         slots, weight = self._sampled(storage, batch_size)
         info: dict[Any, Tensor] = {"priority_weight": weight}
-        for place, adjust in self._telling:
-            counted = () if self._weighing is None else self._weighing.counted
-            info |= adjust.entries(counted[place] if counted else None, len(slots))
         self._last_batch = (slots, weight)
         table = getattr(storage, "signal_table", None)
         if table is not None:
@@ -294,8 +280,7 @@ class SignalSampler(TreeSampler):
 
     def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
         """Priorities of Eq. (21), eps included, shape ``[B]``."""
-        combine = COMBINATIONS[self.combination]
-        return combine(rows[:, self._columns], weighing.weights, eps=self._eps)
+        return fuse(rows[:, self._columns], weighing.weights, eps=self._eps)
 
     def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
         """Weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""

@@ -30,7 +30,7 @@ from torchrl_mpfa import (
     make_td3_loss,
     make_value_network,
 )
-from torchrl_mpfa.methods import Method, loss_options
+from torchrl_mpfa.methods import Method, Prioritized, loss_options
 from torchrl_mpfa.methods.curiosity import Curiosity
 from torchrl_mpfa.networks import DirectModule, StochasticActor, make_value_table
 from torchrl_mpfa.networks.values import ValueNetwork, ValueTable
@@ -174,7 +174,7 @@ def _q_learning(
 def method_of(settings: TrainSettings) -> Method:
     """The method of a run; where actions are choices, without the action gradient."""
     method = settings.method
-    if not is_discrete(settings.learner):
+    if not is_discrete(settings.learner) or not isinstance(method, Prioritized):
         return method
     return replace(method, signals=[s for s in method.signals if s != "action_gradient"])
 
@@ -199,7 +199,7 @@ def make_curiosity(
     """The bonus on rewards, if the method has one."""
     if not method.curiosity:
         return None
-    made = Curiosity(observation_size, action_size, scale=method.curiosity_scale)
+    made = Curiosity(observation_size, action_size, scale=method.curiosity)
     return made.to(device)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import asdict, fields, is_dataclass, replace
 from importlib.util import find_spec
@@ -12,30 +11,17 @@ import torch
 
 from mpfa_envs import GoalRelabeling, RobotNoise, TaskConfig, world_tasks
 from mpfa_envs.robots.model import resolve_robot
-from torchrl_mpfa.checks import Rule
-from torchrl_mpfa.methods import Method, can_be_remote
-from torchrl_mpfa.methods.assembly import WORDS, unused_settings
-from torchrl_mpfa.methods.catalogue import RANGES
-from torchrl_mpfa.methods.la3p import ACTOR_PARTS
+from torchrl_mpfa.checks import Rule, rules_of
+from torchrl_mpfa.methods import METHODS, Method
 from training.environments import check_physics, make_training_env, task_arguments
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import is_discrete
-from training.settings.rules import NAME, check_rules, choice, rules_of, up_to
+from training.settings.rules import check_rules, choice, up_to
 from training.settings.train import TrainSettings
 from training.worlds import is_of_a_test
 
-LEVEL: Rule = (
-    lambda value: value == "mean" or (_is_number(value) and math.isfinite(value)),
-    "a finite number or mean",
-)
-OF_A_METHOD: dict[str, Rule] = {
-    "name": NAME,
-    **{name: choice(*sorted(words)) for name, words in WORDS.items()},
-    **RANGES,
-    "positive_above": LEVEL,
-    "capacity": up_to(10**9),
-}
-"""Those of the package, and what this machine has room for."""
+OF_A_METHOD: dict[str, Rule] = {"name": choice(*METHODS), "capacity": up_to(10**9)}
+"""What this machine has room for; a method checks the rest itself."""
 SIGNALS = (
     *("reward", "td_error", "action_gradient", "value"),
     *("relative_value", "relative_td_error", "information_gain"),
@@ -43,20 +29,16 @@ SIGNALS = (
 """What the losses of ``train.py`` write; a script of your own may have others."""
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def check_settings(settings: TrainSettings) -> None:
     """Refuse a value that cannot be."""
     if not settings.curriculum.stages:
         raise ValueError("curriculum.stages must name at least one world, got []")
-    check_rules(settings, rules_of(settings), "")
+    check_rules(settings, rules_of(type(settings)), "")
     check_rules(settings.method, OF_A_METHOD, "method.")
     for entry in fields(settings):
         group = getattr(settings, entry.name)
         if is_dataclass(group):
-            check_rules(group, rules_of(group), f"{entry.name}.")
+            check_rules(group, rules_of(type(group)), f"{entry.name}.")
     _resolve("environment.robot", resolve_robot, settings.environment.robot)
     _check_environment(settings.environment, hindsight=settings.method.hindsight > 0)
     _check_stages(settings)
@@ -110,23 +92,17 @@ def _relabeling(environment: EnvironmentSettings) -> GoalRelabeling:
 
 def _check_method(method: Method) -> None:
     """Refuse what does not go together, or has no effect."""
-    for name, only, cause in unused_settings(method):
+    try:
+        replace(method)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"method.{error}") from error
+    for signal in method.priority_signals():
+        if signal.name not in SIGNALS:
+            raise ValueError(f"method.signals must be of {', '.join(SIGNALS)}, got {signal.name!r}")
+    if method.capacity < method.rows:
         raise ValueError(
-            f"method.{name} must be {only} with method.{cause}="
-            f"{getattr(method, cause)}, which cannot use it, got {getattr(method, name)}"
-        )
-    for name in method.signals:
-        if name not in SIGNALS:
-            raise ValueError(f"method.signals must be of {', '.join(SIGNALS)}, got {name!r}")
-    if method.combination == "mixture" and method.selection != "prioritized":
-        raise ValueError(
-            f"method.combination must be sum or product with method.selection={method.selection}, "
-            "got mixture"
-        )
-    if method.capacity < method.batch_size * method.candidates:
-        raise ValueError(
-            f"method.capacity must hold a batch of {method.batch_size * method.candidates}, "
-            f"got {method.capacity}: it would never learn"
+            f"method.capacity must hold a batch of {method.rows}, got {method.capacity}: it would "
+            "never learn"
         )
 
 
@@ -141,7 +117,7 @@ def _check_ray(settings: TrainSettings) -> None:
         raise ValueError(
             f"robots must be a multiple of ray.workers={workers}, got {settings.robots}"
         )
-    if not can_be_remote(settings.method):
+    if not settings.method.remote:
         raise ValueError(
             f"ray.workers must be 0 with method={settings.method.name}, got {workers}: it needs "
             "its buffer in the process that learns"
@@ -157,27 +133,25 @@ def _check_values_alone(settings: TrainSettings) -> None:
     """Refuse what a method has only where actions are numbers, or actor and critic two."""
     method, algorithm = settings.method, settings.learner.algorithm
     own = {"reward", "td_error", "action_gradient"}
+    signals = [signal.name for signal in method.priority_signals()]
     # A table has no loss that could bend.
     distances = ("l2", "smooth_l1") if algorithm == "dqn" else ("l2",)
-    for name, wrong in (
-        ("signals", any(signal not in own for signal in method.signals)),
-        ("selection", method.selection in (*ACTOR_PARTS, "halves", "near_policy")),
-        ("candidates", method.candidates > 1),
-        ("target_average", method.target_average > 1),
-        ("loss_function", method.loss_function not in distances),
-        ("curiosity", method.curiosity),
-    ):
-        if wrong:
-            raise ValueError(
-                f"method={method.name} is not for learner={algorithm}, which has neither an actor "
-                f"nor continuous actions: method.{name}={getattr(method, name)}"
-            )
+    if method.needs_actor or not own.issuperset(signals):
+        raise ValueError(
+            f"method={method.name} is not for learner={algorithm}, which has neither an actor nor "
+            "continuous actions"
+        )
+    if method.loss_function not in distances:
+        raise ValueError(
+            f"method.loss_function must be {' or '.join(distances)} with learner={algorithm}, got "
+            f"{method.loss_function}"
+        )
     if algorithm == "q_learning" and settings.learner.reward_scale != 1:
         raise ValueError(
             "learner.reward_scale must be 1 with q_learning, whose table is in units of the "
             f"reward, got {settings.learner.reward_scale}"
         )
-    if method.signals == ["action_gradient"]:
+    if signals == ["action_gradient"]:
         raise ValueError(
             f"method.signals must hold reward or td_error with learner={algorithm}, which has no "
             "action gradient"

@@ -14,6 +14,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
+from torchrl_mpfa.methods import METHODS, Method
 from training.settings.checks import check_settings
 from training.settings.from_file import lines_of
 from training.settings.resuming import choices_of
@@ -31,7 +32,9 @@ def known_settings(settings: Any = TrainSettings, prefix: str = "") -> Iterator[
         name = prefix + entry.name
         yield name
         default = entry.default_factory() if callable(entry.default_factory) else entry.default
-        if is_dataclass(default):
+        if name == "method":
+            yield from {f"method.{each.name}" for kind in METHODS.values() for each in fields(kind)}
+        elif is_dataclass(default):
             yield from known_settings(default, f"{name}.")
 
 
@@ -118,6 +121,13 @@ def _one_line(error: Exception) -> str:
     while cause.__cause__ is not None:
         cause = cause.__cause__
     key = getattr(cause, "full_key", None)
+    kind = getattr(cause, "object_type", None)
+    if (
+        isinstance(cause, AttributeError | KeyError)
+        and isinstance(kind, type)
+        and issubclass(kind, Method)
+    ):
+        return f"this method has no {key}, but {', '.join(each.name for each in fields(kind))}"
     text = str(getattr(cause, "msg", None) or cause).splitlines()[0]
     return f"{key}: {text}" if key else text
 

@@ -55,15 +55,6 @@ def settings_by_name(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any
             yield name, value
 
 
-def rules_of(settings: Any) -> dict[str, Rule]:
-    """The rules of a group of settings, of those too whose default a subclass changes."""
-    found: dict[str, Rule] = {}
-    for kind in reversed(type(settings).__mro__):
-        for name, entry in getattr(kind, "__dataclass_fields__", {}).items():
-            found |= {name: entry.metadata["rule"]} if "rule" in entry.metadata else {}
-    return found
-
-
 def check_rules(settings: Any, rules: Mapping[str, Rule], prefix: str) -> None:
     """Reject a value that its rule does not allow."""
     for name, rule in rules.items():

@@ -1,8 +1,8 @@
 """Settings of a training run: typed, in one place, each with its default and its reason.
 
 Hydra builds its command line from these: ``train.py method=per learner.width=128 seed=3``. The
-settings of a method are those of :class:`torchrl_mpfa.methods.Method`; ``checks.py`` has what
-settings may not be together.
+settings of a method are the fields of its class in :mod:`torchrl_mpfa.methods`; ``checks.py`` has
+what settings may not be together.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, Rule
-from torchrl_mpfa.methods import METHODS, Method
+from torchrl_mpfa.methods import METHODS, MPFA, Method, method_named
 from training.settings.environment import EnvironmentSettings
 from training.settings.learners import (
     DQNSettings,
@@ -228,7 +228,7 @@ class TrainSettings:
     a stage give up their episodes."""
     updates: int = setting(1, at_least(1))
     """Updates for one action of each robot."""
-    method: Method = field(default_factory=Method)
+    method: Method = field(default_factory=MPFA)
     """One of the methods by name; its settings can be changed one by one."""
     learner: LearnerSettings = field(default_factory=LearnerSettings)
     """``ddpg``, ``td3``, ``sac``, ``plain``, ``dqn`` or ``q_learning``."""
@@ -324,7 +324,8 @@ def register() -> None:
     OmegaConf.register_new_resolver("curriculum_name", _resolve_name, replace=True)
     OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
     store = ConfigStore.instance()
-    store.store(name="train", node=TrainSettings)
+    # The settings that every method has: those of the chosen one come on top.
+    store.store(name="train", node=TrainSettings(method=Method()))
     for group, choices in GROUPS.items():
         package = "_global_" if group == "regime" else None
         for name, node in choices.items():
@@ -341,9 +342,17 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
     OmegaConf.set_struct(values, False)
     for name in ("defaults", "hydra"):
         values.pop(name, None)
-    merged = OmegaConf.merge(OmegaConf.structured(TrainSettings), values)
+    structure = OmegaConf.structured(TrainSettings)
+    if "method" in values:
+        # Each method has settings of its own: its name says which.
+        structure.method = method_named(values.method.name)
+    merged = OmegaConf.merge(structure, values)
     merged.pop("hydra", None)
-    settings = OmegaConf.to_object(merged)
+    try:
+        settings = OmegaConf.to_object(merged)
+    except (TypeError, ValueError) as error:
+        # What a method checks itself.
+        raise ValueError(f"method.{error}") from error
     assert isinstance(settings, TrainSettings)
     curriculum = settings.curriculum
     curriculum.name = curriculum.name or curriculum_name(curriculum.stages)

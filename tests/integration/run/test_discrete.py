@@ -37,9 +37,7 @@ def test_a_run_learns_from_choices_and_saves_a_policy_that_drives_them(tmp_path,
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize(
-    "method", ["hvper", "la3p", "ref_er", "averaged_ddpg", "pal", "ddpg_radam"]
-)
+@pytest.mark.parametrize("method", ["hvper", "la3p", "ref_er", "averaged_ddpg", "ddpg_radam"])
 def test_a_method_that_needs_an_actor_is_rejected(method, learner):
     with pytest.raises(ValueError, match=rf"method={method} is not for learner={learner}"):
         check_settings(tiny(method, learner=learner))
@@ -63,5 +61,8 @@ def test_a_setting_that_these_learners_lack_is_rejected(learner, setting, value,
 
 def test_the_loss_of_lap_is_for_dqn_and_for_no_table():
     check_settings(tiny("lap", learner="dqn"))
-    with pytest.raises(ValueError, match="method=lap is not for learner=q_learning"):
-        check_settings(tiny("lap", learner="q_learning"))
+    for method in ("lap", "pal"):
+        with pytest.raises(ValueError, match="loss_function must be l2 with learner=q_learning"):
+            check_settings(tiny(method, learner="q_learning"))
+    with pytest.raises(ValueError, match="must be l2 or smooth_l1 with learner=dqn, got pal"):
+        check_settings(tiny("pal", learner="dqn"))

@@ -299,10 +299,6 @@ def test_a_run_of_wandb_s_sweep_is_what_its_file_says(monkeypatch: pytest.Monkey
 # Names ---------------------------------------------------------------------------------------
 
 
-def of_curiosity(settings: TrainSettings) -> None:
-    settings.method.curiosity = True
-
-
 def of_evaluations(settings: TrainSettings) -> None:
     settings.evaluation = replace(settings.evaluation, every=10, world="A", episodes=1)
     settings.tracking.pictures_every = 0
@@ -327,7 +323,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
         ("mpfa_per", "ddpg", of_evaluations),
         ("hvper", "td3", nothing),
         ("per", "sac", nothing),
-        ("uniform", "ddpg", of_curiosity),
+        ("ddpg_radam", "ddpg", nothing),
         ("mpfa_per", "dqn", nothing),
         ("mpfa_per", "q_learning", nothing),
     ]

@@ -24,7 +24,7 @@ from tests.integration.tiny_runs import (
     train,
 )
 from torchrl_mpfa import SignalSampler
-from torchrl_mpfa.methods import ALIASES, Method
+from torchrl_mpfa.methods import ALIASES, METHODS
 from torchrl_mpfa.saving import save_atomically
 from training.files import CHECKPOINT
 from training.records import EvaluationRecord
@@ -102,32 +102,33 @@ def test_every_method_trains_every_learner_by_its_own_signals(
     assert all(math.isfinite(record.reward) for record in run.records)
     weights = [value for value in run.learner.loss.state_dict().values() if value.ndim > 0]
     assert all(value.isfinite().all() for value in weights)
-    if not settings.method.signals:
+    signals = [signal.name for signal in settings.method.priority_signals()]
+    if not signals:
         assert isinstance(run.buffer.sampler, RandomSampler)
     else:
         assert isinstance(run.buffer.sampler, SignalSampler)
-        assert sorted(run.buffer.sampler.weights) == sorted(settings.method.signals)
-        assert run.buffer.sampler.beta == settings.method.beta_end
+        assert sorted(run.buffer.sampler.weights) == sorted(signals)
+        assert run.buffer.sampler.beta == settings.method.beta_at(1.0)
 
 
 def test_no_two_methods_have_the_same_settings() -> None:
     methods = {name: m for name, m in GROUPS["method"].items() if name not in ALIASES}
-    bare = [replace(method, name="") for method in methods.values()]
+    bare = [replace(method, name="per") for method in methods.values()]
     assert all(one != other for place, one in enumerate(bare) for other in bare[:place])
     assert all(method.name == name for name, method in methods.items())
 
 
 def test_the_reward_in_the_records_has_no_bonus_in_it(tmp_path: Path) -> None:
     settings = tiny("ddpg_radam")
-    settings.method.curiosity_scale = 1e6
+    settings.method.curiosity = 1e6
     # Nothing is learned in the first episodes, so that both runs drive the same way.
     settings.method.batch_size = settings.method.capacity = 1000
-    plain = replace(settings.method, curiosity=False, curiosity_scale=Method().curiosity_scale)
+    plain = replace(METHODS["per"], capacity=1000, batch_size=1000, optimizer="radam")
     without = replace(settings, method=plain)
     curious, bare = train(tmp_path / "curious", settings), train(tmp_path / "plain", without)
     assert [r.reward for r in curious.records] == [r.reward for r in bare.records]
     learned = tiny("ddpg_radam")
-    learned.method.curiosity_scale = 1e6
+    learned.method.curiosity = 1e6
     run = train(tmp_path / "learned", learned)
     assert max(abs(record.reward) for record in run.records) < 1e3
     assert run.buffer[:]["next", "reward"].abs().max() < 1e3

@@ -1,0 +1,211 @@
+"""What a method is: settings, and the parts of a replay that it makes of them.
+
+A method of your own is a subclass: its fields are its settings, and it overrides what it makes
+otherwise. Parts are imported where they are made, as TorchRL's buffers take half a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from torchrl_mpfa.checks import COUNT, COUNT_OR_ZERO, NOT_NEGATIVE, SHARE, Rule, check, rules_of
+
+if TYPE_CHECKING:
+    from torchrl.data import RandomSampler
+
+    from torchrl_mpfa.adjustment import Adjustment
+    from torchrl_mpfa.fusion import Fusion
+    from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+    from torchrl_mpfa.selection import Selection
+    from torchrl_mpfa.signals import Signal
+
+SWITCH: Rule = (lambda value: isinstance(value, bool), "true or false")
+
+
+def within(rule: Rule, default: Any) -> Any:
+    """Return a field with a default and the rule of its values."""
+    return field(default=default, metadata={"rule": rule})
+
+
+def one_of(*words: str) -> Any:
+    """Return a field whose values are words, the first by default."""
+    return within((lambda value: value in words, f"one of {', '.join(words)}"), words[0])
+
+
+@dataclass
+class Method:
+    """Uniform replay, and the settings of every method.
+
+    Raises:
+        TypeError: If a number is of another type.
+        ValueError: If a setting is out of its range.
+
+    Examples:
+        >>> Method("mine", batch_size=64).rows
+        64
+    """
+
+    name: str = "uniform"
+    """Name of the method."""
+    capacity: int = within(COUNT, 100_000)
+    """Transitions that the buffer holds (the paper's Table 1)."""
+    batch_size: int = within(COUNT, 256)
+    """Transitions in a batch (the paper's Table 1)."""
+    importance: str = one_of("critic", "torchrl", "none")
+    """Importance weights: ``critic`` (Eq. 11), ``torchrl`` (both losses) or ``none``."""
+    loss_function: str = one_of("l2", "smooth_l1", "pal")
+    """Distance of the critic's loss: ``l2`` (Eq. 4), ``smooth_l1`` (Huber) or ``pal``."""
+    optimizer: str = one_of("adam", "radam")
+    """``adam`` or ``radam``."""
+    hindsight: int = within(COUNT_OR_ZERO, 0)
+    """Goals for which each episode is learned from once more (HER); 0: none."""
+    update_block: int = within(COUNT, 1)
+    """Actions between two blocks of updates, of which there are as many as otherwise (RUD)."""
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Arguments of :func:`make_replay` that the method cannot do without."""
+    why: ClassVar[str] = ""
+    """Reason why the method needs these arguments."""
+    plain: ClassVar[bool] = True
+    """True if the method trains by one batch of its buffer for each update, and no more."""
+    needs_actor: ClassVar[bool] = False
+    """True if the method is only for learners with an actor."""
+
+    def __post_init__(self) -> None:
+        for name, rule in rules_of(type(self)).items():
+            check(rule, **{name: getattr(self, name)})
+
+    @property
+    def rows(self) -> int:
+        """Transitions that the buffer samples for a batch."""
+        return self.batch_size
+
+    @property
+    def target_average(self) -> int:
+        """Critics of which the target is the mean."""
+        return 1
+
+    @property
+    def pal_alpha(self) -> float:
+        """Exponent of the loss PAL."""
+        return 0.4
+
+    @property
+    def curiosity(self) -> float:
+        """Factor of the bonus for what the robot could not foresee (ICM); 0: none."""
+        return 0.0
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Entries that transitions must have beside the usual ones."""
+        return ("episode",) if self.hindsight else ()
+
+    @property
+    def remote(self) -> bool:
+        """True if the buffer may be in another process than the learner."""
+        return not self.entries
+
+    def beta_at(self, fraction: float) -> float | None:
+        """Return the importance exponent after a part of the training; None without weights."""
+        return None
+
+    def priority_signals(self) -> list[Signal]:
+        """Return the signals of the priority."""
+        return []
+
+    def kept_signals(self) -> list[Signal]:
+        """Return the signals that the storage keeps."""
+        return self.priority_signals()
+
+    def sampler(self) -> SignalSampler | RandomSampler:
+        """Make the sampler."""
+        from torchrl.data import RandomSampler
+
+        return RandomSampler()
+
+    def selection(self, policy: Any, sigma: Any) -> Selection:
+        """Make the function that samples the batches of one training step.
+
+        Args:
+            policy: The policy in training, which is there if :attr:`needs` names it.
+            sigma: Standard deviation of its exploration noise, or a function that gives it.
+        """
+        from torchrl_mpfa.selection import one_batch
+
+        return one_batch
+
+
+@dataclass
+class Prioritized(Method):
+    """PER: one priority of one signal or several, sampled in proportion (Eq. 8).
+
+    Several signals have equal weights.
+
+    Examples:
+        >>> Prioritized("mine", signals=["td_error", "novelty"]).alpha
+        0.6
+    """
+
+    name: str = "per"
+    signals: list[str] = field(default_factory=lambda: ["td_error"])
+    """Signals of the priority."""
+    alpha: float = within(NOT_NEGATIVE, 0.6)
+    """Priority exponent, Eq. 8."""
+    beta: float = within(SHARE, 0.4)
+    """Importance exponent at the start, Eq. 10."""
+    beta_end: float = within(SHARE, 1.0)
+    """Importance exponent at the end; between the two it rises with the episodes."""
+    eps: float = within(NOT_NEGATIVE, 0.05)
+    """Added to every priority, Eq. 21."""
+    max_priority_within_buffer: bool = within(SWITCH, True)
+    """Whether a fresh transition gets the highest priority in the buffer, or the highest ever."""
+    stratified: bool = within(SWITCH, False)
+    """Whether a batch takes one transition from each of equal parts of the total priority."""
+
+    def beta_at(self, fraction: float) -> float:
+        """Return the importance exponent after a part of the training (Eq. 10)."""
+        return self.beta + (self.beta_end - self.beta) * fraction
+
+    def priority_signals(self) -> list[Signal]:
+        """Return the signals of the priority; an unknown name is a signal of the loss."""
+        from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE
+        from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
+
+        known = {each.name: each for each in (*MPFA_SIGNALS, RELATIVE_VALUE, RELATIVE_ERROR)}
+        return [known.get(name) or Signal(name) for name in self.signals]
+
+    def fusion(self) -> Fusion:
+        """Make the fusion of the signals."""
+        from torchrl_mpfa.fusion import FixedFusion
+
+        return FixedFusion(dict.fromkeys(self.signals, 1.0))
+
+    def adjustments(self) -> list[Adjustment]:
+        """Make the adjustments of fused priorities, in their order."""
+        return []
+
+    def sampler_kind(self) -> type[SignalSampler]:
+        """Return the class of the sampler."""
+        from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+
+        return SignalSampler
+
+    def sampler_options(self) -> dict[str, Any]:
+        """Return the arguments that the class of the sampler has beyond the usual ones."""
+        return {}
+
+    def sampler(self) -> SignalSampler:
+        """Make the sampler."""
+        return self.sampler_kind()(
+            self.capacity,
+            self.alpha,
+            self.beta,
+            self.eps,
+            max_priority_within_buffer=self.max_priority_within_buffer,
+            stratified=self.stratified,
+            signals=self.priority_signals(),
+            fusion=self.fusion(),
+            adjustments=self.adjustments(),
+            **self.sampler_options(),
+        )
