@@ -279,8 +279,9 @@ def test_what_lies_under_everything_else_is_the_floor(name, tmp_path):
     ("content", "boxes"),
     [
         (box(0, 0, 2.55, "11 11 0.1") + box(0, 0, 3, "1 1 1"), 4),  # A roof with a chimney.
-        (box(0, 0, 0.2, "8.7 8.7 0.4") + box(0, 0, 0.6, "1 1 0.3"), 6),  # A ring of corridors.
+        (box(0, 0, 0.2, "9.2 9.2 0.4") + box(0, 0, 0.6, "1 1 0.3"), 6),  # A ring of corridors.
         (box(2, 2, 0.2, "1 1 0.4") + box(2, 2, 0.6, "0.3 0.3 0.4"), 6),  # A vase on a table.
+        (box(-2, 0, 0.2, "5.8 9.8 0.4") * 2, 6),  # One half of the room, twice.
         (box(0, 0, -1, "30 30 0.5") + box(2, 2, 0.2, "1 1 0.4"), 5),  # A slab that is buried.
         (model("<plane/>", "0 0 3 3.14159 0 0") + box(0, 0, 3.5, "1 1 1"), 4),  # A ceiling.
     ],
@@ -316,6 +317,7 @@ def test_quarter_turns_exchange_the_axes(geometry, turn, bounds, tmp_path):
     shape = (
         world.obstacles[-1] if "cylinder" not in geometry or bounds == (1, 1) else world.boxes[4]
     )
+    assert not world.polygons
     x_min, y_min, x_max, y_max = shape.bounds
     assert (x_max - x_min, y_max - y_min) == pytest.approx(bounds, abs=1e-4)
     assert ((x_max + x_min) / 2, (y_max + y_min) / 2) == pytest.approx((2, -1))
@@ -415,18 +417,20 @@ def include(uri="model://b", rest="<pose>2 2 0.5 0 0 0</pose>"):
     return f"<include><uri>{uri}</uri>{rest}</include>"
 
 
-@pytest.mark.parametrize("where", ["", "GAZEBO_MODEL_PATH", "GZ_SIM_RESOURCE_PATH", "model_paths"])
+@pytest.mark.parametrize(
+    "where", ["", "worlds/models", "GAZEBO_MODEL_PATH", "GZ_SIM_RESOURCE_PATH", "model_paths"]
+)
 @pytest.mark.parametrize("uri", ["model://b", "file://b/model.sdf", "model://b/model.sdf"])
 def test_an_included_model_is_read_from_the_search_folders(where, uri, tmp_path, monkeypatch):
     models = tmp_path / where
     put(models)
     arguments = {}
     if where == "model_paths":
-        arguments = {where: [models]}
-    elif where:
+        arguments = {where: models}
+    elif where.isupper():
         monkeypatch.setenv(where, os.pathsep.join(("", str(tmp_path / "none"), str(models))))
     folder = tmp_path if not where else tmp_path / "worlds"
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True)  # Models may lie in a folder of it.
     path = write(folder, walls() + include(uri) + include(uri, "<name>two</name>"))
     world, told = quietly(path, center=(0, 0), **arguments)
     assert not told

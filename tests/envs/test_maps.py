@@ -175,13 +175,15 @@ def test_unknown_cells_of_map_saver_are_not_free(tmp_path):
         assert World.from_map(saved, unknown="free").size == pytest.approx((8.0, 7.0))
 
 
-@pytest.mark.filterwarnings("ignore:.*free_thresh = 0.21 would make 1 cells")
+@pytest.mark.filterwarnings("ignore:.*free_thresh = 0.[279]")
 @pytest.mark.parametrize(
     ("changes", "occupied"),
     [
         ({}, [1, 1, 1, 0]),  # 0, 100 and 205 are p of 1, 0.61 and 0.2, 254 of 0.004.
         ({"occupied_thresh": 0.6, "free_thresh": 0.21}, [1, 1, 1, 0]),
         ({"free_thresh": 0.25, "mode": "scale"}, [1, 1, 0, 0]),
+        ({"occupied_thresh": 0.5, "free_thresh": 0.7}, [1, 1, 1, 0]),
+        ({"occupied_thresh": 0.1, "free_thresh": 0.9, "mode": "scale"}, [1, 1, 1, 0]),
         ({"negate": 1}, [0, 1, 1, 1]),
         ({"mode": "scale"}, [1, 1, 0, 0]),
         ({"mode": "scale", "occupied_thresh": 0.99, "free_thresh": 0.5}, [1, 0, 0, 0]),

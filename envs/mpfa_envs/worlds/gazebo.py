@@ -52,7 +52,7 @@ def load_gazebo_world(
     size: tuple[float, float] | None = None,
     center: tuple[float, float] | None = None,
     height: float = 0.5,
-    model_paths: Sequence[str | os.PathLike[str]] = (),
+    model_paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] = (),
 ) -> World:
     """Read the boxes, cylinders and upright planes of a Gazebo world.
 
@@ -67,8 +67,9 @@ def load_gazebo_world(
         size: Width and depth of the room [m]. None: as large as the obstacles need.
         center: Middle of the room in the file (x, y) [m]. None: that of the obstacles.
         height: Shapes that begin higher above the floor are no obstacles [m], nor are those in it.
-        model_paths: Folders of the models of ``model://`` and ``file://``, besides the file's and
-            those of GAZEBO_MODEL_PATH and GZ_SIM_RESOURCE_PATH. Nothing outside them is read.
+        model_paths: Folder or folders of the models of ``model://`` and ``file://``, besides the
+            file's, ``models`` in it, and those of GAZEBO_MODEL_PATH and GZ_SIM_RESOURCE_PATH.
+            Nothing outside them is read.
 
     Returns:
         The world, with the name of the file.
@@ -79,7 +80,9 @@ def load_gazebo_world(
     """
     path = Path(path)
     listed = [folder for name in _FOLDERS for folder in os.environ.get(name, "").split(os.pathsep)]
-    folders = [*map(Path, model_paths), path.parent, *map(Path, filter(None, listed))]
+    given = (model_paths,) if isinstance(model_paths, (str, os.PathLike)) else model_paths
+    beside = path.parent, path.parent / "models"
+    folders = [*map(Path, given), *beside, *map(Path, filter(None, listed))]
     text, name = read_sdf(path), str(path)
     return read_gazebo_world(text, name, size=size, center=center, height=height, folders=folders)
 

@@ -111,6 +111,7 @@ class SdfFiles:
 
     def included(self, include: Element) -> Element | None:
         """Read the model of an include, with what the include changes; None if there is none."""
+        self._spend(include, 100)  # A look into the folders takes as long as a hundred elements.
         uri = include.first("uri")
         path = None if uri is None else self._locate(uri.text)
         if path is None:
