@@ -292,6 +292,13 @@ def test_what_lies_over_or_beside_other_things_is_no_floor(content, boxes, tmp_p
     assert len(world.boxes) == boxes
 
 
+def test_a_pedestal_in_a_hall_is_no_floor(tmp_path):
+    content = box(0, 0, 0.2, "2 2 0.4") + box(0, 0, 0.7, "0.2 0.2 0.6")
+    assert len(load_gazebo_world(write(tmp_path, content), size=(10, 10)).boxes) == 2
+    with pytest.raises(ValueError, match=r"size must be two positive lengths, got .'wide', 10"):
+        load_gazebo_world(write(tmp_path, content), size=("wide", 10))
+
+
 @pytest.mark.parametrize(
     ("geometry", "turn", "bounds"),
     [
@@ -430,7 +437,7 @@ def test_an_included_model_is_read_from_the_search_folders(where, uri, tmp_path,
     elif where.isupper():
         monkeypatch.setenv(where, os.pathsep.join(("", str(tmp_path / "none"), str(models))))
     folder = tmp_path if not where else tmp_path / "worlds"
-    folder.mkdir(exist_ok=True)  # Models may lie in a folder of it.
+    folder.mkdir(exist_ok=True)
     path = write(folder, walls() + include(uri) + include(uri, "<name>two</name>"))
     world, told = quietly(path, center=(0, 0), **arguments)
     assert not told

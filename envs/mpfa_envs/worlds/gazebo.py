@@ -97,6 +97,7 @@ def read_gazebo_world(
     folders: Sequence[Path] = (),
 ) -> World:
     """Read the text of a file; ``path`` names it in errors, and the world."""
+    least = 0.0 if size is None else World(name="room", size=size).room.area / 10
     files = SdfFiles(folders)
     root = files.parse(path, text)
     world = root.first("world") if root.tag == "sdf" else None
@@ -104,7 +105,7 @@ def read_gazebo_world(
         raise root.error("must be an sdf element with a world in it")
     reader = _Reader(files)
     reader.read_world(root, world)
-    floor = floor_of(reader.solids, reader.grounds)
+    floor = floor_of(reader.solids, reader.grounds, least)
     shapes = [
         solid.shape
         for solid in reader.solids

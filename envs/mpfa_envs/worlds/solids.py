@@ -104,8 +104,9 @@ def _prism(pose: Array, direction: Array, along: float, across: float, tall: flo
     return Solid(shape, float(z - tall / 2), float(z + tall / 2))
 
 
-def floor_of(solids: Sequence[Solid], grounds: Sequence[float]) -> float:
+def floor_of(solids: Sequence[Solid], grounds: Sequence[float], least: float = 0.0) -> float:
     """Find the height on which everything else stands [m], from solids and level planes."""
+    # A floor has the least area [m²] or more: a pedestal in a hall is none.
     # The floor is the lowest of the ground, 0, and of what is as wide as the world, on which
     # something stands. From there it rises to whatever else is as wide, lies on it, and has most of
     # what is higher on it.
@@ -124,7 +125,7 @@ def floor_of(solids: Sequence[Solid], grounds: Sequence[float]) -> float:
 
     def is_wide(part: NDArray[np.int64], area: float) -> bool:
         shapes = {solids[k].shape for k in part}  # The same one may be there twice.
-        return not shapes or sum(shape.area for shape in shapes) >= _WIDE * area
+        return not shapes or sum(shape.area for shape in shapes) >= max(_WIDE * area, least)
 
     area = area_above(-math.inf)
     floors = [0.0, *(top for top, _, part in levels if is_wide(part, area))]
