@@ -358,6 +358,15 @@ def test_the_state_of_the_file_scales_models(tmp_path):
     assert world.cylinders[0].radius == pytest.approx(0.3)
 
 
+def test_a_state_has_nested_models_in_the_frame_of_the_world(tmp_path):
+    nested = box(1, 0, 0.5, "1 1 1", name="b").replace("<static>1</static>", "")
+    outer = f"<model name='o'><static>1</static><pose>3 3 0 0 0 0</pose>{nested}</model>"
+    inner = "<model name='b'><pose>-2 -2 0.5 0 0 0</pose><scale>2 1 1</scale></model>"
+    state = f"<state><model name='o'><pose>1 1 0 0 0 0</pose>{inner}</model></state>"
+    world = load_gazebo_world(write(tmp_path, walls() + outer + state), center=(0, 0))
+    assert world.boxes[4].bounds == (-3.0, -2.5, -1.0, -1.5)
+
+
 def test_collisions_in_unknown_places_are_counted(tmp_path):
     crowd = f"<population>{model(CYLINDER)}</population>"
     bare = model("").replace("<geometry></geometry>", "<pose>0 0 0 0 0 0</pose>")

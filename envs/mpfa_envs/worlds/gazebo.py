@@ -8,7 +8,6 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -43,7 +42,6 @@ _FOLDERS: Final = ("GAZEBO_MODEL_PATH", "GZ_SIM_RESOURCE_PATH")
 """Variables of the environment that list folders of models."""
 _MOVABLE: Final = ("models that may move", "actors")
 """Parts that are no part of the room."""
-_NONE: Final[Mapping[str, Element]] = MappingProxyType({})
 
 
 def load_gazebo_world(
@@ -143,11 +141,7 @@ class _Reader:
     def read_world(self, root: Element, world: Element) -> None:
         """Collect the solids of a world, and account for all collisions of the file."""
         self._total += root.count("collision")
-        state = world.first("state")
-        states = {
-            each.attributes.get("name", ""): each for each in (state.all("model") if state else ())
-        }
-        self._parts(world, np.eye(4), False, states, 0)
+        self._parts(world, np.eye(4), False, _models_of(world.first("state")), 0)
         for actor in world.all("actor"):
             self._leave("actors", actor)
         others = self._total - self._read - self._explained
@@ -207,14 +201,14 @@ class _Reader:
         inner = self._pose(model, moved)
         if inner is None:
             return None
-        place = outer @ inner
+        place = inner if moved is not None else outer @ inner  # That of a state is in the world.
         for link in model.all("link"):
             inner = self._pose(link)
             for collision in link.all("collision") if inner is not None else ():
                 own = self._pose(collision)
                 if inner is not None and own is not None:
                     self._collision(collision, place @ inner @ own, scale)
-        return self._parts(model, place, True, _NONE, depth)
+        return self._parts(model, place, True, _models_of(state), depth)
 
     def _pose(self, owner: Element, moved: Element | None = None) -> Array | None:
         """Read the pose of a part, ``[4, 4]``; None if it is of a kind that is left out."""
@@ -288,3 +282,9 @@ class _Reader:
         if len(numbers) != count or not all(abs(number) < _FARTHEST for number in numbers):
             raise element.error(f"{element.tag} must be {count} numbers, got {element.text!r}")
         return numbers
+
+
+def _models_of(state: Element | None) -> dict[str, Element]:
+    """The models in a state, by name."""
+    models = () if state is None else state.all("model")
+    return {model.attributes.get("name", ""): model for model in models}

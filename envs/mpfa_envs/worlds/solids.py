@@ -61,7 +61,7 @@ def cylinder_of(pose: Array, radius: float, length: float) -> Solid | None:
     """A cylinder that stands, or the box around one that lies; None if it is tilted."""
     x, y, z = pose[:3, 3].tolist()
     if abs(pose[2, 2]) >= math.cos(_TILT):
-        return Solid(Cylinder(x, y, radius), z - length / 2, z + length / 2)
+        return Solid(Cylinder(x, y, float(radius)), z - length / 2, z + length / 2)
     if abs(pose[2, 2]) <= math.sin(_TILT):
         return _prism(pose, pose[:2, 2], length, 2 * radius, 2 * radius)
     return None
@@ -71,7 +71,7 @@ def plane_of(pose: Array, normal: Array, size: Array) -> Solid | float | None:
     """A thin wall, or the height of a level plane [m]; None if it is tilted."""
     # The shortest turn from z to the normal, as in Gazebo, tells how the plane's sides lie.
     a, b, c = normal / np.linalg.norm(normal)
-    half = (1.0 - c) / (a * a + b * b) if a or b else 0.0
+    half = (1.0 - c) / (a * a + b * b) if a * a + b * b else 0.0
     sides = pose[:3, :3] @ [
         [1 - half * a * a, -half * a * b],
         [-half * a * b, 1 - half * b * b],
