@@ -347,6 +347,18 @@ def test_a_bad_map_is_rejected_with_line_and_reason(changes, line, reason, tmp_p
     assert f"map.yaml:{wrong}: " in str(caught.value)
 
 
+@pytest.mark.parametrize("read", [World.from_map, load_world])
+@pytest.mark.parametrize("content", [b"P5\n2 1\n255\n\xfe\xfe", b"<?xml version='1.0'?>\n<sdf/>"])
+def test_a_file_of_another_kind_is_rejected_with_the_kinds_that_are_read(read, content, tmp_path):
+    (tmp_path / "map.pgm").write_bytes(content)
+    with pytest.raises(
+        WorldFileError, match=r"(not UTF-8|mapping).*\.yml .* image of a ROS map.*\.sdf"
+    ):
+        read(tmp_path / "map.pgm")
+    with pytest.raises(ValueError, match=r"world must be .*\.yml .* image of a ROS map.*\.sdf"):
+        NavigationEnv(world=str(tmp_path / "map.pgm"))
+
+
 def test_huge_broken_or_full_images_are_rejected(tmp_path):
     path = write_map(tmp_path, None)
     for side, reason in (

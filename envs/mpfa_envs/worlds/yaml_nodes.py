@@ -101,7 +101,9 @@ class NodeReader:
     ) -> dict[str, yaml.Node]:
         """Read a mapping that has no key twice, and as :meth:`unknown` says no others."""
         if not isinstance(node, yaml.MappingNode):
-            raise self.error(node, f"{what} must be a mapping with the keys {', '.join(keys)}")
+            hint = f"; a world is read from {KINDS}" if what == "the file" else ""
+            text = f"{what} must be a mapping with the keys {', '.join(keys)}{hint}"
+            raise self.error(node, text)
         entries: dict[str, yaml.Node] = {}
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
