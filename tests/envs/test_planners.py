@@ -108,6 +108,18 @@ print((peak() - before) / 1024, time.process_time() - began)
     assert megabytes < 150 and seconds < 3
 
 
+@pytest.mark.slow
+def test_a_planner_in_a_very_large_room_takes_cells_that_are_not_too_many() -> None:
+    planner = make_planner("astar")
+    assert isinstance(planner, MapPlanner)
+    start, goal = (0.0, -5.0), (0.0, 5.0)
+    for side in (190.0, 300.0):
+        wall = Box(-side / 2, -0.1, side / 2, 0.1)
+        divided = World(name="divided", size=(side, side), boxes=(wall,))
+        assert planner.plan(divided, start, goal)[0] == [start, goal]
+    assert len(planner.plan(World(name="hall", size=(300.0, 300.0)), start, goal)[0]) > 30
+
+
 @pytest.mark.parametrize("world", ["A", "B", "D"])
 def test_ants_find_a_path_within_a_tenth_of_the_shortest(world: str) -> None:
     grid = FreeGrid(WORLDS[world], distance=0.25, resolution=0.25)
