@@ -2,9 +2,7 @@
 
 import gzip
 import math
-import os
 import time
-import warnings
 
 import pytest
 
@@ -12,27 +10,11 @@ from mpfa_envs import Box, NavigationEnv, WorldFileError
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.worlds.barn import barn_task, barn_world
 from mpfa_envs.worlds.gazebo import load_gazebo_world
+from tests.envs.sdf import CYLINDER, box, model, quietly, walls, write
 
 BARN_CENTER = (-2.25, 7.0)
 SPECK = "<box><size>1e-200 1e-200 1</size></box>"
 LOOSE = "<model name='l'><link><collision/><collision/></link></model>"
-CYLINDER = "<cylinder><radius>0.075</radius><length>1</length></cylinder>"
-
-
-def model(geometry, pose="0 0 0 0 0 0", *, static="<static>1</static>", link="", name="m"):
-    """A model of one link and one collision; the visual is larger and must not count."""
-    seen = "<visual><geometry><box><size>9 9 9</size></box></geometry></visual>"
-    collision = f"<collision name='c'>{link}<geometry>{geometry}</geometry></collision>"
-    link = f"<link name='l'>{seen}{collision}</link>"
-    return f"<model name='{name}'>{static}<pose frame=''>{pose}</pose>\n{link}</model>\n"
-
-
-def write(folder, content, head="", name="room.world"):
-    start = f"<?xml version='1.0'?>\n{head}<sdf version='1.6'>\n<world name='w'>\n"
-    text = f"{start}{content}</world></sdf>"
-    path = folder / name
-    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
-    return path
 
 
 def test_a_benchmark_world_is_the_same_by_file_and_numbers(tmp_path):
@@ -77,8 +59,8 @@ def test_turns_may_be_written_in_degrees(tmp_path):
     with pytest.warns(UserWarning, match="left out 1 tilted parts$"):
         world = load_gazebo_world(write(tmp_path, "".join(models)), size=(9, 9), center=(0, 0))
     assert not world.polygons and len(world.boxes) == 2
-    for box in world.boxes:
-        assert tuple(box.bounds) == pytest.approx((0.9, -2.0, 1.1, 2.0))
+    for each in world.boxes:
+        assert tuple(each.bounds) == pytest.approx((0.9, -2.0, 1.1, 2.0))
 
 
 def test_the_state_of_the_file_says_where_models_are(tmp_path):
@@ -213,33 +195,6 @@ def test_other_files_and_too_small_rooms_are_rejected(tmp_path):
         load_gazebo_world(
             write(tmp_path, model(CYLINDER, "9 0 0 0 0 0")), size=(4, 4), center=(0, 0)
         )
-
-
-def box(x, y, z, sides, name="m"):
-    """A static box in the middle of its pose."""
-    return model(f"<box><size>{sides}</size></box>", f"{x} {y} {z} 0 0 0", name=name)
-
-
-def walls(bottom=0.0, *, height=1.0, half=5.0):
-    """Four walls of 0.2 m around a room of 10 x 10 m, or another."""
-    z, long = bottom + height / 2, f"{2 * half}"
-    return "".join(
-        box(*place, sides)
-        for place, sides in (
-            ((0, half, z), f"{long} 0.2 {height}"),
-            ((0, -half, z), f"{long} 0.2 {height}"),
-            ((half, 0, z), f"0.2 {long} {height}"),
-            ((-half, 0, z), f"0.2 {long} {height}"),
-        )
-    )
-
-
-def quietly(path, **arguments):
-    """A world, and the only warning or an empty text."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        world = load_gazebo_world(path, **arguments)
-    return world, "".join(str(each.message) for each in caught)
 
 
 DISC = "<cylinder><radius>8</radius><length>0.3</length></cylinder>"
@@ -415,95 +370,3 @@ def test_marks_without_an_end_are_rejected_soon(text, tmp_path):
     with pytest.raises(WorldFileError, match="is not XML"):
         load_gazebo_world(tmp_path / "a.world")
     assert time.process_time() - start < 2.0
-
-
-BLOCK = (
-    "<sdf><model name='b'>{}<pose>0 0 0.5 0 0 0</pose><link><collision><geometry><box>"
-    "<size>1 1 1</size></box></geometry></collision></link>{}</model></sdf>"
-)
-
-
-def put(folder, name="b", extra="", static="<static>1</static>", file="model.sdf"):
-    """Write a model of a box of a meter into a folder of models."""
-    (folder / name).mkdir(parents=True, exist_ok=True)
-    (folder / name / file).write_text(BLOCK.format(static, extra))
-
-
-def include(uri="model://b", rest="<pose>2 2 0.5 0 0 0</pose>"):
-    return f"<include><uri>{uri}</uri>{rest}</include>"
-
-
-@pytest.mark.parametrize(
-    "where", ["", "worlds/models", "GAZEBO_MODEL_PATH", "GZ_SIM_RESOURCE_PATH", "model_paths"]
-)
-@pytest.mark.parametrize("uri", ["model://b", "file://b/model.sdf", "model://b/model.sdf"])
-def test_an_included_model_is_read_from_the_search_folders(where, uri, tmp_path, monkeypatch):
-    models = tmp_path / where
-    put(models)
-    arguments = {}
-    if where == "model_paths":
-        arguments = {where: models}
-    elif where.isupper():
-        monkeypatch.setenv(where, os.pathsep.join(("", str(tmp_path / "none"), str(models))))
-    folder = tmp_path if not where else tmp_path / "worlds"
-    folder.mkdir(exist_ok=True)
-    path = write(folder, walls() + include(uri) + include(uri, "<name>two</name>"))
-    world, told = quietly(path, center=(0, 0), **arguments)
-    assert not told
-    assert world.boxes[4:] == (Box(1.5, 1.5, 2.5, 2.5), Box(-0.5, -0.5, 0.5, 0.5))
-
-
-def test_an_include_changes_its_model(tmp_path):
-    put(tmp_path, static="")
-    put(tmp_path, "outer", include(rest="<pose>0 2 0 0 0 0</pose>"))
-    (tmp_path / "b/model.config").write_text(
-        "<model><sdf version='1.10'>old.sdf</sdf><sdf version='1.6'>new.sdf</sdf></model>"
-    )
-    (tmp_path / "b/model.sdf").rename(tmp_path / "b/new.sdf")
-    state = "<state><model name='x'><pose>-2 2 0.5 0 0 0</pose><scale>2 1 1</scale></model></state>"
-    content = include(rest="") + include(rest="<static>true</static><name>x</name>")
-    path = write(tmp_path, walls() + content + include("model://outer") + state)
-    world, told = quietly(path, center=(0, 0))
-    assert told.endswith("read 7 of 8 collisions, left out 1 models that may move")
-    assert [each.bounds for each in world.boxes[4:]] == [
-        (-3.0, 1.5, -1.0, 2.5),
-        (1.5, 1.5, 2.5, 2.5),
-        (1.5, 3.5, 2.5, 4.5),
-    ]
-
-
-def test_nothing_outside_the_search_folders_is_read(tmp_path):
-    put(tmp_path / "out", "b")
-    put(tmp_path / "in", "c", static="")
-    (tmp_path / "in/link").symlink_to(tmp_path / "out/b")
-    (tmp_path / "in/c/model.config").write_text("<model><sdf>../../out/b/model.sdf</sdf></model>")
-    (tmp_path / "in/loop").symlink_to(tmp_path / "in/loop")
-    os.mkfifo(tmp_path / "in/pipe")
-    away = ("model://../out/b", "model://link", "model://c", f"file://{tmp_path}/out/b/model.sdf")
-    odd = ("https://b", "model://loop", "model://pipe", "model://", "", "model://" + "x" * 5000)
-    content = "".join(include(uri) for uri in (*away, *odd)) + "<include/>"
-    path = write(tmp_path / "in", walls() + content)
-    _, told = quietly(path, size=(11, 11))
-    assert told.endswith("read 4 of 4 collisions, left out 11 includes")
-    with pytest.raises(WorldFileError, match=r"is mostly left out; .* left out 11 includes"):
-        load_gazebo_world(path)
-    inside = write(tmp_path / "in", walls() + include(f"file://{tmp_path}/in/c/model.sdf"))
-    assert quietly(inside)[1].endswith("left out 1 models that may move")
-
-
-def test_circles_and_floods_of_includes_are_rejected(tmp_path):
-    put(tmp_path, "b", include() * 2)
-    put(tmp_path, "wide", "<link/>" * 4000)
-    path = write(tmp_path, walls() + include())
-    with pytest.raises(WorldFileError, match=r"b/model.sdf:1: is in more than 20 includes"):
-        load_gazebo_world(path)
-    path = write(tmp_path, walls() + include("model://wide") * 200)
-    with pytest.raises(WorldFileError, match=r"room.world:12: has more than 500000 elements"):
-        load_gazebo_world(path)
-    put(tmp_path, "bad", "<link>")
-    path = write(tmp_path, walls() + include("model://bad"))
-    with pytest.raises(WorldFileError, match=r"bad/model.sdf:1: is not XML"):
-        load_gazebo_world(path)
-    path = write(tmp_path, box(0, 0, 1, "1 1 1") * 5001)
-    with pytest.raises(WorldFileError, match=r"has more than 5000 shapes"):
-        load_gazebo_world(path)

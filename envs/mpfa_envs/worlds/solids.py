@@ -69,7 +69,7 @@ def cylinder_of(pose: Array, radius: float, length: float) -> Solid | None:
 
 def plane_of(pose: Array, normal: Array, size: Array) -> Solid | float | None:
     """A thin wall, or the height of a level plane [m]; None if it is tilted."""
-    # The shortest turn from z to the normal, as in Gazebo, tells how the plane's sides lie.
+    # The shortest turn from z to the normal, as in Gazebo, says how the plane's sides lie.
     a, b, c = normal / np.linalg.norm(normal)
     half = (1.0 - c) / (a * a + b * b) if a * a + b * b else 0.0
     sides = pose[:3, :3] @ [
