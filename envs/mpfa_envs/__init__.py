@@ -127,7 +127,7 @@ _RENAMED = {
     "world_seed": "generators.world_seed",
 }
 """Old names, which stay for one version, and where they are."""
-_OF_THE_EXTRA = ("gymnasium", "networkx", "numba", "PIL", "yaml", "scipy")
+_OF_THE_EXTRA = ("gymnasium", "numba", "PIL", "yaml", "scipy")
 
 
 def __getattr__(name: str) -> Any:

@@ -182,7 +182,7 @@ pilot = Pilot.load({str(file)!r})
 pilot.begin((3.0, 1.0))
 print(pilot.decide(Scan(-3.1, 0.01, [2.0] * 620), (0.0, 0.0, 0.0), (0.0, 0.0)))
 """
-    found = run(code, without=(*others, "yaml", "PIL", "networkx"), PYTHONWARNINGS="error")
+    found = run(code, without=(*others, "yaml", "PIL"), PYTHONWARNINGS="error")
     assert found.startswith("Command(left=0.")
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
@@ -84,11 +86,38 @@ def test_a_path_goes_from_each_cell_to_a_neighbor() -> None:
             assert following in neighbors[starts[cell] : starts[cell + 1]]
 
 
-def test_a_search_leaves_the_graph_as_it_was() -> None:
-    grid = FreeGrid(WORLDS["B"], distance=0.25, resolution=0.25)
-    first = astar_path(grid, (0.0, 0.0), (4.0, 0.0))
-    astar_path(grid, (-4.0, 0.0), (0.0, -4.0))
-    assert astar_path(grid, (0.0, 0.0), (4.0, 0.0)) == first
+@pytest.mark.slow
+def test_astar_in_a_room_of_80_m_is_soon_there_and_takes_little_memory() -> None:
+    # In a process of its own, as the peak of a process never falls.
+    code = """
+import resource, time
+from mpfa_envs import World
+from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.planners import astar_path
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for side in (4.0, 80.0):  # The first compiles the loops.
+    before, began = peak(), time.process_time()
+    grid = FreeGrid(World(name="hall", size=(side, side)), distance=0.25)
+    corner = side / 2 - 0.5
+    assert astar_path(grid, (-corner, -corner), (corner, 0.3 * corner)) is not None
+print((peak() - before) / 1024, time.process_time() - began)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    megabytes, seconds = map(float, done.stdout.split())
+    assert megabytes < 150 and seconds < 3
+
+
+@pytest.mark.slow
+def test_a_planner_in_a_very_large_room_takes_cells_that_are_not_too_many() -> None:
+    planner = make_planner("astar")
+    assert isinstance(planner, MapPlanner)
+    start, goal = (0.0, -5.0), (0.0, 5.0)
+    for side in (190.0, 300.0):
+        wall = Box(-side / 2, -0.1, side / 2, 0.1)
+        divided = World(name="divided", size=(side, side), boxes=(wall,))
+        assert planner.plan(divided, start, goal)[0] == [start, goal]
+    assert len(planner.plan(World(name="hall", size=(300.0, 300.0)), start, goal)[0]) > 30
 
 
 @pytest.mark.parametrize("world", ["A", "B", "D"])

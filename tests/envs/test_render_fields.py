@@ -184,3 +184,19 @@ def test_a_long_film_has_fewer_pictures_and_its_end() -> None:
     for number, frame in enumerate(fewer.frames[:-1]):
         np.testing.assert_array_equal(frame, every.frames[4 * number])
     np.testing.assert_array_equal(fewer.frames[-1], every.frames[-1])
+
+
+@pytest.mark.parametrize(("side", "cells"), [(14.0, 70 * 70), (100.0, 71 * 71)])
+def test_a_picture_of_values_has_cells_by_its_pixels_in_large_rooms(
+    side: float, cells: int
+) -> None:
+    seen: list[int] = []
+
+    def values(observations: np.ndarray) -> np.ndarray:
+        seen.append(len(observations))
+        return np.zeros(len(observations))
+
+    world = World(name="hall", size=(side, side))
+    # At the goal and beside the walls there are no robots.
+    render_values(world, goal=(0.0, 0.0), values=values, size=640)
+    assert 0.9 * cells < seen[0] <= cells

@@ -14,6 +14,7 @@ from mpfa_envs.worlds.builtin import WORLDS
 from mpfa_envs.worlds.gazebo import load_gazebo_world
 from mpfa_envs.worlds.world import World
 from mpfa_envs.worlds.world_file import load_world
+from mpfa_envs.worlds.yaml_nodes import KINDS
 
 _GAZEBO: Final = (".world", ".sdf", ".world.gz", ".sdf.gz")
 """Endings of files that are read as Gazebo's."""
@@ -37,6 +38,6 @@ def resolve_world(world: str | os.PathLike[str] | World) -> World:
             return load_gazebo_world(world)
     hint = f" ({question})" if (question := did_you_mean(world, WORLDS)) else ""
     raise ValueError(
-        "world must be a World, the path of a .yaml file, 'barn-0' to 'barn-19', a generator's "
+        f"world must be a World, the path of {KINDS}, 'barn-0' to 'barn-19', a generator's "
         f"'NAME-SEED' or one of {list(WORLDS)}, got {world!r}{hint}"
     )

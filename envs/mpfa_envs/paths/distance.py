@@ -33,7 +33,8 @@ from mpfa_envs.worlds.world import World
 
 RESOLUTION: Final = 0.1
 """Default side of a cell [m]."""
-_MOST_CELLS: Final = 4_000_000
+MOST_CELLS: Final = 4_000_000
+"""Most cells of a grid."""
 _MARGIN: Final = 3
 """Cells by which a window is wider than the longest path."""
 
@@ -72,9 +73,9 @@ class FreeGrid:
             )
         # The grid is as wide as the room or a little wider; cells behind a wall are not free.
         sides = [max(1, math.ceil(round(side / resolution, 6))) for side in world.size]
-        if math.prod(sides) > _MOST_CELLS:
+        if math.prod(sides) > MOST_CELLS:
             raise ValueError(
-                f"resolution must leave at most {_MOST_CELLS} cells in a room of {world.size} m, "
+                f"resolution must leave at most {MOST_CELLS} cells in a room of {world.size} m, "
                 f"got {resolution}"
             )
         self.xs, self.ys = (_centers(count, self.resolution) for count in sides)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.paths.distance import MOST_CELLS, FreeGrid
 from mpfa_envs.planners.pure_pursuit import PurePursuit
 from mpfa_envs.planners.search import Search
 from mpfa_envs.robots.model import TRAINING_CLEARANCE, RobotModel, resolve_robot
@@ -35,7 +36,7 @@ class MapPlanner:
         search: Finds a path.
         robot: The robot.
         clearance: Least clearance of the robot's rim on a path [m].
-        resolution: Side of a cell of the grid [m].
+        resolution: Side of a cell of the grid [m], longer in rooms of more than 200 m.
         look_ahead: Of the :class:`~mpfa_envs.planners.PurePursuit` [m].
 
     Raises:
@@ -89,10 +90,13 @@ class MapPlanner:
 
     def plan(self, world: World, start: Point, goal: Point) -> tuple[list[Point], FreeGrid]:
         """Positions of a path from start to goal [m], and the grid that it was found on."""
+        # In a room of more than 100 m the finest cells would be too many.
+        least = 1.01 * math.sqrt(math.prod(world.size) / MOST_CELLS)
+        coarse, fine = max(self.resolution, least), max(min(_FINE, self.resolution), least)
         for clearance, resolution in (
-            (self.clearance, self.resolution),
-            (self.clearance, min(_FINE, self.resolution)),
-            (_LEAST_CLEARANCE, min(_FINE, self.resolution)),
+            (self.clearance, coarse),
+            (self.clearance, fine),
+            (_LEAST_CLEARANCE, fine),
         ):
             grid = self._grid_of(world, self.robot.radius + clearance, resolution)
             path = self.search(grid, start, goal)

@@ -1,25 +1,21 @@
-"""Shortest paths on the grid of a known world, by graph searches of two libraries."""
+"""Shortest paths on the grid of a known world, by two searches."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.paths.grid_loops import STEP_SCALE
+from mpfa_envs.paths.field_loops import astar_tree
+from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.worlds.shapes import Point
 
-if TYPE_CHECKING:
-    import networkx
-
-_START: Final = -1
-_GOAL: Final = -2
-"""Nodes of NetworkX's graph besides the cells."""
+_ORDERED: Final = np.array(sorted(MOVES.tolist(), key=lambda move: min((*move[:2],), (0, 1))))
+"""Moves of A*: to cells of lower numbers first; of paths that are equally short one is found."""
 
 
 class Search(Protocol):
@@ -58,7 +54,7 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
 
 
 def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-    """Find a shortest path with NetworkX's A*, as a :class:`Search`.
+    """Find a shortest path with A*, as a :class:`Search`.
 
     The rest of a path is estimated by the straight line, measured as short as moves are: it is
     never overestimated, so that the path is a shortest one.
@@ -74,41 +70,15 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
     """
     if not grid.free.any():
         return None
-    # Imported here because it takes long, and evaluating a policy does not need it.
-    from networkx import NetworkXNoPath
-    from networkx import astar_path as search
-
-    graph = _networkx_graph(grid)
-    gaps = STEP_SCALE * np.hypot(
-        grid.xs[grid.cells[:, 0]] - goal[0], grid.ys[grid.cells[:, 1]] - goal[1]
-    )
-    # The last two are those of _GOAL and _START, which are -2 and -1.
-    estimates = [*gaps.tolist(), 0.0, STEP_SCALE * math.dist(start, goal)]
-    try:
-        for node, place in ((_START, start), (_GOAL, goal)):
-            edges = ((node, cell, gap) for cell, gap in grid.cells_around(place))
-            graph.add_weighted_edges_from(edges)
-        cells = search(graph, _START, _GOAL, heuristic=lambda cell, _: estimates[cell])[1:-1]
-    except NetworkXNoPath:
-        return None
-    finally:
-        graph.remove_nodes_from((_START, _GOAL))
-    return [start, *centers(grid, cells), goal]
-
-
-@lru_cache(maxsize=2)
-def _networkx_graph(grid: FreeGrid) -> networkx.Graph:
-    """The free cells and the moves between them; some tens of megabytes."""
-    from networkx import Graph
-
-    starts, neighbors, lengths = grid.moves
-    cells = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    once = cells < neighbors
-    graph = Graph()
-    graph.add_nodes_from(range(len(starts) - 1))
-    edges = (cells[once].tolist(), neighbors[once].tolist(), lengths[once].tolist())
-    graph.add_weighted_edges_from(zip(*edges, strict=True))
-    return graph
+    estimates = STEP_SCALE * np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1])
+    ends = (*grid.around(start), *grid.around(goal))
+    step = grid.resolution * STEP_SCALE
+    before = astar_tree(grid.free, *ends, estimates, _ORDERED, step)
+    places, cell = [goal], before[-1]
+    while cell >= 0:
+        places.append(grid.center(*divmod(int(cell), len(grid.ys))))
+        cell = before[cell]
+    return [start, *places[::-1]] if len(places) > 1 else None
 
 
 def centers(grid: FreeGrid, cells: list[int]) -> list[Point]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpfa_envs.checks import check_positive
+from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.render.grids import Heading, fill_cells, observe_room
 from mpfa_envs.robots.model import RobotModel, resolve_robot
@@ -23,6 +23,10 @@ Observations = NDArray[np.float32]
 
 _ARROW_TIME = 1.0
 """Time of the path that an arrow shows [s]."""
+_CELL, _BETWEEN = 0.2, 0.6
+"""Least side of a cell and least distance between two arrows [m]."""
+_CELL_PIXELS = 9
+"""Least side of a cell in larger rooms [px]: each cell takes time, the more the larger the room."""
 
 
 def render_values(
@@ -32,8 +36,8 @@ def render_values(
     heading: Heading = 0.0,
     values: Callable[[Observations], Any] | None = None,
     actions: Callable[[Observations], Any] | None = None,
-    spacing: float = 0.2,
-    arrow_spacing: float = 0.6,
+    spacing: float | None = None,
+    arrow_spacing: float | None = None,
     name: str = "Q",
     title: str = "",
     size: int = 480,
@@ -53,8 +57,8 @@ def render_values(
             actions; None: no colors.
         actions: From observations to actions, ``[N, 2]``, as a :class:`~mpfa_envs.Policy`; None: no
             arrows.
-        spacing: Side of a cell [m].
-        arrow_spacing: Distance between two arrows [m].
+        spacing: Side of a cell [m]. None: 0.2 m, or nine pixels if that is more.
+        arrow_spacing: Distance between two arrows [m]. None: 0.6 m, or 27 pixels.
         name: Of the value.
         title: What to write in the strip.
         size: Longer side of the picture without the strip [px].
@@ -74,6 +78,10 @@ def render_values(
         (508, 480, 3)
     """
     world = resolve_world(world)
+    pixel = max(world.size) / check_count("size", size, least=32)
+    wider = max(1.0, _CELL_PIXELS * pixel / _CELL)
+    spacing = _CELL * wider if spacing is None else spacing
+    arrow_spacing = _BETWEEN * wider if arrow_spacing is None else arrow_spacing
     check_positive("arrow_spacing", arrow_spacing)
     where: dict[str, Any] = {"goal": goal, "heading": heading, **env_arguments}
     entries: list[Entry] = titled(title)

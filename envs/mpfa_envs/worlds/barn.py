@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.files import read_file
-from mpfa_envs.worlds.gazebo import LARGEST_FILE, read_gazebo_world
+from mpfa_envs.worlds.gazebo import read_gazebo_world
+from mpfa_envs.worlds.sdf import LARGEST_FILE
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import Box, Cylinder, World
 from mpfa_envs.worlds.yaml_nodes import WorldFileError

@@ -1,78 +1,47 @@
-"""Worlds of Gazebo (SDF): the boxes and cylinders of their static models."""
+"""Worlds of Gazebo (SDF): the boxes, cylinders and upright planes of their static models."""
 
 from __future__ import annotations
 
-import gzip
-import io
 import math
 import os
 import warnings
-import zlib
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
-from xml.parsers import expat
+from typing import Final
 
-from mpfa_envs.files import read_file
-from mpfa_envs.worlds.shapes import Box, Cylinder, Polygon, Shape
+import numpy as np
+from numpy.typing import NDArray
+
+from mpfa_envs.worlds.sdf import Element, SdfFiles, read_sdf
+from mpfa_envs.worlds.solids import (
+    STEP,
+    Solid,
+    box_of,
+    cylinder_of,
+    floor_of,
+    plane_of,
+    pose_matrix,
+    room_around,
+)
 from mpfa_envs.worlds.world import World
+from mpfa_envs.worlds.world_file import has_room
 from mpfa_envs.worlds.yaml_nodes import WorldFileError, read_number
 
-LARGEST_FILE: Final = 20_000_000
-"""Longest text that is read [bytes]."""
-_DEEPEST: Final = 100
-"""Greatest depth of nested elements."""
-_FLOOR: Final = 0.01
-"""A robot drives over obstacles up to this height [m]."""
+Array = NDArray[np.float64]
+
 _FARTHEST: Final = 1e9
 """Numbers must be smaller than this [m, rad]."""
-_STRAIGHT: Final = 1e-6
-"""Smaller angles count as zero [rad]."""
-
-
-@dataclass(slots=True)
-class _Element:
-    """An element of the file, with its line."""
-
-    tag: str
-    attributes: dict[str, str]
-    line: int
-    pieces: list[str] = field(default_factory=list)
-    children: list[_Element] = field(default_factory=list)
-
-    @property
-    def text(self) -> str:
-        """Text between its children."""
-        return "".join(self.pieces).strip()
-
-    def all(self, tag: str) -> Iterator[_Element]:
-        """Its children with a tag."""
-        return (child for child in self.children if child.tag == tag)
-
-    def first(self, tag: str) -> _Element | None:
-        """Its first child with a tag; None without one."""
-        return next(self.all(tag), None)
-
-
-class _Pose(NamedTuple):
-    """A pose: x, y, z [m] and yaw [rad]."""
-
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-    yaw: float = 0.0
-
-    def __matmul__(self, inner: _Pose) -> _Pose:
-        """Compose two poses: the inner one is given in the frame of this one."""
-        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
-        return _Pose(
-            self.x + cosine * inner.x - sine * inner.y,
-            self.y + sine * inner.x + cosine * inner.y,
-            self.z + inner.z,
-            self.yaw + inner.yaw,
-        )
+_NARROWEST: Final = 0.1
+"""The smallest robot needs this clearance [m]."""
+_MOST_SOLIDS: Final = 5_000
+"""Most shapes, of which at most 1,000 may be obstacles."""
+_INCLUDES: Final = 20
+"""Greatest depth of models that include models."""
+_FOLDERS: Final = ("GAZEBO_MODEL_PATH", "GZ_SIM_RESOURCE_PATH")
+"""Variables of the environment that list folders of models."""
+_MOVABLE: Final = ("models that may move", "actors")
+"""Parts that are no part of the room."""
 
 
 def load_gazebo_world(
@@ -81,29 +50,39 @@ def load_gazebo_world(
     size: tuple[float, float] | None = None,
     center: tuple[float, float] | None = None,
     height: float = 0.5,
+    model_paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] = (),
 ) -> World:
-    """Read the boxes and cylinders of a Gazebo world.
+    """Read the boxes, cylinders and upright planes of a Gazebo world.
 
-    They are those of the collisions of static models, models in models included, where the
-    ``state`` of the file puts them. A warning counts parts that are left out: includes, models that
-    may move, meshes and other geometry, tilted parts, poses in named frames, and poses with a
-    quaternion.
+    They are those of the collisions of static models, included and nested ones as well, where and
+    as large as the ``state`` of the file has them. What lies under everything else is the floor. A
+    warning counts the collisions that are read, and the parts that are left out: includes that are
+    not found, models that may move, meshes and other geometry, tilted parts, poses in named frames,
+    and poses with a quaternion.
 
     Args:
         path: A ``.world`` or ``.sdf`` file, or one that is compressed (``.gz``).
         size: Width and depth of the room [m]. None: as large as the obstacles need.
         center: Middle of the room in the file (x, y) [m]. None: that of the obstacles.
-        height: Shapes that begin above this are no obstacles [m], nor are those below the floor.
+        height: Shapes that begin higher above the floor are no obstacles [m], nor are those in it.
+        model_paths: Folder or folders of the models of ``model://`` and ``file://``, besides the
+            file's, ``models`` in it, and those of GAZEBO_MODEL_PATH and GZ_SIM_RESOURCE_PATH.
+            Nothing outside them is read.
 
     Returns:
         The world, with the name of the file.
 
     Raises:
-        WorldFileError: If the file cannot be read, is no world of SDF, defines entities, or the
-            obstacles do not fit in the room.
+        WorldFileError: If a file cannot be read, is no SDF, or defines entities, the obstacles do
+            not fit in the room, no robot fits, or without a size most of the room is left out.
     """
     path = Path(path)
-    return read_gazebo_world(_read(path), str(path), size=size, center=center, height=height)
+    listed = [folder for name in _FOLDERS for folder in os.environ.get(name, "").split(os.pathsep)]
+    given = (model_paths,) if isinstance(model_paths, (str, os.PathLike)) else model_paths
+    beside = path.parent, path.parent / "models"
+    folders = [*map(Path, given), *beside, *map(Path, filter(None, listed))]
+    text, name = read_sdf(path), str(path)
+    return read_gazebo_world(text, name, size=size, center=center, height=height, folders=folders)
 
 
 def read_gazebo_world(
@@ -113,237 +92,199 @@ def read_gazebo_world(
     size: tuple[float, float] | None,
     center: tuple[float, float] | None,
     height: float = 0.5,
+    folders: Sequence[Path] = (),
 ) -> World:
     """Read the text of a file; ``path`` names it in errors, and the world."""
-    root = _parse(path, text)
+    least = 0.0 if size is None else World(name="room", size=size).room.area / 10
+    files = SdfFiles(folders)
+    root = files.parse(path, text)
     world = root.first("world") if root.tag == "sdf" else None
     if world is None:
-        raise WorldFileError(f"{path}:{root.line}: must be an sdf element with a world in it")
-    reader = _Reader(path, height)
-    moved = reader.state(world.first("state"))
-    for model in world.all("model"):
-        reader.model(model, _Pose(), moved.get(model.attributes.get("name", "")))
-    reader.left_out["includes"] += sum(1 for _ in world.all("include"))
-    reader.left_out["actors"] += sum(1 for _ in world.all("actor"))
-    left_out = [f"{count} {what}" for what, count in reader.left_out.items() if count]
-    if left_out:
-        warnings.warn(f"{path}: left out {', '.join(left_out)}", stacklevel=3)
-    if not reader.shapes and size is None:
-        raise WorldFileError(f"{path}:{world.line}: has no obstacle, and so no size")
+        raise root.error("must be an sdf element with a world in it")
+    reader = _Reader(files)
+    reader.read_world(root, world)
+    floor = floor_of(reader.solids, reader.grounds, least)
+    shapes = [
+        solid.shape
+        for solid in reader.solids
+        if solid.top > floor + STEP and solid.bottom < floor + height
+    ]
+    found = reader.summary()
+    if size is None and not shapes:
+        raise world.error(f"has no obstacle, and so no size; {found}")
+    if size is None and reader.lost > len(shapes):
+        raise world.error(f"is mostly left out; pass a size to read it all the same; {found}")
     try:
-        return _room(path, reader.shapes, size, center)
+        room = room_around(os.path.basename(path).split(".")[0], shapes, size, center)
     except ValueError as error:
-        raise WorldFileError(f"{path}: {error}") from error
-
-
-def _read(path: Path) -> bytes:
-    """Read a file, decompressed if it ends in .gz, up to the largest size."""
-    try:
-        content = read_file(path, LARGEST_FILE)
-        if path.suffix.lower() == ".gz":
-            content = gzip.GzipFile(fileobj=io.BytesIO(content)).read(LARGEST_FILE + 1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise WorldFileError(f"{path}: cannot be read: {error}") from error
-    if len(content) > LARGEST_FILE:
-        raise WorldFileError(f"{path}: has more than {LARGEST_FILE} bytes")
-    return content
-
-
-def _parse(path: str, text: bytes) -> _Element:
-    """Read the elements; a document type, which could define entities, is rejected."""
-    parser = expat.ParserCreate()
-    parser.buffer_text = True  # Else each line end is a separate piece.
-    document = _Element("", {}, 1)
-    open_ones = [document]
-
-    def error(reason: str) -> WorldFileError:
-        return WorldFileError(f"{path}:{parser.CurrentLineNumber}: {reason}")
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        element = _Element(tag, attributes, parser.CurrentLineNumber)
-        open_ones[-1].children.append(element)
-        open_ones.append(element)
-        if len(open_ones) > _DEEPEST:
-            raise error("is nested too deeply")
-
-    def end(_: str) -> None:
-        open_ones.pop()
-
-    def add(text: str) -> None:
-        open_ones[-1].pieces.append(text)
-
-    def reject(*_: object) -> None:
-        raise error("must not have a document type, as that may define entities")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = add, reject
-    try:
-        parser.Parse(text, True)
-    except WorldFileError:
-        raise
-    except (expat.ExpatError, LookupError, ValueError) as reason:  # The last two: its encoding.
-        raise error(f"is not XML: {reason}") from reason
-    return document.children[0]
+        raise WorldFileError(f"{path}: {error}; {found}") from error
+    if has_room(room, room.room, _NARROWEST) is False:
+        raise world.error(f"has no room for a robot in its {room.size} m; {found}")
+    if reader.left_out:
+        warnings.warn(f"{path}: {found}", stacklevel=3)
+    return room
 
 
 class _Reader:
-    """Collects the obstacles of one file, and counts the parts left out."""
+    """Collects the solids of one world, and counts the parts left out."""
 
-    def __init__(self, path: str, height: float) -> None:
-        self._path = path
-        self._height = height
-        self.shapes: list[Shape] = []
+    def __init__(self, files: SdfFiles) -> None:
+        self._files = files
+        self.solids: list[Solid] = []
+        self.grounds: list[float] = []
+        """Heights of level planes [m]."""
         self.left_out: Counter[str] = Counter()
+        self.lost = 0
+        """Number of collisions and includes of the room that are left out."""
+        self._total = self._read = self._explained = 0
 
-    def state(self, state: _Element | None) -> dict[str, _Element]:
-        """Poses of models by name, if the file has them in a separate state."""
-        models = () if state is None else state.all("model")
-        places = ((model.attributes.get("name", ""), model.first("pose")) for model in models)
-        return {name: pose for name, pose in places if pose is not None}
+    def read_world(self, root: Element, world: Element) -> None:
+        """Collect the solids of a world, and account for all collisions of the file."""
+        self._total += root.count("collision")
+        self._parts(world, np.eye(4), False, _models_of(world.first("state")), 0)
+        for actor in world.all("actor"):
+            self._leave("actors", actor)
+        others = self._total - self._read - self._explained
+        if others > 0:
+            self.left_out["other collisions"] += others
 
-    def model(
-        self, model: _Element, outer: _Pose, moved: _Element | None = None, static: bool = False
+    def summary(self) -> str:
+        """What is read and what is left out."""
+        parts = ", ".join(f"{count} {what}" for what, count in self.left_out.items())
+        return f"read {self._read} of {self._total} collisions, left out {parts or 'nothing'}"
+
+    def _leave(self, what: str, part: Element) -> None:
+        """Count a part that is left out, and the collisions in it."""
+        self.left_out[what] += 1
+        count = part.count("collision")
+        self._explained += count
+        self.lost += 0 if what in _MOVABLE else count
+
+    def _parts(
+        self, owner: Element, place: Array, static: bool, states: Mapping[str, Element], depth: int
     ) -> None:
-        """Collect the obstacles of a model and those in it."""
-        flag = model.first("static")
-        static |= flag is not None and flag.text.lower() in ("1", "true")
-        inner = self._pose(moved or model.first("pose"))
-        if not static:
-            self.left_out["models that may move"] += 1
-            return
-        if inner is not None and model.attributes.get("placement_frame"):
-            self.left_out["poses in named frames"] += 1
-            inner = None
-        self.left_out["includes"] += sum(1 for _ in model.all("include"))
-        if inner is None:
-            return
-        place = outer @ inner
-        for link in model.all("link"):
-            inner = self._pose(link.first("pose"))
-            for collision in link.all("collision") if inner is not None else ():
-                own = self._pose(collision.first("pose"))
-                if inner is not None and own is not None:
-                    self._collision(collision, place @ inner @ own)
-        for part in model.all("model"):
-            self.model(part, place, static=static)
+        """Collect the solids of the models and includes in a world or model."""
+        for part in owner.children:
+            if part.tag == "model":
+                self._model(part, place, static, states, depth)
+            elif part.tag == "include":
+                if depth >= _INCLUDES:
+                    raise part.error(f"is in more than {_INCLUDES} includes, maybe in a circle")
+                model = self._files.included(part)
+                if model is None:
+                    uri = part.first("uri")
+                    self._leave("includes", part)
+                    self.lost += uri is None or not uri.text.endswith(("sun", "ground_plane"))
+                else:
+                    self._total += model.count("collision")
+                    self._model(model, place, static, states, depth + 1)
 
-    def _pose(self, pose: _Element | None) -> _Pose | None:
-        """Read a pose; None if it is of a kind that is left out."""
+    def _model(
+        self,
+        model: Element,
+        outer: Array,
+        static: bool,
+        states: Mapping[str, Element],
+        depth: int,
+    ) -> None:
+        """Collect the solids of a model and those in it."""
+        flag = model.first("static")
+        if not (static or (flag is not None and flag.text.lower() in ("1", "true"))):
+            return self._leave("models that may move", model)
+        if model.attributes.get("placement_frame"):
+            return self._leave("poses in named frames", model)
+        state = states.get(model.attributes.get("name", ""))
+        moved, scale = None, np.ones(3)
+        if state is not None:
+            moved = state.first("pose")
+            scale = self._lengths(state, 3, "scale") if state.first("scale") else scale
+        inner = self._pose(model, moved)
+        if inner is None:
+            return None
+        place = inner if moved is not None else outer @ inner  # That of a state is in the world.
+        for link in model.all("link"):
+            inner = self._pose(link)
+            for collision in link.all("collision") if inner is not None else ():
+                own = self._pose(collision)
+                if inner is not None and own is not None:
+                    self._collision(collision, place @ inner @ own, scale)
+        return self._parts(model, place, True, _models_of(state), depth)
+
+    def _pose(self, owner: Element, moved: Element | None = None) -> Array | None:
+        """Read the pose of a part, ``[4, 4]``; None if it is of a kind that is left out."""
+        pose = moved or owner.first("pose")
         if pose is None:
-            return _Pose()
+            return np.eye(4)
         if pose.attributes.get("frame") or pose.attributes.get("relative_to"):
-            self.left_out["poses in named frames"] += 1
+            self._leave("poses in named frames", owner)
             return None
         if pose.attributes.get("rotation_format", "euler_rpy") != "euler_rpy":
-            self.left_out["poses that are not written as roll, pitch and yaw"] += 1
+            self._leave("poses that are not written as roll, pitch and yaw", owner)
             return None
-        x, y, z, roll, pitch, yaw = self._numbers(pose, 6)
+        x, y, z, *angles = self._numbers(pose, 6)
         if pose.attributes.get("degrees", "").strip().lower() in ("1", "true"):
-            roll, pitch, yaw = (math.radians(angle) for angle in (roll, pitch, yaw))
-        if max(abs(roll), abs(pitch)) > _STRAIGHT:
-            self.left_out["tilted parts"] += 1
-            return None
-        return _Pose(x, y, z, yaw)
+            angles = [math.radians(angle) for angle in angles]
+        return pose_matrix(x, y, z, *angles)
 
-    def _collision(self, collision: _Element, pose: _Pose) -> None:
-        """Collect the shape of a collision, if a robot can hit it."""
+    def _collision(self, collision: Element, pose: Array, scale: Array) -> None:
+        """Collect the solid of a collision."""
         geometry = collision.first("geometry")
-        kinds = [] if geometry is None else geometry.children
-        for kind in kinds:
-            if kind.tag == "cylinder":
-                radius, length = (
-                    self._lengths(kind, "radius", 1)[0],
-                    self._lengths(kind, "length", 1)[0],
-                )
-                if self._is_met(pose.z, length):
-                    self.shapes.append(Cylinder(pose.x, pose.y, radius))
-            elif kind.tag == "box":
-                width, depth, tall = self._lengths(kind, "size", 3)
-                if self._is_met(pose.z, tall):
-                    try:
-                        self.shapes.append(_turned_box(pose, width, depth))
-                    except ValueError as error:  # A side vanishes beside where it is.
-                        raise self._error(kind, str(error)) from error
-            elif kind.tag != "plane":  # The ground.
-                self.left_out[f"geometries of the kind {kind.tag}"] += 1
+        kind = next(iter(geometry.children if geometry else ()), None)
+        if kind is None or kind.tag not in ("box", "cylinder", "plane"):
+            what = "none" if kind is None else kind.tag
+            return self._leave(f"geometries of the kind {what}", collision)
+        solid: Solid | float | None
+        try:
+            if kind.tag == "box":
+                solid = box_of(pose, scale * self._lengths(kind, 3, "size"))
+            elif kind.tag == "cylinder":
+                radius, length = (self._lengths(kind, 1, tag)[0] for tag in ("radius", "length"))
+                solid = cylinder_of(pose, radius * max(scale[:2]), length * scale[2])
+            else:
+                solid = self._plane(kind, pose, scale)
+        except WorldFileError:
+            raise
+        except ValueError as error:  # A side vanishes beside where it is.
+            raise kind.error(str(error)) from error
+        if solid is None:
+            return self._leave("tilted parts", collision)
+        self._read += 1
+        if isinstance(solid, Solid):
+            self.solids.append(solid)
+        else:
+            self.grounds.append(solid)
+        if len(self.solids) > _MOST_SOLIDS:
+            raise collision.error(f"has more than {_MOST_SOLIDS} shapes with all that is included")
 
-    def _is_met(self, middle: float, length: float) -> bool:
-        """Tell whether a robot meets an upright shape with its middle at a height [m]."""
-        return middle + length / 2 > _FLOOR and middle - length / 2 < self._height
+    def _plane(self, plane: Element, pose: Array, scale: Array) -> Solid | float | None:
+        """Read a plane, which may lack its normal and its size."""
+        normal, size = plane.first("normal"), plane.first("size")
+        facing = np.array([0.0, 0.0, 1.0] if normal is None else self._numbers(normal, 3))
+        if normal is not None and not np.linalg.norm(facing) > 0.0:
+            raise normal.error(f"normal must not be zero, got {normal.text!r}")
+        sides = np.ones(2) if size is None else np.array(self._lengths(plane, 2, "size"))
+        return plane_of(pose, facing, sides * scale[:2])
 
-    def _lengths(self, element: _Element, tag: str, count: int) -> list[float]:
-        """Read positive numbers."""
+    def _lengths(self, element: Element, count: int, tag: str) -> Array:
+        """Read positive numbers of a child."""
         child = element.first(tag)
         if child is None:
-            raise self._error(element, f"{element.tag} lacks {tag}")
+            raise element.error(f"{element.tag} lacks {tag}")
         numbers = self._numbers(child, count)
         if min(numbers) <= 0.0:
-            raise self._error(child, f"{tag} must be positive, got {child.text!r}")
-        return numbers
+            raise child.error(f"{tag} must be positive, got {child.text!r}")
+        return np.array(numbers)
 
-    def _numbers(self, element: _Element, count: int) -> list[float]:
+    def _numbers(self, element: Element, count: int) -> list[float]:
         """Read finite numbers."""
         numbers = [read_number(word) for word in element.text.split()]
         # Sums and squares of larger numbers are not finite.
         if len(numbers) != count or not all(abs(number) < _FARTHEST for number in numbers):
-            raise self._error(
-                element, f"{element.tag} must be {count} numbers, got {element.text!r}"
-            )
+            raise element.error(f"{element.tag} must be {count} numbers, got {element.text!r}")
         return numbers
 
-    def _error(self, element: _Element, text: str) -> WorldFileError:
-        """An error at the line of an element."""
-        return WorldFileError(f"{self._path}:{element.line}: {text}")
 
-
-def _turned_box(pose: _Pose, width: float, depth: float) -> Box | Polygon:
-    """A box, or a polygon where its sides are not parallel to the axes."""
-    quarters = round(pose.yaw / (math.pi / 2))
-    if abs(pose.yaw - quarters * math.pi / 2) < _STRAIGHT:
-        across, up = (width / 2, depth / 2) if quarters % 2 == 0 else (depth / 2, width / 2)
-        return Box(pose.x - across, pose.y - up, pose.x + across, pose.y + up)
-    corners = [(-width, -depth), (width, -depth), (width, depth), (-width, depth)]
-    places = [pose @ _Pose(x / 2, y / 2) for x, y in corners]
-    return Polygon(tuple((place.x, place.y) for place in places))
-
-
-def _room(
-    path: str,
-    shapes: list[Shape],
-    size: tuple[float, float] | None,
-    center: tuple[float, float] | None,
-) -> World:
-    """Put a room around obstacles, and move them into its frame."""
-    bounds = [shape.bounds for shape in shapes]
-    if center is None:
-        center = (0.0, 0.0)
-        if bounds:
-            center = (
-                (min(b.x_min for b in bounds) + max(b.x_max for b in bounds)) / 2,
-                (min(b.y_min for b in bounds) + max(b.y_max for b in bounds)) / 2,
-            )
-    x, y = center
-    if size is None:
-        half_width = max(max(b.x_max - x, x - b.x_min) for b in bounds)
-        half_depth = max(max(b.y_max - y, y - b.y_min) for b in bounds)
-        # Up to a millimeter wider, so that rounding leaves none outside.
-        size = (math.ceil(2e3 * half_width) / 1e3, math.ceil(2e3 * half_depth) / 1e3)
-        size = (size[0] + 1e-3, size[1] + 1e-3)
-    moved = [_moved(shape, -x, -y) for shape in shapes]
-    name = os.path.basename(path).split(".")[0]
-    return World(
-        name=name,
-        size=size,
-        boxes=tuple(shape for shape in moved if isinstance(shape, Box)),
-        cylinders=tuple(shape for shape in moved if isinstance(shape, Cylinder)),
-        polygons=tuple(shape for shape in moved if isinstance(shape, Polygon)),
-    )
-
-
-def _moved(shape: Shape, x: float, y: float) -> Shape:
-    """The same shape elsewhere."""
-    if isinstance(shape, Cylinder):
-        return Cylinder(shape.x + x, shape.y + y, shape.radius)
-    if isinstance(shape, Box):
-        return Box(shape.x_min + x, shape.y_min + y, shape.x_max + x, shape.y_max + y)
-    return Polygon(tuple((u + x, v + y) for u, v in shape.vertices))
+def _models_of(state: Element | None) -> dict[str, Element]:
+    """The models in a state, by name."""
+    models = () if state is None else state.all("model")
+    return {model.attributes.get("name", ""): model for model in models}

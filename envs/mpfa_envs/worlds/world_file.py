@@ -91,7 +91,7 @@ class _Reader(NodeReader):
         goals = self.parts(entries, "goal", room, "goal_regions")
         for key, regions in (("start", starts), ("goal", goals)):
             for node, region in zip(self.nodes(entries, key), regions, strict=True):
-                found = _has_room(world, region)
+                found = has_room(world, region, _REGION_CLEARANCE)
                 if not found:
                     what = "is too large to find a" if found is None else "has no"
                     raise self.error(
@@ -160,8 +160,8 @@ class _Reader(NodeReader):
         return Walker(**values)
 
 
-def _has_room(world: World, region: Box) -> bool | None:
-    """Tell whether a region has a point that is clear; None if it is too large to tell."""
+def has_room(world: World, region: Box, clearance: float) -> bool | None:
+    """Tell whether a region has a point with a clearance [m]; None if it is too large to tell."""
     # The region is cut in four again and again. Within a rectangle the clearance differs from that
     # of its middle by half its diagonal at most, so that most rectangles are decided at once.
     half = np.array([region.x_max - region.x_min, region.y_max - region.y_min]) / 2
@@ -169,10 +169,10 @@ def _has_room(world: World, region: Box) -> bool | None:
     corners = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
     while len(middles) <= _MOST_CELLS:
         clearances = world.clearances(middles)
-        if (clearances >= _REGION_CLEARANCE).any():
+        if (clearances >= clearance).any():
             return True
         reach = float(np.hypot(*half))
-        undecided = middles[clearances + reach >= _REGION_CLEARANCE]
+        undecided = middles[clearances + reach >= clearance]
         if reach < _FINEST / 2 or not len(undecided):
             return False
         half = half / 2

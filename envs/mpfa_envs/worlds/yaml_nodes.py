@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import math
+import re
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +17,15 @@ _LARGEST_FILE: Final = 1_000_000
 """Longest text that is read [bytes]."""
 _MOST_ENTRIES: Final = 1000
 """Longest list: with aliases, a line of ten letters can stand for a hundred corners."""
+_IMAGE: Final = re.compile(r"""^[\ufeff \t{]*["']?image["']?[ \t]*:""", re.MULTILINE)
+"""What only the YAML file of a map has, which other tools write."""
+
+
+KINDS: Final = (
+    "a .yaml or .yml file, which is a world or names the image of a ROS map, or a .world or .sdf "
+    "file of Gazebo, which may be compressed (.gz)"
+)
+"""Files that are read."""
 
 
 class WorldFileError(ValueError):
@@ -31,19 +42,32 @@ def read_nodes(path: Path) -> yaml.Node | None:
 
 
 def parse_nodes(content: bytes, path: Path) -> yaml.Node | None:
-    """Turn the content of a file into nodes."""
+    """Turn the content of a file into nodes; a map is read as tolerantly as by yaml-cpp."""
     if len(content) > _LARGEST_FILE:  # A file to be written has not been checked.
         raise WorldFileError(f"{path}: has more than {_LARGEST_FILE} bytes")
     try:
+        text = _decoded(content)
+        if _IMAGE.search(text):
+            return next(yaml.compose_all(text.replace("\t", " "), Loader=yaml.SafeLoader), None)
         return yaml.compose(content.decode(), Loader=yaml.SafeLoader)
     except UnicodeDecodeError as error:
-        raise WorldFileError(f"{path}: is not UTF-8: {error}") from error
+        text = f"{path}: is not UTF-8: {error}; a world is read from {KINDS}"
+        raise WorldFileError(text) from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise WorldFileError(f"{where}: is not YAML: {getattr(error, 'problem', error)}") from error
     except RecursionError:
         raise WorldFileError(f"{path}: is nested too deeply") from None
+
+
+def _decoded(content: bytes) -> str:
+    """Read UTF-8, or else what has a mark of UTF-16 or an older encoding, as in a comment."""
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        marks = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
+        return content.decode("utf-16" if content.startswith(marks) else "cp1252", "replace")
 
 
 def read_number(text: str) -> float:
@@ -75,19 +99,26 @@ class NodeReader:
     def mapping(
         self, node: yaml.Node | None, what: str, keys: tuple[str, ...]
     ) -> dict[str, yaml.Node]:
-        """Read a mapping that has no other keys, and none twice."""
+        """Read a mapping that has no key twice, and as :meth:`unknown` says no others."""
         if not isinstance(node, yaml.MappingNode):
-            raise self.error(node, f"{what} must be a mapping with the keys {', '.join(keys)}")
+            hint = f"; a world is read from {KINDS}" if what == "the file" else ""
+            text = f"{what} must be a mapping with the keys {', '.join(keys)}{hint}"
+            raise self.error(node, text)
         entries: dict[str, yaml.Node] = {}
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else None
-            if name not in keys:
-                hint = did_you_mean(name, keys) or f"known are {', '.join(keys)}"
-                raise self.error(key, f"unknown key {name!r} in {what}; {hint}")
+            if name is None or name not in keys:
+                hint = did_you_mean(name, keys)
+                self.unknown(self.error(key, f"unknown key {name!r} in {what}"), hint, keys)
+                continue
             if name in entries:
                 raise self.error(key, f"key {name!r} appears twice in {what}")
             entries[name] = value
         return entries
+
+    def unknown(self, error: WorldFileError, hint: str, keys: tuple[str, ...]) -> None:
+        """Reject an unknown key; the hint is the nearest known one, if any is near."""
+        raise WorldFileError(f"{error}; {hint or 'known are ' + ', '.join(keys)}")
 
     def items(self, node: yaml.Node, what: str) -> list[yaml.Node]:
         """Read a list."""
