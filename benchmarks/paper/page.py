@@ -39,8 +39,7 @@ The paper's worlds are not published. Ours follow its pictures and its text. So 
 within a column, not our column with the paper's.
 """
 _SEEN = """
-What was seen before the end: the rows of the seeds 100 to 104 of MPFA-PER, PER and uniform replay,
-and of two or three seeds of the other methods. Nothing was changed after that.
+What was seen before the end: the rows of the seeds 100 to 104. Nothing was changed after that.
 """
 _LETTER = """
 To the letter of the paper (`learner=plain`): without the additions that keep DDPG from collapsing,
