@@ -10,7 +10,15 @@ import pytest
 
 pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
-from mpfa_envs import World, evaluate, export_policy, load_policy, world_tasks
+from mpfa_envs import (
+    ROBOTS,
+    VectorNavigationEnv,
+    World,
+    evaluate,
+    export_policy,
+    load_policy,
+    world_tasks,
+)
 from mpfa_envs.deploy import Pilot
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
@@ -75,15 +83,51 @@ def test_the_simulated_robot_obeys_until_the_timeout() -> None:
     # Told at 0 s: the steps that begin at 0, 0.1, 0.2 and 0.3 s.
     assert heading == pytest.approx(0.2) and speeds == [0.0, 0.0]
     assert (x, y) == pytest.approx((0.8 * math.sin(0.2), 0.8 * (1 - math.cos(0.2))))
-    robot.obey(0.0, -1.0)
-    robot.step()
-    assert robot.motion.heading == pytest.approx(0.1)  # It turns on the spot.
     robot.obey(math.nan, 0.0)
     robot.step()
     assert robot.motion.linear_speed == 0.0
-    robot.obey(9.0, 0.0)
-    robot.step()
-    assert robot.motion.linear_speed == 0.5
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "wheels"])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_it_drives_with_the_wheels_of_the_environment(robot: str, physics: str) -> None:
+    model, room = ROBOTS[robot], World(name="room", size=(10.0, 10.0))
+    start = (-2.0, 0.0, 0.5)
+    env = VectorNavigationEnv(1, world=room, robot=robot, physics=physics, action_repeat=1)
+    env.reset(options={"tasks": [(start, (3.0, 3.0))]})
+    simulated = SimulatedRobot(room, robot=robot, physics=physics)
+    simulated.place(start)
+    for action in [(1, 1)] * 6 + [(-1, 1)] * 6 + [(-1, -1)] * 6:
+        env.step(np.array([action], dtype=np.float32))
+        left, right = model.wheel_speeds(np.array(action, dtype=np.float32))
+        simulated.obey(0.5 * (left + right), (right - left) / model.wheel_base)
+        simulated.step()
+        assert simulated.motion == pytest.approx(env.motions[0], abs=1e-9)
+    env.close()
+    simulated.close()
+
+
+@pytest.mark.parametrize(
+    ("robot", "told", "wheels"),
+    [
+        ("turtlebot2", (0.0, -1.0), (0.115, 0.05)),  # It can neither stand nor reverse,
+        ("turtlebot2", (-1.0, 0.0), (0.05, 0.05)),
+        ("turtlebot2", (9.0, 0.0), (0.5, 0.5)),
+        ("turtlebot2", (0.0, 0.0), (0.0, 0.0)),  # but its motors can be switched off.
+        ("kobuki", (0.7, 0.0), (0.08, 0.08)),
+        ("kobuki", (0.0, -9.0), (0.08, -0.08)),
+        ("burger", (0.1, 0.0), (0.1, 0.1)),
+    ],
+)
+def test_its_wheels_do_what_those_of_the_model_can(
+    robot: str, told: tuple[float, float], wheels: tuple[float, float]
+) -> None:
+    simulated = SimulatedRobot("A", robot=robot, physics="kinematic")
+    simulated.obey(*told)
+    simulated.step()
+    left, right = wheels
+    turn = (right - left) / ROBOTS[robot].wheel_base
+    assert simulated.motion[3:] == pytest.approx((0.5 * (left + right), turn))
 
 
 def test_its_scan_is_what_is_around_it() -> None:
