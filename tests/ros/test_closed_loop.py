@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ pytest.importorskip("onnx", reason="exported policies are of the extra onnx")
 
 from mpfa_envs import (
     ROBOTS,
+    RobotModel,
     VectorNavigationEnv,
     World,
     evaluate,
@@ -20,6 +22,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.deploy import Pilot
+from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 from tests.envs.exported import SHIPPED
@@ -147,3 +150,67 @@ def test_it_touches_what_it_meets_until_it_is_placed_elsewhere() -> None:
     assert robot.touched
     robot.place((0.0, 0.0, 1.0))
     assert not robot.touched and robot.motion == (0.0, 0.0, 1.0, 0.0, 0.0)
+
+
+KOBUKI = ROBOTS["kobuki"]
+OWN = [
+    KOBUKI,
+    ROBOTS["turtlebot4"],
+    ROBOTS["burger"],
+    replace(KOBUKI, name="wide", radius=0.19, wheel_base=0.3),
+]
+LIDARS = [(108, 360.0), (1440, 360.0), (720, 270.0)]
+"""Rays and field of view [degrees]."""
+WORLDS = ("mazes-1", "mazes-2", "mazes-3", "test", "bars-4", "fields-2", "clutter-3")
+
+
+def least_clearance(
+    folder: Path, robot: RobotModel, lidar: tuple[int, float], drives: int, time_step: float = 0.1
+) -> float:
+    """Least clearance of the rim in drives behind the filter, of 3 cm [m]."""
+    rays, view = lidar
+    half = 0.5 * math.radians(view) * (1.0 - 1.0 / rays)
+    file = export_policy(load_policy("td3-rooms"), folder / "policy.onnx")
+    pilot = Pilot.load(file, robot=robot, clearance=0.03, unseen=0.3)
+    least = math.inf
+    for number in range(drives):
+        world = resolve_world(WORLDS[number % len(WORLDS)])
+        task = world_tasks(world, episodes=number + 1, robot=robot)[number].task
+        simulated = SimulatedRobot(
+            world, robot=robot, physics="kinematic", rays=rays, field=(-half, half),
+            time_step=time_step,
+        )  # fmt: skip
+        simulated.place(task.start)
+        controller = Controller(pilot, stop_distance=0.0)
+        controller.aim(task.goal)
+        while simulated.time < 60.0 / pilot.pace:
+            controller.feel(simulated.motion[:3], simulated.motion[3:], simulated.time)
+            controller.see(simulated.scan(), simulated.time)
+            order = controller.tick(simulated.time)
+            if order is None:
+                break
+            simulated.obey(order.linear, order.angular)
+            simulated.step()
+            least = min(least, world.clearance(*simulated.motion[:2]) - robot.radius)
+    return least
+
+
+@pytest.mark.parametrize("acceleration", [0.2, 4.0])
+@pytest.mark.parametrize("time_step", [0.1, 0.02])
+def test_behind_the_filter_nothing_is_touched(
+    tmp_path: Path, acceleration: float, time_step: float
+) -> None:
+    robot = replace(KOBUKI, name="own", wheel_acceleration=acceleration)
+    assert least_clearance(tmp_path, robot, LIDARS[0], 4, time_step) > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lidar", LIDARS)
+@pytest.mark.parametrize("acceleration", [0.2, "own", 4.0])
+@pytest.mark.parametrize("robot", OWN, ids=lambda robot: robot.name)
+def test_a_thousand_drives_behind_the_filter_touch_nothing(
+    tmp_path: Path, robot: RobotModel, acceleration: float | str, lidar: tuple[int, float]
+) -> None:
+    if acceleration != "own":
+        robot = replace(robot, wheel_acceleration=acceleration)
+    assert least_clearance(tmp_path, robot, lidar, 28) > 0.0
