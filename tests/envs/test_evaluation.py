@@ -14,16 +14,20 @@ from numpy.typing import NDArray
 
 from mpfa_envs import (
     POLICIES,
+    ROBOTS,
     Policy,
+    RobotModel,
     TaskConfig,
     VectorNavigationEnv,
     evaluate,
     load_policy,
+    make_planner,
     run_tasks,
     summarize,
     world_tasks,
 )
 from mpfa_envs.evaluation.results import EpisodeResult, bootstrap, spl, wilson
+from mpfa_envs.evaluation.runs import Filtered
 from mpfa_envs.policies.files import policy_file
 from mpfa_envs.policies.layers import Linear, Tanh
 from mpfa_envs.robots.model import resolve_robot
@@ -283,6 +287,27 @@ def test_an_undrivable_task_is_named_before_any_is_driven() -> None:
     with pytest.raises(ValueError, match=r"task \d+, in world 'bars-test-\d+': (goal|start) must"):
         run_tasks(count, tasks, robot=wide, physics="kinematic")
     assert driven == 0
+
+
+BIG = replace(ROBOTS["kobuki"], name="big", radius=0.35)
+
+
+@pytest.mark.parametrize(
+    ("policy", "robot", "message"),
+    [
+        (make_planner("astar", robot="kobuki"), BIG, "with robot='big': name .* radius 0.18 and"),
+        (make_planner("dijkstra"), "kobuki", "robot='kobuki': .*, min_wheel_speed 0.05 and -0.7"),
+        (load_policy("td3-rooms"), replace(ROBOTS["kobuki"], wheel_acceleration=0.2),
+         "'kobuki' with robot='kobuki': wheel_acceleration 0.8 and 0.2 differ"),
+        (Filtered(load_policy("td3-rooms"), TaskConfig(robot="waffle", memory="map").make_filter()),
+         "kobuki", "filter must be .*, got one for 'waffle' with robot='kobuki'"),
+    ],
+)  # fmt: skip
+def test_a_policy_for_another_robot_is_warned_of(
+    policy: Any, robot: str | RobotModel, message: str
+) -> None:
+    with pytest.warns(UserWarning, match=message):
+        evaluate(policy, "A", episodes=1, physics="kinematic", robot=robot, max_steps=2)
 
 
 def test_no_tasks_have_no_results() -> None:

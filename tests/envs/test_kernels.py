@@ -94,7 +94,7 @@ def test_arcs_are_those_of_plain_geometry() -> None:
     robot, rng = ROBOTS["turtlebot2"], np.random.default_rng(3)
     motions = somewhere(rng, 8)
     config = TaskConfig(robot=robot)
-    drives = KinematicDrives(robot, time_step=0.1)
+    drives = KinematicDrives(robot, 8, time_step=0.1)
     for step in range(200):
         speeds = rng.uniform(0.05, 0.5, (8, 2))
         speeds[step % 8, 1] = speeds[step % 8, 0]  # One of them goes straight.

@@ -145,6 +145,31 @@ def test_a_closed_ring_of_cylinders_leaves_no_path() -> None:
     assert around == pytest.approx(2 * math.sqrt(9 - 2.26**2) + 2.26 * 1.706, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("size", "pillars"),
+    [((60.0, 60.0), 0), ((60.0, 60.0), 60), ((21.0, 5.0), 8), ((500.0, 400.0), 30)],
+)
+def test_tasks_of_a_wide_room_can_be_driven_in_an_episode(
+    size: tuple[float, float], pillars: int
+) -> None:
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-0.4, 0.4, (pillars, 2)) * size
+    pillar = tuple(Cylinder(x, y, 0.2) for x, y in places.tolist())
+    world = World(name="hall", size=size, cylinders=pillar)
+    tasks = evaluation_pairs(world, 40, seed=0)
+    lengths = [shortest_length(world, 0.18, task.start[:2], task.goal) for task in tasks]
+    assert min(lengths) >= 2.0 and max(lengths) <= 20.0
+    assert np.median(lengths) > 5.0
+
+
+def test_goals_in_regions_far_from_most_starts_are_found() -> None:
+    corner = Box(25.0, 25.0, 29.0, 29.0)
+    world = World(name="hall", size=(60.0, 60.0), goal_regions=(corner,))
+    for task in evaluation_pairs(world, 10, seed=0):
+        assert corner.x_min <= task.goal[0] <= corner.x_max
+        assert math.dist(task.start[:2], task.goal) <= 20.0
+
+
 def test_tasks_are_sampled_in_a_narrow_corridor() -> None:
     world = World(name="corridor", size=(8.0, 0.9))
     env = NavigationEnv(world=world, physics="kinematic")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mpfa_envs import Box, NavigationEnv, World, evaluate
+from mpfa_envs import Box, NavigationEnv, RobotModel, World, evaluate
 from mpfa_envs.evaluation.runs import Driver
 from mpfa_envs.planners import DynamicWindow, WindowScore
 from mpfa_envs.robots.model import ROBOTS
@@ -45,6 +46,54 @@ def with_wall_ahead(seen: np.ndarray, distance: float) -> np.ndarray:
 
 def speeds(action: np.ndarray) -> tuple[float, float]:
     return TURTLEBOT.wheel_speeds(action)
+
+
+def cart(speed: float, braking: float, view: float) -> RobotModel:
+    """A robot that can stop and reverse [m/s, m/s², degrees]."""
+    return RobotModel(
+        name="cart", radius=0.25, height=0.3, mass=10.0, wheel_base=0.4, wheel_radius=0.06,
+        min_wheel_speed=-speed, max_wheel_speed=speed, wheel_acceleration=braking,
+        field_of_view=view,
+    )  # fmt: skip
+
+
+CARTS = [(1.0, 0.5, 360.0), (1.5, 1.0, 360.0), (1.0, 0.3, 360.0), (0.7, 0.8, 180.0),
+         (0.7, 0.8, 270.0), (1.0, 0.5, 180.0)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("speed", "braking", "view"), CARTS)
+def test_it_collides_with_nothing_however_long_the_robot_takes_to_stop(
+    speed: float, braking: float, view: float
+) -> None:
+    robot = cart(speed, braking, view)
+    window = DynamicWindow(robot=robot, memory="map")
+    results = evaluate(window, "test", episodes=8, physics="kinematic", robot=robot)
+    assert not any(each.collision for each in results)
+    assert np.mean([each.success for each in results]) > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["test", "mazes-2", "mazes-5"])
+@pytest.mark.parametrize(("speed", "braking", "view"), CARTS)
+def test_it_collides_with_nothing_in_forty_drives(
+    speed: float, braking: float, view: float, world: str
+) -> None:
+    robot = cart(speed, braking, view)
+    window = DynamicWindow(robot=robot, memory="map")
+    results = evaluate(window, world, episodes=40, physics="kinematic", robot=robot)
+    assert not any(each.collision for each in results)
+
+
+@pytest.mark.parametrize("view", [180.0, 270.0, 360.0])
+def test_it_reverses_only_where_it_sees(view: float) -> None:
+    slowest = DynamicWindow(robot=cart(0.7, 0.8, view)).pairs.sum(axis=1).min()
+    assert slowest == (pytest.approx(-1.4) if view == 360.0 else 0.0)
+
+
+def test_arcs_let_a_robot_that_cannot_stop_turn_round() -> None:
+    wide = replace(cart(1.0, 0.5, 180.0), min_wheel_speed=0.4)
+    assert DynamicWindow(robot=wide).length == pytest.approx(math.pi * 0.5 * 0.4 * 1.4 / 0.6)
+    assert DynamicWindow().length == 0.6
 
 
 def test_arcs_are_those_that_the_robot_drives() -> None:

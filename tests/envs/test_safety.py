@@ -12,6 +12,7 @@ from mpfa_envs import (
     GENERATORS,
     ROBOTS,
     Box,
+    RobotModel,
     SafetyFilter,
     TaskConfig,
     VectorNavigationEnv,
@@ -49,10 +50,20 @@ def ahead_is(config: TaskConfig, distance: float) -> np.ndarray:
     return np.minimum(ranges.min(axis=1), 10.0)
 
 
-def drive_at_random(robot: str, world: str, decisions: int, *, physics: str, robots: int) -> float:
+def drive_at_random(
+    robot: str | RobotModel,
+    world: str,
+    decisions: int,
+    *,
+    physics: str,
+    robots: int,
+    view: float = 360.0,
+) -> float:
     """Least clearance of robots that hold a random action for a while [m]."""
-    arguments = task(robot, physics=physics, collision_distance="contact", max_steps=400)
-    arguments["lidar"] = AROUND
+    near = ROBOTS[robot].radius if isinstance(robot, str) else robot.radius
+    arguments = {"robot": robot, "physics": physics, "closeness_distance": near, "max_steps": 400}
+    arguments |= {"collision_distance": "contact"}
+    arguments["lidar"] = {"field_of_view": view, "sectors": round(view / 10.0)}
     keep = TaskConfig(**arguments).make_filter()
     rng = np.random.default_rng(0)
     env = VectorNavigationEnv(robots, world=world, **arguments)
@@ -71,6 +82,34 @@ def drive_at_random(robot: str, world: str, decisions: int, *, physics: str, rob
 @pytest.mark.parametrize("robot", ["kobuki", "burger"])
 def test_a_random_policy_touches_nothing(robot: str, world: str) -> None:
     assert drive_at_random(robot, world, 4_000, physics="kinematic", robots=20) > 0.0
+
+
+@pytest.mark.parametrize("view", [90.0, 180.0, 270.0])
+@pytest.mark.parametrize("world", ["mazes", "rooms"])
+def test_a_random_policy_does_not_drive_into_what_it_does_not_see(world: str, view: float) -> None:
+    arguments = {"physics": "kinematic", "robots": 20, "view": view}
+    assert drive_at_random("kobuki", world, 6_000, **arguments) > 0.0
+
+
+@pytest.mark.parametrize(("speed", "braking"), [(0.7, 0.2), (1.5, 0.5), (0.3, 4.0), (1.0, None)])
+def test_a_random_policy_touches_nothing_whatever_the_brakes(
+    speed: float, braking: float | None
+) -> None:
+    robot = replace(
+        ROBOTS["kobuki"], min_wheel_speed=-speed, max_wheel_speed=speed, wheel_acceleration=braking
+    )
+    assert drive_at_random(robot, "rooms", 4_000, physics="kinematic", robots=20) > 0.0
+
+
+@pytest.mark.parametrize("view", [180.0, 270.0, 360.0])
+def test_what_is_out_of_view_is_not_free(view: float) -> None:
+    config = TaskConfig(**task(lidar={"field_of_view": view, "sectors": round(view / 10.0)}))
+    keep, back = config.make_filter(), np.full(2, -0.3, np.float32)
+    free = observed(config, 5.0)
+    assert np.array_equal(keep(free, back), back) == (view == 360.0)
+    for action in ((0.5, 0.5), (0.6, 0.4), (-0.3, 0.3)):
+        wanted = np.array(action, np.float32)
+        assert np.array_equal(keep(free, wanted), wanted)
 
 
 @pytest.mark.slow
@@ -229,6 +268,7 @@ def test_sixty_four_robots_take_less_than_a_millisecond() -> None:
         ({"clearance": math.nan}, "clearance must be a finite number, got nan"),
         ({"angles": np.zeros(5)}, "angles must be a multiple of sectors = 36, got 5"),
         ({"max_range": 0.0}, "max_range must be positive, got 0.0"),
+        ({"max_range": 0.6}, "max_range must be at least 0.656 m, within which kobuki .* got 0.6"),
         ({"closeness_distance": 0.0}, "closeness_distance must be positive, got 0.0"),
         ({"time_step": 0.0}, "time_step must be positive, got 0.0"),
         ({"action_repeat": 0}, "action_repeat must be a positive integer, got 0"),

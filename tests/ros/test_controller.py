@@ -344,3 +344,45 @@ def test_messages_are_read_and_written_as_ros_means_them() -> None:
     quarter = names(x=0.0, y=0.0, z=math.sin(math.pi / 4), w=math.cos(math.pi / 4))
     transform = names(rotation=quarter, translation=names(x=10.0, y=0.0))
     assert messages.transformed((2.0, 1.0), transform) == pytest.approx((9.0, 2.0))
+
+
+def wander(controller: Controller, times: range, reach: float) -> list[str | None]:
+    """Reasons while the robot swings to and fro over a distance [m], in tenths of a second."""
+    found = []
+    for time in times:
+        passed = time - times.start
+        x, turned = 0.5 * reach * math.sin(0.02 * passed), math.sin(0.1 * passed)
+        controller.see(scan(free=3.0 + 0.001 * (time % 7)), 0.1 * time)
+        controller.feel((x, 0.0, turned), STILL, 0.1 * time)
+        order = controller.tick(0.1 * time)
+        found.append(order and order.reason)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("reach", "robot", "after"), [(0.2, "turtlebot2", 50), (2.0, "burger", 114)]
+)
+def test_a_robot_that_comes_nowhere_new_gives_up_the_goal(
+    reach: float, robot: str, after: int
+) -> None:
+    controller, _ = ready(robot=robot)
+    found = wander(controller, range(100, 100 + 15 * after), reach)
+    driving = found.index("no progress: time for 25 m, and no new place")
+    assert set(found[:driving]) == {"driving"} and found[driving + 1] is None
+    assert after <= 0.1 * driving < 1.1 * after + 10.0 * math.pi
+    controller.aim((4.0, 0.0))
+    assert set(wander(controller, range(3000, 3000 + 9 * after), reach)) == {"driving"}
+
+
+def test_standing_before_an_obstacle_or_coming_to_new_places_is_no_lack_of_progress() -> None:
+    controller, _ = ready()
+    for time in range(100, 2000):
+        controller.see(scan(0.2, free=3.0 + 0.001 * (time % 7)), 0.1 * time)
+        controller.feel((0.0, 0.0, 0.0), STILL, 0.1 * time)
+        assert controller.tick(0.1 * time) == Order(0.0, 0.0, "obstacle: 0.02 m from the rim")
+    controller.aim((40.0, 0.0))
+    for time in range(2000, 3500):
+        controller.see(scan(free=3.0 + 0.001 * (time % 7)), 0.1 * time)
+        controller.feel((0.01 * (time - 2000), 0.0, 0.0), (0.1, 0.0), 0.1 * time)
+        assert controller.tick(0.1 * time) is not None
+    assert controller.pilot.goal is not None

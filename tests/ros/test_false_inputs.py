@@ -310,7 +310,7 @@ def still_wheels(slowest: float = 0.0) -> Any:
     return replace(ROBOTS["turtlebot2"], min_wheel_speed=slowest)
 
 
-@pytest.mark.parametrize("tells", [None, -math.inf])
+@pytest.mark.parametrize("tells", [None, -math.inf, math.nan, 0.0])
 def test_a_robot_that_reverses_stops_for_what_is_behind(tells: float | None) -> None:
     loop = Loop(lambda seen: -ahead(seen), start=(-13.0, 0.0, 0.0), learned=still_wheels(-0.5))
     loop.run(5.0, blind(0.3, tells))

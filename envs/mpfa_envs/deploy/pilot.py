@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -26,8 +27,12 @@ if TYPE_CHECKING:
 
 _WIDER: Final = 0.01
 """A robot's radius may exceed that in training by this [m]."""
-_RAYS: Final = 3
-"""Rays of a sector, any of which may be the one that it reports."""
+_RAYS: Final = 5
+"""Directions of a sector, any of which may be the one of the range that it reports."""
+_PARTS: Final = 5
+"""Parts of a time step in the filter: speeds of real wheels change all the time, not in steps."""
+_TOWARDS: Final = math.radians(45.0)
+"""A robot drives where it sees all directions that differ from its own by less [rad]."""
 _FARTHEST: Final = 1e7
 """Largest coordinate of a place [m]; those of UTM are smaller."""
 _BEYOND: Final = 0.02
@@ -50,22 +55,27 @@ class Command(NamedTuple):
 class Pilot:
     """Runs a policy on a robot: NumPy and onnxruntime, and Numba if the policy has a map.
 
-    A slower robot than that of the training drives the same arcs at a slower pace: its decisions
-    come later and its speeds are read as if it were the other one.
+    A slower robot than that of the training drives the same arcs at a slower pace p: its decisions
+    come later and its speeds are read as if it were the other one. Speeds are p times as large and
+    accelerations p² times, so that a robot whose wheels change more slowly has a slower pace, too.
+    Whatever the card says of its radius, speeds and wheels, the robot's own count.
+
+    The robot does not drive where the scan does not look: if it would, it turns on the spot.
 
     Args:
         card: Of the policy.
         network: From observations ``[1, O]`` to actions ``[1, 2]``.
         robot: What drives, a name or a :class:`~mpfa_envs.RobotModel`; None: the robot that the
             policy learned with.
-        pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can.
+        pace: Its speed as a share of that in training, in (0, 1]; None: as fast as both can, so
+            that it turns, accelerates and brakes as the policy learned.
         mount: Position of the lidar, as for :class:`~mpfa_envs.deploy.Sectors`.
         unseen: As there.
         silent: As there.
         map_size: Side of the map of a policy that has one [m], a square around the robot's first
             position; the path leads through it alone.
         clearance: Clearance of the rim that a :class:`~mpfa_envs.SafetyFilter` keeps [m]; None: no
-            filter.
+            filter, as for a robot that cannot stop.
 
     Raises:
         CardError: If the robot does not fit the policy.
@@ -80,7 +90,7 @@ class Pilot:
         *,
         robot: str | RobotModel | None = None,
         pace: float | None = None,
-        mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        mount: tuple[float, ...] = (0.0, 0.0, 0.0),
         unseen: float | None = None,
         silent: Silent = "refuse",
         map_size: float = 40.0,
@@ -99,7 +109,9 @@ class Pilot:
         if not 0.0 < self.pace <= most:
             raise ValueError(
                 f"pace must be above 0 and at most {most:.3g}, as {self.robot.name} drives "
-                f"{self.robot.max_wheel_speed} m/s, got {pace}"
+                f"{self.robot.max_wheel_speed} m/s, turns by {self.robot.max_angular_speed:.3g} "
+                f"rad/s and changes its wheels' speed by {self.robot.wheel_limits.acceleration} "
+                f"m/s², got {pace}"
             )
         least = self.pace * _wheel_range(self.robot, learned)[0]
         if least < self.robot.min_wheel_speed - _tolerance(self.robot):
@@ -117,7 +129,13 @@ class Pilot:
             from mpfa_envs.deploy.map_path import MapPath
 
             self._map = MapPath(card, size=self._map_size)
-        self._keep = None if clearance is None else _filter_of(card, clearance)
+        if clearance is not None and not learned.can_stop:
+            raise ValueError(
+                f"clearance must be None for a policy of {learned.name}, whose wheels turn at "
+                f"{learned.min_wheel_speed} m/s at least: no filter can promise that it touches "
+                f"nothing, got {clearance}"
+            )
+        self._keep = None if clearance is None else self._filter(clearance)
         self._goal: tuple[float, float] | None = None
         self._center: tuple[float, float] | None = None
         self._fresh = True
@@ -270,16 +288,76 @@ class Pilot:
             The speeds.
         """
         observation = self.observe(scan, pose, speeds, scan_pose=scan_pose)
+        blind, hidden = self.sectors.blind(scan)
         action = self._network(observation[None])[0]
         if not np.isfinite(action).all():
             raise ValueError(f"the network's action must be finite, got {action}")
+        learned = self.card.robot
+        left, right = learned.wheel_speeds(action)
+        towards = blind if left + right >= 0.0 else math.pi - np.abs(blind)
+        if (np.abs(towards) < _TOWARDS).any():
+            left, right = 0.5 * (left - right), 0.5 * (right - left)
         if self._keep is not None:
-            action = self._keep(observation, action)
-        left, right = self.card.robot.wheel_speeds(action)
+            # Whatever the policy is told of them, sectors that are not seen begin at the rim.
+            observation[: self.card.sectors][hidden] = 1.0
+            slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
+            action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)
+            left, right = learned.wheel_speeds(self._keep(observation, action))
         linear = self.pace * 0.5 * (left + right)
-        angular = self.pace * (right - left) / self.card.robot.wheel_base
+        angular = self.pace * (right - left) / learned.wheel_base
         turn = 0.5 * angular * self.robot.wheel_base
         return Command(linear - turn, linear + turn, linear, angular)
+
+    def ramp(
+        self, last: tuple[float, float], wanted: tuple[float, float], passed: float
+    ) -> tuple[float, float]:
+        """Change the speeds to order no faster than the policy knows.
+
+        Args:
+            last: Forward and turning speed ordered last [m/s, rad/s].
+            wanted: Those of the present :class:`Command`.
+            passed: Time since the last order [s].
+
+        Returns:
+            The speeds to order.
+        """
+        known = self.card.robot.wheel_limits.acceleration * self.pace**2
+        if math.isinf(known):
+            return wanted
+        half = 0.5 * self.card.robot.wheel_base
+        left, right = (
+            min(max(to, now - known * passed), now + known * passed)
+            for now, to in (
+                (last[0] + side * half * last[1], wanted[0] + side * half * wanted[1])
+                for side in (-1.0, 1.0)
+            )
+        )
+        return 0.5 * (left + right), 0.5 * (right - left) / half
+
+    def _filter(self, clearance: float) -> SafetyFilter:
+        """The filter of the task that a policy learned, for the robot that drives."""
+        card, learned = self.card, self.card.robot
+        braking = self.robot.wheel_limits.acceleration / _widening(self.robot, learned)
+        braking = min(learned.wheel_limits.acceleration, braking / self.pace**2)
+        body = replace(
+            learned,
+            radius=max(self.robot.radius, 0.5 * learned.wheel_base),
+            wheel_acceleration=None if math.isinf(braking) else braking,
+        )
+        repeat = int(card.env_arguments.get("action_repeat", 2)) * _PARTS
+        rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
+        return SafetyFilter(
+            body,
+            angles=ray_angles(card.field_of_view, rays),
+            sectors=card.sectors,
+            max_range=card.max_range,
+            closeness_distance=card.closeness_distance,
+            memory=card.memory,  # type: ignore[arg-type]
+            history=card.history,
+            time_step=card.period / repeat,
+            action_repeat=repeat,
+            clearance=clearance,
+        )
 
     def _check_on_map(self, goal: tuple[float, float], center: tuple[float, float] | None) -> None:
         """Reject a goal beyond the map, once its center is known."""
@@ -292,30 +370,16 @@ class Pilot:
             )
 
 
-def _filter_of(card: Card, clearance: float) -> SafetyFilter:
-    """The filter of the task that a policy learned."""
-    repeat = int(card.env_arguments.get("action_repeat", 2))
-    rays = card.sectors * (1 if card.reduction == "single" else _RAYS)
-    return SafetyFilter(
-        card.robot,
-        angles=ray_angles(card.field_of_view, rays),
-        sectors=card.sectors,
-        max_range=card.max_range,
-        closeness_distance=card.closeness_distance,
-        memory=card.memory,  # type: ignore[arg-type]
-        history=card.history,
-        time_step=card.period / repeat,
-        action_repeat=repeat,
-        clearance=clearance,
-    )
+def _widening(robot: RobotModel, learned: RobotModel) -> float:
+    """How much more its wheels differ on the same arc than those of another robot, at least 1."""
+    return max(1.0, robot.wheel_base / learned.wheel_base)
 
 
 def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:
     """Least and greatest speed of its wheels on the arcs of another robot, at its pace [m/s]."""
     middle = 0.5 * (learned.max_wheel_speed + learned.min_wheel_speed)
     span = 0.5 * (learned.max_wheel_speed - learned.min_wheel_speed)
-    # Wheels that are farther apart differ more on the same arc, others never drive faster.
-    span *= max(1.0, robot.wheel_base / learned.wheel_base)
+    span *= _widening(robot, learned)
     return middle - span, middle + span
 
 
@@ -326,8 +390,14 @@ def _tolerance(robot: RobotModel) -> float:
 
 def _fastest_pace(robot: RobotModel, learned: RobotModel) -> float:
     """The greatest share of the other robot's speed with which it can drive the same arcs."""
-    turning = (robot.max_wheel_speed + _tolerance(robot)) / _wheel_range(robot, learned)[1]
-    return min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, turning)
+    wheels = (robot.max_wheel_speed + _tolerance(robot)) / _wheel_range(robot, learned)[1]
+    pace = min(1.0, robot.max_wheel_speed / learned.max_wheel_speed, wheels)
+    if robot.turn_limit is not None:
+        pace = min(pace, robot.turn_limit / learned.max_angular_speed)
+    if robot.wheel_acceleration is not None and learned.wheel_acceleration is not None:
+        needed = learned.wheel_acceleration * _widening(robot, learned)
+        pace = min(pace, math.sqrt(robot.wheel_acceleration / needed))
+    return pace
 
 
 def _pair(name: str, place: tuple[float, float]) -> tuple[float, float]:

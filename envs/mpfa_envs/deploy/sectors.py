@@ -19,8 +19,16 @@ Silent = Literal["refuse", "far"]
 """Reading of a sector without a valid ray: the scan is rejected, or nothing is there."""
 _EDGE = 1e-4
 """By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
+_LEVEL = math.radians(10.0)
+"""Roll up to which a scan counts as level [rad]."""
+_OFF = 1.5
+"""Increments by which ``angle_max`` may miss the last ray: some drivers count one more."""
 _NEAR = 0.08
 """Returns up to this beyond the least valid range may be too near for the next scan [m]."""
+_AROUND = np.radians(np.arange(-177.5, 180.0, 5.0))
+"""Directions in which a scan is asked for rays [rad]."""
+_SUDDEN = 0.8
+"""What is nearer than this share of the greatest range does not leave it from scan to scan."""
 _TURNS = 1.05
 """Turns that the rays may cover: those of some drivers overlap a little."""
 
@@ -47,6 +55,8 @@ class Scan(NamedTuple):
     """The least valid range [m]."""
     range_max: float = math.inf
     """The range up to which it sees [m]."""
+    angle_max: float | None = None
+    """Direction of the last ray [rad]; None: as many increments as there are ranges."""
 
 
 class _Rays(NamedTuple):
@@ -91,14 +101,14 @@ class Sectors:
     Args:
         card: Of the policy.
         mount: Position (x, y) of the sensor and direction of its x axis in the robot's frame
-            [m, m, rad].
-        unseen: Range to report for sectors outside of the scan's field of view [m]; None rejects
-            such a scan.
+            [m, m, rad], and its roll around that axis, if it has one: 0, or ±π upside down [rad].
+        unseen: Range to report to the policy for sectors outside of the scan's field of view [m];
+            None rejects such a scan.
         silent: Reading of a sector without a valid ray: ``"refuse"`` rejects the scan, ``"far"``
             holds that nothing is there, for a lidar that reports 0 or NaN for it. As such a lidar
             may report the same for what is too near, a return within 0.08 m of ``range_min`` then
-            stays where it was until its ray is valid again. A scan without any valid ray is
-            rejected in both.
+            stays where it was until its ray is valid again. A scan without any valid ray is a hall
+            wider than the lidar sees, unless the scan before met something well within its range.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -108,12 +118,16 @@ class Sectors:
         self,
         card: Card,
         *,
-        mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        mount: tuple[float, ...] = (0.0, 0.0, 0.0),
         unseen: float | None = None,
         silent: Silent = "refuse",
     ) -> None:
         self.card = card
-        self.mount = check_finite("mount", mount, 3)
+        *place, roll = (*check_finite("mount", mount, max(min(len(mount), 4), 3)), 0.0)[:4]
+        self.mount = tuple(place)
+        if min(abs(roll), abs(abs(roll) - math.pi)) > _LEVEL:
+            raise ValueError(f"mount must have a roll of 0 or π, as scans are level, got {roll}")
+        self._side = 1.0 if abs(roll) < 1.0 else -1.0
         self.unseen = None if unseen is None else check_positive("unseen", unseen)
         self.silent: Silent = check_choice("silent", silent, Silent)
         self._edge = 0.5 * math.radians(card.field_of_view)
@@ -121,6 +135,7 @@ class Sectors:
         self._width = width
         self._middles = self._edge - width * (np.arange(card.sectors) + 0.5)
         self._near: tuple[NDArray[np.float64], NDArray[np.float64]] = np.empty(0), np.empty(0)
+        self._met = False
 
     def read(self, scan: Scan) -> tuple[NDArray[np.float64], Points]:
         """Read a scan.
@@ -179,6 +194,24 @@ class Sectors:
             np.concatenate((ranges, np.full(silent.size, math.nan))),
         )
 
+    def blind(self, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Tell where a scan does not look, whatever ``unseen`` says of these directions.
+
+        Args:
+            scan: What the lidar has measured.
+
+        Returns:
+            Directions in the robot's frame, 5 degrees apart [rad], ``[D]``; and for each sector
+            whether one of them is in it, ``[sectors]``.
+        """
+        count, step = np.size(scan.ranges), self._side * scan.angle_increment
+        middle = self._side * scan.angle_min + self.mount[2] + 0.5 * step * (count - 1)
+        half = 0.5 * abs(step) * count + _EDGE
+        directions = _AROUND[np.abs(_wrapped(_AROUND - middle)) > half]
+        hidden = np.zeros(self.card.sectors, dtype=np.bool_)
+        hidden[self._index(directions[np.abs(directions) <= self._edge])] = True
+        return directions, hidden
+
     def _index(self, angles: NDArray[np.float64]) -> NDArray[np.int64]:
         """Number of the sector of each angle in view."""
         index = ((self._edge - angles) / self._width).astype(np.int64)
@@ -198,17 +231,26 @@ class Sectors:
                 f"the rays of a scan must go round once at most, got {ranges.size} in steps of "
                 f"{step} rad"
             )
+        last = start + step * (ranges.size - 1)
+        if scan.angle_max is not None and not abs(scan.angle_max - last) <= _OFF * abs(step):
+            raise ScanError(
+                f"the {ranges.size} ranges of a scan must reach from angle_min to angle_max = "
+                f"{scan.angle_max:.4g} rad in steps of angle_increment, got {last:.4g} rad"
+            )
         if not 0.0 <= least < most:
             raise ScanError(
                 f"range_min must be at least 0 and below range_max, got {least} and {most}"
             )
-        turn = self.mount[2]
-        directions = _wrapped(start + turn + step * np.arange(ranges.size, dtype=np.float64))
+        along = self._side * (start + step * np.arange(ranges.size, dtype=np.float64))
+        directions = _wrapped(self.mount[2] + along)
         valid = ranges >= least
-        # A broken or covered lidar does not mean free space, whatever it reports.
-        if not valid.any():
-            raise ScanError(f"none of the scan's {ranges.size} rays is valid")
         too_near = (ranges < least) & ((ranges > 0.0) | (ranges == -math.inf))
+        if valid.any():
+            self._met = bool((ranges[valid] < _SUDDEN * min(most, self.card.max_range)).any())
+        # A lidar that breaks or is covered does not mean free space; a wide hall does.
+        elif self.silent == "refuse" or self._met or too_near.any():
+            before = ", and the one before met something near" if self._met else ""
+            raise ScanError(f"none of the scan's {ranges.size} rays is valid{before}")
         ranges = np.where(too_near, least, ranges)
         rays = _Rays(directions, valid | too_near, abs(step))
         angles, distances = directions[rays.valid], ranges[rays.valid]

@@ -23,7 +23,7 @@ from mpfa_envs.env.step_loops import (
 )
 from mpfa_envs.paths.batch import FieldBatch
 from mpfa_envs.robots.drives import make_drives
-from mpfa_envs.robots.motion_loops import accelerate, scale_actions
+from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.saved import read_array, read_list
 from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.sensing.observation import FLAGS, NUMBERS
@@ -95,9 +95,6 @@ class RobotBatch:
         """Errors of the robots' motion, if there are any."""
         self._held = np.zeros((len(NUMBERS), count))
         robot = config.robot
-        self.commands = np.zeros((count, 2))
-        """Speeds that the wheels have by now been told, as fast as they may change [m/s]."""
-        self._change = robot.wheel_limits.acceleration * config.time_step
         self._lengths = (
             robot.radius,
             config.collision_distance,
@@ -123,7 +120,6 @@ class RobotBatch:
         clearance = min(episode.world.clearance(x, y), self.walkers.clearance(index, x, y))
         clearance -= self._config.robot.radius
         self.drives.place(index, x, y, heading)
-        self.commands[index] = 0.0
         self.tasks[index] = task
         episodes.motions[index] = x, y, heading, 0.0, 0.0
         episodes.goals[index] = task.goal
@@ -169,15 +165,13 @@ class RobotBatch:
         last = int(episodes.steps.max()) + self._config.action_repeat
         if last >= self.trails.shape[1]:
             self.trails = grown(self.trails, 2 * last + 1)
+        noise = self.noise
+        disturb = None if noise is None else partial(noise.drive, running=running, rngs=rngs)
         for _ in range(self._config.action_repeat):
             self.walkers.move(running, episodes.motions)
-            accelerate(self.commands, speeds, running, self._change)
-            driven = self.commands
-            if self.noise is not None:
-                driven = self.noise.drive(driven, running, rngs)
-            self.drives.move(episodes.motions, running, driven)
-            if self.noise is not None:
-                self.noise.measure(episodes.motions, running)
+            self.drives.move(episodes.motions, running, speeds, disturb)
+            if noise is not None:
+                noise.measure(episodes.motions, running)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
             judge(episodes, worlds, running, self.trails, self._lengths, self._config.max_steps)
             if self._fields is not None:
@@ -242,12 +236,13 @@ class RobotBatch:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of the episodes by name."""
+        robot = self._config.robot
         return {
             # The name in saved states.
             **{"ways" if n == "remaining" else n: a for n, a in self.episodes._asdict().items()},
             "running": self.running,
             "observations": self.observations,
-            **({} if math.isinf(self._change) else {"commands": self.commands}),
+            **({} if robot.wheel_acceleration is None else {"commands": self.drives.commands}),
             "ranges": self.ranges,
             **({} if self.noise is None else self.noise.arrays()),
         }

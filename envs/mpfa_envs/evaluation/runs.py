@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,6 +21,7 @@ from mpfa_envs.evaluation.results import ENCOUNTERS, EpisodeResult, barn_score, 
 from mpfa_envs.planners.dynamic_window import DynamicWindow
 from mpfa_envs.policies.policy import Policy
 from mpfa_envs.robots.drives import Physics
+from mpfa_envs.robots.model import RobotModel, resolve_robot
 from mpfa_envs.tasks.sets import WorldTask, world_tasks
 from mpfa_envs.worlds.world import World
 
@@ -221,6 +224,9 @@ def run_tasks(
     Raises:
         ValueError: If an argument is out of its range, or the robot cannot drive a task, and
             nothing has moved then; or if the policy gives no action for each observation.
+
+    Warns:
+        UserWarning: If the policy, the planner or the filter is for another robot.
     """
     for name in ("world", "num_envs", "autoreset_mode"):
         if name in env_arguments:
@@ -231,6 +237,7 @@ def run_tasks(
         takes_many = isinstance(policy, (Policy, DynamicWindow, Driver))
         envs_at_once = ENVS_AT_ONCE if takes_many else 1
     check_count("envs_at_once", envs_at_once)
+    _warn_of_another_robot(policy, resolve_robot(env_arguments.get("robot", "turtlebot2")))
     driver = as_driver(policy, alone=envs_at_once == 1)
     # Each task has its own seed, whichever robot drives it.
     tasks = [
@@ -257,6 +264,22 @@ def run_tasks(
                 if on_end:
                     on_end(env, robot, number)
     return [results[number] for number in range(len(tasks))]
+
+
+def _warn_of_another_robot(policy: Action | Driver, robot: RobotModel) -> None:
+    """Warn of a policy, a planner or a filter that was made for another robot."""
+    made_for = getattr(policy, "env_arguments", {}).get("robot")
+    for what, given in (("policy", made_for), ("filter", getattr(policy, "keep", None))):
+        named = getattr(given, "robot", given)
+        if not isinstance(named, (str, RobotModel)) or (other := resolve_robot(named)) == robot:
+            continue
+        both = zip(asdict(other).items(), asdict(robot).values(), strict=True)
+        differ = ", ".join(f"{n} {one} and {two}" for (n, one), two in both if one != two)
+        warnings.warn(
+            f"{what} must be for the robot that drives, got one for {other.name!r} with "
+            f"robot={robot.name!r}: {differ} differ",
+            stacklevel=3,
+        )
 
 
 def _check(env: VectorNavigationEnv, tasks: Sequence[WorldTask], numbers: Sequence[int]) -> None:

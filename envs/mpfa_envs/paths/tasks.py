@@ -16,13 +16,13 @@ from mpfa_envs.worlds.task import START_SLACK, Task
 from mpfa_envs.worlds.world import Box, World
 
 LONGEST_PATH: Final = 20.0
-"""Longest path of a sampled task in a map [m]: a field over the whole map would be too large."""
+"""Longest path of a sampled task in a wide world [m]: longer ones take longer than an episode."""
 _ROOMY: Final = 0.1
 """Least share of free cells with the usual clearance at which starts and goals keep it."""
 _GOALS: Final = 30
 """Number of goals tried before a world counts as without a task."""
-_GOALS_IN_MAP: Final = 100
-"""The same in a map, where each is tried in a window."""
+_GOALS_IN_WINDOWS: Final = 100
+"""The same in a wide world, where each is tried in a window."""
 _DETOURS: Final = 5
 """Number of goals tried for a detour before a straight path is taken."""
 
@@ -43,8 +43,8 @@ def sample_task_on_grid(
     It takes milliseconds however many obstacles there are and however rare tasks are, where
     :func:`~mpfa_envs.tasks.sampling.sample_task` tries points one by one.
 
-    In the world of a map no path is longer than 20 m, start and goal have the usual clearance, and
-    the field is that of a window around the goal.
+    In a wide world (:func:`is_wide`) no path is longer than 20 m, and the field is that of a window
+    around the goal. In a map start and goal have the usual clearance.
 
     Args:
         place: A grid, or a world, of which one is made.
@@ -81,16 +81,16 @@ def sample_task_on_grid(
         )
     check_share("detour_chance", detour_chance)
     grid = _as_grid(place, distance)
-    world, in_map = grid.world, grid.world.occupancy is not None
+    world, wide, in_map = grid.world, is_wide(grid.world), grid.world.occupancy is not None
     start_room, goal_room = (
         _clearance(grid, None if in_map else asked) for asked in (start_clearance, goal_clearance)
     )
     may_start, goals = _places(grid, start_room, goal_room)
-    longest = min(max_goal_distance, LONGEST_PATH) if in_map else max_goal_distance
+    longest = min(max_goal_distance, LONGEST_PATH) if wide else max_goal_distance
     slack = grid.resolution  # Start and goal leave the middle of their cells: by this much.
     detour = detour_chance > 0.0 and rng.random() < detour_chance
     straight: tuple[Task, DistanceField] | None = None
-    attempts = _GOALS_IN_MAP if in_map else _GOALS
+    attempts = _GOALS_IN_WINDOWS if wide else _GOALS
     for attempt in range(attempts if len(goals) and may_start.any() else 0):
         if straight is not None and attempt >= _DETOURS:
             break
@@ -99,7 +99,7 @@ def sample_task_on_grid(
         far = np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1]) >= min_goal_distance + slack
         if not (may_start & far).any():  # The paths to this goal, which take time, are not needed.
             continue
-        field = DistanceField(grid, goal, LONGEST_PATH if in_map else math.inf)
+        field = DistanceField(grid, goal, LONGEST_PATH if wide else math.inf)
         xs, ys = grid.xs[field.window[0], None], grid.ys[None, field.window[1]]
         direct = np.hypot(xs - goal[0], ys - goal[1])
         fits = may_start[field.window] & far[field.window]
@@ -123,6 +123,11 @@ def sample_task_on_grid(
         f"{min_goal_distance} m apart with a path of at most {longest} m between them that keeps "
         f"{grid.distance} m"
     )
+
+
+def is_wide(world: World) -> bool:
+    """Tell whether sampled paths are limited: in maps, and in rooms with a side of over 20 m."""
+    return world.occupancy is not None or max(world.size) > LONGEST_PATH
 
 
 def has_task(grid: FreeGrid) -> bool:

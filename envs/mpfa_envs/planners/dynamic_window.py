@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mpfa_envs.checks import check_count, check_positive
 from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.robots.model import RobotModel, resolve_robot
+from mpfa_envs.safety.filter import SafetyFilter
 from mpfa_envs.sensing.observation import DISTANCE_SCALE, Memory, observation_slices
 
 _STEP: Final = 0.1
@@ -20,6 +21,8 @@ _RESOLUTION: Final = 0.05
 """Difference between the speeds of a wheel that are tried [m/s]."""
 _ACCELERATION: Final = 1.0
 """That of wheels that change their speed at once [m/s²]."""
+_LENGTH: Final = 0.6
+"""Least length of the arcs [m]."""
 _OPEN: Final = 0.3
 """Length of the straight line that is open in an open direction [m]."""
 _LINES: Final = 72
@@ -69,10 +72,12 @@ class DynamicWindow:
     gets farthest.
 
     In the original a pair is admissible if the robot can stop before it collides. So it is for a
-    robot that can stop: all arcs last as long as the fastest takes for its length, in which it can
-    also brake, and a robot that stands may turn on the spot. The facing of the end of an arc, its
-    angle to the target, is a term of its own then, and the target is moved to the nearest
-    direction that is open: without it the robot would stand before a wall, facing the target.
+    robot that can stop: all arcs last as long as the fastest takes for its length, and where it
+    takes farther to brake the pair passes a :class:`~mpfa_envs.SafetyFilter`. A robot that stands
+    may turn on the spot, and it reverses only if its lidar sees all round. The facing of the end of
+    an arc, its angle to the target, is a term of its own then, and the target is moved to the
+    nearest direction that is open: without it the robot would stand before a wall, facing the
+    target.
     The paper's robot neither stops nor reverses: its arcs have the same length for all speeds, long
     enough to turn round.
 
@@ -89,7 +94,8 @@ class DynamicWindow:
         acceleration: By how much a wheel's speed can change [m/s²]; None: that of the robot, or 1
             where its wheels change their speed at once.
         samples: Number of speeds of each wheel; None: one every 0.05 m/s.
-        length: Length of the arcs, or of the fastest one of a robot that can stop [m].
+        length: Length of the arcs, or of the fastest one of a robot that can stop [m]; None: 0.6 m,
+            or what a robot that cannot stop takes to turn round, if that is more.
         score: What arcs are judged by; None: as chosen for the robot.
 
     Raises:
@@ -114,7 +120,7 @@ class DynamicWindow:
         decision: float = 0.2,
         acceleration: float | None = None,
         samples: int | None = None,
-        length: float = 0.6,
+        length: float | None = None,
         score: WindowScore | None = None,
     ) -> None:
         self.robot = resolve_robot(robot)
@@ -132,17 +138,26 @@ class DynamicWindow:
             "decision", decision
         )
         """By how much a wheel's speed can change until the next decision [m/s]."""
+        slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
+        if length is None:
+            half_turn = 0.5 * math.pi * self.robot.wheel_base * (fast + slow) / (fast - slow)
+            length = _LENGTH if self.robot.can_stop else max(_LENGTH, half_turn)
         self.length = check_positive("length", length)
+        self._keep: SafetyFilter | None = None
+        if self.robot.can_stop and fast * (decision + 0.5 * fast / acceleration) > self.length:
+            braking = replace(self.robot, wheel_acceleration=acceleration)
+            settings.update(robot=braking, memory=memory, time_step=0.5 * decision)
+            self._keep = TaskConfig(**settings).make_filter(clearance=self.score.least)
         count = self._lidar.sectors
         self._parts = observation_slices(count, memory=memory)
         self.observation_size = max(part.stop for part in self._parts.values())
         view = math.radians(self._lidar.field_of_view)
         angles = view * (0.5 - (np.arange(count) + 0.5) / count)
         self._directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-        self.pairs = _pairs(self.robot, samples)
+        reverses = self._lidar.field_of_view >= 360.0
+        self.pairs = _pairs(self.robot, samples, min(_RESOLUTION, self.change), reverses=reverses)
         """Speeds of the left and the right wheel [m/s], ``[K, 2]``."""
         left, right = self.pairs.T
-        fast = self.robot.max_wheel_speed
         self._speeds = 0.5 * (left + right) / fast
         along = np.linspace(0.0, self.length, 1 + max(1, round(self.length / _STEP)))[1:]
         # All arcs take the time of the fastest one, or all have its length.
@@ -181,6 +196,8 @@ class DynamicWindow:
         chosen = np.array([self._best(row) for row in rows], dtype=np.int64)
         slow, fast = self.robot.min_wheel_speed, self.robot.max_wheel_speed
         actions = (2.0 * (self.pairs[chosen] - slow) / (fast - slow) - 1.0).astype(np.float32)
+        if self._keep is not None:
+            actions = self._keep(observation.reshape(len(rows), -1), actions)
         return actions.reshape(*observation.shape[:-1], 2)
 
     def _best(self, row: NDArray[np.float64]) -> int:
@@ -280,14 +297,17 @@ def _angles_between(
     return np.abs(np.mod(one - other + math.pi, math.tau) - math.pi)
 
 
-def _pairs(robot: RobotModel, samples: int | None) -> NDArray[np.float64]:
+def _pairs(
+    robot: RobotModel, samples: int | None, resolution: float, *, reverses: bool
+) -> NDArray[np.float64]:
     """Speeds of the left and the right wheel that a robot may have [m/s], ``[K, 2]``."""
     slow, fast = robot.min_wheel_speed, robot.max_wheel_speed
     if samples is None:
-        samples = 1 + max(1, round((fast - slow) / _RESOLUTION))
+        samples = 1 + max(1, round((fast - slow) / resolution))
     speeds = np.linspace(slow, fast, check_count("samples", samples, least=2))
     if robot.can_stop:
         speeds = np.union1d(speeds.round(9), 0.0)
     pairs = np.stack(np.meshgrid(speeds, speeds), axis=-1).reshape(-1, 2)
     across = 0.5 * np.abs(pairs[:, 1] - pairs[:, 0])
-    return np.asarray(pairs[across <= robot.wheel_limits.across + 1e-9])
+    can = across <= robot.wheel_limits.across + 1e-9
+    return np.asarray(pairs[can & (reverses | (pairs.sum(axis=1) >= 0.0))])

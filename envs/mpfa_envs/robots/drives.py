@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from mpfa_envs.robots.motion_loops import drive_arcs
+from mpfa_envs.robots.motion_loops import accelerate, drive_arcs
 from mpfa_envs.saved import read_array
 from mpfa_envs.tables import grown
 
@@ -32,12 +32,31 @@ SERVERS: Final = 32
 
 
 class Drives:
-    """Motion of many robots; the base class holds nothing, as the motions say where they are."""
+    """Motion of many robots, whose wheels do what :class:`WheelLimits` say and no more."""
+
+    def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
+        self._limits = robot.wheel_limits
+        self._time_step = time_step
+        self.commands = np.zeros((robots, 2))
+        """Speeds that the wheels have by now been told, as fast as they may change [m/s]."""
 
     def place(self, index: int, x: float, y: float, heading: float) -> None:
         """Put a robot at rest at a pose [m, m, rad]."""
+        self.commands[index] = 0.0
 
     def move(
+        self,
+        motions: NDArray[np.float64],
+        running: NDArray[np.bool_],
+        speeds: NDArray[np.float64],
+        disturb: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+    ) -> None:
+        """Drive for a time step towards wheel speeds ``[N, 2]`` [m/s]; update the motions."""
+        accelerate(self.commands, speeds, running, self._limits, self._time_step)
+        driven = self.commands if disturb is None else disturb(self.commands)
+        self._turn(motions, running, driven)
+
+    def _turn(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
@@ -58,11 +77,11 @@ class Drives:
 class KinematicDrives(Drives):
     """Moves robots on exact arcs: the wheels have their speed at once and never slip."""
 
-    def __init__(self, robot: RobotModel, *, time_step: float) -> None:
+    def __init__(self, robot: RobotModel, robots: int, *, time_step: float) -> None:
+        super().__init__(robot, robots, time_step=time_step)
         self._wheel_base = robot.wheel_base
-        self._time_step = time_step
 
-    def move(
+    def _turn(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
@@ -80,6 +99,7 @@ class WheelDrives(Drives):
         # Imported here so that kinematic environments run without PyBullet.
         from mpfa_envs.robots.simulation import Simulation
 
+        super().__init__(robot, robots, time_step=time_step)
         self._wheel_radius = robot.wheel_radius
         self._simulations = [
             Simulation(time_step=time_step, substeps=max(1, round(time_step / SUBSTEP)))
@@ -100,10 +120,11 @@ class WheelDrives(Drives):
 
     def place(self, index: int, x: float, y: float, heading: float) -> None:
         """Put a robot at rest at a pose [m, m, rad]."""
+        super().place(index, x, y, heading)
         self._simulation_of(index).place_robot(x, y, heading, name=self._names[index])
         self._counts[index] = 0
 
-    def move(
+    def _turn(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
@@ -153,6 +174,7 @@ class WheelDrives(Drives):
         starts: NDArray[np.float64],  # (x, y, heading) [m, m, rad], [N, 3]
     ) -> None:
         last, motions = int(counts.max()), np.zeros((len(counts), 5))
+        commands = self.commands.copy()
         # All end at once; one that has driven for a shorter time is placed later.
         for step in range(last + 1):
             for index in np.flatnonzero(counts == last - step).tolist():
@@ -160,7 +182,8 @@ class WheelDrives(Drives):
             if step < last:
                 running = step >= last - counts
                 now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
-                self.move(motions, running, now)
+                self._turn(motions, running, now)
+        self.commands[...] = commands
 
     def close(self) -> None:
         """Shut the physics servers down; a second call does nothing."""
@@ -171,5 +194,5 @@ class WheelDrives(Drives):
 def make_drives(physics: Physics, robot: RobotModel, robots: int, *, time_step: float) -> Drives:
     """Make the drives of a kind of physics."""
     if physics == "kinematic":
-        return KinematicDrives(robot, time_step=time_step)
+        return KinematicDrives(robot, robots, time_step=time_step)
     return WheelDrives(robot, robots, time_step=time_step)

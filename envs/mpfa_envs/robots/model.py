@@ -39,7 +39,9 @@ class RobotModel:
         wheel_acceleration: How fast the speed of a wheel changes [m/s²]; None: at once.
         turn_limit: Fastest turn that it makes where its wheels could turn it faster [rad/s]; None:
             as they can. Both wheels then change by the same, so that the forward speed stays.
-        field_of_view: Angle that its lidar sees, which its front halves [deg].
+        field_of_view: Angle that its lidar sees, which its front halves [deg]. The default does not
+            fit a robot that reverses: filter, dynamic window and pilot keep it from driving where
+            it does not see. Give 360.
 
     Raises:
         ValueError: If a measure is not positive, the wheels do not fit in the footprint, or the

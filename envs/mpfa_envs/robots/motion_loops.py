@@ -25,6 +25,26 @@ class WheelLimits(NamedTuple):
     """How fast the speed of a wheel changes [m/s²]."""
 
 
+_ROUNDING = 1e-12
+"""Speeds beyond a limit by this are on it [m/s]: what was limited once keeps its bits."""
+
+
+@njit
+def limited(left: float, right: float, limits: WheelLimits) -> tuple[float, float]:
+    """The speeds that the wheels can have for wanted ones [m/s]; both 0: the motors are off."""
+    if left == 0.0 and right == 0.0:
+        return left, right
+    across = 0.5 * (right - left)
+    if abs(across) > limits.across + _ROUNDING:
+        forward = 0.5 * (left + right)
+        across = math.copysign(limits.across, across)
+        left, right = forward - across, forward + across
+    slow, fast = limits.slow - _ROUNDING, limits.fast + _ROUNDING
+    left = left if slow <= left <= fast else min(max(left, limits.slow), limits.fast)
+    right = right if slow <= right <= fast else min(max(right, limits.slow), limits.fast)
+    return left, right
+
+
 @njit
 def scale_actions(
     actions: NDArray[np.float64], limits: WheelLimits, speeds: NDArray[np.float64]
@@ -37,11 +57,8 @@ def scale_actions(
             action = actions[robot, wheel]
             numbers &= action == action  # NaN is not.
             speeds[robot, wheel] = middle + span * min(max(action, -1.0), 1.0)
-        across = 0.5 * (speeds[robot, 1] - speeds[robot, 0])
-        if abs(across) > limits.across:
-            forward = 0.5 * (speeds[robot, 0] + speeds[robot, 1])
-            across = math.copysign(limits.across, across)
-            speeds[robot, 0], speeds[robot, 1] = forward - across, forward + across
+        left, right = limited(speeds[robot, 0], speeds[robot, 1], limits)
+        speeds[robot, 0], speeds[robot, 1] = left, right
     return numbers
 
 
@@ -50,14 +67,16 @@ def accelerate(
     speeds: NDArray[np.float64],  # of the wheels now [m/s], [N, 2], changed in place
     wanted: NDArray[np.float64],  # [m/s], [N, 2]
     running: NDArray[np.bool_],  # [N]
-    change: float,  # at most [m/s]
+    limits: WheelLimits,
+    time_step: float,  # [s]
 ) -> None:
     """Bring the speeds of the wheels as near to the wanted ones as one time step allows."""
+    change = limits.acceleration * time_step
     for robot in range(speeds.shape[0]):
         if running[robot]:
-            for wheel in range(2):
-                now = speeds[robot, wheel]
-                speeds[robot, wheel] = min(max(wanted[robot, wheel], now - change), now + change)
+            left, right = limited(wanted[robot, 0], wanted[robot, 1], limits)
+            speeds[robot, 0] = min(max(left, speeds[robot, 0] - change), speeds[robot, 0] + change)
+            speeds[robot, 1] = min(max(right, speeds[robot, 1] - change), speeds[robot, 1] + change)
 
 
 @njit

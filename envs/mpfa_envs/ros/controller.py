@@ -5,7 +5,8 @@ is older than it may be (or from the future), while something where it drives is
 than the stop distance, or will be before the next check, and whenever a number cannot be true or a
 scan does not tell enough. A scan that repeats itself while the robot moves grows older. The goal
 stays, and the robot drives on once the reason is gone. Odometry that jumps or stands still gives up
-the goal, whose place is then unknown, and so does a policy that fails. Without a goal the node
+the goal, whose place is then unknown, and so do a policy that fails and one that drives for long
+without coming to a new place. Without a goal the node
 publishes one stop and then nothing, so that others may drive.
 """
 
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 
 _EARLY: Final = 0.2
 """Share of its period by which a decision may come early, as scans are irregular."""
+_PLACE: Final = 0.5
+"""Side of the squares that count as one place [m]."""
+_NOWHERE: Final = 25.0
+"""A robot that could have driven this far must have come to a new place [m]."""
 
 
 class Order(NamedTuple):
@@ -57,7 +62,10 @@ class Controller:
         self.check_period = check_positive("check_period", check_period)
         self._sight = Sight(pilot, stop_distance)
         self._track = Track(pilot.robot, scan_timeout)
-        self._ordered = 0.0
+        self._ordered = 0.0, 0.0
+        self._ticked, self._passed = -math.inf, 0.0
+        self._places: set[tuple[int, int]] = set()
+        self._lost = 0.0
         self._held = ""
         self._command: Command | None = None
         self._decided = -math.inf
@@ -72,7 +80,7 @@ class Controller:
         self, pose: tuple[float, float, float], speeds: tuple[float, float], time: float
     ) -> None:
         """Take odometry: pose (x, y, heading), forward and turning speed, time [m, rad, s]."""
-        lost = self._track.take(Felt(pose, speeds, time), self._ordered)
+        lost = self._track.take(Felt(pose, speeds, time), self._ordered[0])
         if lost and self.pilot.goal is not None:
             self.aim(None, lost)
 
@@ -80,6 +88,7 @@ class Controller:
         """Set out for a goal (x, y) in the odometry's frame [m], or stop for a reason."""
         self._command, self._told = None, False
         self._idle, self._held = reason, ""
+        self._places, self._lost = set(), 0.0
         # The goal is in the frame of the odometry from now on.
         self._track.forget()
         self._sight.forget()
@@ -104,8 +113,10 @@ class Controller:
 
     def tick(self, now: float) -> Order | None:
         """The order to publish at a time [s], if any; call it several times a second."""
+        self._passed = min(max(now - self._ticked, 0.0), self.pilot.period)
+        self._ticked = now
         order = self._choose(now)
-        self._ordered = 0.0 if order is None else order.linear
+        self._ordered = (0.0, 0.0) if order is None else order[:2]
         return order
 
     def _choose(self, now: float) -> Order | None:
@@ -127,19 +138,25 @@ class Controller:
         if self.pilot.arrived(felt.pose):
             self.aim(None, "arrived")
             return self._choose(now)
+        if self._lost > _NOWHERE:
+            self.aim(None, f"no progress: time for {_NOWHERE:g} m, and no new place")
+            return self._choose(now)
         try:
             order = self._drive(seen, felt, now)
         # Whatever the policy raises: a policy that has failed is not asked again.
         except Exception as error:
             self.aim(None, str(error) if isinstance(error, ValueError) else f"failed: {error!r}")
             return self._choose(now)
-        return self._unless_blocked(order, seen, now)
+        order = self._unless_blocked(order, seen, now)
+        if order.reason == "driving":
+            self._count(felt)
+        return order
 
     def _unless_blocked(self, order: Order, seen: Seen, now: float) -> Order:
         """The order, or a stop if it comes too near to something before the next check."""
         nearest, sign = (seen.behind, -1.0) if order.linear < 0.0 else (seen.ahead, 1.0)
         clearance = nearest - self.pilot.robot.radius
-        fastest = max(sign * self._ordered, self._track.fastest(seen.time, sign), 0.0)
+        fastest = max(sign * self._ordered[0], self._track.fastest(seen.time, sign), 0.0)
         covered = fastest * (max(now - seen.time, 0.0) + self.check_period)
         if clearance - covered > self.stop_distance:
             return order
@@ -152,4 +169,12 @@ class Controller:
             taken = self._track.pose_at(seen.time)
             self._command = self.pilot.decide(seen.scan, felt.pose, felt.speeds, scan_pose=taken)
             self._decided = now
-        return Order(self._command.linear, self._command.angular, "driving")
+        return Order(*self.pilot.ramp(self._ordered, self._command[2:], self._passed), "driving")
+
+    def _count(self, felt: Felt) -> None:
+        """Count how far the robot could have driven since it came to its last new place."""
+        place = round(felt.pose[0] / _PLACE), round(felt.pose[1] / _PLACE)
+        self._lost += self._passed * self.pilot.pace * self.pilot.card.robot.max_wheel_speed
+        if place not in self._places:
+            self._places.add(place)
+            self._lost = 0.0

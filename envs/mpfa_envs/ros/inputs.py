@@ -81,7 +81,10 @@ class Sight:
         ahead, behind = (
             float(np.fmin.reduce(points.ranges[half], initial=math.inf)) for half in (front, ~front)
         )
-        fault = self._hidden(scan) if np.isnan(points.ranges[front]).any() else ""
+        silent = np.isnan(points.ranges)
+        fault = self._hidden(scan, 1.0) if silent[front].any() else ""
+        if silent[~front].any() and self._hidden(scan, -1.0):
+            behind = 0.0
         when = self._since if repeated else time
         self.last = Seen(scan, when, ahead, behind, fault, repeated)
 
@@ -111,11 +114,11 @@ class Sight:
             self._from = track.pose_at(time)
         return track.last is not None and _moved(self._from, track.last.pose)
 
-    def _hidden(self, scan: Scan) -> str:
-        """Why a ray in front that is not valid cannot be driven by; empty if it can."""
+    def _hidden(self, scan: Scan, sign: float) -> str:
+        """Why a ray in front, or behind with a sign of -1, that is not valid may hide something."""
         # It may be too near to measure, which matters where the robot does not stop before that.
         x, y, _ = self._sectors.mount
-        blind = scan.range_min + math.hypot(max(x, 0.0), y)
+        blind = scan.range_min + math.hypot(max(sign * x, 0.0), y)
         if blind <= self._free:
             return ""
         return (

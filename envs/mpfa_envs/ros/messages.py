@@ -30,6 +30,7 @@ def scan_of(message: Any) -> Scan:
         message.ranges,
         message.range_min,
         message.range_max,
+        getattr(message, "angle_max", None),
     )
 
 

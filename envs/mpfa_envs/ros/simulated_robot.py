@@ -37,7 +37,7 @@ class Motion(NamedTuple):
 
 
 class SimulatedRobot:
-    """The robot of the environments, driven as real robots are: speeds in, scans out."""
+    """The robot of the environments on their drives, driven as real ones: speeds in, scans out."""
 
     def __init__(
         self,
@@ -105,11 +105,9 @@ class SimulatedRobot:
         # Sums of time steps are rounded.
         fresh = self.time - self._told_at <= self._timeout + 1e-9
         linear, angular = self._told if fresh else (0.0, 0.0)
-        turn, fastest = 0.5 * angular * self.robot.wheel_base, self.robot.max_wheel_speed
-        left, right = (
-            min(max(speed, -fastest), fastest) for speed in (linear - turn, linear + turn)
-        )
-        self._drives.move(self._motions, np.ones(1, dtype=np.bool_), np.array([[left, right]]))
+        turn = 0.5 * angular * self.robot.wheel_base
+        speeds = np.array([[linear - turn, linear + turn]])
+        self._drives.move(self._motions, np.ones(1, dtype=np.bool_), speeds)
         self.time += self.time_step
         clearance = self.world.clearance(*self.motion[:2])
         self.touched = self.touched or clearance <= self.robot.radius

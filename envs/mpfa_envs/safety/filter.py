@@ -17,16 +17,19 @@ if TYPE_CHECKING:
 
 CLEARANCE: Final = 0.03
 """Clearance of the rim that the filter keeps by default [m]."""
+_STEP: Final = math.radians(10.0)
+"""Angle between directions that are not seen, which dip by 0.4 % of the radius between them."""
 
 
 class SafetyFilter:
     """Lets an action pass if the robot can still keep off everything that its lidar sees.
 
     An action is admissible if the robot's rim stays clear while it is carried out and for the time
-    that the robot takes to stand still then. A robot that cannot stand still, as the paper's, must
-    have room for a whole turning circle to the left or to the right afterwards. In place of any
-    other action the nearest admissible one of a grid is taken; if there is none, the robot brakes,
-    or turns.
+    that the robot takes to stand still then. What lies outside of the lidar's field of view is not
+    free: a robot that can stop does not drive there. A robot that cannot stand still, as the
+    paper's, must have room for a whole turning circle to the left or to the right afterwards. In
+    place of any other action the nearest admissible one of a grid is taken; if there is none, the
+    robot brakes, or turns.
 
     It is a function of the observation and the action alone, so that whatever drives can have it:
     a policy, a planner, a training and a robot. :meth:`mpfa_envs.TaskConfig.make_filter` makes the
@@ -48,7 +51,8 @@ class SafetyFilter:
         samples: Speeds of each wheel among which to find another action.
 
     Raises:
-        ValueError: If a number is out of its range.
+        ValueError: If a number is out of its range, or the robot takes farther than it sees to
+            stand still.
 
     Examples:
         >>> import numpy as np
@@ -86,7 +90,10 @@ class SafetyFilter:
         if len(angles) == 0 or len(angles) % sectors:
             raise ValueError(f"angles must be a multiple of sectors = {sectors}, got {len(angles)}")
         self._rays = len(angles) // sectors
-        self._directions = np.stack((np.cos(angles), np.sin(angles)))
+        unseen = _unseen(angles) if self.robot.can_stop else np.empty(0)
+        self._unseen = len(unseen)
+        around = np.concatenate((angles, unseen))
+        self._directions = np.stack((np.cos(around), np.sin(around)))
         self._max_range = check_positive("max_range", max_range)
         self._near = check_positive("closeness_distance", closeness_distance)
         self._body = Body(
@@ -97,6 +104,11 @@ class SafetyFilter:
             check_positive("time_step", time_step),
             check_count("action_repeat", action_repeat),
         )
+        if self.robot.can_stop and (reach := _reach(self._body)) > self._max_range:
+            raise ValueError(
+                f"max_range must be at least {reach:.3g} m, within which {self.robot.name} "
+                f"decides and stops from its greatest speed, got {max_range}"
+            )
         self._candidates = _candidates(check_count("samples", samples, least=2), self._body)
 
     def __call__(
@@ -148,7 +160,9 @@ class SafetyFilter:
         # What is nearer than the observation tells may be at the rim.
         ranges[closeness >= 1.0] = min(self._near, self.robot.radius)
         ranges[ranges >= 0.999 * self._max_range] = math.inf
-        return np.repeat(ranges, self._rays, axis=1)
+        # What is not seen begins at the rim, which may leave it but not approach it.
+        unseen = np.full((len(rows), self._unseen), self.robot.radius)
+        return np.concatenate((np.repeat(ranges, self._rays, axis=1), unseen), axis=1)
 
     def _wheel_speeds(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Speeds of the wheels [m/s], ``[N, 2]``."""
@@ -157,6 +171,21 @@ class SafetyFilter:
         turning = rows[:, parts["angular_speed"]] * robot.max_angular_speed
         across = 0.5 * robot.wheel_base * turning
         return np.concatenate((forward - across, forward + across), axis=1)
+
+
+def _unseen(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions, every 10 degrees or so, between the last and the first sector [rad]."""
+    first, last = float(angles.min()), float(angles.max())
+    step = (last - first) / max(len(angles) - 1, 1)
+    gap = math.tau - (last - first) - step
+    return np.linspace(last + 0.5 * step, last + 0.5 * step + gap, 2 + round(gap / _STEP))[1:-1]
+
+
+def _reach(body: Body) -> float:
+    """Distance of the farthest point that a robot may come to before it stands [m]."""
+    fastest = max(abs(body.limits.slow), abs(body.limits.fast))
+    time = body.repeat * body.time_step + 0.5 * fastest / body.limits.acceleration
+    return fastest * time + body.radius + body.clearance
 
 
 def _candidates(samples: int, body: Body) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ import numpy as np
 from mpfa_envs.checks import check_count, check_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.planner import grid_for, is_small, planner_for, shortest_length
-from mpfa_envs.paths.tasks import sample_task_on_grid
+from mpfa_envs.paths.tasks import LONGEST_PATH, is_wide, sample_task_on_grid
 from mpfa_envs.robots.model import (
     PAPER_CLEARANCE,
     RobotModel,
@@ -30,6 +30,7 @@ _GRID_SLACK = 0.04
 _AROUND = [(math.cos(turn), math.sin(turn)) for turn in np.arange(16) * math.tau / 16]
 """Directions in which points near a goal are tested for reachability."""
 _STARTS = 60
+_STARTS_OF_DETOURS = 10
 _GOALS_PER_START = 50
 _ATTEMPTS = 1000
 _EVALUATION_STREAM = 1281166
@@ -45,7 +46,8 @@ def sample_task(
 ) -> Task:
     """Sample a start and a goal uniformly over the free space of their regions.
 
-    The two are joined by a path that keeps the collision distance, so every task can be solved.
+    The two are joined by a path that keeps the collision distance, so every task can be solved. In
+    a wide world (:func:`~mpfa_envs.paths.tasks.is_wide`) no path is longer than 20 m.
     Worlds with many obstacles, and narrow ones in which no point keeps the usual distance of goals,
     are sampled by :func:`~mpfa_envs.paths.tasks.sample_task_on_grid`.
 
@@ -99,12 +101,20 @@ def _sample_points(
     goal_clearance = max(GOAL_CLEARANCE, collision_distance)
     detour = detour_chance > 0.0 and world.obstacle_count > 0 and rng.random() < detour_chance
     straight: Task | None = None
-    for _ in range(_STARTS):
+    longest = LONGEST_PATH if is_wide(world) else math.inf
+    # In a wide world obstacles may be far from most starts.
+    starts = range(_STARTS_OF_DETOURS if detour and longest < math.inf else _STARTS)
+    for _ in starts:
         start = _sample_point(world, rng, world.start_regions, start_clearance, "start")
+        goals = _around(start, world.goal_regions or (world.room,), longest)
+        if not goals:
+            continue
         for _ in range(_GOALS_PER_START):
-            goal = _sample_point(world, rng, world.goal_regions, goal_clearance, "goal")
+            goal = _sample_point(world, rng, goals, goal_clearance, "goal")
             far = math.dist(start, goal) >= min_goal_distance
             if not (far and planner.is_reachable(start, goal)):
+                continue
+            if longest < math.inf and planner.length(start, goal) > longest:
                 continue
             task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
             if not (detour and planner.is_straight(start, goal)):
@@ -114,8 +124,25 @@ def _sample_points(
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a path between them"
+        f"{min_goal_distance} m apart with a path of at most {longest} m between them"
     )
+
+
+def _around(start: tuple[float, float], regions: tuple[Box, ...], reach: float) -> tuple[Box, ...]:
+    """The parts of regions that lie within a reach of the start [m] along either axis."""
+    if math.isinf(reach):
+        return regions
+    x, y = start
+    sides = [
+        (
+            max(r.x_min, x - reach),
+            max(r.y_min, y - reach),
+            min(r.x_max, x + reach),
+            min(r.y_max, y + reach),
+        )
+        for r in regions
+    ]
+    return tuple(Box(*each) for each in sides if each[0] < each[2] and each[1] < each[3])
 
 
 def check_task(
