@@ -13,7 +13,7 @@ from torch import Tensor
 from benchmarks.values.learning import SignalFunction, mirror
 from torchrl_mpfa.learners import ActorCriticLearner
 from torchrl_mpfa.methods import ALIASES, METHODS, MPFA, Method, Prioritized, Scaled
-from torchrl_mpfa.methods.catalogue import Adjusted
+from torchrl_mpfa.methods.mpfa import Adjusted
 
 LEFT_OUT = {
     "rud": "the policy is held anyway: it is uniform replay",

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from torchrl_mpfa.methods.base import Prioritized as Prioritized
     from torchrl_mpfa.methods.catalogue import ALIASES as ALIASES
     from torchrl_mpfa.methods.catalogue import METHODS as METHODS
-    from torchrl_mpfa.methods.catalogue import MPFA as MPFA
-    from torchrl_mpfa.methods.catalogue import Scaled as Scaled
     from torchrl_mpfa.methods.catalogue import method_named as method_named
+    from torchrl_mpfa.methods.mpfa import MPFA as MPFA
+    from torchrl_mpfa.methods.mpfa import Adjusted as Adjusted
+    from torchrl_mpfa.methods.mpfa import Scaled as Scaled
     from torchrl_mpfa.methods.remote import MethodReplayBuffer as MethodReplayBuffer
     from torchrl_mpfa.methods.remote import RaySignalReplayBuffer as RaySignalReplayBuffer
     from torchrl_mpfa.methods.remote import make_ray_replay as make_ray_replay
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
 _NAMES = {
     "assembly": "Replay loss_options make_replay",
     "base": "Method Prioritized",
-    "catalogue": "ALIASES METHODS MPFA Scaled method_named",
+    "catalogue": "ALIASES METHODS method_named",
+    "mpfa": "Adjusted MPFA Scaled",
     "remote": "MethodReplayBuffer RaySignalReplayBuffer make_ray_replay",
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}

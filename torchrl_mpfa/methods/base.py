@@ -7,6 +7,7 @@ otherwise. Parts are imported where they are made, as TorchRL's buffers take hal
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torchrl_mpfa.checks import COUNT, COUNT_OR_ZERO, NOT_NEGATIVE, SHARE, Rule, check, rules_of
@@ -63,6 +64,10 @@ class Method:
     update_block: int = within(COUNT, 1)
     """Actions between two blocks of updates, of which there are as many as otherwise (RUD)."""
 
+    kind: ClassVar[str] = "torchrl.data.RandomSampler"
+    """Class of the sampler, by its full name: it is imported when a replay is made."""
+    batches: ClassVar[str] = "torchrl_mpfa.selection.one_batch"
+    """Function that samples the batches of one training step, by its full name."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Arguments of :func:`make_replay` that the method cannot do without."""
     why: ClassVar[str] = ""
@@ -118,11 +123,14 @@ class Method:
         """Return the signals that the storage keeps."""
         return self.priority_signals()
 
+    def sampler_options(self) -> dict[str, Any]:
+        """Return the arguments of the sampler's class, beyond those of all prioritized ones."""
+        return {}
+
     def sampler(self) -> SignalSampler | RandomSampler:
         """Make the sampler."""
-        from torchrl.data import RandomSampler
-
-        return RandomSampler()
+        made: SignalSampler | RandomSampler = resolve_name(self.kind)(**self.sampler_options())
+        return made
 
     def selection(self, policy: Any, sigma: Any) -> Selection:
         """Make the function that samples the batches of one training step.
@@ -131,9 +139,8 @@ class Method:
             policy: The policy in training, which is there if :attr:`needs` names it.
             sigma: Standard deviation of its exploration noise, or a function that gives it.
         """
-        from torchrl_mpfa.selection import one_batch
-
-        return one_batch
+        found: Selection = resolve_name(self.batches)
+        return found
 
 
 @dataclass
@@ -146,6 +153,8 @@ class Prioritized(Method):
         >>> Prioritized("mine", signals=["td_error", "novelty"]).alpha
         0.6
     """
+
+    kind: ClassVar[str] = "torchrl_mpfa.samplers.SignalSampler"
 
     name: str = "per"
     signals: list[str] = field(default_factory=lambda: ["td_error"])
@@ -185,19 +194,9 @@ class Prioritized(Method):
         """Make the adjustments of fused priorities, in their order."""
         return []
 
-    def sampler_kind(self) -> type[SignalSampler]:
-        """Return the class of the sampler."""
-        from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-
-        return SignalSampler
-
-    def sampler_options(self) -> dict[str, Any]:
-        """Return the arguments that the class of the sampler has beyond the usual ones."""
-        return {}
-
     def sampler(self) -> SignalSampler:
         """Make the sampler."""
-        return self.sampler_kind()(
+        made: SignalSampler = resolve_name(self.kind)(
             self.capacity,
             self.alpha,
             self.beta,
@@ -209,3 +208,4 @@ class Prioritized(Method):
             adjustments=self.adjustments(),
             **self.sampler_options(),
         )
+        return made

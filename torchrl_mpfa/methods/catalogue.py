@@ -6,125 +6,26 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.checks import BELOW_ONE, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Rule
-from torchrl_mpfa.methods.base import SWITCH, Method, Prioritized, one_of, within
+from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE
+from torchrl_mpfa.methods.base import Method, Prioritized, within
+from torchrl_mpfa.methods.mpfa import MPFA, Adjusted, Scaled
 from torchrl_mpfa.spelling import unknown
 
 if TYPE_CHECKING:
-    from torchrl.data import RandomSampler
-
     from torchrl_mpfa.adjustment import Adjustment
     from torchrl_mpfa.fusion import Fusion
-    from torchrl_mpfa.samplers.signal_sampler import SignalSampler
     from torchrl_mpfa.selection import Selection
     from torchrl_mpfa.signals import Signal
-
-
-LEVEL: Rule = (
-    lambda value: (
-        value == "mean"
-        or (isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value))
-    ),
-    "a finite number or 'mean'",
-)
-
-
-@dataclass
-class Adjusted(Prioritized):
-    """PER whose priorities of positive transitions are raised and decayed (Eqs. 22-24)."""
-
-    boost: bool = within(SWITCH, False)
-    """Raise positive transitions, Eq. 22."""
-    boost_factor: float = within(POSITIVE, 3.0)
-    """phi of Eq. 22; its upper bound where ``boost_target`` is above 0."""
-    boost_target: float = within(BELOW_ONE, 0.0)
-    """Share of the total priority that positive transitions are to have, by a phi that follows how
-    rare they are in the buffer; 0: phi is fixed."""
-    boost_bound: str = one_of("floor", "cap", "none")
-    """The 1 of Eq. 22: ``floor``, ``cap`` or ``none``."""
-    decay: bool = within(SWITCH, False)
-    """Decay positive transitions above the batch mean, Eqs. 23-24."""
-    decay_sharpness: float = within(POSITIVE, 0.01)
-    """sigma of Eq. 23."""
-    decay_position: str = one_of("batch", "rank", "count")
-    """j of Eq. 23: ``batch``, ``rank`` or ``count``."""
-    positive_above: Any = field(default=0.0, metadata={"rule": LEVEL})
-    """A transition is positive, in Eqs. 17 and 22-24, when its reward is above this: a number, or
-    ``mean``, the mean reward of the buffer, for rewards of one sign."""
-
-    def adjustments(self) -> list[Adjustment]:
-        """Make the boost and the decay that are on."""
-        from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
-
-        made: list[Adjustment] = []
-        if self.boost:
-            boost = PositiveBoost(
-                boost=self.boost_factor,
-                bound=self.boost_bound,  # type: ignore[arg-type]
-                positive_above=self.positive_above,
-                target_share=self.boost_target,
-            )
-            made.append(boost)
-        if self.decay:
-            decay = PositiveDecay(
-                sharpness=self.decay_sharpness,
-                position=self.decay_position,  # type: ignore[arg-type]
-                positive_above=self.positive_above,
-            )
-            made.append(decay)
-        return made
-
-
-@dataclass
-class MPFA(Adjusted):
-    """MPFA-PER: signals weighted by information entropy (Eqs. 15-21), raised and decayed."""
-
-    name: str = "mpfa_per"
-    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
-    boost: bool = True
-    decay: bool = True
-    weight_floor: float = within(BELOW_ONE, 0.0)
-    """Least weight of a signal: without one the reward alone counts until the first goal; 0: none,
-    as in the paper."""
-    population: str = one_of("buffer", "batch")
-    """Transitions that Eqs. 16-17 count: ``buffer`` or ``batch``."""
-
-    def fusion(self) -> Fusion:
-        """Make the fusion by entropy weights."""
-        from torchrl_mpfa.fusion import EntropyFusion
-
-        return EntropyFusion(
-            population=self.population,  # type: ignore[arg-type]
-            positive_above=self.positive_above,
-            floor=self.weight_floor,
-        )
-
-
-@dataclass
-class Scaled(Adjusted):
-    """Signals in equal shares: each is divided by its mean."""
-
-    name: str = "mpfa_plus"
-    signals: list[str] = field(default_factory=lambda: ["reward", "td_error", "action_gradient"])
-    # Signals are in units of their means, of which a floor of 1 is not one.
-    boost_bound: str = "none"
-    # More than a step can bring, and less than a goal.
-    positive_above: Any = 1.0
-
-    def fusion(self) -> Fusion:
-        """Make the fusion in equal shares."""
-        from torchrl_mpfa.moving_fusion import ScaledFusion
-
-        return ScaledFusion(super().fusion())
 
 
 @dataclass
 class MW(Prioritized):
     """Reward and TD error in equal shares, with a cap on replays (MW-MADDPG)."""
+
+    kind: ClassVar[str] = "torchrl_mpfa.methods.mw.MWSampler"
 
     name: str = "mw"
     signals: list[str] = field(default_factory=lambda: ["reward", "td_error"])
@@ -136,12 +37,6 @@ class MW(Prioritized):
         from torchrl_mpfa.moving_fusion import ScaledFusion
 
         return ScaledFusion(super().fusion())
-
-    def sampler_kind(self) -> type[SignalSampler]:
-        """Return the sampler with the cap."""
-        from torchrl_mpfa.methods.mw import MWSampler
-
-        return MWSampler
 
     def sampler_options(self) -> dict[str, Any]:
         """Return the cap."""
@@ -175,20 +70,18 @@ class HVPER(Prioritized):
 class RankPER(Prioritized):
     """PER by rank."""
 
+    kind: ClassVar[str] = "torchrl_mpfa.methods.rank_per.RankPERSampler"
+
     name: str = "rank_per"
     alpha: float = 0.7
     beta: float = 0.5
-
-    def sampler_kind(self) -> type[SignalSampler]:
-        """Return the sampler by rank."""
-        from torchrl_mpfa.methods.rank_per import RankPERSampler
-
-        return RankPERSampler
 
 
 @dataclass
 class ReaPER(Prioritized):
     """PER whose TD errors count by how reliable they are; transitions need ``"episode"``."""
+
+    kind: ClassVar[str] = "torchrl_mpfa.methods.reaper.ReaPERSampler"
 
     name: str = "reaper"
     alpha: float = 0.3
@@ -214,12 +107,6 @@ class ReaPER(Prioritized):
         from torchrl_mpfa.methods.reaper import ENDED, EPISODE
 
         return [*self.priority_signals(), EPISODE, ENDED]
-
-    def sampler_kind(self) -> type[SignalSampler]:
-        """Return the sampler that knows reliabilities."""
-        from torchrl_mpfa.methods.reaper import ReaPERSampler
-
-        return ReaPERSampler
 
     def sampler_options(self) -> dict[str, Any]:
         """Return the power of the reliability."""
@@ -255,6 +142,9 @@ class LAP(Prioritized):
 class LA3P(LAP):
     """The critic learns from large errors, the actor from small ones, both from a fair share."""
 
+    kind: ClassVar[str] = "torchrl_mpfa.methods.la3p.LA3PSampler"
+    batches: ClassVar[str] = "torchrl_mpfa.methods.la3p.la3p_batches"
+
     name: str = "la3p"
     plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
@@ -263,18 +153,6 @@ class LA3P(LAP):
     def remote(self) -> bool:
         """False: its parts depend on each other."""
         return False
-
-    def sampler_kind(self) -> type[SignalSampler]:
-        """Return the sampler of the parts."""
-        from torchrl_mpfa.methods.la3p import LA3PSampler
-
-        return LA3PSampler
-
-    def selection(self, policy: Any, sigma: Any) -> Selection:
-        """Make the selection of the three parts."""
-        from torchrl_mpfa.methods.la3p import la3p_batches
-
-        return la3p_batches
 
 
 @dataclass
@@ -296,43 +174,35 @@ class PAL(Method):
 class CER(Method):
     """Uniform replay with the newest transition in every batch."""
 
+    kind: ClassVar[str] = "torchrl_mpfa.methods.cer.CERSampler"
+
     name: str = "cer"
-
-    def sampler(self) -> RandomSampler:
-        """Make the sampler."""
-        from torchrl_mpfa.methods.cer import CERSampler
-
-        return CERSampler()
 
 
 @dataclass
 class Geometric(Method):
     """Replay by age: the older a transition, the less often."""
 
+    kind: ClassVar[str] = "torchrl_mpfa.methods.geometric.GeometricSampler"
+
     name: str = "geometric"
     recency: float = within(NOT_NEGATIVE, 3.0)
     """c: the newest transition is sampled e^c times as often as the oldest."""
 
-    def sampler(self) -> RandomSampler:
-        """Make the sampler."""
-        from torchrl_mpfa.methods.geometric import GeometricSampler
-
-        return GeometricSampler(recency=self.recency)
+    def sampler_options(self) -> dict[str, Any]:
+        """Return the rate."""
+        return {"recency": self.recency}
 
 
 @dataclass
 class UniformHalves(Method):
     """Two updates on uniform halves of a batch, the control of LA3P."""
 
+    batches: ClassVar[str] = "torchrl_mpfa.methods.halves.uniform_halves"
+
     name: str = "uniform_halves"
     plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
-
-    def selection(self, policy: Any, sigma: Any) -> Selection:
-        """Make the selection of the halves."""
-        from torchrl_mpfa.methods.halves import uniform_halves
-
-        return uniform_halves
 
 
 @dataclass
@@ -363,6 +233,8 @@ class KLPER(Method):
 class ReFER(Method):
     """Uniform replay of transitions that are near to the policy (ReF-ER)."""
 
+    kind: ClassVar[str] = "torchrl_mpfa.methods.ref_er.ReFERSampler"
+
     name: str = "ref_er"
     far_share: float = within(SHARE, 0.1)
     """Share of transitions that may be far from the policy before the policy is held."""
@@ -377,12 +249,6 @@ class ReFER(Method):
     def entries(self) -> tuple[str, ...]:
         """The behavior's action without noise, and its standard deviation."""
         return (*super().entries, "behavior_mean", "behavior_sigma")
-
-    def sampler(self) -> RandomSampler:
-        """Make the sampler."""
-        from torchrl_mpfa.methods.ref_er import ReFERSampler
-
-        return ReFERSampler()
 
     def selection(self, policy: Any, sigma: Any) -> Selection:
         """Make the selection that leaves out what is far."""

@@ -27,7 +27,8 @@ class LAPFloor:
         ValueError: If the floor is not positive and finite.
 
     Examples:
-        >>>         >>> facts = BatchFacts(torch.zeros(2), torch.ones(2), torch.arange(2))
+        >>> import torch
+        >>> facts = BatchFacts(torch.zeros(2), torch.ones(2), torch.arange(2))
         >>> LAPFloor(1.0)(torch.tensor([0.2, 3.0]), facts).tolist()
         [1.0, 3.0]
     """
