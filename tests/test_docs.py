@@ -124,7 +124,6 @@ EPISODES = {
 
 HOWTO = [page for page in PAGES if page.startswith("howto/")]
 TASK_PAGES = [
-    "cliffwalk.md",
     "discrete.md",
     "maps.md",
     "moving.md",

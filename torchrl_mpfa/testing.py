@@ -9,14 +9,12 @@ nothing otherwise::
         check_adjustment(MyAdjustment())
         check_fusion(MyFusion(), ["reward", "td_error"])
         check_sampler(lambda: MySampler(64, 0.6, 0.4, 0.05))
-        check_prioritization(lambda capacity: MySampler(capacity, 0.6, 0.4, 1e-3))
 """
 
 from __future__ import annotations
 
 import copy
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,10 +23,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
-from torchrl.data import RandomSampler
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting, counts_buffer
-from torchrl_mpfa.cliffwalk import Cliffwalk, updates_to_convergence
 from torchrl_mpfa.fusion import Fusion
 from torchrl_mpfa.moving_fusion import Annealed
 from torchrl_mpfa.replay import SignalReplayBuffer
@@ -178,51 +174,6 @@ def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int 
     _check_round_trip(buffer, _buffer(make_sampler(), batch_size, seed=1))
     _check_rejections(buffer)
     _check_frequencies(buffer)
-
-
-def check_prioritization(
-    make_sampler: Callable[[int], SignalSampler], *, length: int = 8, seeds: int = 3
-) -> None:
-    """Check that a sampler finds what there is to learn: that its priorities work.
-
-    On a :class:`~torchrl_mpfa.cliffwalk.Cliffwalk` Q learning has to need at most half the updates
-    that it needs with uniform sampling, in the median over the seeds. PER and MPFA-PER need a
-    sixth where their ``eps`` is small beside the reward of 1.
-
-    Args:
-        make_sampler: From a capacity to a new sampler, whose signals are among reward and TD error.
-        length: Number of states. With few of them there is little to gain.
-        seeds: Number of runs.
-
-    Raises:
-        AssertionError: If it needs more.
-
-    Examples:
-        >>> from torchrl_mpfa import SignalSampler
-        >>> check_prioritization(lambda capacity: SignalSampler(capacity, 0.6, 0.4, 1e-3), seeds=1)
-    """
-    cliff = Cliffwalk(length)
-
-    def median(make: Callable[[int], Any], batch_size: int, limit: int | None = None) -> float:
-        counts = []
-        for seed in range(seeds):
-            sampler = make(cliff.size)
-            signals = getattr(sampler, "signals", ("td_error",))
-            buffer = SignalReplayBuffer(
-                storage=SignalTensorStorage(cliff.size, signals=signals),
-                sampler=sampler,
-                batch_size=batch_size,
-                generator=torch.Generator().manual_seed(seed),
-            )
-            counts.append(updates_to_convergence(cliff, buffer, seed=seed, limit=limit))
-        return statistics.median(counts)
-
-    uniform = median(lambda capacity: RandomSampler(), 64)
-    _require(
-        median(make_sampler, 4, limit=int(uniform / 2)) <= uniform / 2,
-        f"a prioritized sampler must learn a cliffwalk of {length} states in at most half the "
-        f"{uniform:g} updates of uniform sampling, and needs more",
-    )
 
 
 def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalReplayBuffer:

@@ -24,7 +24,6 @@ from torchrl_mpfa import (
     make_stochastic_actor,
     run_updates,
 )
-from torchrl_mpfa.cliffwalk import Cliffwalk
 from torchrl_mpfa.fusion import entropy_weights, positive_entropy, reward_entropy
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.samplers import TreeSampler
@@ -182,7 +181,6 @@ ROWS = [
     ],
     (actor, {"final_init": "0"}, f"final_init {NO_NUMBER} '0'"),
     (actor, {"width": 2**31}, f"width {NO_COUNT}"),
-    *[(Cliffwalk, {"length": length}, "length must be .* got") for length in (1, 21, 2.5, True)],
     *[(updates, {"count": count}, f"updates {NO_COUNT} {count}") for count in (0, -1, 1.5, True)],
     (sac_loss, {"alpha_init": NAN}, f"alpha_init {NOT_POSITIVE} nan"),
 ]
