@@ -168,6 +168,48 @@ def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> Tens
     return found
 
 
+def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
+    """Numbers of actions among ``K``, shape ``[B]``, given one-hot or as numbers.
+
+    Args:
+        action: One-hot, ``[B, K]``, or numbers, ``[B]`` or ``[B, 1]``.
+        count: ``K``.
+        batch: The batch that has them.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        ValueError: If the actions have neither form.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> batch = TensorDict({}, [2])
+        >>> read_choices(torch.eye(3)[[2, 0]], 3, batch).tolist()
+        [2, 0]
+        >>> read_choices(torch.tensor([[2], [0]]), 3, batch).tolist()
+        [2, 0]
+    """
+    form = tuple(action.shape[batch.ndim :])
+    if form == (count,):
+        # One number is not zero, and it is one.
+        if bool((action.count_nonzero(-1) == 1).all() & (action.sum(-1) == 1).all()):
+            return action.float().argmax(-1)
+    elif form in ((), (1,)) and action.dtype is not torch.bool:
+        number = action.reshape(batch.shape)
+        if bool(((number >= 0) & (number < count) & (number == number.long())).all()):
+            return number.long()
+    raise ValueError(
+        f"action must be one-hot among {count}, shape {[*batch.shape, count]}, or the number of "
+        f"one, shape {[*batch.shape, 1]}, got {action.dtype} of shape {[*action.shape]}"
+        + (
+            ""
+            if form not in ((count,), (), (1,))
+            else f": {action.reshape(-1)[: 2 * count].tolist()}"
+        )
+    )
+
+
 class Trust(NamedTuple):
     """Weights of ReF-ER, which hold the actor near the behavior policy."""
 
