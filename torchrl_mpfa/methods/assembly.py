@@ -337,10 +337,7 @@ def make_selection(
     if method.selection == "near_policy" and policy is not None:
         return ReFERSelection(policy, far_share=method.far_share, cutoff=method.far_cutoff)
     if policy is not None and sigma is not None and method.candidates > 1:
-        choose = KLPERSelection(policy, batches=method.candidates, sigma=sigma)
-        return lambda buffer: (
-            replace(each, batch=choose(each.batch)) for each in one_batch(buffer)
-        )
+        return KLPERSelection(policy, batches=method.candidates, sigma=sigma).select
     return one_batch
 
 

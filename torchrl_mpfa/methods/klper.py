@@ -11,16 +11,19 @@ no further from it, are our reading.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
 from torchrl_mpfa.methods.acting import actions_of
+from torchrl_mpfa.selection import SampledBatch, one_batch
 
 _LEAST_VARIANCE = 1e-3
 
@@ -109,6 +112,11 @@ class KLPERSelection:
         self.batches = batches
         self.sigma = sigma
         self.action_key = action_key
+
+    def select(self, buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
+        """Sample a batch and choose: a :class:`~torchrl_mpfa.selection.Selection`."""
+        for each in one_batch(buffer):
+            yield replace(each, batch=self(each.batch))
 
     @torch.no_grad()
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
+import torch
+from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
 from torchrl.data import LazyMemmapStorage
 
@@ -19,7 +22,8 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
     """:class:`~torchrl.data.LazyMemmapStorage` with the signals of every slot beside the data.
 
     With ``scratch_dir`` the signals are memory-mapped too, to ``scratch_dir/signals.memmap``;
-    without it they stay in memory, 8 bytes a column and slot.
+    without it they stay in memory, 8 bytes a column and slot. What is pickled or copied has
+    temporary files of its own.
 
     Args:
         max_size: Capacity ``N``.
@@ -42,6 +46,8 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         torch.Size([1000, 6])
     """
 
+    _storage: Any
+
     def __init__(
         self,
         max_size: int,
@@ -60,3 +66,16 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
             max_size, signals, reward_key=reward_key, file=file, existsok=existsok
         )
         super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
+
+    def __getstate__(self) -> Any:
+        state = super().__getstate__()
+        if get_spawning_popen() is None and self.initialized:
+            # The copy has files of its own. Processes that TorchRL starts share those of this one.
+            data = torch.utils._pytree.tree_map(lambda entry: entry.clone(), self._storage)
+            state |= {"_storage": data, "scratch_dir": None, "_scratch_dir_is_temp": True}
+        return state
+
+    def __setstate__(self, state: Any) -> None:
+        super().__setstate__(state)
+        if is_tensor_collection(self._storage) and not self._storage.is_memmap():
+            self._storage = self._storage.memmap()
