@@ -40,6 +40,8 @@ ENDED = Signal("ended", key=("next", "done"), known_at="write")
 """Whether the transition is the last one of its episode, likewise."""
 _LEAST = 1e-3
 """With a reliability of zero a transition would be lost for good."""
+_UNDER_WAY = 1024
+"""Episodes that may go on; of more, those that were written last."""
 _SPARSE = 8
 """Up to so many numbers for each transition, those of the episodes serve as places in a table."""
 
@@ -197,8 +199,9 @@ class ReaPERSampler(SignalSampler):
         # The last step of each is the one that is written last.
         tail = torch.zeros(self._last_number + 1, dtype=torch.long)
         tail[found] = torch.arange(len(found))
-        tail = tail[found.unique()]
-        self._open, self._numbered = slots[tail[~(last[tail] > 0)]], table.writes
+        tail = tail[found.unique()].sort().values
+        self._open = slots[tail[~(last[tail] > 0)]][-_UNDER_WAY:]
+        self._numbered = table.writes
 
     def _rely(self, table: SignalTable, slots: Tensor) -> None:
         """Write the leaves of all transitions of the episodes that these are of."""

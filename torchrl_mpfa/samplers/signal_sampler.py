@@ -126,11 +126,8 @@ class SignalSampler(TreeSampler):
                 raise TypeError(f"adjustments must be callable, got {type(adjust).__name__}")
         self.entropy_refresh = entropy_refresh
         self._counting = [counts_buffer(each) for each in self.adjustments]
-        self._telling = [
-            (place, each)
-            for place, each in enumerate(self.adjustments)
-            if self._counting[place] and hasattr(each, "entries")
-        ]
+        counting = [(i, each) for i, each in enumerate(self.adjustments) if self._counting[i]]
+        self._telling = [(i, each) for i, each in counting if hasattr(each, "entries")]
         self._learned = {s.name: s.priority for s in self.signals if s.known_at == "update"}
         self._names = [s.name for s in self.signals]
         self._columns: Columns = slice(0)

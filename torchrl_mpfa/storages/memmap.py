@@ -7,9 +7,9 @@ from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
+from torch.utils._pytree import tree_map
 from torchrl.data import LazyMemmapStorage
 
 from torchrl_mpfa.checks import check_counts
@@ -69,13 +69,15 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
 
     def __getstate__(self) -> Any:
         state = super().__getstate__()
-        if get_spawning_popen() is None and self.initialized:
+        if get_spawning_popen() is None:
             # The copy has files of its own. Processes that TorchRL starts share those of this one.
-            data = torch.utils._pytree.tree_map(lambda entry: entry.clone(), self._storage)
-            state |= {"_storage": data, "scratch_dir": None, "_scratch_dir_is_temp": True}
+            state |= {"scratch_dir": None, "_scratch_dir_is_temp": True}
+            if self.initialized:
+                state["_storage"] = tree_map(lambda entry: entry.clone(), self._storage)
         return state
 
     def __setstate__(self, state: Any) -> None:
         super().__setstate__(state)
-        if is_tensor_collection(self._storage) and not self._storage.is_memmap():
-            self._storage = self._storage.memmap()
+        data: Any = self._storage if self.initialized else None
+        if is_tensor_collection(data) and not data.is_memmap():
+            self._storage = data.memmap()
