@@ -23,7 +23,7 @@ _STEPS = "steps_to_next_obs"
 def follows(storage: Any, table: SignalTable, before: Tensor, after: Tensor) -> Tensor:
     """Whether stored steps can follow others, by their slots, shape ``[B]``.
 
-    Where nothing tells, those that were written since the buffer was loaded follow none of before.
+    Without observations, those that were written since a load follow none of before.
     """
     old, new = (
         table.written_at(slots.to(table.device)) < table.loaded for slots in (before, after)
@@ -52,14 +52,15 @@ def episodes_of(
         places: Places of those to number along the flattened dimensions, shape ``[B]``.
         number: Numbers of their episodes, which may begin again, shape ``[B]``.
         last: Whether an episode ends with a step, shape ``[B]``.
-        loaded: Whether steps are from before a load, across which nothing goes on unless the steps
-            tell that it does, shape ``[B]``.
+        loaded: Whether steps are from before a load, across which no episode continues without
+            an observation that says so, shape ``[B]``.
         ndim: How many dimensions there are.
 
     Returns:
         The position of the first step of each one's episode, shape ``[B]``.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> at = torch.tensor([[0.0], [5.0], [1.0], [6.0]])  # Two robots in turn.
         >>> steps = TensorDict({"observation": at, "next": {"observation": at + 1}}, [4])
         >>> none = torch.zeros(4, dtype=torch.bool)

@@ -34,14 +34,14 @@ from torchrl_mpfa.storages.table import SignalTable
 EPISODE = Signal("episode", key="episode", known_at="write")
 """The number of the episode that a transition is of, which the storage has to keep.
 
-It may begin again with a process or a collector: a transition goes on with an episode of its number
+It may begin again with a process or a collector: a transition continues an episode of its number
 if it begins with what that ended with (:func:`~torchrl_mpfa.episodes.episodes_of`)."""
 ENDED = Signal("ended", key=("next", "done"), known_at="write")
 """Whether the transition is the last one of its episode, likewise."""
 _LEAST = 1e-3
 """With a reliability of zero a transition would be lost for good."""
 _UNDER_WAY = 1024
-"""Episodes that may go on; of more, those that were written last."""
+"""Episodes that may continue; of more, those that were written last."""
 _SPARSE = 8
 """Up to so many numbers for each transition, those of the episodes serve as places in a table."""
 

@@ -133,7 +133,7 @@ class SignalSliceSampler(SignalSampler):
 
     @property
     def _done_key(self) -> NestedKey:
-        """Where a batch marks the last step of each slice beside the end by a time limit."""
+        """Where a batch marks the last step of each slice as an end of any kind."""
         return (*as_path(self.truncated_key or "")[:-1], "done")
 
     @property
