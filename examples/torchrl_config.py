@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from torchrl.trainers.algorithms.configs import EnvConfig
 
 from torchrl_mpfa.configs import register_configs
 from torchrl_trainer import close_progress_bar, report, silence
+from training.settings.from_file import quoted
 
 
 @dataclass
@@ -65,6 +67,7 @@ def main() -> None:
     """Hand over to Hydra."""
     register()
     folder = str(Path(__file__).parent.resolve())
+    sys.argv[1:] = map(quoted, sys.argv[1:])
     hydra.main(version_base="1.3", config_path=folder, config_name="torchrl_config")(run)()
 
 

@@ -107,6 +107,18 @@ def check_index(index: Tensor, size: int) -> Tensor:
     return index[index >= 0] if low == -1 else index
 
 
+def as_mask(name: str, value: Any) -> Tensor:
+    """Booleans, given as such or as 0 and 1; anything else is rejected by name."""
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be a tensor of booleans, got {type(value).__name__}")
+    # A compiled program looks at no values.
+    if value.dtype is torch.bool or torch.compiler.is_compiling():
+        return value.bool()
+    if bool((wrong := (value != 0) & (value != 1)).any()):
+        raise ValueError(f"{name} must be booleans, or 0 and 1, got {value[wrong][0].item()}")
+    return value != 0
+
+
 def check_finite(name: str, value: Tensor) -> None:
     """Reject values that are negative or not finite, naming the first."""
     wrong = ~((value >= 0) & (value < math.inf))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Final
 
 TOP: Final[dict[str, str]] = {
@@ -72,7 +74,7 @@ OF_CLIFFWALK: Final[dict[str, str]] = {
 def find(
     package: str, name: str, renamed: Mapping[str, str], module_of: Mapping[str, str] | None = None
 ) -> Any:
-    """What a package has by a name, from one of its modules; old names stay for one version.
+    """What a package has by a name: from a module, or a module; old names stay for one version.
 
     Raises:
         AttributeError: If there is no such name, or it is not in the package any more.
@@ -80,6 +82,9 @@ def find(
     if module_of and name in module_of:
         return getattr(import_module(f"{package}.{module_of[name]}"), name)
     if name not in renamed:
+        # A module is an attribute of its package only once it was imported.
+        if "__path__" in vars(sys.modules[package]) and find_spec(f"{package}.{name}"):
+            return import_module(f"{package}.{name}")
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
     module, _, new = renamed[name].rpartition(".")
     message = f"{package}.{name} is now {renamed[name]}"

@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import ReplayBuffer, RoundRobinWriter, Transition
+from torchrl.data import ReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import check_counts, check_finite, seeded_generator
+from torchrl_mpfa.checks import check_counts, seeded_generator
 from torchrl_mpfa.dumps import new_dump, open_dump
 from torchrl_mpfa.replay_writes import FollowedReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.saved import Entry, check_entries, count, generator
+from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
@@ -29,6 +30,8 @@ _MISSING = (
     "SignalSACLoss write td_error and action_gradient; with another loss, or a signal of your own, "
     "write batch[{key!r}] = ..., one number per transition"
 )
+_KEPT, _TRANSFORMS = "_kept", "transforms.pt"
+"""Where a saved buffer has what waits in its transforms, and the file of a dump with that."""
 _UNRETURNED = 100
 """Batches in a row without an update of priorities after which a warning is given."""
 
@@ -108,6 +111,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 self._sampler.check_batch_size(self._batch_size)
             self._storage.needs_signals = True
             self._storage.needed_keys = self._sampler.needed_keys
+            self._storage.mask_keys = self._sampler.mask_keys
         if self._checks:
             self._storage.strict = True
 
@@ -141,56 +145,25 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
         Raises:
             KeyError: If an entry is missing or unknown; nothing is changed.
-            ValueError: If an entry has another shape or dtype than in the storage, or a number is
-                not finite; nothing is changed.
+            ValueError: If an entry has another shape or dtype than in the storage, a number is not
+                finite, a first priority cannot be, or there is no batch size; nothing is changed,
+                in the transforms neither.
         """
         self._wait_for_queue()
         if not self._checks or not isinstance(tensordicts, TensorDictBase):
-            return super().extend(tensordicts, update_priority=update_priority)
-        data = self._transform.inv(tensordicts)
-        if data is None or data.shape.numel() == 0:
-            shape = (0,) if self._storage.ndim == 1 else (0, self._storage.ndim)
-            return torch.zeros(shape, dtype=torch.long)
-        priority = data.get(self.priority_key, None)
-        # The writer adds the slots to it, and the caller's is left as it is.
-        taken = priority is not None and self._fuses
-        data = data.exclude(self.priority_key) if taken else data.copy()
-        if type(data) is not TensorDict:
-            data = data.contiguous()
-        if self._storage.ndim == 1 and data.ndim > 1:
-            data = data.reshape(-1)
-        # Where nothing is sampled by it, a reward may be negative.
-        weighs = isinstance(self._sampler, PrioritizedSampler)
-        reward_key = self._storage.signal_table.reward_key
-        if priority is not None and (weighs or self.priority_key != reward_key):
-            check_finite(f"{self.priority_key!r} of the transitions", priority)
-        with self._replay_lock, self._write_lock:
-            index = self._write(data)
-        if priority is not None and update_priority is not False:
-            # In the order of the slots, which is that of the data as they were written.
-            priority = self._transpose(priority) if self.dim_extend > 0 else priority
-            self.update_priority(index, priority.reshape(-1, *priority.shape[data.ndim :]))
-        return index
-
-    def _write(self, data: TensorDictBase) -> Tensor:
-        if self.dim_extend > 0:
-            data = self._transpose(data)
-        writer = self._writer
-        in_a_ring = isinstance(writer, RoundRobinWriter)
-        if not in_a_ring:
-            # It may hand on some of them only, and takes note of them before the storage does.
-            self._storage.check(data)
-        place = (writer._cursor, writer._write_count) if in_a_ring else None
-        try:
-            with torch.no_grad():
-                index: Tensor = writer.extend(data)
-        except BaseException:
-            if place is not None:
-                # It moves on before the storage checks what it is to write.
-                writer._cursor, writer._write_count = place
-            raise
-        self._sampler.extend(index)
-        return index
+            with self._memory.at_a_write(tensordicts) as (given, _):
+                return super().extend(given, update_priority=update_priority)
+        if tensordicts.ndim < self._storage.ndim:
+            raise ValueError(
+                f"tensordicts must have a batch size of {self._storage.ndim} or more dimensions, "
+                f"got {[*tensordicts.shape]}: write a single step by add(...)"
+            )
+        # What is made here must be of use where the caller has no inference mode.
+        outside = torch.inference_mode(False), torch.no_grad()
+        with outside[0], outside[1], self._memory.at_a_write(tensordicts) as (given, check):
+            data = self._transform.inv(given)
+            check()
+            return self._extend_checked(data, update_priority is not False)
 
     def add(self, data: TensorDictBase) -> Any:
         """Write one transition, and return its slot.
@@ -204,7 +177,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         """
         if not self._checks:
             self._wait_for_queue()
-            return super().add(data)
+            with self._memory.at_a_write(data) as (given, _):
+                return super().add(given)
         if data.ndim < self.dim_extend:
             raise ValueError(
                 f"data must be one step of each environment, batch size [E], got {[*data.shape]}"
@@ -383,6 +357,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             )
         self._storage.check_state(state_dict["_storage"])
         # A writer of data that no one may write has no cursor, nor has its state.
+        self._memory.check_state(state_dict.get(_KEPT, {}))
         if hasattr(self._writer, "_cursor"):
             slots = self._storage._max_size_along_dim0() if self._storage.ndim == 1 else None
             last = None if slots is None else slots - 1
@@ -390,8 +365,14 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             if "_write_count" in state_dict["_writer"]:
                 check_entries("writer", state_dict["_writer"], [count("_write_count")])
 
+    def state_dict(self) -> dict[str, Any]:
+        """All parts as TorchRL has them, and what waits in the transforms."""
+        with self._without_queue(), self._replay_lock:
+            return {**super().state_dict(), _KEPT: self._memory.state_dict()}
+
+    @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore storage, signals, priorities, writer and generator.
+        """Restore storage, signals, priorities, writer, generator, and what waits in transforms.
 
         Raises:
             KeyError: See :meth:`check_state`.
@@ -400,6 +381,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         if self._checks:
             self.check_state(state_dict)
         super().load_state_dict(state_dict)
+        # A state of an earlier version has none: nothing waits.
+        self._memory.load_state_dict(state_dict.get(_KEPT, {}))
         self._tell_last_cursor()
 
     def dumps(self, path: str | Path) -> None:
@@ -408,9 +391,15 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         Raises:
             ValueError: If the data hold anything but tensors and plain values.
         """
-        with new_dump(path) as folder:
+        with new_dump(path) as folder, self._without_queue(), self._replay_lock:
             super().dumps(folder)
+            # TorchRL's would be unpickled, and execute anything.
+            (folder / "transform.t").unlink(missing_ok=True)
+            kept = {"_transforms": self._transform.state_dict(), _KEPT: self._memory.state_dict()}
+            save_atomically(kept, folder / _TRANSFORMS)
+            load_safely(folder / _TRANSFORMS)
 
+    @torch.inference_mode(False)
     def loads(self, path: str | Path) -> None:
         """Restore from a folder that :meth:`dumps` wrote, without executing anything in it.
 
@@ -424,7 +413,13 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         for part, name in ((self.sampler, "sampler"), (self.storage, "storage")):
             if hasattr(part, "check_dump"):
                 part.check_dump(folder / name)
+        file = folder / _TRANSFORMS
+        saved = load_safely(file) if file.exists() else {}
+        self._memory.check_state(saved.get(_KEPT, {}))
         super().loads(folder)
+        if "_transforms" in saved:
+            self._transform.load_state_dict(saved["_transforms"])
+        self._memory.load_state_dict(saved.get(_KEPT, {}))
         self._tell_last_cursor()
 
     def _tell_last_cursor(self) -> None:

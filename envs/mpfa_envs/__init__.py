@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -146,9 +147,26 @@ def __getattr__(name: str) -> Any:
                 raise
             needs = f"mpfa_envs.{name} needs {package}: pip install 'torchrl-mpfa[envs]'"
             raise ImportError(needs, name=error.name) from error
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _submodule(__name__, name)
 
 
+def _submodule(package: str, name: str) -> Any:
+    """A module of a package, which is an attribute of it only once it was imported."""
+    path = f"{package}.{name}"
+    if find_spec(path) is None:
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    module = import_module(path)
+    if hasattr(module, "__path__"):
+        vars(module).setdefault("__getattr__", partial(_submodule, path))
+    return module
+
+
+# Other modules import parts of these; importing one of them alone costs nothing.
+for _folder in (
+    *("env", "evaluation", "paths", "policies", "robots", "ros"),
+    *("safety", "scene", "sensing", "tasks", "walkers", "worlds"),
+):
+    _submodule(__name__, _folder)
 # A robot that runs :mod:`mpfa_envs.deploy` may have no gymnasium, and needs no ids.
 if find_spec("gymnasium") is not None:
     import_module("mpfa_envs.env.registration")

@@ -57,6 +57,55 @@ def test_a_choice_drives_as_its_wheel_speeds(place):
     assert torch.equal(*seen)
 
 
+NUMBERS = torch.tensor([5, 2])
+HOT = torch.nn.functional.one_hot(NUMBERS, len(WHEEL_PAIRS))
+SOFT = torch.full((2, len(WHEEL_PAIRS)), 1.0 / len(WHEEL_PAIRS))
+
+
+@pytest.mark.parametrize(
+    "form", [HOT, HOT.bool(), HOT.float(), NUMBERS, NUMBERS.unsqueeze(1), NUMBERS.float()]
+)
+def test_every_form_of_a_choice_drives_its_pair_and_is_mirrored(form):
+    rows = TensorDict({"action": form, "observation": torch.rand(2, 24)}, [2])
+    rows["next"] = {"observation": torch.rand(2, 24)}
+    driven = DiscreteWheels().inv(rows)["action"]
+    assert driven.tolist() == [[*WHEEL_PAIRS[5]], [*WHEEL_PAIRS[2]]]
+    mirrored = RandomMirror(chance=1.0, pairs=WHEEL_PAIRS)(rows.clone())
+    assert mirrored["action"].shape == form.shape and mirrored["action"].dtype is form.dtype
+    assert DiscreteWheels().inv(mirrored)["action"].equal(driven.flip(1))
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        SOFT,
+        HOT * 2,
+        HOT.roll(1, 0) + HOT,
+        HOT * 0,
+        HOT[:, :6],
+        torch.nn.functional.pad(HOT, (0, 1)),
+        torch.tensor([7, 0]),
+        torch.tensor([[-1], [0]]),
+        torch.tensor([[0.5], [0.0]]),
+        torch.tensor([[torch.nan], [0.0]]),
+    ],
+)
+def test_what_is_no_choice_is_rejected_by_name(form):
+    with pytest.raises(ValueError, match=r"action must be one-hot, shape \[..., 7\]"):
+        DiscreteWheels().inv(TensorDict({"action": form}, [2]))
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_actions_of_another_width_are_neither_mirrored_nor_driven(width):
+    with pytest.raises(ValueError, match="action must have the shape"):
+        Mirror().action(torch.zeros(2, width))
+    env = NavigationTorchEnv(num_envs=2, world="A", physics="kinematic")
+    state = env.reset().set("action", torch.zeros(2, width))
+    with pytest.raises(ValueError, match=r"action must have shape \[2, 2\]"):
+        env.step(state)
+    env.close()
+
+
 def test_a_mirrored_choice_has_its_wheels_swapped():
     choices = torch.eye(len(WHEEL_PAIRS), dtype=torch.long)
     mirrored = Mirror(pairs=WHEEL_PAIRS).action(choices).argmax(-1).tolist()

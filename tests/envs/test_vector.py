@@ -265,6 +265,37 @@ def test_environments_for_training_and_tests_cause_no_warning() -> None:
         step_in_turn([env], 150)
 
 
+@pytest.mark.parametrize(
+    ("words", "actions"),
+    [
+        ({"max_episode_steps": 7}, 7),
+        ({"max_episode_steps": 7, "action_repeat": 3}, 7),
+        ({"max_episode_steps": 7, "max_steps": 8}, 4),
+        ({"max_episode_steps": -1, "max_steps": 8}, 4),
+    ],
+)
+def test_the_time_limit_of_gymnasium_is_that_of_one_environment(words, actions) -> None:
+    words = {**words, "physics": "kinematic"}
+    one, many = (
+        make("mpfa/Navigation-A-v1", **words, **more)
+        for make, more in ((gymnasium.make, {}), (gymnasium.make_vec, {"num_envs": 2}))
+    )
+    one.reset(seed=0)
+    many.reset(seed=0)
+    for step in range(1, actions + 1):
+        ended = one.step(np.zeros(2, np.float32))[3]
+        assert many.step(np.zeros((2, 2), np.float32))[3].tolist() == [ended] * 2
+        assert ended == (step == actions)
+    one.close()
+    many.close()
+
+
+@pytest.mark.parametrize("limit", [0, 1.5, "7", -2])
+def test_a_time_limit_that_is_no_count_is_rejected_by_name(limit) -> None:
+    with pytest.raises(ValueError, match="max_episode_steps"):
+        gymnasium.make_vec("mpfa/Navigation-A-v1", num_envs=2, max_episode_steps=limit)
+
+
 @pytest.mark.parametrize("env_id", [f"mpfa/Navigation-{name}-v1" for name in WORLDS])
 def test_every_world_has_an_id_of_a_vector_environment(env_id: str) -> None:
     env = gymnasium.make_vec(env_id, num_envs=2, physics="kinematic")

@@ -13,6 +13,14 @@ from torchrl_mpfa import make_actor
 from torchrl_mpfa.methods.klper import KLPERSelection, gaussian_divergence
 
 
+@pytest.mark.parametrize("shape", [(8,), (8, 1), (8, 3)])
+def test_actions_of_another_form_than_the_policys_are_rejected_by_name(shape):
+    select = KLPERSelection(make_actor(24, 2), batches=2, sigma=0.2)
+    seen = TensorDict({"observation": torch.rand(8, 24), "action": torch.zeros(shape)}, [8])
+    with pytest.raises(ValueError, match=r"'action' must have the shape"):
+        select(seen)
+
+
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_deviations_wider_than_the_noise_have_the_divergence_of_two_gaussians(size):
     deviation = torch.randn(3, 64, size, generator=seeded(size)).double() * 0.3 + 0.1

@@ -1,11 +1,15 @@
 """Saved samplers: what does not fit is rejected by name, before anything changes."""
 
+import copy
+import pickle
+
 import pytest
 import torch
 
 from tests.methods.replays import make_transitions, seeded
 from tests.mpfa.transitions import rejected, restore, same
-from torchrl_mpfa import MPFASampler
+from torchrl_mpfa import MPFASampler, SignalMemmapStorage, make_actor
+from torchrl_mpfa.methods import METHODS as ALL
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.samplers import TreeSampler
 
@@ -162,3 +166,26 @@ def test_a_uniform_buffer_rejects_the_state_of_a_prioritized_one(method, message
     first, second = make_trained("mpfa_per"), make_trained(method, seed=3)
     with rejected(second.buffer, ValueError, message):
         second.buffer.load_state_dict(first.buffer.state_dict())
+
+
+@pytest.mark.parametrize("way", [copy.deepcopy, lambda replay: pickle.loads(pickle.dumps(replay))])
+@pytest.mark.parametrize("name", ALL)
+def test_the_replay_of_every_method_is_pickled_and_copied(name, way):
+    actor = make_actor(3, 2, width=8)
+    more = {"klper": {"policy": actor, "sigma": 0.2}, "ref_er": {"policy": actor}}.get(name, {})
+    replay = make_replay(name, capacity=16, batch_size=4, generator=seeded(), **more)
+    rows = make_transitions(12)
+    rows["observation"] = torch.rand(12, 3, generator=seeded(1))
+    rows["action"] = rows["behavior_mean"] = torch.rand(12, 2, generator=seeded(2))
+    rows["behavior_sigma"] = torch.full((12, 1), 0.3)
+    rows["episode"], rows["next", "done"] = torch.zeros(2, 12, 1).long()
+    replay.buffer.extend(rows)
+    again = way(replay)
+    assert batches(replay).equal(batches(again))
+
+
+def test_the_replay_of_a_method_with_a_memory_mapped_storage_is_copied():
+    replay = make_replay("per", storage=SignalMemmapStorage(16, signals=["td_error"]), batch_size=4)
+    replay.buffer.extend(make_transitions(12))
+    again = copy.deepcopy(replay)
+    assert batches(replay).equal(batches(again))

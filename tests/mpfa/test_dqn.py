@@ -209,12 +209,47 @@ def test_ends_that_are_bytes_count_as_booleans(kind):
 
 
 @pytest.mark.parametrize("kind", [0, 1])
-def test_actions_may_be_booleans(kind):
-    batch, booleans = transitions(), transitions()
-    booleans["action"] = booleans["action"].bool()
-    for each in (batch, booleans):
+@pytest.mark.parametrize("form", ["booleans", "floats", "column", "numbers", "column of floats"])
+def test_every_form_of_an_action_is_learned_from_alike(kind, form):
+    batch, other = transitions(), transitions()
+    hot = batch["action"]
+    number = hot.argmax(-1)
+    other["action"] = {
+        "booleans": hot.bool(),
+        "floats": hot.float(),
+        "column": number.unsqueeze(1),
+        "numbers": number,
+        "column of floats": number.float().unsqueeze(1),
+    }[form]
+    for each in (batch, other):
         learners()[kind].update(each)
-    assert torch.equal(batch["signals", "td_error"], booleans["signals", "td_error"])
+    assert torch.equal(batch["signals", "td_error"], other["signals", "td_error"])
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda hot: hot / ACTIONS,
+        lambda hot: hot * 2,
+        lambda hot: hot * 0,
+        lambda hot: hot + hot.roll(1, -1),
+        lambda hot: hot[:, 1:],
+        lambda hot: torch.nn.functional.pad(hot, (0, 1)),
+        lambda hot: hot.argmax(-1) + ACTIONS,
+        lambda hot: hot.argmax(-1).neg() - 1,
+        lambda hot: hot.argmax(-1) + 0.5,
+        lambda hot: hot[:, :1].bool(),
+    ],
+)
+def test_what_is_no_action_is_rejected_by_name_and_nothing_changes(kind, spoil):
+    learner = learners()[kind]
+    before, batch = copy.deepcopy(learner.state_dict()["loss"]), transitions()
+    batch["action"] = spoil(batch["action"])
+    with pytest.raises(ValueError, match=f"action must be one-hot among {ACTIONS}"):
+        learner.update(batch)
+    after = learner.state_dict()["loss"]
+    assert all(torch.equal(before[key], after[key]) for key in before)
 
 
 @pytest.mark.parametrize("kind", [0, 1])

@@ -7,12 +7,32 @@ import torch
 from tensordict import TensorDict, lazy_stack
 from torchrl.data import TensorDictMaxValueWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.envs.transforms import MultiStepTransform
 
 from tests.mpfa.transitions import make_buffer, rejected, same, seeded, snapshot, train_rounds
-from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import (
+    TD_ERROR,
+    FixedFusion,
+    MPFASampler,
+    SignalMemmapStorage,
+    SignalReplayBuffer,
+    SignalSliceSampler,
+    SignalTensorStorage,
+)
+from torchrl_mpfa.methods.her import HindsightGoals
+from torchrl_mpfa.methods.reaper import ENDED, EPISODE, ReaPERSampler
 from torchrl_mpfa.samplers import TreeSampler
 
 CAPACITY = 8
+
+
+class Nothing:
+    """Relabels an episode as it was."""
+
+    entries = ()
+
+    def __call__(self, episode, steps):
+        return episode[:0].clone()
 
 
 def make_full_transitions(count, value=1.0):
@@ -226,3 +246,118 @@ def test_transitions_with_gradients_are_stored_without():
         data["action"] = data["action"].requires_grad_()
         buffer.extend(data)
     assert not buffer.sample()["action"].requires_grad
+
+
+FIRST = {
+    "several numbers": torch.ones(2, 3),
+    "too few": torch.ones(2, 0),
+    "complex": torch.ones(2, dtype=torch.complex64),
+    "not finite": torch.tensor([1.0, torch.inf]),
+    "so high that sums overflow": torch.tensor([1e300, 1.0], dtype=torch.double) ** 2,
+    "as high as they can be": torch.tensor([1e308, 1.0], dtype=torch.double),
+}
+
+
+@pytest.mark.parametrize("name", FIRST)
+@pytest.mark.parametrize("fuses", [True, False])
+def test_first_priorities_that_cannot_be_are_rejected_before_anything_is_stored(name, fuses):
+    alpha = {"alpha": 1.0} if "high" in name else {}
+    sampler = MPFASampler(CAPACITY, **alpha) if fuses else TreeSampler(CAPACITY, 1.0, 0.4)
+    buffer = SignalReplayBuffer(storage=SignalTensorStorage(CAPACITY), sampler=sampler)
+    buffer.extend(make_full_transitions(3))
+    rows = make_full_transitions(2)
+    rows["td_error"] = FIRST[name]
+    with rejected(buffer, (ValueError, RuntimeError)):
+        buffer.extend(rows)
+    assert len(buffer) == 3
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.int64, torch.bool])
+@pytest.mark.parametrize("shape", [(2,), (2, 1)])
+def test_first_priorities_of_any_real_type_are_taken(kind, shape):
+    buffer = make_buffer(CAPACITY)
+    rows = make_full_transitions(2)
+    rows["td_error"] = torch.tensor([1, 0]).reshape(shape).to(kind)
+    buffer.extend(rows)
+    assert buffer.sampler.priorities()[:2].tolist() == pytest.approx([1.05, 0.05])
+
+
+@pytest.mark.parametrize("shape", [(), (4,)])
+def test_steps_without_all_dimensions_of_a_batch_are_rejected_and_told_of_add(shape):
+    ndim = len(shape) + 1
+    storage = SignalTensorStorage(CAPACITY, ndim=ndim)
+    buffer = make_buffer(CAPACITY, storage=storage)
+    rows = make_full_transitions(4)
+    rows = rows[0] if shape == () else rows
+    with pytest.raises(ValueError, match=r"tensordicts must have a batch size .* by add"):
+        buffer.extend(rows)
+    buffer.add(rows)
+    assert len(buffer) == (shape or (1,))[0]
+
+
+@pytest.mark.parametrize("part", ["construction", "first write", "update", "load"])
+def test_whatever_is_done_in_inference_mode_the_buffer_works_outside_of_it(part):
+    def make():
+        buffer = make_buffer(CAPACITY)
+        buffer.append_transform(MultiStepTransform(n_steps=2, gamma=1.0, done_keys=["done"]))
+        return buffer
+
+    with torch.inference_mode(part == "construction"):
+        buffer = make()
+    with torch.inference_mode(part == "first write"):
+        buffer.extend(make_full_transitions(6))
+    with torch.inference_mode(part == "update"):
+        train_rounds(buffer, 2)
+    with torch.inference_mode(part == "load"):
+        again = make()
+        again.load_state_dict(snapshot(buffer))
+    for each in (buffer, again):
+        each.extend(make_full_transitions(5, 3.0))
+        each["next", "reward"] = torch.full((CAPACITY, 1), 2.0)
+    assert torch.equal(train_rounds(buffer, 3), train_rounds(again, 3))
+
+
+ENDS = [torch.uint8, torch.int64, torch.float32, torch.float64]
+
+
+@pytest.mark.parametrize("kind", ENDS)
+@pytest.mark.parametrize("method", ["slices", "reaper", "her", "n-step"])
+def test_ends_as_numbers_are_booleans_and_other_numbers_are_rejected_by_name(kind, method):
+    def make():
+        names, signals = ("td_error",), [TD_ERROR]
+        sampler = SignalSliceSampler(CAPACITY, 0.6, 0.4, slice_len=2, signals=names)
+        if method == "reaper":
+            sampler, signals = (
+                ReaPERSampler(CAPACITY, 0.6, 0.4, signals=names),
+                [TD_ERROR, EPISODE, ENDED],
+            )
+        elif method != "slices":
+            sampler = MPFASampler(CAPACITY, signals=names, fusion=FixedFusion({"td_error": 1.0}))
+        storage = SignalTensorStorage(CAPACITY, signals=signals)
+        buffer = SignalReplayBuffer(
+            storage=storage, sampler=sampler, generator=seeded(), batch_size=4
+        )
+        if method == "her":
+            buffer.append_transform(HindsightGoals(Nothing(), goals=1, generator=seeded()))
+        if method == "n-step":
+            buffer.append_transform(MultiStepTransform(2, 1.0, done_keys=["done"]))
+        return buffer
+
+    rows = make_full_transitions(6)
+    rows["episode"] = torch.arange(6).unsqueeze(1) // 3
+    rows["observation"] = rows["next", "observation"] = torch.zeros(6, 3)
+    rows["next", "done"][2] = True
+    plain, numbers, wrong = make(), make(), make()
+    plain.extend(rows)
+    as_numbers = rows.clone()
+    as_numbers["next", "done"] = rows["next", "done"].to(kind)
+    numbers.extend(as_numbers)
+    assert len(plain) == len(numbers)
+    for each in (plain, numbers):
+        each.update_priority(torch.arange(len(each)), torch.linspace(1, 2, len(each)))
+    weights = [each.sampler.batch_weights(len(each)) for each in (plain, numbers)]
+    assert same(*weights)
+    as_numbers["next", "done"] = as_numbers["next", "done"] * 2
+    with rejected(wrong, ValueError, r"'done'.* must be booleans, or 0 and 1, got 2"):
+        wrong.extend(as_numbers)
+    assert len(wrong) == 0

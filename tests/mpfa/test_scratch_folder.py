@@ -1,12 +1,14 @@
 """Memory-mapped signals: no storage ever empties the file of another."""
 
+import copy
 import gc
 import os
+import pickle
 
 import pytest
 import torch
 
-from tests.mpfa.transitions import make_filled, make_transitions, train_rounds
+from tests.mpfa.transitions import make_buffer, make_filled, make_transitions, same, train_rounds
 from torchrl_mpfa import SignalMemmapStorage
 
 
@@ -40,3 +42,22 @@ def test_a_storage_that_is_gone_leaves_its_folder_free(tmp_path):
         storage = SignalMemmapStorage(8, scratch_dir=tmp_path, existsok=True)
         del storage
         gc.collect()
+
+
+@pytest.mark.parametrize("folder", [True, False])
+@pytest.mark.parametrize("filled", [0, 9, 16])
+@pytest.mark.parametrize("way", [copy.deepcopy, lambda buffer: pickle.loads(pickle.dumps(buffer))])
+def test_a_copy_has_files_of_its_own_and_goes_on_like_the_first(tmp_path, folder, filled, way):
+    kwargs = {"scratch_dir": tmp_path} if folder else {}
+    first = make_buffer(16, storage=SignalMemmapStorage(16, **kwargs))
+    if filled:
+        first.extend(make_transitions(filled))
+        train_rounds(first, 2)
+    second, third = way(first), way(first)
+    third.extend(make_transitions(12, seed=4, first=500))
+    for each in (first, second):
+        each.extend(make_transitions(5, seed=1, first=100))
+    assert same(train_rounds(first, 3), train_rounds(second, 3))
+    assert same(first[:].to_dict(), second[:].to_dict())
+    assert (third[:]["observation"] >= 500).sum() == 12
+    assert second.storage._storage.is_memmap()

@@ -72,6 +72,7 @@ def make_steps(first, steps, *, seed=0):
     generator = seeded(seed + first)
     number = 1000.0 * torch.arange(ENVS).unsqueeze(1) + torch.arange(first, first + steps)
     after = {
+        "observation": number.unsqueeze(-1) + 1.0,
         "reward": torch.randn(ENVS, steps, 1, generator=generator),
         "done": torch.rand(ENVS, steps, 1, generator=generator) < 0.2,
     }

@@ -13,7 +13,7 @@ from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
 from torchrl_mpfa.learners.base import OptimizedLearner, OptimizerName
 from torchrl_mpfa.learners.states import naming, refuse_unfinished
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
-from torchrl_mpfa.losses.functional import bootstrap_target
+from torchrl_mpfa.losses.functional import bootstrap_target, read_choices
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
 from torchrl_mpfa.saved import Entry, check_entries, count
@@ -173,20 +173,19 @@ class TabularQLearner:
         """Move the entries that the transitions of a batch belong to.
 
         Args:
-            draw: As in :meth:`DQNLearner.update`; actions are one-hot, ``[B, K]``.
+            draw: As in :meth:`DQNLearner.update`; actions are one-hot, ``[B, K]``, or numbers.
 
         Returns:
             Values for the log.
 
         Raises:
             KeyError: If the batch lacks an entry.
-            ValueError: If a number is not finite, or the draw is for an actor or critic alone;
-                nothing is changed then.
+            ValueError: If a number is not finite, the actions have neither form, or the draw is
+                for an actor or critic alone; nothing is changed then.
         """
         batch = _whole_batch(draw, type(self).__name__)
         cell_of, table = self.policy.module.cell_of, self.table
-        # Booleans have no argmax.
-        action = batch["action"].float().argmax(-1)
+        action = read_choices(batch["action"], table.shape[1], batch)
         entry = cell_of(batch["observation"]) * table.shape[1] + action
         ahead = table[cell_of(batch["next", "observation"])].amax(-1)
         steps = batch.get("steps_to_next_obs", None)

@@ -74,7 +74,7 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, DDPGLoss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.keys.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

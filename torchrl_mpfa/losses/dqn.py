@@ -8,11 +8,11 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
-from torchrl_mpfa.losses.functional import distance, scale_rewards
+from torchrl_mpfa.losses.functional import distance, read_choices, scale_rewards
 from torchrl_mpfa.losses.keys import check_importance
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
@@ -81,17 +81,26 @@ class SignalDQNLoss(DQNLoss):
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.signals, self.importance, self.reward_scale = tuple(signals), importance, reward_scale
         self._bends = loss_function == "smooth_l1"
+        self._count: int | None = None
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss; writes the signal in ``batch``.
 
         Args:
-            batch: Transitions, batch size ``[B]``, with one-hot actions, ``[B, K]``.
+            batch: Transitions, batch size ``[B]``, with actions one-hot, ``[B, K]``, or as numbers,
+                ``[B, 1]``.
 
         Returns:
             The loss, and detached values for the log.
+
+        Raises:
+            ValueError: If the actions have neither form.
         """
         scaled = scale_rewards(batch.select(*self.in_keys), self.tensor_keys, self.reward_scale)
+        if self._count is None:
+            self._count = self._count_actions(batch)
+        number = read_choices(batch[self.tensor_keys.action], self._count, batch)
+        scaled[self.tensor_keys.action] = nn.functional.one_hot(number, self._count)
         # Transitions of several steps say of how many: the bootstrap is discounted by all of them.
         steps = self.value_estimator.tensor_keys.steps_to_next_obs
         if (count := batch.get(steps, None)) is not None:
@@ -110,6 +119,16 @@ class SignalDQNLoss(DQNLoss):
             mean = weight.mean() if self.importance == "torchrl" else 1.0
             each = each * weight / mean
         return each.mean(), {"td_error": squared}
+
+    @torch.no_grad()
+    def _count_actions(self, batch: TensorDictBase) -> int:
+        """Number of actions that the network values."""
+        training = self.value_network.training
+        self.value_network.eval()
+        with self.value_network_params.to_module(self.value_network):
+            values = self.value_network(batch.select(*self.value_network.in_keys))
+        self.value_network.train(training)
+        return int(values[self.tensor_keys.action_value].shape[-1])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss under the key ``"loss"``, as TorchRL has it.

@@ -13,6 +13,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_mpfa.checks import as_mask
+
 PAL = "pal"
 DISTANCES = ("l1", "l2", "smooth_l1", PAL)
 """Names of the loss functions, of which all but the last are TorchRL's too."""
@@ -40,7 +42,7 @@ def bootstrap_target(
     Args:
         reward: :math:`r_i`, discounted and summed over the steps, shape ``[B]``.
         next_value: Q of the target networks at the next state, shape ``[B]``.
-        terminated: Whether the episode ended there, as booleans or numbers; a time limit is no
+        terminated: Whether the episode ended there, as booleans, or 0 and 1; a time limit is no
             end, shape ``[B]``.
         gamma: Discount.
         steps: Steps :math:`n_i` to the next state, shape ``[B]``; None: one.
@@ -58,7 +60,7 @@ def bootstrap_target(
     """
     discount = gamma if steps is None else gamma**steps
     # Of integers ~ would turn over the bits.
-    return reward + discount * next_value * ~terminated.bool()
+    return reward + discount * next_value * ~as_mask("'terminated' of the next step", terminated)
 
 
 def smoothing_noise(action: Tensor, *, deviation: float, limit: float) -> Tensor:
@@ -164,8 +166,50 @@ def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> Tens
     after.set(keys.reward, after[keys.reward] * reward_scale)
     for key in (keys.done, keys.terminated):
         if (end := after.get(key, None)) is not None:
-            after.set(key, end.bool())
+            after.set(key, as_mask(f"{key!r} of the next step", end))
     return found
+
+
+def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
+    """Numbers of actions among ``K``, shape ``[B]``, given one-hot or as numbers.
+
+    Args:
+        action: One-hot, ``[B, K]``, or numbers, ``[B]`` or ``[B, 1]``.
+        count: ``K``.
+        batch: The batch that has them.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        ValueError: If the actions have neither form.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> batch = TensorDict({}, [2])
+        >>> read_choices(torch.eye(3)[[2, 0]], 3, batch).tolist()
+        [2, 0]
+        >>> read_choices(torch.tensor([[2], [0]]), 3, batch).tolist()
+        [2, 0]
+    """
+    form = tuple(action.shape[batch.ndim :])
+    if form == (count,):
+        # One number is not zero, and it is one.
+        if bool((action.count_nonzero(-1) == 1).all() & (action.sum(-1) == 1).all()):
+            return action.float().argmax(-1)
+    elif form in ((), (1,)) and action.dtype is not torch.bool:
+        number = action.reshape(batch.shape)
+        if bool(((number >= 0) & (number < count) & (number == number.long())).all()):
+            return number.long()
+    raise ValueError(
+        f"action must be one-hot among {count}, shape {[*batch.shape, count]}, or the number of "
+        f"one, shape {[*batch.shape, 1]}, got {action.dtype} of shape {[*action.shape]}"
+        + (
+            ""
+            if form not in ((count,), (), (1,))
+            else f": {action.reshape(-1)[: 2 * count].tolist()}"
+        )
+    )
 
 
 class Trust(NamedTuple):

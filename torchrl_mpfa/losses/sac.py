@@ -64,7 +64,7 @@ class SignalSACLoss(SignalLoss, SACLoss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, SACLoss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.keys.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

@@ -55,7 +55,7 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, TD3Loss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.keys.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

@@ -13,7 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.checks import as_mask, check_counts
+from torchrl_mpfa.episodes import episodes_of
 
 
 class Relabel(Protocol):
@@ -116,7 +117,8 @@ class HindsightGoals(Transform):
         check_counts(goals=goals)
         self.goals, self.generator = goals, generator
         self._relabel, self._episode_key = relabel, episode_key
-        self._pending: list[TensorDictBase] = []
+        # Never written in place, and for that reason a tuple.
+        self._pending: tuple[TensorDictBase, ...] = ()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Leave a sampled batch as it is."""
@@ -128,20 +130,26 @@ class HindsightGoals(Transform):
             if tensordict.get(key, None) is None:
                 raise KeyError(f"transitions for goals in hindsight must have {key!r}")
         rows = tensordict.reshape(-1)
-        self._pending.append(rows.clone())
+        done = as_mask("('next', 'done')", rows["next", "done"]).reshape(-1)
+        self._pending = (*self._pending, rows.clone())
         written = [rows.exclude(*beside)]
-        done = rows["next", "done"].reshape(-1)
         if done.any():
-            ended = rows[self._episode_key].reshape(-1)[done]
-            written += [self._in_hindsight(episode) for episode in self._take(ended)]
+            written += [self._in_hindsight(episode) for episode in self._take()]
         return torch.cat(written)
 
-    def _take(self, ended: Tensor) -> list[TensorDictBase]:
-        """Take the episodes with these numbers out of those under way."""
+    def _take(self) -> list[TensorDictBase]:
+        """Take the episodes that have ended out of those under way."""
         rows = cast(TensorDictBase, torch.cat(self._pending))
-        numbers = rows[self._episode_key].reshape(-1)
-        self._pending = [rows[~torch.isin(numbers, ended)]]
-        return [rows[numbers == number] for number in ended.tolist()]
+        number, done = (
+            rows[key].reshape(-1).cpu() for key in (self._episode_key, ("next", "done"))
+        )
+        done = done.bool()
+        mine = torch.isin(number, number[done]).nonzero().squeeze(1)
+        episode = torch.full((len(rows),), -1)
+        episode[mine] = episodes_of(rows, mine, number[mine], done[mine])
+        ended = episode[done]
+        self._pending = (rows[~torch.isin(episode, ended)],)
+        return [rows[episode == each] for each in ended.tolist()]
 
     def _in_hindsight(self, episode: TensorDictBase) -> TensorDictBase:
         steps = future_goals(len(episode), self.goals, self.generator)
@@ -157,10 +165,10 @@ class HindsightGoals(Transform):
     def set_extra_state(self, state: dict[Any, Tensor]) -> None:
         """Go on from what :meth:`get_extra_state` gave."""
         if not state:
-            self._pending = []
+            self._pending = ()
             return
         count = len(next(iter(state.values())))
         rows = TensorDict({}, [count])
         for key, value in state.items():
             rows.set(key, value.clone())
-        self._pending = [rows]
+        self._pending = (rows,)

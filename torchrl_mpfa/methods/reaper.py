@@ -20,21 +20,28 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.checks import POSITIVE, check
+from torchrl_mpfa.episodes import episodes_of
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.slots import as_slots
 from torchrl_mpfa.signals import TD_ERROR, Signal
 from torchrl_mpfa.storages.table import SignalTable
 
 EPISODE = Signal("episode", key="episode", known_at="write")
-"""The number of the episode that a transition is of, which the storage has to keep."""
+"""The number of the episode that a transition is of, which the storage has to keep.
+
+It may begin again with a process or a collector: a transition continues an episode of its number
+if it begins with what that ended with (:func:`~torchrl_mpfa.episodes.episodes_of`)."""
 ENDED = Signal("ended", key=("next", "done"), known_at="write")
 """Whether the transition is the last one of its episode, likewise."""
 _LEAST = 1e-3
 """With a reliability of zero a transition would be lost for good."""
+_UNDER_WAY = 1024
+"""Episodes that may continue; of more, those that were written last."""
 _SPARSE = 8
 """Up to so many numbers for each transition, those of the episodes serve as places in a table."""
 
@@ -99,11 +106,25 @@ class ReaPERSampler(SignalSampler):
     """
 
     KIND = "reaper"
+    _steps: Any = None
+    """The storage that is sampled from."""
 
     def __init__(self, *args: Any, exponent: float = 0.3, **kwargs: Any) -> None:
         check(POSITIVE, exponent=exponent)
         self.exponent = exponent
         super().__init__(*args, **kwargs)
+
+    def _init(self) -> None:
+        super()._init()
+        # Numbers of the episodes that no two share, as those that are written may begin again.
+        self._episodes = torch.zeros(self._max_capacity, dtype=torch.long, device=self.device)
+        self._last_number = self._numbered = 0
+        self._open = torch.empty(0, dtype=torch.long)
+
+    @property
+    def mask_keys(self) -> list[NestedKey]:
+        """See :attr:`SignalSampler.mask_keys`."""
+        return [ENDED.key]
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give fresh transitions the highest priority, and rely on episodes that they end.
@@ -143,21 +164,54 @@ class ReaPERSampler(SignalSampler):
         Raises:
             ValueError: If it does not keep :data:`EPISODE`, :data:`ENDED` and the TD error.
         """
+        before = self._table
         table = super().bind(storage)
+        self._steps = storage
+        if table is not before:
+            self._numbered = 0
         kept = (EPISODE.name, ENDED.name, TD_ERROR.name)
         if absent := [name for name in kept if name not in table.column]:
             raise ValueError(f"the storage must keep the signals {absent}, got {table.names}")
         return table
 
+    def reread(self, storage: Storage) -> None:
+        """Number all episodes again, after a write in place."""
+        self._numbered = 0
+
+    def _number(self, table: SignalTable) -> None:
+        """Number the episodes of the rows that were written since this was last done."""
+        if not 0 < self._numbered <= table.writes:
+            self._open, self._numbered = self._open[:0], 0
+        if self._numbered == table.writes:
+            return
+        time = table.rows[: table.size, table.time_column].cpu()
+        known = self._open[time[self._open] < self._numbered]
+        slots = torch.cat((known, (time >= self._numbered).nonzero().squeeze(1)))
+        slots = slots[time[slots].argsort()]
+        number, last = (table.rows[slots, table.column[s.name]].cpu() for s in (EPISODE, ENDED))
+        loaded, data = time[slots] < table.loaded, self._steps._storage
+        first = episodes_of(data, slots, number, last > 0, loaded, ndim=self._steps.ndim)
+        is_new = time[slots] >= self._numbered
+        fresh = self._last_number + ((first == torch.arange(len(first))) & is_new).cumsum(0)
+        found = torch.where(is_new, fresh, self._episodes[slots].cpu())[first]
+        self._last_number = int(fresh[-1])
+        self._episodes[slots] = found.to(self.device)
+        # The last step of each is the one that is written last.
+        tail = torch.zeros(self._last_number + 1, dtype=torch.long)
+        tail[found] = torch.arange(len(found))
+        tail = tail[found.unique()].sort().values
+        self._open = slots[tail[~(last[tail] > 0)]][-_UNDER_WAY:]
+        self._numbered = table.writes
+
     def _rely(self, table: SignalTable, slots: Tensor) -> None:
         """Write the leaves of all transitions of the episodes that these are of."""
         priority = self._priorities[: table.size]
-        names = (TD_ERROR.name, EPISODE.name, ENDED.name)
-        columns = [*(table.column[name] for name in names), table.time_column]
+        self._number(table)
+        columns = [*(table.column[s.name] for s in (TD_ERROR, ENDED)), table.time_column]
         # One at a time, which is much faster than by a list.
-        errors, episode, last, time = (table.rows[: table.size, c].contiguous() for c in columns)
+        errors, last, time = (table.rows[: table.size, c].contiguous() for c in columns)
         errors = torch.where(errors.isnan(), priority - self._eps, errors)
-        numbers = _numbers(episode)
+        numbers = _numbers(self._episodes[: table.size])
         sums = torch.bincount(numbers, weights=errors)
         ended, touched = torch.zeros(2, len(sums), dtype=torch.bool, device=sums.device)
         ended[numbers[last.nonzero().squeeze(1)]] = True
@@ -165,7 +219,9 @@ class ReaPERSampler(SignalSampler):
         totals = torch.where(ended, sums, sums[ended].max() if ended.any() else 0.0)
         mine = touched.index_select(0, numbers).nonzero().squeeze(1)
         of = numbers.index_select(0, mine)
-        share = reliability(errors[mine], of, time[mine], total=totals[of])
+        # In the order of the numbers that were written, which rounding depends on.
+        ordered = table.rows[mine, table.column[EPISODE.name]].long() * 2**32 + of
+        share = reliability(errors[mine], ordered, time[mine], total=totals[of])
         leaf = self._leaf(priority[mine]) * share.clamp_min(_LEAST).pow(self.exponent)
         self._write_leaves(mine, leaf)
 

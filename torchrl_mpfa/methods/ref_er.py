@@ -144,6 +144,11 @@ class ReFERSelection:
         batch = buffer.sample()
         now = actions_of(self.policy, batch)
         sigma = batch[BEHAVIOR_SIGMA].clamp_min(LEAST_SIGMA)
+        if batch[BEHAVIOR_MEAN].shape != now.shape or sigma.shape != (len(batch), 1):
+            raise ValueError(
+                f"{BEHAVIOR_MEAN!r} must have the shape {[*now.shape]} and {BEHAVIOR_SIGMA!r} "
+                f"{[len(batch), 1]}, got {[*batch[BEHAVIOR_MEAN].shape]} and {[*sigma.shape]}"
+            )
         ratio = importance_ratio(batch["action"], now, batch[BEHAVIOR_MEAN], sigma)
         limit = self.limit(sampler.batches)
         near = ((ratio > 1.0 / limit) & (ratio < limit)).to(sigma.dtype)

@@ -159,6 +159,11 @@ class SignalSampler(TreeSampler):
         """Entries that transitions must have beside reward and signals."""
         return []
 
+    @property
+    def mask_keys(self) -> list[NestedKey]:
+        """Entries of transitions that are read as booleans."""
+        return []
+
     def check_batch_size(self, batch_size: int) -> None:
         """Reject a batch size that cannot be sampled."""
         check_counts(batch_size=batch_size)

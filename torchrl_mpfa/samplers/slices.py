@@ -12,10 +12,12 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.checks import check_counts, check_index
+from torchrl_mpfa.episodes import follows
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.slots import as_slots, leaves_of, set_leaves
 from torchrl_mpfa.saved import Entry, exactly
 from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
 
 SlicePriority = Literal["mean", "start"]
@@ -41,6 +43,10 @@ class SignalSliceSampler(SignalSampler):
 
     A slice of a storage ``[T, E]`` is of one environment. None has steps of two trajectories, and
     none joins the newest steps of a full buffer to the oldest: such a start has the probability 0.
+    A step follows another one if it was written right after it, has the same number of a
+    trajectory, and begins with what that one ended with: ``"observation"`` with ``("next",
+    "observation")``, and so all that steps have before and after. Where they have nothing so, what
+    is written after a load follows nothing of before.
 
     Kapturowski et al. (2019), https://openreview.net/forum?id=r1lyTjAqYX
 
@@ -121,6 +127,16 @@ class SignalSliceSampler(SignalSampler):
         return [self.end_key, *([] if self.traj_key is None else [self.traj_key])]
 
     @property
+    def mask_keys(self) -> list[NestedKey]:
+        """See :attr:`SignalSampler.mask_keys`."""
+        return [self.end_key, *([] if self.truncated_key is None else [self._done_key])]
+
+    @property
+    def _done_key(self) -> NestedKey:
+        """Where a batch marks the last step of each slice as an end of any kind."""
+        return (*as_path(self.truncated_key or "")[:-1], "done")
+
+    @property
     def divisible(self) -> bool:
         """See :attr:`TreeSampler.divisible`."""
         return super().divisible and self.strict_length
@@ -153,12 +169,8 @@ class SignalSliceSampler(SignalSampler):
             return index, info
         last = torch.zeros(int(self._lengths.sum()), 1, dtype=torch.bool)
         last[self._lengths.cumsum(0) - 1] = True
-        path = (
-            self.truncated_key if isinstance(self.truncated_key, tuple) else (self.truncated_key,)
-        )
-        done_key = (*path[:-1], "done")
-        done = _column(storage, done_key, as_slots(index, storage), default=last)
-        return index, {**info, self.truncated_key: last, done_key: last | done}
+        done = _column(storage, self._done_key, as_slots(index, storage), default=last).bool()
+        return index, {**info, self.truncated_key: last, self._done_key: last | done}
 
     def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
         self.check_batch_size(batch_size)
@@ -209,7 +221,8 @@ class SignalSliceSampler(SignalSampler):
     def reread(self, storage: Storage) -> None:
         """Read again where trajectories end, after a write in place."""
         slots = torch.arange(self._max_capacity)
-        self._join(slots, storage)
+        for part in slots.split(_AT_ONCE):
+            self._join(part, storage)
         self._refresh(slots)
 
     def _join(self, slots: Tensor, storage: Any) -> None:
@@ -224,11 +237,12 @@ class SignalSliceSampler(SignalSampler):
         # Of times of writing: what follows was written with or right after this, not a round ago.
         times = table.rows[:, table.time_column]
         joined = times[following] - times[slots] == self._stride
-        joined &= ~_column(storage, self.end_key, slots).squeeze(1)
+        joined &= ~_column(storage, self.end_key, slots).bool().squeeze(1)
         key = _TRAJ_IDS if self.traj_key is None else self.traj_key
         one = torch.zeros(len(slots), 1, dtype=torch.bool)
         ids = [_column(storage, key, each, default=one) for each in (slots, following)]
-        self._joined[slots] = joined & (ids[0] == ids[1]).squeeze(1)
+        joined &= (ids[0] == ids[1]).squeeze(1) & follows(storage, table, slots, following)
+        self._joined[slots] = joined
 
     def _windows(self, starts: Tensor, joined: Tensor, stride: int) -> tuple[Tensor, Tensor]:
         """Slots of slices and which of them belong to the same trajectory, both ``[S, L]``."""

@@ -74,6 +74,7 @@ class TreeSampler(SavedTrees):
     _alpha: float
     _beta: float
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         max_capacity: int,
@@ -394,6 +395,11 @@ class TreeSampler(SavedTrees):
             kept, value = kept[~inherited], value[~inherited]
         if len(kept):
             self._set(kept, value, highest)
+
+    def check_priority(self, priority: Tensor) -> None:
+        """Reject priorities of new transitions, before eps, as :meth:`update_priority` does."""
+        check_finite("priority", priority)
+        self._checked(priority.to(torch.double) + self._eps)
 
     def _inherited(self, slots: Tensor, value: Tensor) -> Tensor:
         """Rows that only get the highest priority, which fresh ones have anyway, shape ``[B]``.

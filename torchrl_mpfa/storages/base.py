@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.checks import generator_on
+from torchrl_mpfa.checks import as_mask, generator_on
 from torchrl_mpfa.dumps import open_dump, seal_dump
 from torchrl_mpfa.saved import Entry, check_entries, exactly
 from torchrl_mpfa.saving import load_safely, save_atomically
@@ -50,6 +50,8 @@ class SignalStorageMixin:
     needs_signals = False
     #: Set by the same buffer: further entries that its sampler reads.
     needed_keys: Sequence[NestedKey] = ()
+    #: Set by the same buffer: entries that its sampler reads as booleans.
+    mask_keys: Sequence[NestedKey] = ()
     _allow_nonfinite: Sequence[NestedKey] = ()
     _schema: Schema | None = None
     _all_slots: Tensor | None = None
@@ -76,6 +78,9 @@ class SignalStorageMixin:
         for key in self.needed_keys:
             if data.get(key, None) is None:
                 raise KeyError(f"the transitions lack {key!r}, which the sampler reads")
+        for key in self.mask_keys:
+            if (mask := data.get(key, None)) is not None:
+                as_mask(repr(key), mask)
         lead = min(self.ndim, data.ndim)
         pairs = None
         if isinstance(data, TensorDictBase):

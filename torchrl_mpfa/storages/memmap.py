@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
+from tensordict import is_tensor_collection
 from tensordict.utils import NestedKey
+from torch.utils._pytree import tree_map
 from torchrl.data import LazyMemmapStorage
 
 from torchrl_mpfa.checks import check_counts
@@ -19,7 +22,8 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
     """:class:`~torchrl.data.LazyMemmapStorage` with the signals of every slot beside the data.
 
     With ``scratch_dir`` the signals are memory-mapped too, to ``scratch_dir/signals.memmap``;
-    without it they stay in memory, 8 bytes a column and slot.
+    without it they stay in memory, 8 bytes a column and slot. What is pickled or copied has
+    temporary files of its own.
 
     Args:
         max_size: Capacity ``N``.
@@ -42,6 +46,8 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
         torch.Size([1000, 6])
     """
 
+    _storage: Any
+
     def __init__(
         self,
         max_size: int,
@@ -60,3 +66,18 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
             max_size, signals, reward_key=reward_key, file=file, existsok=existsok
         )
         super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
+
+    def __getstate__(self) -> Any:
+        state = super().__getstate__()
+        if get_spawning_popen() is None:
+            # The copy has files of its own. Processes that TorchRL starts share those of this one.
+            state |= {"scratch_dir": None, "_scratch_dir_is_temp": True}
+            if self.initialized:
+                state["_storage"] = tree_map(lambda entry: entry.clone(), self._storage)
+        return state
+
+    def __setstate__(self, state: Any) -> None:
+        super().__setstate__(state)
+        data: Any = self._storage if self.initialized else None
+        if is_tensor_collection(data) and not data.is_memmap():
+            self._storage = data.memmap()

@@ -43,6 +43,7 @@ class SignalTable:
             process or another, is mapped to it.
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         capacity: int,
@@ -74,6 +75,8 @@ class SignalTable:
         self._blank[0, self.count_column] = 0.0
         self.clock = [0]
         self.size = self.cleared = 0
+        self.loaded = 0
+        """Count of writes when a state was loaded."""
         self.clear()
 
     @property
@@ -257,6 +260,10 @@ class SignalTable:
         """Replays of each slot, shape ``[B]``."""
         return self.rows.select(1, self.count_column).index_select(0, index)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy is in memory: the file is that of this one.
+        return {**vars(self), "rows": self.rows.clone(), "in_memory": True}
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that restores the table; tensors and plain values only."""
         return {
@@ -311,6 +318,7 @@ class SignalTable:
         self.check_state(state)
         self.clear()
         self.size, self.writes = state["size"], state["writes"]
+        self.loaded = self.writes
         self.rows[: self.size] = state["rows"]
 
 
@@ -379,7 +387,9 @@ def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
 
 def _not_negative(signal: Signal, value: Tensor) -> Tensor:
     priority = (signal.priority or torch.abs)(value)
-    if not priority.min().item() >= 0:
-        bad = priority[~(priority >= 0)][0].item()
-        raise ValueError(f"signal {signal.name!r} must not be negative, got {bad}")
+    low, high = bounds(priority)
+    if not (low >= 0 and high < math.inf):
+        wanted = "be finite" if low >= 0 else "not be negative"
+        bad = priority[~((priority >= 0) & (priority < math.inf))][0].item()
+        raise ValueError(f"signal {signal.name!r} must {wanted}, got {bad}")
     return priority

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium
 
+from mpfa_envs.checks import check_count
 from mpfa_envs.worlds.builtin import WORLDS
 
+if TYPE_CHECKING:
+    from mpfa_envs.env.vector import VectorNavigationEnv
+
+_OF_TIME = ("max_steps", "action_repeat")
 _GENERATED = ("rooms", "clutter", "bars", "fields", "halls", "mazes", "mixed", "crowd")
 _WORLD_OF = {
     f"mpfa/Navigation-{name if name in WORLDS else name.capitalize()}-v1": name
@@ -33,6 +38,31 @@ ROOMS_TASK: Final[Mapping[str, Any]] = MappingProxyType(
 the task of ``regime=rooms`` for the paper's robot, without a filter and a cost of time: those of
 ``mpfa/Rooms-v1``."""
 
+
+def make_vector(
+    num_envs: int, *, max_episode_steps: int | None = None, **arguments: Any
+) -> VectorNavigationEnv:
+    """The vector of an id, with gymnasium's word for a time limit as ``gymnasium.make`` has it.
+
+    Args:
+        num_envs: Number of robots.
+        max_episode_steps: Actions after which an episode ends, if ``max_steps`` is not less; None
+            or -1: no other limit than that.
+        **arguments: As :class:`~mpfa_envs.VectorNavigationEnv`.
+
+    Returns:
+        The vector.
+    """
+    from mpfa_envs.env.config import TaskConfig
+    from mpfa_envs.env.vector import VectorNavigationEnv
+
+    if max_episode_steps is not None and max_episode_steps != -1:
+        given = {name: arguments[name] for name in _OF_TIME if name in arguments}
+        limits, actions = TaskConfig(**given), check_count("max_episode_steps", max_episode_steps)
+        arguments["max_steps"] = min(limits.max_steps, actions * limits.action_repeat)
+    return VectorNavigationEnv(num_envs, **arguments)
+
+
 for _id, _arguments in {
     **{name: {"world": world} for name, world in _WORLD_OF.items()},
     "mpfa/Rooms-v1": dict(ROOMS_TASK),
@@ -42,6 +72,6 @@ for _id, _arguments in {
         gymnasium.register(
             _id,
             entry_point="mpfa_envs.env.navigation:NavigationEnv",
-            vector_entry_point="mpfa_envs.env.vector:VectorNavigationEnv",
+            vector_entry_point="mpfa_envs.env.registration:make_vector",
             kwargs=_arguments,
         )

@@ -208,6 +208,10 @@ class NavigationTorchEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach().cpu().numpy()
+        if actions.shape != (*self.batch_size, 2):
+            raise ValueError(
+                f"action must have shape {[*self.batch_size, 2]}, got {[*actions.shape]}"
+            )
         # A rollout that waits for the last episode of a batch masks the ended ones.
         observations, rewards, terminated, truncated, _ = self.env.step(
             actions.reshape(self.env.num_envs, 2), only=self._mask(tensordict, "_step")

@@ -51,11 +51,28 @@ def mirrored_places(pairs: WheelPairs) -> Tensor:
     return same.long().argmax(1)
 
 
+def read_choices(action: Tensor, count: int) -> Tensor:
+    """Numbers of choices among ``K``, ``[...]``, of one-hot ones, ``[..., K]``, or ``[..., 1]``."""
+    if action.shape[-1:] == (count,):
+        # One number is not zero, and it is one.
+        if bool((action.count_nonzero(-1) == 1).all() & (action.sum(-1) == 1).all()):
+            return action.float().argmax(-1)
+    elif action.shape[-1:] == (1,) and action.dtype is not torch.bool:
+        number = action.squeeze(-1)
+        if bool(((number >= 0) & (number < count) & (number == number.long())).all()):
+            return number.long()
+    raise ValueError(
+        f"action must be one-hot, shape [..., {count}], or the number of one of {count} pairs, "
+        f"shape [..., 1], got {action.dtype} of shape {[*action.shape]}: {action.tolist()}"
+    )
+
+
 class DiscreteWheels(Transform):
     """Makes the action of a navigation environment a choice among pairs of wheel speeds.
 
     The action of the transformed environment is one-hot, shape ``[..., K]``, which TorchRL's
-    ``DQNLoss`` takes as it is.
+    ``DQNLoss`` takes as it is. Its number does as well, shape ``[..., 1]`` or that of the batch;
+    anything else is rejected.
 
     Args:
         pairs: The pairs, as actions of the environment, in [-1, 1].
@@ -78,9 +95,15 @@ class DiscreteWheels(Transform):
         super().__init__(in_keys=[], out_keys=[], in_keys_inv=["action"], out_keys_inv=["action"])
         self.register_buffer("pairs", check_pairs(pairs), persistent=False)
 
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action")
+        if action.ndim == tensordict.ndim:
+            action = action.unsqueeze(-1)
+        return tensordict.set("action", self._inv_apply_transform(action))
+
     def _inv_apply_transform(self, action: Tensor) -> Tensor:
-        """From one-hot choices, shape ``[..., K]``, to wheel speeds, shape ``[..., 2]``."""
-        return self.pairs.to(action.device)[action.long().argmax(-1)]
+        """From choices, shape ``[..., K]`` or ``[..., 1]``, to wheel speeds, ``[..., 2]``."""
+        return self.pairs.to(action.device)[read_choices(action, len(self.pairs))]
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Put the choice in the place of the wheel speeds.

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from mpfa_envs.checks import check_share
-from mpfa_envs.robots.discrete import WheelPairs, mirrored_places
+from mpfa_envs.robots.discrete import WheelPairs, mirrored_places, read_choices
 from mpfa_envs.sensing.observation import Memory, observation_slices
 
 
@@ -57,6 +57,7 @@ class Mirror(nn.Module):
         if memory == "map":
             sign[parts["way_direction"].start + 1] = -1.0
         swapped = torch.tensor([1, 0]) if pairs is None else mirrored_places(pairs)
+        self._choosing = pairs is not None
         self.register_buffer("swapped", swapped, persistent=False)
         self.register_buffer("order", order, persistent=False)
         self.register_buffer("sign", sign, persistent=False)
@@ -67,8 +68,13 @@ class Mirror(nn.Module):
         return observation.index_select(-1, order) * sign
 
     def action(self, action: Tensor) -> Tensor:
-        """Mirror actions, ``[..., 2]``, or one-hot choices among ``K`` pairs, ``[..., K]``."""
-        return action.index_select(-1, self.swapped.to(action.device))
+        """Mirror actions, ``[..., 2]``, or choices of ``K`` pairs, ``[..., K]`` or ``[..., 1]``."""
+        swapped, width = self.swapped.to(action.device), len(self.swapped)
+        if self._choosing and action.shape[-1] == 1:
+            return swapped[read_choices(action, width)].unsqueeze(-1).to(action.dtype)
+        if action.shape[-1] != width:
+            raise ValueError(f"action must have the shape [..., {width}], got {[*action.shape]}")
+        return action.index_select(-1, swapped)
 
 
 class RandomMirror(Transform):
@@ -128,5 +134,8 @@ class RandomMirror(Transform):
         for key in ("action", "behavior_mean"):
             done = tensordict.get(key, None)
             if done is not None:
-                tensordict.set(key, torch.where(chosen, self.mirror.action(done), done))
+                # Numbers of choices may come without a dimension of their own.
+                each = done.unsqueeze(-1) if done.ndim == tensordict.ndim else done
+                mirrored = torch.where(chosen, self.mirror.action(each), each)
+                tensordict.set(key, mirrored.reshape(done.shape))
         return tensordict

@@ -76,7 +76,7 @@ class WandbLog:
 
     def keep(self, file: Path, card: Mapping[str, Any]) -> None:
         """Keep a policy as an artifact, whose versions are those of runs with the same name."""
-        name = re.sub(r"[^\w.-]", "-", f"policy-{file.parent.name}")[:128]
+        name = re.sub(r"[^\w.-]", "-", f"policy-{file.parent.name}", flags=re.ASCII)[:128]
         artifact = wandb.Artifact(name, type="policy", metadata=dict(card))
         artifact.add_file(str(file))
         self._run.log_artifact(artifact)

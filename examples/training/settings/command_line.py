@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_mpfa.methods import METHODS, Method
 from training.settings.checks import check_settings
-from training.settings.from_file import lines_of
+from training.settings.from_file import lines_of, quoted
 from training.settings.resuming import choices_of
 from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
 
@@ -59,7 +59,7 @@ def _parsed(texts: Sequence[str]) -> list[Override]:
     parsed = []
     for text in texts:
         try:
-            parsed.append(parser.parse_override(text))
+            parsed.append(parser.parse_override(quoted(text)))
         except HydraException as error:
             raise ValueError(f"{text!r} is not NAME=VALUE: {_one_line(error)}") from error
     known = list(known_settings())

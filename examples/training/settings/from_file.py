@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 _WORD = "settings="
+_QUOTED = r"""'(?:\\.|[^'])*'|"(?:\\.|[^"])*\""""
+_SPECIAL = r"[^\x00-\x7f]|[#!&;<>^`~]"
+"""What Hydra reads in quotes only."""
 
 
 def lines_of(arguments: Sequence[str]) -> tuple[str, list[str]]:
@@ -33,9 +37,30 @@ def lines_of(arguments: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def with_lines(arguments: Sequence[str]) -> list[str]:
-    """A command line with the settings of a file in the place of the file."""
+    """A command line for Hydra, with the settings of a file in the place of the file."""
     _, lines = lines_of(arguments)
-    return [word for text in arguments for word in (lines if text.startswith(_WORD) else [text])]
+    words = [word for text in arguments for word in (lines if text.startswith(_WORD) else [text])]
+    return [quoted(word) for word in words]
+
+
+def quoted(text: str) -> str:
+    """A setting whose words are in quotes where they have letters that Hydra reads in quotes only.
+
+    Examples:
+        >>> quoted("run_dir=/runs/ünï"), quoted("seed=1"), quoted("names=[a,ü,'ï']")
+        ("run_dir='/runs/ünï'", 'seed=1', "names=[a,'ü','ï']")
+    """
+    name, equals, value = text.partition("=")
+    if not equals or text.startswith("-"):
+        return text
+    # A colon ends a key of a mapping, and is part of a word elsewhere.
+    word = rf"(?:[^,\[\]{{}}()'\"{':' if '{' in value else ''}])+"
+
+    def in_quotes(found: re.Match[str]) -> str:
+        part = found.group()
+        return f"'{part}'" if part[0] not in "'\"" and re.search(_SPECIAL, part) else part
+
+    return name + equals + re.sub(f"{_QUOTED}|{word}", in_quotes, value)
 
 
 def read_names(path: Path) -> dict[str, Any]:

@@ -32,6 +32,22 @@ def one(*arguments: str) -> TrainSettings:
     return settings
 
 
+@pytest.mark.parametrize(
+    "folder",
+    ["/runs/ünï", "/runs/日本/Ωμ", "/runs/a b é", "/runs/🤖#1", "'/runs/ü'", "/runs/plain"],
+)
+def test_a_folder_has_letters_of_any_alphabet(folder) -> None:
+    assert one(f"run_dir={folder}").run_dir == folder.strip("'")
+
+
+def test_words_of_any_alphabet_in_lists_and_sweeps_are_kept_apart() -> None:
+    words = parse_overrides(["curriculum.stages=[{world:ünï.yaml,actions:9},{world:B,actions:9}]"])
+    assert [stage["world"] for stage in words[0].value()] == ["ünï.yaml", "B"]
+    found = [settings.run_dir for settings in composed(["run_dir=/ü,/b,/ï"])]
+    assert found == ["/ü", "/b", "/ï"]
+    assert with_lines(["run_dir=/ü", "-m", "seed=1"]) == ["run_dir='/ü'", "-m", "seed=1"]
+
+
 def test_the_defaults_are_table_1_of_the_paper() -> None:
     settings = one("regime=paper")
     assert (settings.robots, settings.updates) == (1, 1)

@@ -1,0 +1,261 @@
+"""What transforms keep from one write to the next, whichever transforms they are."""
+
+import copy
+import pickle
+from collections import deque
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, RandomSampler
+from torchrl.envs.transforms import Compose, MultiStepTransform, Transform
+
+from tests.mpfa.transitions import rejected, restore, same, seeded, snapshot
+from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa.methods.her import HindsightGoals
+
+WAIT = 3
+"""Steps that wait in each transform."""
+
+
+class Late(Transform):
+    """A user's own: hands on each step three steps later, from a list that it writes in place."""
+
+    def __init__(self):
+        super().__init__()
+        self.rows, self.seen, self.last = [], 0, torch.zeros(1)
+
+    def _inv_call(self, tensordict):
+        self.rows += [*tensordict.unbind(0)]
+        self.seen += len(tensordict)
+        self.last.copy_(tensordict["observation"][-1])
+        ready = self.rows[:-WAIT]
+        del self.rows[: len(ready)]
+        return torch.stack(ready) if ready else None
+
+
+class LateByWindow(Late):
+    """The same with a window, and only its last step kept as a tensordict."""
+
+    def __init__(self):
+        super().__init__()
+        self.rows = deque()
+
+    def _inv_call(self, tensordict):
+        self.rows.extend(tensordict.unbind(0))
+        ready = [self.rows.popleft() for _ in range(max(len(self.rows) - WAIT, 0))]
+        return torch.stack(ready) if ready else None
+
+
+class LateByNumber(Late):
+    """The same with a mapping from the number of a step."""
+
+    def __init__(self):
+        super().__init__()
+        self.rows = {}
+
+    def _inv_call(self, tensordict):
+        for row in tensordict.unbind(0):
+            self.rows[int(row["observation"])] = row
+        ready = [self.rows.pop(key) for key in sorted(self.rows)[:-WAIT]]
+        return torch.stack(ready) if ready else None
+
+
+class LateWithState(Late):
+    """The same by the protocol of PyTorch."""
+
+    def get_extra_state(self):
+        rows = [{"step": row["observation"], "seen": self.seen} for row in self.rows]
+        return {"rows": rows, "last": self.last.clone()}
+
+    def set_extra_state(self, state):
+        self.rows = [steps(int(row["step"]), 1)[0] for row in state["rows"]]
+        self.seen = state["rows"][0]["seen"] if state["rows"] else 0
+        self.last = state["last"].clone()
+
+
+class Repeat:
+    """Writes an episode once more for one of its goals."""
+
+    entries = ()
+
+    def __call__(self, episode, steps):
+        if (episode["observation"] == 99.0).any():
+            raise ZeroDivisionError("no goals")
+        return episode.clone()
+
+
+TRANSFORMS = {
+    "n-step": lambda: MultiStepTransform(n_steps=WAIT, gamma=1.0, done_keys=["done"]),
+    "n-step within": lambda: Compose(MultiStepTransform(WAIT, 1.0, done_keys=["done"])),
+    "hindsight": lambda: HindsightGoals(Repeat(), goals=1, generator=seeded(1)),
+    "list": Late,
+    "window": LateByWindow,
+    "mapping": LateByNumber,
+    "extra state": LateWithState,
+}
+
+
+def steps(first, count, *, end=None):
+    at = torch.arange(first, first + count).float().unsqueeze(1)
+    done = torch.zeros(count, 1, dtype=torch.bool)
+    if end is not None:
+        done[end] = True
+    after = {"observation": at + 1, "reward": torch.ones(count, 1), "done": done}
+    rows = {"observation": at, "action": torch.zeros(count, 1), "next": after}
+    return TensorDict({**rows, "episode": torch.zeros(count, 1, dtype=torch.long)}, [count])
+
+
+def make(kind, **kwargs):
+    parts = {"storage": SignalTensorStorage(60), "sampler": MPFASampler(60), "batch_size": 4}
+    return SignalReplayBuffer(
+        transform=TRANSFORMS[kind](), generator=seeded(), **{**parts, **kwargs}
+    )
+
+
+def held(buffer):
+    """The whole state of a buffer but for slots that are not filled."""
+    state = snapshot(buffer)
+    state["_storage"].pop("_storage")
+    return {**state, "rows": buffer[:].to_dict()}
+
+
+def writes():
+    """Writes of one long episode, then of the end of it."""
+    return [steps(0, 4), steps(4, 1), steps(5, 6, end=5)]
+
+
+def spoiled(change):
+    rows = steps(5, 6, end=5)
+    change(rows)
+    return rows
+
+
+def set_last(key, value):
+    return lambda rows: rows[key].__setitem__(-1, value)
+
+
+BAD = {
+    "NaN in what is kept": set_last("action", torch.nan),
+    "NaN in what is stored": lambda rows: rows["next", "reward"].__setitem__(0, torch.nan),
+    "another type": lambda rows: rows.set("action", rows["action"].double()),
+    "another width": lambda rows: rows.set("action", torch.zeros(6, 2)),
+    "an entry less": lambda rows: rows.pop("action"),
+    "a negative priority": lambda rows: rows.set("td_error", torch.full((6,), -1.0)),
+    "too high a priority": lambda rows: rows.set("td_error", torch.full((6,), 1e300).double() ** 2),
+}
+
+
+@pytest.mark.parametrize("kind", TRANSFORMS)
+@pytest.mark.parametrize("bad", BAD)
+def test_a_rejected_write_changes_nothing_and_mended_it_is_as_if_it_never_was(kind, bad):
+    buffer, other = make(kind), make(kind)
+    for place, each in enumerate(writes()):
+        if place == 2:
+            with rejected(buffer, Exception):
+                buffer.extend(spoiled(BAD[bad]))
+        assert torch.equal(buffer.extend(each), other.extend(each))
+    for each in (buffer, other):
+        each.extend(steps(11, 7))
+    assert same(held(buffer), held(other))
+
+
+def test_a_relabeling_function_that_raises_leaves_goals_and_random_numbers_as_they_were():
+    buffer, other = make("hindsight"), make("hindsight")
+    buffer.extend(steps(0, 4))
+    other.extend(steps(0, 4))
+    bad = steps(4, 3, end=2)
+    bad["observation"][1] = 99.0
+    bad["next", "observation"][0] = 99.0
+    before = torch.get_rng_state()
+    with rejected(buffer, ZeroDivisionError):
+        buffer.extend(bad)
+    assert torch.equal(before, torch.get_rng_state())
+    for each in (buffer, other):
+        each.extend(steps(4, 3, end=2))
+    assert same(held(buffer), held(other))
+    states = [each.transform[0].generator.get_state() for each in (buffer, other)]
+    assert torch.equal(*states)
+
+
+@pytest.mark.parametrize("kind", TRANSFORMS)
+@pytest.mark.parametrize("way", ["state", "folder", "pickle", "copy"])
+def test_what_waits_is_saved_and_goes_on(kind, way, tmp_path):
+    buffer, again = make(kind), make(kind)
+    again.extend(steps(40, 5))  # A load replaces what waits.
+    for each in writes()[:2]:
+        buffer.extend(each)
+    if way in ("state", "folder"):
+        restore(again, buffer, tmp_path / "replay" if way == "folder" else None)
+    else:
+        again = pickle.loads(pickle.dumps(buffer)) if way == "pickle" else copy.deepcopy(buffer)
+    for each in (buffer, again):
+        each.extend(writes()[2])
+        each.extend(steps(11, 7))
+    assert same(held(buffer), held(again))
+    assert len(buffer) > 10
+
+
+@pytest.mark.parametrize("kind", TRANSFORMS)
+def test_an_emptied_buffer_keeps_nothing_and_settings_stay(kind):
+    buffer, fresh = make(kind), make(kind)
+    buffer.extend(steps(20, 4))
+    if kind == "n-step":
+        for each in (buffer, fresh):
+            each.transform[0].n_steps = 2
+    buffer.empty()
+    found = [each.extend(steps(0, 8)).tolist() for each in (buffer, fresh)]
+    assert found[0] == found[1]
+    assert torch.equal(buffer[:]["observation"], fresh[:]["observation"])
+
+
+@pytest.mark.parametrize("kind", TRANSFORMS)
+def test_what_waits_is_no_reference_to_tensors_of_the_caller(kind):
+    buffer, other = make(kind), make(kind)
+    mine = steps(0, 2)
+    for first in range(0, 10, 2):
+        mine.copy_(steps(first, 2))
+        buffer.extend(mine)
+        other.extend(steps(first, 2))
+    assert torch.equal(buffer[:]["observation"], other[:]["observation"])
+
+
+def test_a_state_of_an_earlier_version_has_nothing_that_waits():
+    buffer, again = make("n-step"), make("n-step")
+    buffer.extend(steps(0, 8))
+    again.extend(steps(30, 5))
+    state = snapshot(buffer)
+    del state["_kept"]
+    again.load_state_dict(state)
+    again.extend(steps(20, 4))
+    assert again[:]["observation"].flatten().tolist() == [0, 1, 2, 3, 4, 20]
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [3, {"7.": {"rows": 1}}, {"0.": {"no_such": 1}}, {"0.": 3}],
+    ids=["number", "part", "name", "3"],
+)
+def test_a_state_of_other_transforms_is_rejected_before_anything_changes(kept):
+    buffer = make("n-step")
+    buffer.extend(steps(0, 8))
+    state = {**snapshot(buffer), "_kept": kept}
+    with rejected(buffer, ValueError, "'_kept' of the saved buffer"):
+        buffer.load_state_dict(state)
+
+
+def test_steps_of_several_with_ends_as_numbers_stop_at_them():
+    for kind in (torch.uint8, torch.int64, torch.float32):
+        buffer, rows = make("n-step"), steps(0, 8, end=4)
+        rows["next", "done"] = rows["next", "done"].to(kind)
+        buffer.extend(rows)
+        assert buffer[:]["next", "observation"].flatten().tolist() == [3, 4, 5, 5, 5]
+
+
+def test_other_storages_and_samplers_set_transforms_back_as_well():
+    buffer = make("list", storage=LazyTensorStorage(60), sampler=RandomSampler())
+    buffer.extend(steps(0, 5))
+    with pytest.raises(Exception, match=r"action|shape|expand|size"):
+        buffer.extend(spoiled(BAD["another width"]))
+    buffer.extend(steps(5, 3))
+    assert buffer[:]["observation"].flatten().tolist() == [0, 1, 2, 3, 4]

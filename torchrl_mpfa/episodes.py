@@ -1,0 +1,117 @@
+"""Which steps belong together: a step follows another one if it begins with what that ended with.
+
+Numbers of episodes and trajectories begin again with every collector and process; what a robot
+observes does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_mpfa.storages.schema import as_path
+from torchrl_mpfa.storages.table import SignalTable
+
+_NOT_OBSERVED = {"reward", "done", "terminated", "truncated"}
+_STEPS = "steps_to_next_obs"
+
+
+def follows(storage: Any, table: SignalTable, before: Tensor, after: Tensor) -> Tensor:
+    """Whether stored steps can follow others, by their slots, shape ``[B]``.
+
+    Without observations, those that were written since a load follow none of before.
+    """
+    old, new = (
+        table.written_at(slots.to(table.device)) < table.loaded for slots in (before, after)
+    )
+    found = None
+    for begin, end in _seen(storage._storage):
+        first, second = _rows(end, before, storage.ndim), _rows(begin, after, storage.ndim)
+        same = ((first == second) | ((first != first) & (second != second))).all(1).cpu()
+        found = same if found is None else found & same
+    return (old == new).cpu() if found is None else found
+
+
+def episodes_of(
+    steps: TensorDictBase,
+    places: Tensor,
+    number: Tensor,
+    last: Tensor,
+    loaded: Tensor | None = None,
+    *,
+    ndim: int = 1,
+) -> Tensor:
+    """Number episodes that no two share, of steps in the order in which they were written.
+
+    Args:
+        steps: All steps, ``ndim`` dimensions of them.
+        places: Places of those to number along the flattened dimensions, shape ``[B]``.
+        number: Numbers of their episodes, which may begin again, shape ``[B]``.
+        last: Whether an episode ends with a step, shape ``[B]``.
+        loaded: Whether steps are from before a load, across which no episode continues without
+            an observation that says so, shape ``[B]``.
+        ndim: How many dimensions there are.
+
+    Returns:
+        The position of the first step of each one's episode, shape ``[B]``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> at = torch.tensor([[0.0], [5.0], [1.0], [6.0]])  # Two robots in turn.
+        >>> steps = TensorDict({"observation": at, "next": {"observation": at + 1}}, [4])
+        >>> none = torch.zeros(4, dtype=torch.bool)
+        >>> episodes_of(steps, torch.arange(4), torch.zeros(4), none).tolist()
+        [0, 1, 0, 1]
+    """
+    count, place = len(places), torch.arange(len(places))
+    seen, own = [*_seen(steps)], number.double().view(torch.long).cpu()
+    if loaded is not None and not seen:
+        own = 2 * own + loaded
+    ends, begins = own.clone(), own.clone()
+    for weight, (begin, end) in enumerate(seen, 1):
+        begins += weight * _hash(_rows(begin, places, ndim))
+        ends += weight * _hash(_rows(end, places, ndim))
+    key = torch.cat((begins, ends))
+    # Of equal ones in their order, in which a step begins before it ends.
+    order = torch.cat((2 * place, 2 * place + 1)).argsort()
+    order = order[key[order].argsort(stable=True)]
+    at = torch.arange(2 * count)
+    open_end = (order >= count) & ~last.cpu().repeat(2)[order]
+    latest = torch.where(open_end, at, -1).cummax(0).values.clamp_min(0)
+    joined = open_end[latest] & (key[order[latest]] == key[order]) & (order < count)
+    first = place.clone()
+    first[order[joined]] = order[latest[joined]] - count
+    while not torch.equal(first, further := first[first]):
+        first = further
+    return first
+
+
+def _seen(steps: TensorDictBase) -> Iterator[tuple[Tensor, Tensor]]:
+    """Entries that steps have at their beginning and at their end."""
+    ends = steps.get("next", None)
+    # What several steps make of one is not what the next one begins with.
+    if not isinstance(ends, TensorDictBase) or steps.get(_STEPS, None) is not None:
+        return
+    for key, end in ends.items(True, True):
+        begin = steps.get(key, None)
+        known = isinstance(end, Tensor) and isinstance(begin, Tensor) and begin.shape == end.shape
+        if known and as_path(key)[-1] not in _NOT_OBSERVED:
+            yield begin, end
+
+
+def _rows(entry: Tensor, places: Tensor, ndim: int) -> Tensor:
+    """An entry of some steps, shape ``[B, M]``."""
+    return entry.flatten(0, ndim - 1)[places.to(entry.device)].unsqueeze(-1).flatten(1)
+
+
+def _hash(rows: Tensor) -> Tensor:
+    """A number for each row, on the CPU, which differs for different ones, shape ``[B]``."""
+    # Adding zero makes one zero of the two that there are.
+    bits = (rows.nan_to_num(nan=1e30).double() + 0.0).view(torch.long)
+    factor = torch.randint(2**62, (rows.shape[1],), generator=torch.Generator().manual_seed(0))
+    mixed = (bits ^ (bits >> 29)) * (2 * factor + 1).to(bits.device)
+    return (mixed ^ (mixed >> 32)).sum(1).cpu()
