@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
-
-from torchrl_mpfa.renamed import OF_SELECTION, find
 
 Trains = Literal["both", "critic", "actor"]
 """The networks that learn from a batch."""
@@ -90,8 +88,3 @@ def one_batch(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
         [4]
     """
     yield SampledBatch(buffer.sample())
-
-
-def __getattr__(name: str) -> Any:
-    """Old names, which warn."""
-    return find(__name__, name, OF_SELECTION)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -95,49 +94,12 @@ _NAMES = {
 runs :mod:`mpfa_envs.deploy` has neither SciPy nor torch, and Numba takes half a second."""
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(["EXAMPLE_WORLD", *_MODULE_OF], key=lambda name: (not name.isupper(), name))
-_RENAMED = {
-    "BARN_WORLDS": "worlds.barn.BARN_WORLDS",
-    "Binning": "sensing.binning.Binning",
-    "DistanceField": "paths.distance.DistanceField",
-    "Driver": "evaluation.runs.Driver",
-    "DynamicWindow": "planners.DynamicWindow",
-    "EpisodeResult": "evaluation.results.EpisodeResult",
-    "FreeGrid": "paths.distance.FreeGrid",
-    "INFO_TYPES": "sensing.observation.INFO_TYPES",
-    "Interval": "evaluation.results.Interval",
-    "MapMemory": "sensing.map_memory.MapMemory",
-    "MapPlanner": "planners.MapPlanner",
-    "OccupancyGrid": "worlds.occupancy.OccupancyGrid",
-    "PathPlanner": "paths.planner.PathPlanner",
-    "PolicyFileError": "policies.policy.PolicyFileError",
-    "RoomsEnv": "env.navigation.NavigationEnv",
-    "VECTOR_ENV_IDS": "env.registration.ENV_IDS",
-    "WHEEL_PAIRS": "robots.discrete.WHEEL_PAIRS",
-    "WorldArrays": "worlds.world.WorldArrays",
-    "barn_task": "worlds.barn.barn_task",
-    "barn_world": "worlds.barn.barn_world",
-    "evaluation_pairs": "tasks.sampling.evaluation_pairs",
-    "generator_tasks": "generators.generator_tasks",
-    "load_gazebo_world": "worlds.gazebo.load_gazebo_world",
-    "observation_slices": "sensing.observation.observation_slices",
-    "render_trajectories": "render.render_trajectories",
-    "sample_task": "tasks.sampling.sample_task",
-    "sample_task_on_grid": "paths.tasks.sample_task_on_grid",
-    "spl": "evaluation.results.spl",
-    "split_worlds": "generators.split_worlds",
-    "world_seed": "generators.world_seed",
-}
-"""Old names, which stay for one version, and where they are."""
 _OF_THE_EXTRA = ("gymnasium", "numba", "PIL", "yaml", "scipy")
 
 
 def __getattr__(name: str) -> Any:
     """Import a name when it is first used."""
     module = _MODULE_OF.get(name)
-    if name in _RENAMED:
-        message = f"mpfa_envs.{name} is now mpfa_envs.{_RENAMED[name]}"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        module, _, name = _RENAMED[name].rpartition(".")
     if module is not None:
         try:
             return getattr(import_module(f"mpfa_envs.{module}"), name)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from torchrl_mpfa.renamed import OF_METHODS, find
+from torchrl_mpfa.lazy import find
 
 if TYPE_CHECKING:
     from torchrl_mpfa.methods.assembly import Replay as Replay
@@ -32,5 +32,5 @@ __all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name when it is first used; old names warn."""
-    return find(__name__, name, OF_METHODS, _MODULE_OF)
+    """Import a name when it is first used."""
+    return find(__name__, name, _MODULE_OF)
