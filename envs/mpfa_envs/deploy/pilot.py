@@ -298,7 +298,7 @@ class Pilot:
         if (np.abs(towards) < _TOWARDS).any():
             left, right = 0.5 * (left - right), 0.5 * (right - left)
         if self._keep is not None:
-            # Whatever the policy is told of them, sectors that are not seen begin at the rim.
+            # Whatever the policy reads in them, sectors that are not seen begin at the rim.
             observation[: self.card.sectors][hidden] = 1.0
             slow, fast = learned.min_wheel_speed, learned.max_wheel_speed
             action = (2.0 * np.array((left, right), np.float32) - slow - fast) / (fast - slow)

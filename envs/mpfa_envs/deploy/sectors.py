@@ -195,7 +195,7 @@ class Sectors:
         )
 
     def blind(self, scan: Scan) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Tell where a scan does not look, whatever ``unseen`` says of these directions.
+        """Find where a scan does not look, whatever ``unseen`` says of these directions.
 
         Args:
             scan: What the lidar has measured.

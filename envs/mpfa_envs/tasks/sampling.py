@@ -124,24 +124,18 @@ def _sample_points(
         return straight
     raise ValueError(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
-        f"{min_goal_distance} m apart with a path of at most {longest} m between them"
+        f"{min_goal_distance} m apart with a path between them"
     )
 
 
 def _around(start: tuple[float, float], regions: tuple[Box, ...], reach: float) -> tuple[Box, ...]:
     """The parts of regions that lie within a reach of the start [m] along either axis."""
-    if math.isinf(reach):
-        return regions
     x, y = start
     sides = [
-        (
-            max(r.x_min, x - reach),
-            max(r.y_min, y - reach),
-            min(r.x_max, x + reach),
-            min(r.y_max, y + reach),
-        )
-        for r in regions
-    ]
+        (*map(max, region.bounds[:2], (x - reach, y - reach)),
+         *map(min, region.bounds[2:], (x + reach, y + reach)))
+        for region in regions
+    ]  # fmt: skip
     return tuple(Box(*each) for each in sides if each[0] < each[2] and each[1] < each[3])
 
 
