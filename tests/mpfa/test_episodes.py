@@ -162,7 +162,7 @@ def test_hindsight_learns_of_one_episode_at_a_time(kind):
 def test_reliability_is_that_of_one_episode_at_a_time(load, at_a_time):
     def make():
         return make_replay(
-            "per",
+            "reaper",
             capacity=CAPACITY,
             batch_size=8,
             reliability=0.5,

@@ -126,6 +126,7 @@ def test_the_node_stops_on_stale_scans_and_at_its_end(bench: Bench, policy: Path
         odometry.publish(felt)
         if sees:
             seen = LaserScan(angle_min=-math.pi, angle_increment=math.pi / 180, range_max=8.0)
+            seen.angle_max = math.pi - math.pi / 180
             seen.header.stamp, seen.ranges = stamp, [3.0] * 360
             scans.publish(seen)
 
