@@ -93,7 +93,7 @@ def read_map(
     shades, opacity = reader.image(entries["image"])
     quarters = round(yaw / (math.pi / 2))
     # No cell may be off by more than half a side.
-    if abs(yaw - quarters * math.pi / 2) * max(500, *shades.shape) > 0.5:
+    if abs(yaw - quarters * math.pi / 2) > min(1e-4, 0.5 / max(shades.shape)):
         raise reader.error(
             entries["origin"],
             "origin must have a yaw of 0 or a multiple of pi/2, as the cells lie along the axes, "
