@@ -10,7 +10,6 @@ import pytest
 from mpfa_envs import Box, Cylinder, Polygon, Walker, World
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.walkers.orca import OrcaRoom, _outlines
-from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.batch import WorldBatch
 
 pytest.importorskip("pyrvo", reason="an extra")
@@ -85,12 +84,10 @@ def test_a_velocity_into_a_wall_is_not_driven(
     monkeypatch.setattr(OrcaRoom, "choose", choose)
     worlds = WorldBatch([World(name="free", walkers=(AVOIDER,))])
     batch = WalkerBatch(worlds, radius=0.18, time_step=0.1)
-    batch.begin(0, start_walkers(worlds[0], (0.0, 0.0), np.random.default_rng(0)))
-    targets = np.ones((1, 1), dtype=np.int64)
+    targets = np.ones(1, dtype=np.int64)
     # The wall is at 5 m, and the walker's radius 0.25 m.
     for x, speed, moves in ((4.7, 1.0, False), (4.6, 1.0, True), (4.9, -1.0, True)):
-        state = {"states": np.array([[[x, 0.0, speed, 0.0]]]), "targets": targets}
-        batch.read(state, list(worlds))()
+        batch.begin(0, (np.array([[x, 0.0, speed, 0.0]]), targets))
         velocity[0] = speed
         batch.move(np.ones(1, dtype=np.bool_), np.zeros((1, 5)))
         expected = (x + 0.1 * speed, speed) if moves else (x, 0.0)

@@ -19,7 +19,6 @@ from mpfa_envs.env import episodes
 from mpfa_envs.generators import generate_world
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.worlds.plain import world_to_plain
 
 GENERATOR_IDS = [each for each in ENV_IDS if each.split("-")[1] not in WORLDS]
 
@@ -122,10 +121,8 @@ def test_a_task_needs_its_world_where_worlds_come_and_go() -> None:
 def test_a_replacement_world_is_kept_for_as_many_episodes() -> None:
     env = VectorNavigationEnv(1, world="clutter", physics="kinematic", episodes_per_world=3)
     env.reset(seed=0)
-    state = env.state_dict()
     full = World(name="full", boxes=(Box(-5.0, -5.0, 5.0, 5.0),))
-    state["source"].update(worlds=[world_to_plain(full)], left=[1])
-    env.load_state_dict(state)
+    env._source._worlds[0], env._source._left[0] = full, 1
     names = []
     for _ in range(4):
         env.reset()

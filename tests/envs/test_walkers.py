@@ -208,23 +208,6 @@ def test_a_map_holds_what_stands_and_no_walker() -> None:
     assert not (rows[0] & ~rows[1]).any()
 
 
-def test_a_state_of_other_walkers_is_rejected_and_changes_nothing() -> None:
-    env = VectorNavigationEnv(1, world=BUSY, physics="kinematic")
-    env.reset(seed=1)
-    state = env.state_dict()
-    env.reset(seed=2)
-    before, walkers = env.walkers(0), state["batch"]["walkers"]
-    for name, bad, message in (
-        ("targets", np.where(walkers["targets"] > 0, 3, 0), "targets of the state must be numbers"),
-        ("states", np.full_like(walkers["states"], np.nan), "states of the state must be finite"),
-        ("states", None, "states of the state must have rows for 6 walkers"),
-    ):
-        state["batch"]["walkers"] = {**walkers, name: bad}
-        with pytest.raises(ValueError, match=message):
-            env.load_state_dict(state)
-        np.testing.assert_array_equal(env.walkers(0), before)
-
-
 def test_a_robot_that_waits_keeps_its_scans_and_its_walkers() -> None:
     env = VectorNavigationEnv(2, world=BUSY, physics="kinematic", history=3)
     env.reset(seed=0)

@@ -260,7 +260,6 @@ class TaskConfig:
         robot = asdict(self.robot)
         described["robot"] = robot.pop("name")
         described.update({f"robot.{name}": value and float(value) for name, value in robot.items()})
-        # Older states have None for no noise.
         described["noise"] = None if self.noise == RobotNoise() else asdict(self.noise)
         described["reward"] = "a function of your own"
         if payments := payments_of(self.reward_function):

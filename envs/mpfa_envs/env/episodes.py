@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean
+from mpfa_envs.env.state import Beginning, generator_at
 from mpfa_envs.generators import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.planner import shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
-from mpfa_envs.saved import read_list
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers
 from mpfa_envs.worlds.builtin import WORLDS
-from mpfa_envs.worlds.plain import fingerprint, world_from_plain, world_to_plain
+from mpfa_envs.worlds.plain import fingerprint
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
 
@@ -105,6 +106,8 @@ class EpisodeSource:
         fixed = [] if self._generator else _resolve_worlds(world)
         self._worlds = [fixed[i % len(fixed)] if fixed else None for i in range(robots)]
         self._left = [0] * robots
+        self.begins: dict[int, Beginning] = {}
+        """What each robot's episode was sampled from."""
         # A world without any task fails here, before anything runs.
         rng = np.random.default_rng(0)
         probes = [self._worlds[i] for i in range(min(len(fixed), robots))] or [None]
@@ -125,19 +128,40 @@ class EpisodeSource:
     ) -> list[Episode]:
         """Sample the next episodes of some robots, or none if one of them has none."""
         before = self.rejected, list(self._left), list(self._worlds)
-        states = [(rngs[robot], rngs[robot].bit_generator.state) for robot in robots]
+        for robot in renewed:
+            self._left[robot] = 0
+        begins = {
+            robot: Beginning(
+                rngs[robot].bit_generator.state,
+                self._left[robot],
+                self._worlds[robot] if self._generator else None,
+                None if given is None else given[robot],
+            )
+            for robot in robots
+        }
         try:
-            for robot in renewed:
-                self.forget(robot)
-            return [
-                self._sample_next(each, rngs[each], None if given is None else given[each])
-                for each in robots
-            ]
+            episodes = [self._sample_next(each, rngs[each], begins[each].given) for each in robots]
         except BaseException:
             self.rejected, self._left, self._worlds = before
-            for rng, state in states:
-                rng.bit_generator.state = state
+            for robot, begin in begins.items():
+                rngs[robot].bit_generator.state = begin.generator
             raise
+        self.begins.update(begins)
+        return episodes
+
+    def sample_again(
+        self, begins: Sequence[Beginning], *, rejected: int
+    ) -> tuple[EpisodeSource, list[Episode], list[np.random.Generator]]:
+        """Sample episodes from the beginnings of all robots, or of none, in a copy."""
+        rngs = [generator_at(begin.generator) for begin in begins]
+        source = copy.copy(self)
+        source.begins = {}
+        source._left = [begin.left for begin in begins] or [0] * len(self._left)
+        if self._generator:
+            source._worlds = [begin.kept for begin in begins] or [None] * len(self._left)
+        episodes = source.sample(range(len(begins)), rngs, [begin.given for begin in begins])
+        source.rejected = rejected
+        return source, episodes, rngs
 
     def _sample_next(
         self, robot: int, rng: np.random.Generator, given: tuple[World, Task | None] | None
@@ -152,10 +176,6 @@ class EpisodeSource:
             self._left[robot] = (self._episodes_per_world if new else self._left[robot]) - 1
             self._worlds[robot] = episode.world
         return episode
-
-    def forget(self, robot: int) -> None:
-        """Have the next episode of a robot in a new world, as after a seed."""
-        self._left[robot] = 0
 
     def fixed(self, robot: int) -> World | None:
         """The world that a robot always drives in; None with a generator."""
@@ -175,31 +195,6 @@ class EpisodeSource:
             "episodes_per_world": self._episodes_per_world,
             "split": self._split,
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """The world of each robot among those of a generator."""
-        kept = zip(self._worlds, self._left, strict=True)
-        return {
-            "refused": self.rejected,
-            "left": list(self._left),
-            "worlds": [world_to_plain(world) if left and world else None for world, left in kept],
-        }
-
-    def read(self, state: Mapping[str, Any]) -> Callable[[], None]:
-        """Check what :meth:`state_dict` gave; the result loads it."""
-        counts, values = (read_list(state, name, len(self._left)) for name in ("left", "worlds"))
-        rejected = check_count("refused", state.get("refused"), least=0, most=math.inf)
-        left = [check_count("left", count, least=0) for count in counts]
-        worlds = [None if each is None else world_from_plain(each) for each in values]
-        if any(count and world is None for count, world in zip(left, worlds, strict=True)):
-            raise ValueError("worlds of the state must hold a world wherever left is not 0")
-
-        def load() -> None:
-            self.rejected, self._left = rejected, left
-            if self._generator:
-                self._worlds = worlds
-
-        return load
 
     def check_world(self, world: World) -> None:
         """Reject a world that is too large."""

@@ -92,52 +92,19 @@ def _read_list(options: Mapping[str, Any] | None, key: str, robots: int) -> Sequ
 
 def read_seed(
     seed: int | Sequence[int | None] | None, robots: int
-) -> Sequence[np.random.Generator | None]:
-    """A generator for each robot; None where the present one is kept."""
+) -> dict[int, np.random.Generator]:
+    """New generators by robot; there are none where the present ones are kept."""
     if seed is None:
-        return [None] * robots
+        return {}
     if isinstance(seed, Sequence) and not isinstance(seed, (str, bytes)):
         if len(seed) != robots:
             raise ValueError(f"seed must have {robots} entries, got {len(seed)}")
         checked = [None if one is None else check_seed(one) for one in seed]
-        return [None if one is None else np.random.default_rng(one) for one in checked]
-    return spawn_generators(np.random.SeedSequence(check_seed(seed)), robots)
+        given = {robot: one for robot, one in enumerate(checked) if one is not None}
+        return {robot: np.random.default_rng(one) for robot, one in given.items()}
+    return dict(enumerate(spawn_generators(np.random.SeedSequence(check_seed(seed)), robots)))
 
 
 def spawn_generators(sequence: np.random.SeedSequence, robots: int) -> list[np.random.Generator]:
     """A generator for each robot that does not depend on the number of robots."""
     return [np.random.default_rng(child) for child in sequence.spawn(robots)]
-
-
-def check_alike(state: object, expected: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Reject a state of an environment with other arguments than the expected ones."""
-    parts = {"arguments": Mapping, "source": Mapping, "batch": Mapping, "begun": bool}
-    if not isinstance(state, Mapping) or not all(
-        isinstance(state.get(part), kind) for part, kind in parts.items()
-    ):
-        raise ValueError(
-            f"state must be what state_dict() gave, with {tuple(parts)}, got another value"
-        )
-    found = state["arguments"]
-    for name, value in expected.items():
-        # Older states describe fewer of them.
-        if name in found and found[name] != value:
-            raise ValueError(
-                f"state must be of an environment with {name} = {value!r}, got one with "
-                f"{found[name]!r}"
-            )
-    return state
-
-
-def read_generators(states: object, robots: int, *, begun: bool) -> list[np.random.Generator]:
-    """Restore each robot's generator; before the first reset there may be none."""
-    counts = (robots,) if begun else (0, robots)
-    if not isinstance(states, Sequence) or len(states) not in counts:
-        raise ValueError(f"rngs of the state must have {robots} entries, got {states!r}")
-    generators = [np.random.default_rng(0) for _ in states]
-    for generator, state in zip(generators, states, strict=True):
-        try:
-            generator.bit_generator.state = state
-        except (TypeError, ValueError, KeyError, OverflowError) as error:
-            raise ValueError(f"rngs of the state must be of PCG64, got {state!r}") from error
-    return generators

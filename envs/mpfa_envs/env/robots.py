@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpfa_envs.env.episodes import distance_field
 from mpfa_envs.env.step_loops import (
     DISTANCE,
     ENCOUNTERS,
@@ -24,7 +23,6 @@ from mpfa_envs.env.step_loops import (
 from mpfa_envs.paths.batch import FieldBatch
 from mpfa_envs.robots.drives import make_drives
 from mpfa_envs.robots.motion_loops import scale_actions
-from mpfa_envs.saved import read_array, read_list
 from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.sensing.observation import FLAGS, NUMBERS
 from mpfa_envs.sensing.observation_loops import observe_all
@@ -32,12 +30,10 @@ from mpfa_envs.tables import grown
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
 from mpfa_envs.worlds.batch import WorldBatch
-from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
-from mpfa_envs.worlds.task import read_task
 from mpfa_envs.worlds.walker import no_encounters
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -80,8 +76,9 @@ class RobotBatch:
         """Their episodes so far."""
         self.running = np.zeros(count, dtype=np.bool_)
         """Whether an episode has begun and not ended, ``[N]``."""
-        self.trails = np.zeros((count, min(config.max_steps, _TRAIL) + 1, 2))
-        """Positions since the start of the episode [m], ``[N, steps, 2]``."""
+        self.trails = np.zeros((count, min(config.max_steps, _TRAIL) + 1, 4))
+        """Positions since the start of the episode [m], and the wheel speeds that actions asked for
+        until there [m/s], ``[N, steps, 4]``."""
         self.ranges = np.zeros((count, lidar.angles.size))
         """Range of each ray [m], ``[N, rays]``."""
         self.memory = MapMemory(count, config.robot, lidar) if config.memory == "map" else None
@@ -134,7 +131,7 @@ class RobotBatch:
         numbers[DISTANCE] = distance
         numbers[POSE : POSE + 3] = x, y, heading
         numbers[ENCOUNTERS:] = no_encounters()
-        self.trails[index, 0] = x, y
+        self.trails[index, 0, :2] = x, y
         self.running[index] = True
         if self.noise is not None:
             self.noise.begin(index, (x, y, heading), rng)
@@ -173,7 +170,15 @@ class RobotBatch:
             if noise is not None:
                 noise.measure(episodes.motions, running)
             self.walkers.count_encounters(episodes.motions, running, episodes.numbers[ENCOUNTERS:])
-            judge(episodes, worlds, running, self.trails, self._lengths, self._config.max_steps)
+            judge(
+                episodes,
+                worlds,
+                running,
+                speeds,
+                self.trails,
+                self._lengths,
+                self._config.max_steps,
+            )
             if self._fields is not None:
                 measure_remaining(episodes, running, self._fields.arrays)
             if self._payments is None:
@@ -182,70 +187,37 @@ class RobotBatch:
                 break
         self.running[moving] = running[moving]
 
-    def state_dict(self) -> dict[str, Any]:
-        """The state of the robots as plain values and arrays."""
-        last = int(self.episodes.steps.max())
-        return {
-            "worlds": [world_to_plain(world) for world in self.worlds],
-            "tasks": [task and (task.start, task.goal) for task in self.tasks],
-            "trails": self.trails[:, : last + 1].copy(),
-            "drives": self.drives.state_dict(),
-            "walkers": self.walkers.state_dict(),
-            "memory": {} if self.memory is None else self.memory.state_dict(),
-            **{name: array.copy() for name, array in self._arrays().items()},
-        }
+    def driven(self, index: int) -> NDArray[np.float64]:
+        """The wheel speeds that each action of a robot's episode asked for [m/s], ``[A, 2]``."""
+        steps = self.episodes.steps[index]
+        return self.trails[index, 1 : steps + 1 : self._config.action_repeat, 2:].copy()
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave; if it is rejected, nothing has changed."""
-        arrays = self._arrays()
-        values = {name: read_array(state, name, like) for name, like in arrays.items()}
-        plain, given = (read_list(state, name, len(self.tasks)) for name in ("worlds", "tasks"))
-        worlds = [world_from_plain(each) for each in plain]
-        tasks = [None if task is None else read_task(task) for task in given]
-        fields = None if self._fields is None else FieldBatch(len(tasks))
-        for index, (world, task) in enumerate(zip(worlds, tasks, strict=True)):
-            places = [values["motions"][index, :2], values["goals"][index]]
-            places += [] if task is None else [task.start[:2], task.goal]
-            if not (np.abs(places) <= np.divide(world.size, 2)).all():
-                raise ValueError(
-                    f"tasks, motions and goals of the state must lie in {world.room}, got {places}"
-                )
-            if task is not None and fields is not None:
-                fields[index] = distance_field(world, self._config.collision_distance, task.goal)
-        starts = np.array([(0.0, 0.0, 0.0) if task is None else task.start for task in tasks])
-        starts[:, 2] = [math.remainder(heading, math.tau) for heading in starts[:, 2]]
-        load_walkers = self.walkers.read(state.get("walkers", {}), worlds)
-        load_drives = self.drives.read(state.get("drives", {}), starts)
-        # The compiled loops use the number of steps as an index, unchecked.
-        steps, most = values["steps"], self._config.max_steps
-        if steps.min() < 0 or steps.max() > most:
-            raise ValueError(f"steps of the state must be in [0, {most}], got {steps.tolist()}")
-        last = int(steps.max())
-        trails = read_array(state, "trails", np.zeros((len(tasks), last + 1, 2)))
-        if self.memory is not None:
-            self.memory.load_state_dict(state.get("memory", {}))
-        self.trails = grown(self.trails, last + 1)
-        self.trails[:, : last + 1] = trails
-        for name, array in arrays.items():
-            array[...] = values[name]
-        self.tasks, self._fields = tasks, fields
-        for index, world in enumerate(worlds):
-            self.worlds[index] = world
-        load_walkers()
-        load_drives()
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays of the episodes by name."""
-        robot = self._config.robot
-        return {
-            # The name in saved states.
-            **{"ways" if n == "remaining" else n: a for n, a in self.episodes._asdict().items()},
-            "running": self.running,
-            "observations": self.observations,
-            **({} if robot.wheel_acceleration is None else {"commands": self.drives.commands}),
-            "ranges": self.ranges,
-            **({} if self.noise is None else self.noise.arrays()),
-        }
+    def drive_again(
+        self,
+        episodes: Sequence[Episode],
+        driven: Sequence[NDArray[np.float64]],  # by robot, [A, 2]
+        rngs: Sequence[np.random.Generator],
+    ) -> None:
+        """Begin episodes, and drive them with the wheel speeds [m/s] of their actions."""
+        counts = np.array([len(speeds) for speeds in driven])
+        last = int(counts.max())
+        table = np.zeros((last, len(driven), 2))
+        for index, speeds in enumerate(driven):
+            table[last - counts[index] :, index] = speeds
+        # All end at once: in a shared physics server, a robot that waited would roll on.
+        for step in range(last + 1):
+            beginning, moving = counts == last - step, counts > last - step - 1
+            for index in np.flatnonzero(beginning).tolist():
+                self.begin(index, episodes[index], rngs[index])
+            if beginning.any():
+                self.sense(beginning, rngs)
+            if step == last:
+                break
+            if (ended := moving & ~self.running).any():
+                robots = np.flatnonzero(ended).tolist()
+                raise ValueError(f"speeds of the state go on after the episodes of robots {robots}")
+            self.advance(table[step], moving, rngs)
+            self.sense(moving, rngs)
 
     def _pay_by_function(self, running: NDArray[np.bool_]) -> None:
         """Add the rewards of the user's function, robot by robot."""
@@ -312,7 +284,7 @@ class RobotBatch:
 
     def trail(self, index: int) -> list[tuple[float, float]]:
         """Positions (x, y) of a robot's episode so far [m]."""
-        rows = self.trails[index, : self.episodes.steps[index] + 1]
+        rows = self.trails[index, : self.episodes.steps[index] + 1, :2]
         return [(x, y) for x, y in rows.tolist()]
 
     def snapshots(self) -> tuple[Callable[[], NDArray[np.uint8]], ...]:

@@ -59,7 +59,8 @@ def judge(
     episodes: EpisodeArrays,
     worlds: BatchArrays,
     running: NDArray[np.bool_],  # have moved, [N]
-    trails: NDArray[np.float64],  # positions of the episode [m], [N, steps, 2]
+    speeds: NDArray[np.float64],  # of the wheels that an action asks for [m/s], [N, 2]
+    trails: NDArray[np.float64],  # positions [m] and these speeds so far, [N, steps, 4]
     rules: tuple[float, float, float, float],  # robot, collision, goal radius [m], time_step [s]
     max_steps: int,
 ) -> None:
@@ -73,6 +74,7 @@ def judge(
         episodes.steps[robot] += 1
         steps = episodes.steps[robot]
         trails[robot, steps, 0], trails[robot, steps, 1] = x, y
+        trails[robot, steps, 2], trails[robot, steps, 3] = speeds[robot, 0], speeds[robot, 1]
         moved = math.hypot(x - numbers[POSE, robot], y - numbers[POSE + 1, robot])
         distance = math.hypot(episodes.goals[robot, 0] - x, episodes.goals[robot, 1] - y)
         to_obstacle = clearance_at(worlds, robot, x, y)

@@ -14,10 +14,8 @@ from gymnasium.vector.utils import batch_space
 
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.config import TaskConfig
-from mpfa_envs.env.episodes import Episode, EpisodeSource, WorldChoice
+from mpfa_envs.env.episodes import EpisodeSource, WorldChoice
 from mpfa_envs.env.inputs import (
-    check_alike,
-    read_generators,
     read_mask,
     read_reset_mask,
     read_seed,
@@ -26,6 +24,7 @@ from mpfa_envs.env.inputs import (
     spawn_generators,
 )
 from mpfa_envs.env.robots import RobotBatch
+from mpfa_envs.env.state import read_state, robot_to_plain
 from mpfa_envs.env.step_loops import outcomes
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
@@ -133,11 +132,16 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._batch = RobotBatch(
-            self.config, self.lidar, [self._source.fixed(i) or _EMPTY for i in range(self.num_envs)]
-        )
+        self._batch = self._make_batch()
         self._rngs: list[np.random.Generator] = []
+        self._seeded: dict[int, np.random.Generator] = {}
+        """Sources of randomness of the episodes that begin next, where seeds were given."""
         self._begun = False
+
+    def _make_batch(self) -> RobotBatch:
+        """Make robots whose episodes have not begun."""
+        worlds = [self._source.fixed(index) or _EMPTY for index in range(self.num_envs)]
+        return RobotBatch(self.config, self.lidar, worlds)
 
     @property
     def worlds(self) -> list[World]:
@@ -222,18 +226,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         Raises:
             ValueError: If a seed is negative, or there are not as many as robots.
         """
-        seeded = read_seed(seed, self.num_envs)
-        self._rngs = self._generators(seeded)
-        for index, rng in enumerate(seeded):
-            if rng is not None:
-                self._source.forget(index)
-
-    def _generators(
-        self, seeded: Sequence[np.random.Generator | None]
-    ) -> list[np.random.Generator]:
-        """The robots' sources of randomness, new ones where they are given."""
-        kept = self._rngs or spawn_generators(np.random.SeedSequence(), self.num_envs)
-        return [new or old for new, old in zip(seeded, kept, strict=True)]
+        self._seeded |= read_seed(seed, self.num_envs)
 
     def reset(
         self,
@@ -262,13 +255,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         given = read_tasks(options, self.num_envs, self._source)
         if not self._begun and not chosen.all():
             raise ResetNeeded("the first reset must start all robots, got a reset_mask")
-        robots = np.flatnonzero(chosen).tolist()
-        seeded = [rng if wanted else None for rng, wanted in zip(seeded, chosen, strict=True)]
-        rngs = self._generators(seeded)
-        renewed = [index for index in robots if seeded[index] is not None]
-        episodes = self._source.sample(robots, rngs, given, renewed)
-        self._rngs = rngs
-        self._begin(robots, episodes)
+        self._begin(chosen, self._seeded | seeded, given)
         self._begun = True
         self._batch.sense(chosen, self._rngs)
         return self._batch.observations.copy(), self._infos(chosen)
@@ -309,7 +296,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
                 "reset(options={'reset_mask': ...}) before step()"
             )
         moving = chosen & self._batch.running
-        self._begin_next(waiting)
+        self._begin(waiting, self._seeded)
         self._batch.advance(speeds, moving, self._rngs)
         self._batch.sense(chosen, self._rngs)
         rewards, terminated, truncated = outcomes(self._batch.episodes, moving)
@@ -317,20 +304,30 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
             infos = self._final_infos(ended)
-            self._begin_next(ended)
+            self._begin(ended, self._seeded)
             self._batch.sense(ended, self._rngs)
         infos = self._infos(None) | infos
         return self.observations, rewards, terminated, truncated, infos
 
-    def _begin_next(self, waiting: NDArray[np.bool_]) -> None:
-        """Start the next episodes of the robots that wait for them."""
-        if robots := np.flatnonzero(waiting).tolist():
-            self._begin(robots, self._source.sample(robots, self._rngs))
-
-    def _begin(self, robots: Sequence[int], episodes: Sequence[Episode]) -> None:
-        """Start these episodes of some robots."""
+    def _begin(
+        self,
+        chosen: NDArray[np.bool_],
+        seeded: Mapping[int, np.random.Generator],
+        given: Sequence[tuple[World, Task | None] | None] | None = None,
+    ) -> None:
+        """Start the next episodes of some robots, ``[N]``, or none if one of them has none."""
+        robots = np.flatnonzero(chosen).tolist()
+        if not robots:
+            return
+        rngs = list(self._rngs) or spawn_generators(np.random.SeedSequence(), self.num_envs)
+        renewed = [index for index in robots if index in seeded]
+        for index in renewed:
+            rngs[index] = seeded[index]
+        episodes = self._source.sample(robots, rngs, given, renewed)
+        self._rngs = rngs
         for index, episode in zip(robots, episodes, strict=True):
-            self._batch.begin(index, episode, self._rngs[index])
+            self._seeded.pop(index, None)
+            self._batch.begin(index, episode, rngs[index])
 
     def _infos(self, chosen: NDArray[np.bool_] | None) -> dict[str, Any]:
         """The infos of the chosen robots, or of all: an array for each key, and its mask."""
@@ -361,36 +358,56 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         """Give all that the environment needs to go on elsewhere in the middle of episodes.
 
         Returns:
-            Plain values and arrays. Worlds, tasks and motions are in it, sources of randomness too;
-            on wheels also what was driven in each episode.
+            Plain values and arrays: for each robot the state of its source of randomness where its
+            episode began, the world and the task if they were given, and the actions since.
         """
+        robots = range(self.num_envs) if self._begun else ()
+        begins, driven = self._source.begins, self._batch.driven
         return {
             "arguments": self._describe(),
-            "rngs": [rng.bit_generator.state for rng in self._rngs],
-            "begun": self._begun,
-            "source": self._source.state_dict(),
-            "batch": self._batch.state_dict(),
+            "rejected": self._source.rejected,
+            "seeded": [
+                self._seeded[index].bit_generator.state if index in self._seeded else None
+                for index in range(self.num_envs)
+            ],
+            "robots": [robot_to_plain(begins[index], driven(index)) for index in robots],
+            "positions": self._batch.episodes.motions[:, :2].copy(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where another environment with the same arguments was.
 
-        What follows is the same to the bit. On wheels the episodes so far are driven again from
-        their starts, which takes a moment and is as exact for up to 32 robots.
+        The episodes so far are sampled and driven again, and what follows is the same to the bit;
+        on wheels for up to 32 robots. Loading takes as long as the steps of the longest episode. A
+        reward function of your own is called again, too.
 
         Args:
             state: What :meth:`state_dict` gave.
 
         Raises:
             ValueError: If it is of an environment with other arguments, the first of which is
-                named, or no state; nothing has changed then.
+                named, of an earlier version, or no state, or ends elsewhere when it is driven
+                again; nothing has changed then.
         """
-        state = check_alike(state, self._describe())
-        rngs = read_generators(state.get("rngs"), self.num_envs, begun=state["begun"])
-        load_source = self._source.read(state["source"])
-        self._batch.load_state_dict(state["batch"])
-        load_source()
-        self._rngs, self._begun = rngs, state["begun"]
+        begins, driven, seeded = read_state(state, self._describe(), self.config, self._source)
+        source, episodes, rngs = self._source.sample_again(begins, rejected=state["rejected"])
+        batch = self._make_batch()
+        try:
+            if episodes:
+                batch.drive_again(episodes, driven, rngs)
+            # Robots that share a physics server may be off by a millimeter.
+            here = batch.episodes.motions[:, :2]
+            if not np.allclose(np.reshape(state["positions"], here.shape), here, rtol=0, atol=0.01):
+                raise ValueError(
+                    "state cannot be loaded: its episodes end elsewhere when they are driven "
+                    "again, as it was changed or is of another version; begin new ones with reset()"
+                )
+        except BaseException:
+            batch.drives.close()
+            raise
+        self._batch.drives.close()
+        self._batch, self._source, self._begun = batch, source, bool(episodes)
+        self._rngs, self._seeded = rngs, {i: rng for i, rng in enumerate(seeded) if rng}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Render each robot's room from above.

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
 from mpfa_envs.robots.motion_loops import accelerate, drive_arcs
-from mpfa_envs.saved import read_array
-from mpfa_envs.tables import grown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -62,14 +59,6 @@ class Drives:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
         raise NotImplementedError
 
-    def state_dict(self) -> dict[str, Any]:
-        """State that brings the robots back to where they are in their episodes."""
-        return {}
-
-    def read(self, state: Mapping[str, Any], starts: NDArray[np.float64]) -> Callable[[], None]:
-        """Check what :meth:`state_dict` gave; the result loads it, from starts ``[N, 3]``."""
-        return lambda: None
-
     def close(self) -> None:
         """Release what is held; a second call does nothing."""
 
@@ -106,9 +95,6 @@ class WheelDrives(Drives):
             for _ in range(min(robots, SERVERS))
         ]
         self._names = [f"robot_{index}" for index in range(robots)]
-        # Speeds of each robot in its episode so far, and their number.
-        self._driven = np.zeros((robots, 64, 2))
-        self._counts = np.zeros(robots, dtype=np.int64)
         for index, name in enumerate(self._names):
             self._simulation_of(index).add_robot(robot, name=name)
         for index in range(robots):
@@ -122,13 +108,11 @@ class WheelDrives(Drives):
         """Put a robot at rest at a pose [m, m, rad]."""
         super().place(index, x, y, heading)
         self._simulation_of(index).place_robot(x, y, heading, name=self._names[index])
-        self._counts[index] = 0
 
     def _turn(
         self, motions: NDArray[np.float64], running: NDArray[np.bool_], speeds: NDArray[np.float64]
     ) -> None:
         """Hold the wheel speeds ``[N, 2]`` [m/s] for one time step and update the motions."""
-        self._remember(running, speeds)
         turning = np.where(running[:, None], speeds / self._wheel_radius, 0.0).tolist()
         moving = np.flatnonzero(running).tolist()
         # In a server of its own, a robot that does not run is not simulated; in a shared one it
@@ -146,44 +130,6 @@ class WheelDrives(Drives):
             )
             forward = speed_x * math.cos(heading) + speed_y * math.sin(heading)
             motions[index] = x, y, heading, forward, turn
-
-    def _remember(self, running: NDArray[np.bool_], speeds: NDArray[np.float64]) -> None:
-        """Record the wheel speeds since the start of the episodes."""
-        if self._counts.max() == self._driven.shape[1]:
-            self._driven = grown(self._driven, 2 * self._driven.shape[1])
-        self._driven[running, self._counts[running]] = speeds[running]
-        self._counts[running] += 1
-
-    def state_dict(self) -> dict[str, Any]:
-        """The wheel speeds of the episodes so far: the engine cannot save its whole state."""
-        counts = self._counts.copy()
-        return {"counts": counts, "speeds": self._driven[:, : counts.max()].copy()}
-
-    def read(self, state: Mapping[str, Any], starts: NDArray[np.float64]) -> Callable[[], None]:
-        """Check what :meth:`state_dict` gave; the result drives the episodes again."""
-        counts = read_array(state, "counts", self._counts)
-        if counts.min() < 0:
-            raise ValueError(f"counts of the state must not be negative, got {counts.tolist()}")
-        speeds = read_array(state, "speeds", np.zeros((len(counts), counts.max(), 2)))
-        return partial(self._drive_again, counts, speeds, starts)
-
-    def _drive_again(
-        self,
-        counts: NDArray[np.int64],  # time steps so far, [N]
-        speeds: NDArray[np.float64],  # of the wheels in them [m/s], [N, steps, 2]
-        starts: NDArray[np.float64],  # (x, y, heading) [m, m, rad], [N, 3]
-    ) -> None:
-        last, motions = int(counts.max()), np.zeros((len(counts), 5))
-        commands = self.commands.copy()
-        # All end at once; one that has driven for a shorter time is placed later.
-        for step in range(last + 1):
-            for index in np.flatnonzero(counts == last - step).tolist():
-                self.place(index, *starts[index].tolist())
-            if step < last:
-                running = step >= last - counts
-                now = speeds[np.arange(len(counts)), np.maximum(step - last + counts, 0)]
-                self._turn(motions, running, now)
-        self.commands[...] = commands
 
     def close(self) -> None:
         """Shut the physics servers down; a second call does nothing."""

@@ -162,16 +162,6 @@ class NoisyMotion:
         self.odometry[running] = held
         self._poses[running] = now
 
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """The arrays of its state by name, changed in place."""
-        return {
-            "noise_commands": self._commands,
-            "noise_kept": self._kept,
-            "noise_scales": self._scales,
-            "noise_poses": self._poses,
-            "noise_odometry": self.odometry,
-        }
-
 
 def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles in [-π, π] [rad]."""

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from mpfa_envs.saved import read_array
 from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, cell_of, follow_path, remember
 from mpfa_envs.tables import grown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from mpfa_envs.robots.model import RobotModel
@@ -148,27 +145,3 @@ class MapMemory:
         path = follow_path(levels, costs, cell_of(u, columns), cell_of(v, rows))
         along = [(across, up) for across, up in (origin + RESOLUTION * path).tolist()]
         return Sketch(levels == BLOCKED, along, RESOLUTION)
-
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """The maps and the paths, as arrays."""
-        values = {**self.arrays._asdict(), "ways": self._paths}
-        return {name: array.copy() for name, array in values.items()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave.
-
-        Raises:
-            ValueError: If something is missing or of another shape; nothing has changed then.
-        """
-        count = len(self._paths)
-        sides = np.shape(state.get("levels", ()))[1:]
-        if len(sides) != 2:
-            raise ValueError(f"levels of the state must have shape [N, columns, rows], got {sides}")
-        likes = {
-            **self.arrays._asdict(),
-            "levels": np.zeros((count, *sides), dtype=np.uint8),
-            "costs": np.zeros((count, *sides), dtype=np.int32),
-        }
-        arrays = {name: read_array(state, name, like) for name, like in likes.items()}
-        self._paths = read_array(state, "ways", self._paths)
-        self.arrays = MapArrays(**arrays)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpfa_envs.saved import read_array
 from mpfa_envs.tables import grown
 from mpfa_envs.walkers.loops import (
     ORCA,
@@ -21,14 +20,11 @@ from mpfa_envs.walkers.loops import (
 from mpfa_envs.walkers.orca import OrcaRoom
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from numpy.typing import NDArray
 
     from mpfa_envs.sensing.lidar import Lidar
     from mpfa_envs.walkers.starts import WalkerStarts
     from mpfa_envs.worlds.batch import WorldBatch
-    from mpfa_envs.worlds.world import World
 
 _MARGIN: Final = 0.05
 """A ray that ends this near to a walker, and three deviations of its noise, met it [m]."""
@@ -55,8 +51,31 @@ class WalkerBatch:
         """Worlds of the robots around which walkers avoid others, by robot."""
 
     def begin(self, index: int, starts: WalkerStarts) -> None:
-        """Put the walkers of a robot's world at their starts."""
-        self._set(index, self._worlds[index], starts)
+        """Put the walkers of a robot's world, and their circles in it, at their starts."""
+        world = self._worlds[index]
+        count = len(world.walkers)
+        points = max((len(each.waypoints) for each in world.walkers), default=0)
+        self._arrays = arrays = WalkerArrays(
+            **{
+                name: grown(table, *(count, points)[: 2 if name == "waypoints" else 1])
+                for name, table in self._arrays._asdict().items()
+            }
+        )
+        arrays.counts[index] = count
+        self._rooms.pop(index, None)
+        if any(walker.behavior == "orca" for walker in world.walkers):
+            self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
+        for number, walker in enumerate(world.walkers):
+            arrays.bodies[index, number] = walker.radius, walker.speed
+            arrays.behaviors[index, number] = _BEHAVIORS[walker.behavior]
+            points = len(walker.waypoints)
+            arrays.waypoint_counts[index, number] = points
+            if points:
+                arrays.waypoints[index, number, :points] = walker.waypoints
+        arrays.states[index, :count], arrays.targets[index, :count] = starts
+        arrays.slacks[index] = 0.0
+        first = self._worlds.standing.counts[index, 1]
+        self._worlds.arrays.circles[index, first : first + count, :2] = starts[0][:, :2]
 
     def move(self, running: NDArray[np.bool_], motions: NDArray[np.float64]) -> None:
         """Move the walkers for one time step."""
@@ -105,57 +124,3 @@ class WalkerBatch:
         margin = _MARGIN + 3 * lidar.noise
         hide_walkers(self._arrays, motions, directions, margin, lidar.max_range, seen)
         return seen
-
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """Positions, speeds and targets of the walkers; the worlds have the rest."""
-        return {"states": self._arrays.states.copy(), "targets": self._arrays.targets.copy()}
-
-    def read(self, state: Mapping[str, Any], worlds: list[World]) -> Callable[[], None]:
-        """Check what :meth:`state_dict` gave for some worlds; the result loads it."""
-        most = np.shape(state.get("states", ()))[1:2]
-        need = max((len(world.walkers) for world in worlds), default=0)
-        if len(most) != 1 or most[0] < need:
-            raise ValueError(f"states of the state must have rows for {need} walkers")
-        states = read_array(state, "states", np.zeros((len(worlds), *most, 4)))
-        targets = read_array(state, "targets", np.zeros((len(worlds), *most), dtype=np.int64))
-        for world, row in zip(worlds, targets.tolist(), strict=True):
-            for walker, target in zip(world.walkers, row, strict=False):
-                # The compiled loops do not check bounds.
-                if not 0 <= target < max(len(walker.waypoints), 1):
-                    raise ValueError(
-                        f"targets of the state must be numbers of waypoints, got {target} for "
-                        f"{walker}"
-                    )
-
-        def load() -> None:
-            for index, world in enumerate(worlds):
-                count = len(world.walkers)
-                self._set(index, world, (states[index, :count], targets[index, :count]))
-
-        return load
-
-    def _set(self, index: int, world: World, starts: WalkerStarts) -> None:
-        """Set the walkers of a robot's world, and write their places into its circles."""
-        count = len(world.walkers)
-        points = max((len(each.waypoints) for each in world.walkers), default=0)
-        self._arrays = arrays = WalkerArrays(
-            **{
-                name: grown(table, *(count, points)[: 2 if name == "waypoints" else 1])
-                for name, table in self._arrays._asdict().items()
-            }
-        )
-        arrays.counts[index] = count
-        self._rooms.pop(index, None)
-        if any(walker.behavior == "orca" for walker in world.walkers):
-            self._rooms[index] = OrcaRoom(world, radius=self._radius, time_step=self._time_step)
-        for number, walker in enumerate(world.walkers):
-            arrays.bodies[index, number] = walker.radius, walker.speed
-            arrays.behaviors[index, number] = _BEHAVIORS[walker.behavior]
-            points = len(walker.waypoints)
-            arrays.waypoint_counts[index, number] = points
-            if points:
-                arrays.waypoints[index, number, :points] = walker.waypoints
-        arrays.states[index, :count], arrays.targets[index, :count] = starts
-        arrays.slacks[index] = 0.0
-        first = self._worlds.standing.counts[index, 1]
-        self._worlds.arrays.circles[index, first : first + count, :2] = starts[0][:, :2]
