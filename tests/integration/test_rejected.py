@@ -94,7 +94,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (train.main, "tracking.group=", "tracking.group must be a word of at most 128 letters"),
         (train.main, "threads=1000000", "threads must be from 1 to 1024, got 1000000"),
         (train.main, "learner.width=3000000", "learner.width must be from 1 to 65536, got 3000000"),
-        (train.main, "method.capacity=10000000000", "method.capacity must be from 1 to 1000000000"),
+        (train.main, "method.capacity=2000000000", "method.capacity must be from 1 to 1000000000"),
         (train.main, "method.signals=[rewad]", "method.signals must be of .*, got 'rewad'"),
         (train.main, "curriculum.stages=3", "curriculum.stages"),
         (
