@@ -46,12 +46,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     A reward that is written in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``,
     ``buffer["next", "reward"] = ...``) counts in the next update of its transition's priority.
 
-    With ``prefetch=N`` a thread samples ``N`` batches ahead, while the learner has another one.
-    Writes (all but ``update_if_present``), updates and :meth:`anneal` wait for those that are being
-    sampled. So they count in the ``N + 1``-th batch from then on, and in a loop of one thread one
-    seed gives the same batches. Saving, loading, :meth:`empty`, a new transform and another batch
-    size drop those in the queue.
-
     Args:
         generator: Source of all randomness of the buffer; by default a new one, seeded by
             ``torch.manual_seed``. Its state is saved with the buffer.
@@ -60,9 +54,9 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     Raises:
         TypeError: If the sampler fuses signals and the storage keeps none, or ``generator`` is no
             generator.
-        ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` negative or without
-            ``batch_size``, or capacity or signals of sampler and storage differ; or, where signals
-            are fused, if ``priority_key`` is where one is read, or ``sample_unit`` makes sequences.
+        ValueError: If ``batch_size`` is not a positive integer, ``prefetch`` is not None or 0, or
+            capacity or signals of sampler and storage differ; or, where signals are fused, if
+            ``priority_key`` is where one is read, or ``sample_unit`` makes sequences.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -88,8 +82,11 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         self._unreturned, self._warned = 0, False
         if (batch_size := kwargs.get("batch_size")) is not None:
             check_counts(batch_size=batch_size)
-        if prefetch := kwargs.get("prefetch"):
-            check_counts(prefetch=prefetch)
+        if (prefetch := kwargs.get("prefetch")) not in (None, 0):
+            raise ValueError(
+                f"prefetch must be None, got {prefetch!r}: a batch that is sampled ahead knows "
+                "nothing of the priorities of the update before"
+            )
         if not isinstance(generator, torch.Generator | None):
             raise TypeError(f"generator must be a torch.Generator, got {generator!r}")
         # TorchRL sets it once the parts are made, which have to agree with it.
@@ -149,7 +146,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 finite, a first priority cannot be, or there is no batch size; nothing is changed,
                 in the transforms neither.
         """
-        self._wait_for_queue()
         if not self._checks or not isinstance(tensordicts, TensorDictBase):
             with self._memory.at_a_write(tensordicts) as (given, _):
                 return super().extend(given, update_priority=update_priority)
@@ -176,7 +172,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             ValueError: See :meth:`extend`; or if ``data`` has no dimension of environments.
         """
         if not self._checks:
-            self._wait_for_queue()
             with self._memory.at_a_write(data) as (given, _):
                 return super().add(given)
         if data.ndim < self.dim_extend:
@@ -225,10 +220,9 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             check_counts(batch_size=batch_size)
         if isinstance(self.sampler, PrioritizedSampler):
             self._count_batch()
-        with self._queue_of(batch_size):
-            if return_info or include_info is not None or not self._fuses:
-                return super().sample(batch_size, return_info, include_info)
-            return ReplayBuffer.sample(self, batch_size)
+        if return_info or include_info is not None or not self._fuses:
+            return super().sample(batch_size, return_info, include_info)
+        return ReplayBuffer.sample(self, batch_size)
 
     def _count_batch(self) -> None:
         """Warn of a training loop that never updates priorities."""
@@ -245,7 +239,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def update_priority(self, index: Any, priority: Any) -> None:
         """Set priorities directly, as in TorchRL."""
-        self._wait_for_queue()
         super().update_priority(index, priority)
         self._unreturned = 0
 
@@ -278,7 +271,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 if value is None:
                     raise KeyError(_MISSING.format(name=signal.name, key=signal.key))
                 signals[signal.name] = value
-        self._wait_for_queue()
         with self._replay_lock, self._write_lock:
             stale = self._sampler.update_signals(
                 index,
@@ -298,7 +290,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             fraction: How much of the training is done, from 0 to 1.
         """
         if self._fuses:
-            self._wait_for_queue()
             with self._replay_lock:
                 self._sampler.beta = beta
                 self._sampler.anneal(fraction)
@@ -326,7 +317,6 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def stats(self) -> dict[str, Any]:
         """TorchRL's counters, and the sampler's statistics of signals and batch."""
-        self._wait_for_queue()
         with self._replay_lock:
             found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:
@@ -367,7 +357,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
     def state_dict(self) -> dict[str, Any]:
         """All parts as TorchRL has them, and what waits in the transforms."""
-        with self._without_queue(), self._replay_lock:
+        with self._replay_lock:
             return {**super().state_dict(), _KEPT: self._memory.state_dict()}
 
     @torch.inference_mode(False)
@@ -391,7 +381,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         Raises:
             ValueError: If the data hold anything but tensors and plain values.
         """
-        with new_dump(path) as folder, self._without_queue(), self._replay_lock:
+        with new_dump(path) as folder, self._replay_lock:
             super().dumps(folder)
             # TorchRL's would be unpickled, and execute anything.
             (folder / "transform.t").unlink(missing_ok=True)
@@ -421,6 +411,12 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             self._transform.load_state_dict(saved["_transforms"])
         self._memory.load_state_dict(saved.get(_KEPT, {}))
         self._tell_last_cursor()
+
+    def _dump_prefetch_state(self, path: Path, prefetch_state: dict[str, Any]) -> None:
+        """Write nothing: TorchRL would pickle it, and what is pickled can execute anything."""
+
+    def _load_prefetch_state(self, path: Path) -> None:
+        """Read nothing: TorchRL would unpickle it."""
 
     def _tell_last_cursor(self) -> None:
         """Tell the storage what was written last, which TorchRL keeps no record of."""

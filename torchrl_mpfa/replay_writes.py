@@ -15,22 +15,17 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.envs.transforms import MultiStepTransform
 
 from torchrl_mpfa.checks import check_finite
-from torchrl_mpfa.replay_queue import QueueReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.transform_memory import TransformMemory
 
 
-def _followed(
-    write: Callable[..., Any], told: Callable[..., tuple[Any, Any]], *, waits: bool = True
-) -> Any:
+def _followed(write: Callable[..., Any], told: Callable[..., tuple[Any, Any]]) -> Any:
     """A write in place, of certain entries in certain slots, that the signals follow."""
 
     @wraps(write)
-    def followed(self: QueueReplayBuffer, *args: Any, **kwargs: Any) -> Any:
-        if waits:
-            self._wait_for_queue()
+    def followed(self: TensorDictReplayBuffer, *args: Any, **kwargs: Any) -> Any:
         if not isinstance(self.storage, SignalStorageMixin):
             return write(self, *args, **kwargs)
         with self._replay_lock, self.storage.rewriting(*told(*args, **kwargs)):
@@ -50,16 +45,13 @@ def _chosen(data: Any, clone: bool = False, *, keys_to_update: Any = None) -> tu
 _Buffer = TensorDictReplayBuffer
 
 
-class FollowedReplayBuffer(QueueReplayBuffer):
+class FollowedReplayBuffer(TensorDictReplayBuffer):
     """TorchRL's buffer with signals in its storage that follow every write in place."""
 
     set_ = _followed(_Buffer.set_, lambda key, value: ({key: value}, slice(None)))
     set_at_ = _followed(_Buffer.set_at_, lambda key, value, index: ({key: value}, index))
     update_ = _followed(_Buffer.update_, _chosen)
-    # TorchRL puts it in the order of the batches itself, and these may wait for it.
-    update_if_present = _followed(
-        _Buffer.update_if_present, lambda patch, **_: (patch, None), waits=False
-    )
+    update_if_present = _followed(_Buffer.update_if_present, lambda patch, **_: (patch, None))
     _set_places = _followed(_Buffer.__setitem__, lambda index, value: (value, index))
 
     def _extend_checked(self, data: TensorDictBase | None, prioritizes: bool) -> Tensor:
@@ -130,7 +122,6 @@ class FollowedReplayBuffer(QueueReplayBuffer):
         value itself in the storage.
         """
         if not isinstance(self.storage, SignalStorageMixin) or not isinstance(index, str | tuple):
-            self._wait_for_queue()
             super().__setitem__(index, value)
         elif isinstance(index, str) or all(isinstance(word, str) for word in index):
             self.set_(index, self._transpose(value) if self.dim_extend > 0 else value)
@@ -151,26 +142,25 @@ class FollowedReplayBuffer(QueueReplayBuffer):
     def append_transform(self, transform: Any, *, invert: bool = False) -> Any:
         """Add a transform at the end, as in TorchRL."""
         _warn_of_steps_past_the_end(transform)
-        with self._without_queue():
-            found = super().append_transform(transform, invert=invert)
-            self._memory.parts()
-            return found
+        found = super().append_transform(transform, invert=invert)
+        self._memory.parts()
+        return found
 
     def insert_transform(self, index: int, transform: Any, *, invert: bool = False) -> Any:
         """Add a transform at a place, as in TorchRL."""
         _warn_of_steps_past_the_end(transform)
-        with self._without_queue():
-            found = super().insert_transform(index, transform, invert=invert)
-            self._memory.parts()
-            return found
+        found = super().insert_transform(index, transform, invert=invert)
+        self._memory.parts()
+        return found
 
     def empty(self, empty_write_count: bool = True) -> None:
-        """Forget all transitions, those that wait in a transform and batches sampled ahead.
+        """Forget all transitions, and those that wait in a transform.
 
         Args:
             empty_write_count: As in TorchRL.
         """
-        super().empty(empty_write_count)
+        with self._replay_lock, self._write_lock:
+            super().empty(empty_write_count)
         self._memory.empty()
 
 

@@ -165,4 +165,5 @@ def _divides(buffer: TensorDictReplayBuffer) -> bool:
     sampler = buffer.sampler
     drawn_alone = type(sampler) in (RandomSampler, PrioritizedSampler)
     alone = drawn_alone or bool(getattr(sampler, "divisible", False))
+    # TorchRL's buffer may sample ahead, each batch by itself.
     return alone and not getattr(buffer, "_prefetch", False)

@@ -82,7 +82,6 @@ BENCHMARKS: Mapping[str, Callable[..., list[Entry]]] = {
     "loss": loss.measure,
     "train_step": training.measure_train_step,
     "sb3_step": training.measure_sb3_step,
-    "prefetch": training.measure_prefetch,
     "methods": method_steps.measure,
     "environment": measure_environment,
     "vector": vector.measure,

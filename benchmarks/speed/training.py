@@ -10,7 +10,7 @@ import copy
 import importlib.util
 import time
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -33,8 +33,6 @@ from benchmarks.speed.timing import (
     take_turns,
 )
 from torchrl_mpfa import (
-    ACTION_GRADIENT,
-    TD_ERROR,
     DDPGLearner,
     Learner,
     MPFASampler,
@@ -64,14 +62,11 @@ class Agent:
         plain: Whether the networks are plain perceptrons, as Stable-Baselines3's are.
         width: Units of a hidden layer.
         compile: Whether an update is one compiled program.
-        prefetch: Batches that are sampled ahead.
     """
 
     learner: Learner
 
-    def __init__(
-        self, *, plain: bool, width: int = WIDTH, compile: bool = False, prefetch: int = 0
-    ) -> None:
+    def __init__(self, *, plain: bool, width: int = WIDTH, compile: bool = False) -> None:
         torch.manual_seed(0)
         sizes = OBSERVATION_SIZE, ACTION_SIZE
         options: dict[str, Any] = {"width": width, **(_PLAIN if plain else {})}
@@ -84,7 +79,6 @@ class Agent:
             storage=SignalTensorStorage(CAPACITY, device="auto"),
             sampler=MPFASampler(CAPACITY),
             batch_size=BATCH_SIZE,
-            prefetch=prefetch,
         )
         self.buffer.extend(make_transitions(_FILL))
 
@@ -113,28 +107,6 @@ def make_step(*, compile: bool = False) -> Call:
         agent.learn(transition)
 
     return step
-
-
-class _Elsewhere:
-    """A learner that leaves this processor idle, as one on a GPU would, and learns nothing."""
-
-    def __init__(self) -> None:
-        self._signals = torch.rand(2, BATCH_SIZE, generator=torch.Generator().manual_seed(1))
-
-    def update(self, batch: TensorDictBase) -> dict[str, torch.Tensor]:
-        """Wait, and write signals as the loss writes them."""
-        time.sleep(ELSEWHERE_SECONDS)
-        for key, value in zip((TD_ERROR.key, ACTION_GRADIENT.key), self._signals, strict=True):
-            batch.set(key, value)
-        return {}
-
-
-def make_learning(*, prefetch: int, elsewhere: bool) -> Call:
-    """Write one transition, sample, update, and write priorities; the update here or elsewhere."""
-    agent, transition = Agent(plain=False, prefetch=prefetch), make_transitions(1)
-    if elsewhere:
-        agent.learner = cast(Learner, _Elsewhere())
-    return lambda: agent.learn(transition)
 
 
 def make_bare_step(*, gamma: float = 0.99, tau: float = 0.01) -> Call:
@@ -319,24 +291,6 @@ def measure_train_step(*, quick: bool) -> list[Entry]:
     """
     ours = _variants("train_step", make_step, quick=quick)
     return _compare(ours, "train_step_bare", make_bare_step(), quick=quick)
-
-
-def measure_prefetch(*, quick: bool) -> list[Entry]:
-    """Compare learning from batches that are sampled ahead with learning from others.
-
-    Args:
-        quick: Fewer and shorter rounds.
-
-    Returns:
-        An entry for each; those sampled ahead have the ratio. Updates are computed by this
-        processor, or (``prefetch_elsewhere``) wait as for another one.
-    """
-    entries = []
-    for name, elsewhere in (("prefetch", False), ("prefetch_elsewhere", True)):
-        ahead = make_learning(prefetch=1, elsewhere=elsewhere)
-        plain = make_learning(prefetch=0, elsewhere=elsewhere)
-        entries += _compare({name: ahead}, f"{name}_without", plain, quick=quick)
-    return entries
 
 
 def measure_sb3_step(*, quick: bool) -> list[Entry]:

@@ -145,22 +145,6 @@ def test_a_training_step_is_compared_with_anothers(
     assert (ours["name"], ours["baseline"], other["name"]) == (name, baseline, baseline)
 
 
-def test_learning_from_batches_sampled_ahead_is_compared_with_learning_from_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for constant, small in (("WIDTH", 16), ("THREADS", 1), ("_BLOCK", 4), ("BATCH_SIZE", 32)):
-        monkeypatch.setattr(training, constant, small)
-    found = training.measure_prefetch(quick=True)
-    check_schema(found)
-    names = ["prefetch", "prefetch_elsewhere"]
-    assert [each["name"] for each in found[1::2]] == names
-    assert [each["baseline"] for each in found[1::2]] == [f"{name}_without" for name in names]
-    for prefetch in (0, 1):
-        agent = training.Agent(plain=False, prefetch=prefetch)
-        agent.learn(training.make_transitions(1))
-        assert agent.buffer.stats()["prefetch_queue_size"] == prefetch
-
-
 def test_both_training_steps_learn() -> None:
     agent = training.Agent(plain=False)
     before = [p.detach().clone() for p in agent.learner.loss.parameters()]

@@ -140,13 +140,10 @@ def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
 
     Raises:
         TypeError: If the buffer has another sampler.
-        ValueError: If the buffer prefetches: it would sample before the priorities are updated.
     """
     sampler = buffer.sampler
     if not isinstance(sampler, LA3PSampler):
         raise TypeError(f"buffer must have an LA3PSampler, got {type(sampler).__name__}")
-    if getattr(buffer, "_prefetch", False):
-        raise ValueError("prefetch must be None with LA3P, whose parts depend on each other")
     with sampler.part("uniform"):
         batch = buffer.sample()
     yield SampledBatch(batch, loss_function="pal")
