@@ -73,7 +73,7 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, options):
     ("name", "more"),
     [
         ("td3", {}),
-        ("ddpg", {"bend": torch.full((6,), 0.2), "steps_to_next_obs": torch.full((6, 1), 3)}),
+        ("ddpg", {"steps_to_next_obs": torch.full((6, 1), 3)}),
         (
             "td3",
             {
@@ -84,7 +84,7 @@ def test_gradients_signals_and_log_are_those_of_the_losses(name, options):
             },
         ),
     ],
-    ids=["no weights", "bend and steps", "trust"],
+    ids=["no weights", "steps", "trust"],
 )
 def test_what_a_batch_may_say_beside_its_transitions_counts(name, more):
     assert_same_gradients(name, {}, make_batch().update(more), loss_function="smooth_l1")

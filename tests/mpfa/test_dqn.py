@@ -88,13 +88,10 @@ def test_an_update_of_dqn_is_that_of_a_plain_loop(double, importance):
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
-@pytest.mark.parametrize("bend", [None, 2.5])
-def test_the_huber_loss_bends_in_units_of_the_reward_or_where_the_batch_says(bend):
+def test_huber_loss_bends_at_one_in_units_of_the_reward():
     batch = transitions()
     batch["next", "reward"] *= 0.5
     squares = batch.clone()
-    if bend is not None:
-        batch["bend"] = torch.full((12,), bend)
     torch.manual_seed(0)
     losses = {
         name: SignalDQNLoss(
@@ -103,7 +100,7 @@ def test_the_huber_loss_bends_in_units_of_the_reward_or_where_the_batch_says(ben
         for name in ("l2", "smooth_l1")
     }
     losses["l2"].losses(squares)
-    unit = 0.5 * (bend or 1.0)
+    unit = 0.5
     expected = [
         0.5 * size**2 if size < unit else unit * (size - 0.5 * unit)
         for size in (0.5 * squares["signals", "td_error"]).tolist()

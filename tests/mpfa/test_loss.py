@@ -353,15 +353,12 @@ def test_the_exponent_of_pal_reaches_the_loss(alpha):
 
 
 @pytest.mark.parametrize("name", ["smooth_l1", "pal"])
-def test_a_loss_bends_where_the_batch_says_in_units_of_the_reward(name):
-    loss, batch = make_loss(loss_function=name, reward_scale=0.5), make_batch()
-    batch["bend"] = torch.linspace(0.1, 1.0, 6).unsqueeze(-1)
-    found = loss(batch)
-    unit = 0.5 * batch["bend"].squeeze(-1)
-    expected = distance(found["pred_value"], found["target_value"], name, unit=unit)
+def test_loss_bends_at_one_in_units_of_the_reward(name):
+    found = make_loss(loss_function=name, reward_scale=0.5)(make_batch())
+    expected = distance(found["pred_value"], found["target_value"], name, unit=0.5)
     torch.testing.assert_close(found["loss_value"], expected.mean())
-    plain = loss(batch.exclude("bend"))["loss_value"]
-    assert not torch.allclose(found["loss_value"], plain)
+    other = distance(found["pred_value"], found["target_value"], name, unit=1.0)
+    assert not torch.allclose(found["loss_value"], other.mean())
 
 
 def test_an_action_spec_takes_the_place_of_bounds():

@@ -325,12 +325,11 @@ class SignalLoss:
         self, tensordict: TensorDictBase, value: Tensor, target: Tensor, loss_function: str | None
     ) -> Tensor:
         """Loss of the critics (Eq. 4), with the importance weights of Eq. (11) or TorchRL's."""
-        bend = tensordict.get(self.tensor_keys.bend, None)
         loss = critic_loss(
             value,
             target,
             loss_function or self.loss_function,
-            unit=self.reward_scale * (1.0 if bend is None else bend.reshape(-1)),
+            unit=self.reward_scale,
             pal_alpha=self.pal_alpha,
         )
         if self.noise_network is not None:

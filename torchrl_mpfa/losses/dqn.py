@@ -35,7 +35,7 @@ class SignalDQNLoss(DQNLoss):
             their sum; ``"none"``.
         reward_scale: Factor of the rewards in the loss; the signal is divided by it again.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, which bends at an error of one in
-            units of the environment's reward, or at ``"bend"`` where a batch has it.
+            units of the environment's reward.
         double: Whether the next action is that of the network, and not of the target network
             (van Hasselt et al. 2016, https://arxiv.org/abs/1509.06461).
         gamma: Discount, in [0, 1].
@@ -107,9 +107,7 @@ class SignalDQNLoss(DQNLoss):
             scaled[steps] = count
         each: Tensor = super().forward(scaled)["loss"]
         if self._bends:
-            bend = batch.get("bend", None)
-            unit = self.reward_scale * (1.0 if bend is None else bend.reshape(-1))
-            each = distance(each, torch.zeros_like(each), "smooth_l1", unit=unit)
+            each = distance(each, torch.zeros_like(each), "smooth_l1", unit=self.reward_scale)
         squared = scaled[self.tensor_keys.priority].squeeze(-1)
         if TD_ERROR.name in self.signals:
             size = td_error_priority(squared.sqrt())

@@ -88,7 +88,7 @@ def critic_loss(
     target: Tensor,
     loss_function: str,
     *,
-    unit: float | Tensor,
+    unit: float,
     pal_alpha: float,
 ) -> Tensor:
     """Loss of each transition (Eq. 4), summed over the critics, from ``[C, B]`` to ``[B]``."""
@@ -101,14 +101,14 @@ def distance(
     target: Tensor,
     loss_function: str,
     *,
-    unit: float | Tensor = 1.0,
+    unit: float = 1.0,
     pal_alpha: float = 0.4,
 ) -> Tensor:
     """Distance of value and target, ``[C, B]`` or ``[B]``, one of :data:`DISTANCES`.
 
     ``"l2"`` is Eq. (4), ``"smooth_l1"`` the Huber loss of LAP. This and PAL bend at an error of
     ``unit``: the factor of the rewards in a loss that scales them, so that they bend at an error
-    of one in units of the environment's reward; or a number for each transition, ``[B]``.
+    of one in units of the environment's reward.
     """
     if loss_function not in DISTANCES:
         raise ValueError(f"loss_function must be one of {DISTANCES}, got {loss_function!r}")

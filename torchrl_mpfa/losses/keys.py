@@ -25,7 +25,6 @@ class SignalKeys:
     action_gradient_signal: NestedKey = ACTION_GRADIENT.key
     value_signal: NestedKey = (SIGNALS_KEY, VALUE)
     information_gain_signal: NestedKey = INFORMATION_GAIN.key
-    bend: NestedKey = "bend"
 
 
 def check_importance(importance: str) -> None:
