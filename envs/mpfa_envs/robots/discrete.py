@@ -84,7 +84,8 @@ class DiscreteWheels(Transform):
         >>> from torchrl.envs import TransformedEnv
         >>> from mpfa_envs import DiscreteWheels, make_navigation_env
         >>> env = TransformedEnv(make_navigation_env("A", physics="kinematic"), DiscreteWheels())
-        >>> env.action_spec.shape, env.rollout(3)["action"].sum(-1).tolist()
+        >>> rows = env.rollout(3, break_when_any_done=False)
+        >>> env.action_spec.shape, rows["action"].sum(-1).tolist()
         (torch.Size([7]), [1, 1, 1])
         >>> env.close()
     """
