@@ -67,9 +67,10 @@ other programs compute the same numbers. The arm to the letter has five seeds in
 )
 _MADE = f"""
 Every run was trained and tested at commit {COMMIT}, two runs side by side, one thread each. A run
-takes five to six minutes, and all of them take some eight hours of two cores. The first command
-makes the runs, and continues where it was stopped. The second one makes those of Table 3's times,
-one at a time. The third one writes this page from their rows.
+takes five to six minutes, and all of them take some eight hours of two cores. The commands below
+make the same runs with the code of this version. The first one continues where it was stopped. The
+second one makes the runs of Table 3's times, one at a time. The third one writes this page from
+their rows.
 """
 _COMMANDS = """\
     python -m benchmarks.paper run --folder runs/paper
