@@ -47,7 +47,7 @@ def unseen_table(found: Mapping[str, pd.DataFrame], paper: Mapping[str, Tested])
             ["", "", ""]
             if runs is None
             else [
-                number(TESTS * runs["collision"], "{:.1f}"),
+                number(TESTS * runs["collision"], "{:.1f}", highest=TESTS),
                 share(runs["success"]),
                 number(runs["time"], "{:.1f}"),
             ]
@@ -88,7 +88,7 @@ def arms_table(found: Mapping[str, pd.DataFrame], arms: Mapping[str, str]) -> st
         [
             name,
             share(found[arm]["success"]),
-            number(TESTS * found[arm]["collision"], "{:.1f}"),
+            number(TESTS * found[arm]["collision"], "{:.1f}", highest=TESTS),
             number(found[arm]["time"], "{:.1f}"),
             _count(found[arm]),
         ]
@@ -188,10 +188,10 @@ def comparison_table(
     return table([*head, "found with 80 % power [points]", "seeds"], lines)
 
 
-def number(runs: Iterable[float], form: str) -> str:
-    """Format the mean of counts or times and its 95 % interval, which begins at 0."""
+def number(runs: Iterable[float], form: str, *, highest: float = math.inf) -> str:
+    """Format the mean of counts or times and its 95 % interval, from 0 to the highest."""
     values = np.asarray(list(runs), dtype=float)
-    return _mean(values, form, lowest=0.0, highest=math.inf) if len(values) else ""
+    return _mean(values, form, lowest=0.0, highest=highest) if len(values) else ""
 
 
 def share(runs: pd.Series) -> str:

@@ -83,10 +83,13 @@ def student(values: list[float]) -> list[float]:
     return [mean, mean - reach, mean + reach]
 
 
-def section(title: str) -> Iterator[list[str]]:
+def text_of(title: str) -> str:
     page = (DOCS / "paper.md").read_text(encoding="utf-8")
-    text = next(part for part in page.split("\n## ") if part.startswith(title))
-    for line in text.splitlines():
+    return next(part for part in page.split("\n## ") if part.startswith(title))
+
+
+def section(title: str) -> Iterator[list[str]]:
+    for line in text_of(title).splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if line.startswith("| ") and cells[0]:
             yield cells
@@ -108,7 +111,7 @@ def test_tests_in_the_unseen_world_are_those_of_the_rows(table: str) -> None:
     for name, _, hit, _, reached, _, time, runs in section(table):
         if f"ddpg-{METHODS[name]}" in RUNS:
             arm = f"ddpg-{METHODS[name]}"
-            assert_printed(hit, collisions(arm), 1)
+            assert_printed(hit, collisions(arm), 1, 200.0)
             assert_printed(reached, [100 * each for each in success(arm).values()], 1, 100.0)
             assert_printed(time, times(arm), 1)
             assert int(runs) == len(RUNS[arm])
@@ -124,10 +127,13 @@ def test_training_steps_are_those_of_the_rows() -> None:
 
 def arm_of(name: str) -> str:
     method, _, kind = name.partition(", ")
+    if name.startswith("φ"):
+        return f"ddpg-mpfa_per-phi{name[-1]}"
     if kind.startswith("φ"):
         return f"ddpg-{METHODS[method]}-phi{kind[-1]}"
     learner, end = {
         "": ("ddpg", ""),
+        "sixteen robots": ("ddpg", ""),
         "to the letter": ("plain", "-letter"),
         "one robot": ("ddpg", "-one_robot"),
     }[kind]
@@ -175,3 +181,55 @@ def test_comparisons_are_those_of_the_rows(title: str) -> None:
         assert numbers(cells[4]) == pytest.approx([p], abs=0.000501)
         count += 1
     assert count >= 11
+
+
+def test_other_settings_are_those_of_the_rows() -> None:
+    count, kind = 0, ""
+    for line in text_of("Uniform replay").splitlines():
+        kind = ", to the letter" if line.startswith("To the letter") else kind
+        kind = "" if line.startswith("One robot") else kind
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if not line.startswith("| ") or not cells[0]:
+            continue
+        name, reached, hit, time, runs = cells
+        arm = arm_of(name + ("" if name.startswith("φ") else kind))
+        assert_printed(reached, [100 * each for each in success(arm).values()], 1, 100.0)
+        assert_printed(hit, collisions(arm), 1, 200.0)
+        assert_printed(time, times(arm), 1)
+        assert int(runs) == len(RUNS[arm])
+        count += 1
+    assert count >= 9
+
+
+def test_sentences_of_the_head_are_those_of_the_rows() -> None:
+    head = " ".join(text_of("# Does").split())
+    of_all = {name: 100 * np.mean([*success(f"ddpg-{m}").values()]) for name, m in METHODS.items()}
+    a, b = success("ddpg-mpfa_per"), success("ddpg-per")
+    common = sorted(a.keys() & b.keys())
+    if len(common) >= 6:
+        gap, low, high, p = by_signs([a[seed] - b[seed] for seed in common])
+    else:
+        gap, low, high, p = by_deals([*a.values()], [*b.values()])
+    assert (
+        f"{of_all['MPFA-PER']:.1f}% of the goals and {of_all['PER']:.1f}%. The difference is "
+        f"{100 * gap:+.1f} points, 95 % [{100 * low:.1f}, {100 * high:+.1f}], p = {p:.3f}" in head
+    )
+    assert f"reach {min(of_all.values()):.1f}% to {max(of_all.values()):.1f}%" in head
+    spread = np.mean([np.var([*success(f"ddpg-{m}").values()], ddof=1) for m in METHODS.values()])
+    assert f"vary by {100 * math.sqrt(spread):.1f} points (standard deviation)" in head
+    arms = ("mpfa_per", "per", "uniform")
+    for end, words in (
+        ("plain-{}-letter", "To the letter of the paper its methods reach"),
+        ("ddpg-{}", "with the additions that keep DDPG from collapsing they reach"),
+    ):
+        means = [100 * np.mean([*success(end.format(arm)).values()]) for arm in arms]
+        assert f"{words} {min(means):.1f}% to {max(means):.1f}%" in head
+    for table in ("Table 2", "Table 4"):
+        pairs = [(numbers(cells[3])[0], success(arm_of(cells[0]))) for cells in section(table)]
+        tau = stats.kendalltau(
+            [published for published, _ in pairs], [np.mean([*s.values()]) for _, s in pairs]
+        ).statistic
+        assert f"{tau:+.2f} in {table}" in head
+    longer = [np.mean(steps(f"ddpg-{METHODS[c[0]]}")) for c in section("Table 3")]
+    *others, ours = longer
+    assert f"{sum(each > ours for each in others)} of the 5 other methods of Table 3" in head
