@@ -15,12 +15,11 @@ from torchrl.data import ReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts, seeded_generator
-from torchrl_mpfa.dumps import new_dump, open_dump
+from torchrl_mpfa.files import load_safely, new_dump, open_dump, save_atomically
 from torchrl_mpfa.replay_writes import FollowedReplayBuffer
 from torchrl_mpfa.samplers.signal_sampler import SignalSampler
 from torchrl_mpfa.samplers.tree import TreeSampler
 from torchrl_mpfa.saved import Entry, check_entries, count, generator
-from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.storages.base import SignalStorageMixin
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable

@@ -20,7 +20,7 @@ from torchrl.data.replay_buffers import RandomSampler
 
 from tests.mpfa.transitions import Trap, make_buffer, make_transitions, same, snapshot, train_rounds
 from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.dumps import MANIFEST, new_dump, open_dump, seal_dump
+from torchrl_mpfa.files import MANIFEST, new_dump, open_dump, seal_dump
 
 
 @pytest.fixture

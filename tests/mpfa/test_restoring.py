@@ -20,8 +20,7 @@ from tests.mpfa.transitions import (
     train_rounds,
 )
 from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
-from torchrl_mpfa.dumps import seal_dump
-from torchrl_mpfa.saving import load_safely, save_atomically
+from torchrl_mpfa.files import load_safely, save_atomically, seal_dump
 
 ROUNDS = 100
 

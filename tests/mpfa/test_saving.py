@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.mpfa.transitions import Trap, same
-from torchrl_mpfa.saving import load_safely, save_atomically, write_text_atomically
+from torchrl_mpfa.files import load_safely, save_atomically, write_text_atomically
 
 
 def test_what_is_saved_is_read_again(tmp_path):

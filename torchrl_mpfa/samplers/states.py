@@ -13,10 +13,10 @@ from torch import Tensor
 from torchrl.data import RandomSampler, Storage
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from torchrl_mpfa.files import load_safely, save_atomically
 from torchrl_mpfa.samplers.leaves import Leaves
 from torchrl_mpfa.samplers.slots import leaves_of, set_leaves
 from torchrl_mpfa.saved import Entry, check_entries, exactly, number, wrong
-from torchrl_mpfa.saving import load_safely, save_atomically
 
 FORMAT = 2
 

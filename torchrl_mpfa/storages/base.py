@@ -13,9 +13,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.checks import as_mask, generator_on
-from torchrl_mpfa.dumps import open_dump, seal_dump
+from torchrl_mpfa.files import load_safely, open_dump, save_atomically, seal_dump
 from torchrl_mpfa.saved import Entry, check_entries, exactly
-from torchrl_mpfa.saving import load_safely, save_atomically
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
 from torchrl_mpfa.storages.states import (
     check_data_state,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchrl_mpfa.saving import load_safely
+from torchrl_mpfa.files import load_safely
 from training.files import CHECKPOINT
 from training.records import EpisodeRecord, EvaluationRecord
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from torchrl_mpfa.saving import write_text_atomically
+from torchrl_mpfa.files import write_text_atomically
 from training import files
 from training.run.hooks import Hook
 

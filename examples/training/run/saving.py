@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from mpfa_envs import save_policy
 from torchrl_mpfa import Learner
-from torchrl_mpfa.saving import save_atomically
+from torchrl_mpfa.files import save_atomically
 from training import files
 from training.records import (
     EpisodeRecord,

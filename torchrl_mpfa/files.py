@@ -1,0 +1,344 @@
+"""Saved states: files and folders that are whole or absent, and loads that fit or change nothing.
+
+Files hold tensors and plain values only, so that reading one executes nothing, and a checksum, so
+that damage is noticed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import glob
+import json
+import math
+import os
+import pickle
+import re
+import secrets
+import shutil
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from pathlib import Path
+from typing import IO, Any
+
+import torch
+from torch import Tensor
+
+MANIFEST = "manifest.json"
+_FORMAT = 1
+_LOCK = ".lock"
+_ENDINGS = {".json", ".memmap", ".pt"}
+"""Of tensors and plain values. TensorDict unpickles what has others, also inside of archives."""
+_EVALUATED = "data_indices.json"
+"""Where this is, TorchRL's compressed storage executes text of its ``metadata.json``."""
+_NO_COMMENT = bytes(2)
+"""The last bytes of an archive without a comment: the length of that comment."""
+_MARK = b"crc32:"
+
+
+def save_atomically(state: Any, path: str | Path) -> None:
+    """Write tensors and plain values to a file in one step.
+
+    The file is written next to its place and renamed, so that a crash at any moment leaves the
+    old file or the new one, never half of one. Leftovers of a killed save are removed. Of several
+    saves at once, by threads or processes, the last one counts.
+
+    Args:
+        state: Values that ``torch.load(weights_only=True)`` can read again.
+        path: The file.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "state.pt"
+        >>> save_atomically({"step": 3}, path)
+        >>> load_safely(path)
+        {'step': 3}
+    """
+    with _replacing(Path(path)) as file:
+        torch.save(state, file)
+        _seal(file)
+
+
+def write_text_atomically(text: str, path: str | Path) -> None:
+    """Write a text file in one step, as :func:`save_atomically` does.
+
+    Args:
+        text: The whole text.
+        path: The file, in UTF-8.
+    """
+    with _replacing(Path(path)) as file:
+        file.write(text.encode())
+
+
+def load_safely(
+    path: str | Path, *, map_location: str | torch.device = "cpu", mmap: bool = False
+) -> Any:
+    """Read a file of tensors and plain values without executing anything in it.
+
+    Args:
+        path: The file.
+        map_location: Device of the tensors.
+        mmap: True to leave tensors in the file until they are read.
+
+    Returns:
+        The saved values.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is damaged, cut short, or not from :func:`save_atomically`.
+        pickle.UnpicklingError: If the file holds anything but tensors and plain values.
+    """
+    _check_seal(Path(path))
+    try:
+        return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+    except pickle.UnpicklingError as error:
+        raise pickle.UnpicklingError(
+            f"{path} holds more than tensors and plain values: {error}"
+        ) from None
+    except Exception as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def check_saved(part: str, state: Any, names: Iterable[str] = (), **exact: Any) -> None:
+    """Reject the saved state of a part that lacks entries, or is of another kind of part.
+
+    Args:
+        part: Name of the part, for the error.
+        state: Its saved state.
+        names: Entries that the state must have.
+        **exact: Entries that must have these values: format, kind, sizes.
+
+    Raises:
+        KeyError: If an entry is missing.
+        ValueError: If the state is no mapping, or an entry has another value.
+
+    Examples:
+        >>> check_saved("sampler", {"_format": 1}, _format=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: '_format' of the saved sampler must be 2, got 1
+    """
+    if not isinstance(state, Mapping):
+        raise ValueError(f"the saved {part} must be a mapping, got {type(state).__name__}")
+    for name in (*names, *exact):
+        if name not in state:
+            raise KeyError(f"{name!r} is missing in the saved {part}")
+    for name, value in exact.items():
+        if type(state[name]) is not type(value) or state[name] != value:
+            raise ValueError(f"{name!r} of the saved {part} must be {value!r}, got {state[name]!r}")
+
+
+def check_saved_numbers(part: str, state: Any) -> None:
+    """Reject a saved state with a number that is not finite, in whatever entry it is.
+
+    Raises:
+        ValueError: If there is one.
+
+    Examples:
+        >>> check_saved_numbers("learner", {"loss": {"weight": torch.tensor([1.0, torch.inf])}})
+        Traceback (most recent call last):
+        ...
+        ValueError: the saved learner must be finite, got inf in 'weight'
+    """
+    for name, value in state.items():
+        entries = dict(enumerate(value)) if isinstance(value, list | tuple) else value
+        if isinstance(entries, Mapping):
+            check_saved_numbers(part, entries)
+        elif isinstance(value, Tensor) and not bool(value.isfinite().all()):
+            wrong = value[~value.isfinite()][0].item()
+            raise ValueError(f"the saved {part} must be finite, got {wrong} in {name!r}")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"the saved {part} must be finite, got {value} in {name!r}")
+
+
+def load_together(*parts: tuple[Any, Any]) -> None:
+    """Load states into parts, or raise before any part is changed.
+
+    Each state is loaded into a copy of its part first.
+
+    Args:
+        *parts: Pairs of a part (module, optimizer, or the like) and its saved state.
+
+    Examples:
+        >>> weight = torch.nn.Linear(1, 1)
+        >>> load_together((weight, {"weight": torch.ones(1, 1), "bias": torch.ones(1)}))
+        >>> weight.bias.item()
+        1.0
+    """
+    for part, state in parts:
+        deepcopy(part).load_state_dict(state)
+    for part, state in parts:
+        part.load_state_dict(state)
+
+
+@contextmanager
+def new_dump(path: str | Path) -> Iterator[Path]:
+    """A new folder inside ``path`` that counts once it is whole, and then replaces the one before.
+
+    ``path/manifest.json`` names the folder that counts and is replaced in one step: a crash at any
+    moment leaves the old dump or the new one. The next dump removes what a killed one left. Of
+    several at once, by threads or processes, each waits for the one before.
+    """
+    path = Path(path).absolute()
+    path.mkdir(exist_ok=True)
+    with (path / _LOCK).open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        numbers = [int(found.name[5:]) for found in _versions(path)]
+        folder = path / f"dump-{max(numbers, default=0) + 1}"
+        folder.mkdir()
+        try:
+            yield folder
+            seal_dump(path, folder)
+        except BaseException:
+            shutil.rmtree(folder)
+            raise
+        for old in _versions(path):
+            if old != folder:
+                shutil.rmtree(old, ignore_errors=True)
+
+
+def seal_dump(path: Path, folder: Path) -> None:
+    """Write size and checksum of every file in ``folder`` to ``path/manifest.json``."""
+    files = {name: _measure(folder / name) for name in _files(folder)}
+    manifest = {"format": _FORMAT, "folder": os.path.relpath(folder, path), "files": files}
+    write_text_atomically(json.dumps(manifest, indent=1) + "\n", path / MANIFEST)
+
+
+def open_dump(path: str | Path) -> Path:
+    """Compare every file of a dump with its checksum, and return the folder of the files.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        ValueError: If it is not a complete dump, a file is missing, unknown or damaged, or there is
+            a link, or a file that could execute something when it is read.
+    """
+    path = Path(path).absolute()
+    if not path.is_dir():
+        raise FileNotFoundError(f"no such folder: {path}")
+    if not (path / MANIFEST).is_file() or (path / MANIFEST).is_symlink():
+        raise ValueError(f"{path} is not a complete dump of this package: it has no {MANIFEST}")
+    try:
+        manifest: dict[str, Any] = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        name, files, found = manifest["folder"], dict(manifest["files"]), manifest["format"]
+        own = re.fullmatch(r"dump-\d+", name) and not (path / name).is_symlink()
+        if name != "." and not own:
+            raise ValueError(f"it names the folder {name!r}, which is not the dump's own")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path / MANIFEST} is damaged: {error}") from error
+    if found != _FORMAT:
+        raise ValueError(f"format of {path / MANIFEST} is {found}, this version reads {_FORMAT}")
+    folder = path / name
+    present = _files(folder)
+    for file in sorted({*present} ^ {*files}):
+        word = "missing" if file in files else "not part of the dump"
+        raise ValueError(f"{folder / file} is {word}")
+    for file in present:
+        if _measure(folder / file) != files[file]:
+            raise ValueError(f"{folder / file} is damaged: its size or checksum is wrong")
+    return folder
+
+
+def _versions(path: Path) -> list[Path]:
+    return [found for found in path.glob("dump-*") if re.fullmatch(r"dump-\d+", found.name)]
+
+
+def _files(folder: Path) -> list[str]:
+    """Names of all files under a folder, but for its own manifest, none of which may execute."""
+    found = [file for file in folder.rglob("*") if file != folder / MANIFEST]
+    for file in found:
+        if file.is_symlink() or not (file.is_dir() or file.is_file()):
+            raise ValueError(f"{file} is a link or a device: dumps hold files and folders only")
+        name = file.name.lower()
+        if file.is_file() and (file.suffix.lower() not in _ENDINGS or name == _EVALUATED):
+            raise ValueError(
+                f"{file} could execute anything when it is read: dumps hold tensors and plain "
+                "values only"
+            )
+    return sorted(file.relative_to(folder).as_posix() for file in found if file.is_file())
+
+
+def _measure(file: Path) -> list[int]:
+    """Size in bytes and CRC-32 of a file, which is on the disk afterwards."""
+    with file.open("rb") as opened:
+        os.fsync(opened.fileno())
+        size = opened.seek(0, os.SEEK_END)
+        return [size, checksum_of(opened, size)]
+
+
+def _seal(file: IO[bytes]) -> None:
+    """Put a checksum of the whole archive in its comment, which a reader of archives skips.
+
+    The archive's own checksums do not cover its table of contents.
+    """
+    end = file.seek(0, os.SEEK_END) - len(_NO_COMMENT)
+    checksum = _hex(file, end)
+    file.seek(end)
+    if file.read() != _NO_COMMENT:
+        raise RuntimeError("torch.save wrote an archive with a comment, which has no room for one")
+    file.seek(end)
+    file.write(len(_MARK + checksum).to_bytes(2, "little") + _MARK + checksum)
+
+
+def _check_seal(path: Path) -> None:
+    """Reject a file whose content is not what was saved."""
+    with path.open("rb") as file:
+        length = len(_NO_COMMENT) + len(_MARK) + 8
+        end = file.seek(0, os.SEEK_END) - length
+        file.seek(max(end, 0))
+        sealed = file.read()[len(_NO_COMMENT) :]
+        if not sealed.startswith(_MARK):
+            raise ValueError(f"{path} is cut short, or was not written by save_atomically")
+        if sealed != _MARK + _hex(file, end):
+            raise ValueError(f"{path} is damaged: its checksum is wrong")
+
+
+def _hex(file: IO[bytes], end: int) -> bytes:
+    return f"{checksum_of(file, end):08x}".encode()
+
+
+def checksum_of(file: IO[bytes], end: int) -> int:
+    """CRC-32 of the first ``end`` bytes of a file."""
+    file.seek(0)
+    found = 0
+    while end > 0 and (chunk := file.read(min(end, 1 << 20))):
+        found = zlib.crc32(chunk, found)
+        end -= len(chunk)
+    return found
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[IO[bytes]]:
+    """A new file to write, which takes the place of ``path`` once it is whole."""
+    _remove_leftovers(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(8)}.tmp")
+    try:
+        # A new file with the permissions that any gets, which mkstemp's would not have; never one,
+        # nor a link, that is there already.
+        with temporary.open("x+b") as file:
+            yield file
+            file.flush()
+            # Without this, a power cut after the rename could leave an empty file.
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove the temporary files of saves whose process is gone."""
+    for found in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        process = found.name.removesuffix(".tmp").rpartition(".")[2].partition("-")[0]
+        if process.isdigit() and not _lives(int(process)):
+            found.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # It lives and is another user's.
+        return True
+    return True
