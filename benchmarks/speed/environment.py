@@ -21,7 +21,8 @@ import numpy as np
 
 from benchmarks.speed.bullet_world import BulletWorld
 from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, World
-from mpfa_envs.paths.planner import PathPlanner
+from mpfa_envs.paths.lengths import grid_for, is_reachable, shortest_length
+from mpfa_envs.planners import astar_path
 from mpfa_envs.render import render_trajectories, tiled
 from mpfa_envs.tasks.sampling import evaluation_pairs
 
@@ -210,7 +211,7 @@ def drive_shortest_path(env: NavigationEnv, options: dict[str, Any]) -> tuple[st
     """
     start, goal = options["start"][:2], options["goal"]
     for radius in (PAPER_TASK["collision_distance"], env.config.robot.radius):
-        path = PathPlanner(env.world, radius=radius).find(start, goal)
+        path = astar_path(grid_for(env.world, radius), start, goal)
         if path is not None:
             return _follow(env, options, path[1:])
     raise ValueError(f"there is no path from {start} to {goal}")
@@ -252,8 +253,7 @@ def describe_world(world: World) -> dict[str, float]:
     """
     pairs = evaluation_pairs(world, PAIRS, seed=0)
     clearances = [world.clearance(x, y) for x in GRID for y in GRID]
-    tight, wide = PathPlanner(world, radius=0.18), PathPlanner(world, radius=0.35)
-    lengths = [tight.length(pair.start[:2], pair.goal) for pair in pairs]
+    lengths = [shortest_length(world, 0.18, pair.start[:2], pair.goal) for pair in pairs]
     direct = [math.dist(pair.start[:2], pair.goal) for pair in pairs]
     row = {
         "obstacles": float(world.obstacle_count),
@@ -262,7 +262,8 @@ def describe_world(world: World) -> dict[str, float]:
         "path / straight line": statistics.mean(
             a / b for a, b in zip(lengths, direct, strict=True)
         ),
-        "path at 0.35 m": sum(wide.find(p.start[:2], p.goal) is not None for p in pairs) / PAIRS,
+        "path at 0.35 m": sum(is_reachable(world, 0.35, p.start[:2], p.goal) for p in pairs)
+        / PAIRS,
     }
     for name, rule, drive in (
         ("straight fails, 0.35 m", 0.35, drive_straight),

@@ -1,4 +1,4 @@
-"""What a new world costs, the error of its distance field, and what the worlds look like.
+"""What a new world costs, and what the worlds look like.
 
 python -m benchmarks.speed.worlds                         # a table of the generators
 python -m benchmarks.speed.worlds --pictures docs/images  # twelve worlds of each, from easy to hard
@@ -7,9 +7,8 @@ python -m benchmarks.speed.worlds --pictures docs/images  # twelve worlds of eac
 from __future__ import annotations
 
 import argparse
-import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -19,8 +18,7 @@ import numpy as np
 
 from benchmarks.speed.timing import Call, Entry, entry, take_turns
 from mpfa_envs import GENERATORS, NavigationEnv, World, generate_world
-from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.planner import PathPlanner
+from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.tasks import sample_task_on_grid
 from mpfa_envs.render import render_trajectories, tiled
 from mpfa_envs.worlds.barn import barn_world
@@ -30,8 +28,6 @@ DISTANCE = 0.25
 WORLDS = 60
 """Worlds of a generator that are measured in turn."""
 _MILLISECONDS = 1e3
-_FEW_CORNERS = 60
-"""The exact planner is asked in worlds with so many obstacles at most."""
 
 
 def _new_world(name: str) -> Call:
@@ -74,34 +70,6 @@ def measure(*, quick: bool, names: Sequence[str] = ("mixed",)) -> list[Entry]:
     ]
 
 
-def errors_of_fields(name: str, *, worlds: int = 20) -> Iterator[float]:
-    """Compare lengths of a field with those of the exact planner.
-
-    Args:
-        name: A generator.
-        worlds: How many of its worlds; those with more than 60 obstacles are left out.
-
-    Yields:
-        What a field says over what the planner says, less one, at places 1 m and more from the goal
-        that keep 0.1 m more than they need.
-    """
-    rng = np.random.default_rng(1)
-    for seed in range(worlds):
-        world = generate_world(name, seed)
-        if world.obstacle_count > _FEW_CORNERS:
-            continue
-        grid, planner = FreeGrid(world, distance=DISTANCE), PathPlanner(world, radius=DISTANCE)
-        field = DistanceField(grid, sample_task_on_grid(grid, rng)[0].goal)
-        for x, y in (rng.uniform(-0.5, 0.5, (20, 2)) * world.size).tolist():
-            i, j = grid.index(x, y)
-            near = math.dist((x, y), field.goal) < 1.0
-            if near or grid.clearance[i, j] < DISTANCE + 0.1 or math.isinf(field.lengths[i, j]):
-                continue
-            exact = planner.length((x, y), field.goal)
-            if math.isfinite(exact):
-                yield field.at(x, y) / exact - 1.0
-
-
 def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
     """Figures of a generator.
 
@@ -113,7 +81,6 @@ def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
         Figures by the heading of their column.
     """
     worlds = [generate_world(name, seed) for seed in range(WORLDS)]
-    errors = [abs(error) for error in errors_of_fields(name)]
     obstacles = [world.obstacle_count for world in worlds]
     sides = [side for world in worlds for side in world.size]
     free = [FreeGrid(world, distance=DISTANCE).free.mean() for world in worlds]
@@ -124,8 +91,6 @@ def describe(name: str, milliseconds: dict[str, float]) -> dict[str, Any]:
         "free": f"{statistics.mean(free):.0%}",
         "world [ms]": f"{milliseconds[f'world_{name}']:.1f}",
         "task and field [ms]": f"{milliseconds[f'field_{name}']:.1f}",
-        "error of the field": f"{statistics.mean(errors):.1%}",
-        "of 95 %": f"{np.quantile(errors, 0.95):.1%}",
     }
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpfa_envs import WORLDS, Box, Cylinder, NavigationEnv, Polygon, Walker, World
-from mpfa_envs.paths.planner import planner_for
+from mpfa_envs.paths.lengths import is_reachable
 from mpfa_envs.tasks.sampling import evaluation_pairs, sample_task
 from tests.envs.paper import drive_to_end, full_speed
 from tests.envs.process import run
@@ -85,9 +85,9 @@ def test_the_test_world_is_denser_than_the_densest_of_training() -> None:
 @pytest.mark.parametrize("name", ["validation", "test"])
 def test_most_unseen_tasks_need_a_detour_and_all_can_be_solved(name: str) -> None:
     pairs = evaluation_pairs(name, 200, seed=0)
-    wide, tight = (planner_for(WORLDS[name], margin) for margin in (0.35, 0.18))
-    assert all(wide.is_reachable(pair.start[:2], pair.goal) for pair in pairs)
-    blocked = [not tight.is_straight(pair.start[:2], pair.goal) for pair in pairs]
+    world = WORLDS[name]
+    assert all(is_reachable(world, 0.35, pair.start[:2], pair.goal) for pair in pairs)
+    blocked = [world.clearance_along(pair.start[:2], pair.goal) < 0.18 for pair in pairs]
     assert sum(blocked) > 120
 
 
@@ -107,13 +107,12 @@ def test_starts_and_goals_keep_their_margins(name: str) -> None:
 @pytest.mark.parametrize("name", ["B", "C", "D"])
 def test_a_detour_has_an_obstacle_on_its_line(name: str) -> None:
     world, rng = WORLDS[name], np.random.default_rng(0)
-    planner = planner_for(world, 0.25)
     for chance, low, high in ((1.0, 1.0, 1.0), (0.5, 0.6, 0.95), (0.0, 0.3, 0.8)):
         sampled = [
             sample_task(world, rng, collision_distance=0.25, detour_chance=chance)
             for _ in range(80)
         ]
-        blocked = [not planner.is_straight(start[:2], goal) for start, goal in sampled]
+        blocked = [world.clearance_along(start[:2], goal) < 0.25 for start, goal in sampled]
         assert low <= sum(blocked) / len(blocked) <= high
 
 

@@ -16,7 +16,7 @@ from mpfa_envs.env.state import Beginning, generator_at
 from mpfa_envs.generators import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.planner import shortest_length
+from mpfa_envs.paths.lengths import shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers

@@ -1,9 +1,9 @@
 """Shortest paths from everywhere in a world to a goal, on a grid.
 
-Where :mod:`~mpfa_envs.paths.planner` answers one question exactly, a field answers it for all cells
-at once, and in milliseconds however many obstacles there are. Moves lead from a free cell to its 16
-neighbors, hence a path in the open is up to 1.4 % too long or too short. Around corners and in
-narrow passages the size of the cells adds to it: ``docs/worlds.md`` has measurements.
+A field has the lengths from all cells, and takes milliseconds however many obstacles there are.
+Moves lead from a free cell to its 16 neighbors, hence a path in the open is up to 1.4 % too long or
+too short. Around corners and in narrow passages the size of the cells adds to it:
+``docs/worlds.md`` has measurements.
 
 Centers of free cells keep the distance d. Between two that are a step L apart a path keeps
 √(d² - L²/4) at least: whatever is nearest to its middle is d away from both ends.
@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 from scipy.sparse import csr_array
 
 from mpfa_envs.checks import check_number, check_positive
@@ -33,8 +34,10 @@ from mpfa_envs.worlds.world import World
 
 RESOLUTION: Final = 0.1
 """Default side of a cell [m]."""
-MOST_CELLS: Final = 4_000_000
-"""Most cells of a grid."""
+MOST_CELLS: Final = 40_000_000
+"""Most cells of a grid, for rooms of up to 1,000 m x 1,000 m."""
+MANY_CELLS: Final = 4_000_000
+"""Where a grid would have more cells than this, longer cells are chosen if they are allowed."""
 _MARGIN: Final = 3
 """Cells by which a window is wider than the longest path."""
 
@@ -49,7 +52,7 @@ class FreeGrid:
             wall. None: 0.1 m, or the distance if that is less.
 
     Raises:
-        ValueError: If a number is out of its range, or there would be more than four million cells.
+        ValueError: If a number is out of its range, or there would be more than 40 million cells.
 
     Examples:
         >>> from mpfa_envs import WORLDS
@@ -94,6 +97,12 @@ class FreeGrid:
     def cells(self) -> NDArray[np.int64]:
         """Column and row of each free cell, shape ``[cells, 2]``."""
         return np.argwhere(self.free)
+
+    @cached_property
+    def parts(self) -> NDArray[np.int32]:
+        """Number of the connected part of each free cell, 0 for the others, ``[nx, ny]``."""
+        parts, _ = label(self.free, np.ones((3, 3)))
+        return np.asarray(parts, dtype=np.int32)
 
     @cached_property
     def _numbers(self) -> NDArray[np.int32]:
@@ -163,14 +172,20 @@ class FreeGrid:
         cells, gaps = self.around(place)
         return list(zip(self._numbers[tuple(cells.T)].tolist(), gaps.tolist(), strict=True))
 
+    def joins(self, start: tuple[float, float], goal: tuple[float, float]) -> bool:
+        """Return True if there is a path between two positions (x, y) [m]."""
+        if not self.free.any():
+            return False
+        one, other = (self.parts[tuple(self.around(place)[0][0])] for place in (start, goal))
+        return bool(one == other)
+
     def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
         """Length of the path between two positions (x, y) [m]; infinite if there is none."""
-        if not self.free.any():
+        if not self.joins(start, goal):
             return math.inf
         direct = math.dist(start, goal)
-        # In a map, which may be large, a window is searched first.
-        windows = (1.2 * direct + 1.0, 2.0 * direct + 4.0) if self.world.occupancy else ()
-        for longest in windows:
+        # Most paths lie in a window, which takes less time than the whole room.
+        for longest in (1.2 * direct + 1.0, 2.0 * direct + 4.0):
             found = DistanceField(self, goal, longest).length_from(start)
             # A cell with a longer path was not found, but might have been the best one.
             if found <= longest:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_positive
 from mpfa_envs.env.vector import VectorNavigationEnv
-from mpfa_envs.paths.distance import MOST_CELLS, FreeGrid
+from mpfa_envs.paths.distance import MANY_CELLS, FreeGrid
 from mpfa_envs.planners.pure_pursuit import PurePursuit
 from mpfa_envs.planners.search import Search
 from mpfa_envs.robots.model import TRAINING_CLEARANCE, RobotModel, resolve_robot
@@ -91,7 +91,7 @@ class MapPlanner:
     def plan(self, world: World, start: Point, goal: Point) -> tuple[list[Point], FreeGrid]:
         """Positions of a path from start to goal [m], and the grid that it was found on."""
         # In a room of more than 100 m the finest cells would be too many.
-        least = 1.01 * math.sqrt(math.prod(world.size) / MOST_CELLS)
+        least = 1.01 * math.sqrt(math.prod(world.size) / MANY_CELLS)
         coarse, fine = max(self.resolution, least), max(min(_FINE, self.resolution), least)
         for clearance, resolution in (
             (self.clearance, coarse),

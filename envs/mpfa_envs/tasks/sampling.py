@@ -12,8 +12,9 @@ import numpy as np
 
 from mpfa_envs.checks import check_count, check_seed
 from mpfa_envs.generators.resolve import resolve_world
-from mpfa_envs.paths.planner import grid_for, is_small, planner_for, shortest_length
-from mpfa_envs.paths.tasks import LONGEST_PATH, is_wide, sample_task_on_grid
+from mpfa_envs.paths.distance import FreeGrid
+from mpfa_envs.paths.lengths import grid_for, is_reachable
+from mpfa_envs.paths.tasks import is_wide, sample_task_on_grid
 from mpfa_envs.robots.model import (
     PAPER_CLEARANCE,
     RobotModel,
@@ -30,7 +31,6 @@ _GRID_SLACK = 0.04
 _AROUND = [(math.cos(turn), math.sin(turn)) for turn in np.arange(16) * math.tau / 16]
 """Directions in which points near a goal are tested for reachability."""
 _STARTS = 60
-_STARTS_OF_DETOURS = 10
 _GOALS_PER_START = 50
 _ATTEMPTS = 1000
 _EVALUATION_STREAM = 1281166
@@ -46,10 +46,9 @@ def sample_task(
 ) -> Task:
     """Sample a start and a goal uniformly over the free space of their regions.
 
-    The two are joined by a path that keeps the collision distance, so every task can be solved. In
-    a wide world (:func:`~mpfa_envs.paths.tasks.is_wide`) no path is longer than 20 m.
-    Worlds with many obstacles, and narrow ones in which no point keeps the usual distance of goals,
-    are sampled by :func:`~mpfa_envs.paths.tasks.sample_task_on_grid`.
+    The two are joined by a path that keeps the collision distance, so every task can be solved.
+    Tasks in maps, in wide rooms (:func:`~mpfa_envs.paths.tasks.is_wide`) and in rooms too narrow
+    for the usual distance of goals are those of :func:`~mpfa_envs.paths.tasks.sample_task_on_grid`.
 
     Args:
         world: The room, its obstacles and its regions.
@@ -74,50 +73,33 @@ def sample_task(
         (3, 2)
     """
     asked = {"min_goal_distance": min_goal_distance, "detour_chance": detour_chance}
-
-    def on_grid() -> Task:
-        return sample_task_on_grid(grid_for(world, collision_distance), rng, **asked)[0]
-
-    if not is_small(world):
-        return on_grid()
+    grid = grid_for(world, collision_distance)
+    if is_wide(world):
+        return sample_task_on_grid(grid, rng, **asked)[0]
     try:
-        return _sample_points(world, rng, collision_distance, **asked)
+        return _sample_points(grid, rng, **asked)
     except ValueError:
         with suppress(ValueError):
-            return on_grid()
+            return sample_task_on_grid(grid, rng, **asked)[0]
         raise
 
 
 def _sample_points(
-    world: World,
-    rng: np.random.Generator,
-    collision_distance: float,
-    min_goal_distance: float,
-    detour_chance: float,
+    grid: FreeGrid, rng: np.random.Generator, min_goal_distance: float, detour_chance: float
 ) -> Task:
     """Sample points until two of them make a task."""
-    planner = planner_for(world, collision_distance)
-    start_clearance = collision_distance + START_SLACK
-    goal_clearance = max(GOAL_CLEARANCE, collision_distance)
+    world, distance = grid.world, grid.distance
     detour = detour_chance > 0.0 and world.obstacle_count > 0 and rng.random() < detour_chance
     straight: Task | None = None
-    longest = LONGEST_PATH if is_wide(world) else math.inf
-    # In a wide world obstacles may be far from most starts.
-    starts = range(_STARTS_OF_DETOURS if detour and longest < math.inf else _STARTS)
-    for _ in starts:
-        start = _sample_point(world, rng, world.start_regions, start_clearance, "start")
-        goals = _around(start, world.goal_regions or (world.room,), longest)
-        if not goals:
-            continue
+    for _ in range(_STARTS):
+        start = _sample_point(world, rng, world.start_regions, distance + START_SLACK, "start")
         for _ in range(_GOALS_PER_START):
-            goal = _sample_point(world, rng, goals, goal_clearance, "goal")
-            far = math.dist(start, goal) >= min_goal_distance
-            if not (far and planner.is_reachable(start, goal)):
-                continue
-            if longest < math.inf and planner.length(start, goal) > longest:
+            clearance = max(GOAL_CLEARANCE, distance)
+            goal = _sample_point(world, rng, world.goal_regions, clearance, "goal")
+            if math.dist(start, goal) < min_goal_distance or not grid.joins(start, goal):
                 continue
             task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
-            if not (detour and planner.is_straight(start, goal)):
+            if not (detour and world.clearance_along(start, goal) >= distance):
                 return task
             straight = straight or task
     if straight is not None:  # No task in this world needs a detour.
@@ -126,17 +108,6 @@ def _sample_points(
         f"world {world.name!r} has no start and goal at least min_goal_distance = "
         f"{min_goal_distance} m apart with a path between them"
     )
-
-
-def _around(start: tuple[float, float], regions: tuple[Box, ...], reach: float) -> tuple[Box, ...]:
-    """The parts of regions that lie within a reach of the start [m] along either axis."""
-    x, y = start
-    sides = [
-        (*map(max, region.bounds[:2], (x - reach, y - reach)),
-         *map(min, region.bounds[2:], (x + reach, y + reach)))
-        for region in regions
-    ]  # fmt: skip
-    return tuple(Box(*each) for each in sides if each[0] < each[2] and each[1] < each[3])
 
 
 def check_task(
@@ -172,7 +143,7 @@ def check_task(
             f"goal must be farther than goal_radius = {goal_radius} m from the start {(x, y)}, "
             f"got {goal}"
         )
-    if shortest_length(world, radius, (x, y), goal) == math.inf:
+    if not is_reachable(world, radius, (x, y), goal):
         raise ValueError(f"goal must be within reach of the start {(x, y)}, got {goal}")
     kept = max(radius, collision_distance - _GRID_SLACK)
     if kept > radius and not _can_be_won(world, kept, (x, y), goal, goal_radius):
@@ -190,16 +161,14 @@ def _can_be_won(
     goal: tuple[float, float],
     goal_radius: float,
 ) -> bool:
-    """Tell whether a path that keeps the distance leads to the goal, or near enough to reach it."""
+    """Return True if a path that keeps the distance leads to the goal, or within its radius."""
     # A goal may lie nearer to a wall than a robot comes, and is reached from beside it then.
     around = [
         (goal[0] + share * goal_radius * across, goal[1] + share * goal_radius * up)
         for share in (0.5, 0.99)
         for across, up in _AROUND
     ]
-    return any(
-        shortest_length(world, distance, start, place) < math.inf for place in (goal, *around)
-    )
+    return any(is_reachable(world, distance, start, place) for place in (goal, *around))
 
 
 def _sample_point(
