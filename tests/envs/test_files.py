@@ -13,7 +13,6 @@ import pytest
 from mpfa_envs import (
     WORLDS,
     Policy,
-    World,
     WorldFileError,
     load_policy,
     load_world,
@@ -37,7 +36,7 @@ def card_of_nothing(path: Path) -> object:
 
 def map_of(path: Path) -> object:
     path.with_name("map.yaml").write_text(f"{MAP}free_thresh: 0.196\n")
-    return World.from_map(path.with_name("map.yaml"))
+    return load_world(path.with_name("map.yaml"))
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="there are no pipes and no such device")

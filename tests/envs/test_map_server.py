@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mpfa_envs import World, load_world
+from mpfa_envs import load_world
 from tests.envs.map_files import write_map
 
 
@@ -24,8 +24,8 @@ def test_transparent_white_is_unknown(mode, kind, tmp_path):
         image.putpalette([255] * 6)
     image.save(tmp_path / "map.png", **transparent)
     path = write_map(tmp_path, None, image="map.png", mode=mode)
-    assert np.argwhere(World.from_map(path).occupancy.occupied).tolist() == [[1, 1]]
-    assert not World.from_map(path, unknown="free").occupancy.occupied.any()
+    assert np.argwhere(load_world(path).occupancy.occupied).tolist() == [[1, 1]]
+    assert not load_world(path, unknown="free").occupancy.occupied.any()
 
 
 def test_opacity_is_averaged_in_as_by_map_server_but_gray_of_map_saver_stays_unknown(tmp_path):
@@ -35,7 +35,7 @@ def test_opacity_is_averaged_in_as_by_map_server_but_gray_of_map_saver_stays_unk
     Image.fromarray(pixels).save(tmp_path / "map.png")
     path = write_map(tmp_path, None, image="map.png")
     with pytest.warns(UserWarning, match="1 cells of shade 205 free.* free_thresh: 0.147"):
-        found = World.from_map(path).occupancy.occupied[1:12:3, 1]
+        found = load_world(path).occupancy.occupied[1:12:3, 1]
     assert found.tolist() == [True, True, False, True]
 
 
@@ -62,26 +62,25 @@ TRUTH[1, 0] = True
         ("free_thresh: 0.196", "free_thresh: 0.196\n---\nimage: other", None),
     ],
 )
-@pytest.mark.parametrize("read", [World.from_map, load_world])
-def test_what_map_server_accepts_is_read(read, old, new, told, tmp_path):
+def test_what_map_server_accepts_is_read(old, new, told, tmp_path):
     shades = np.where(TRUTH.T[::-1], 0, 254).astype(np.uint8)
     path = write_map(tmp_path, shades)
     assert old in path.read_text()
     path.write_bytes(path.read_text().replace(old, new).encode("latin-1"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        world = read(path)
+        world = load_world(path)
     np.testing.assert_array_equal(world.occupancy.occupied, TRUTH)
     assert len(caught) == (told is not None)
     if told is not None:
-        assert caught[0].filename == __file__ or read is load_world
+        assert caught[0].filename == __file__
         assert re.search(told, str(caught[0].message))
 
 
 def test_a_map_in_utf_16_is_read(tmp_path):
     path = write_map(tmp_path, np.full((3, 4), 254, dtype=np.uint8))
     path.write_bytes(path.read_text().encode("utf-16"))
-    assert World.from_map(path).size == pytest.approx((0.2, 0.15))
+    assert load_world(path).size == pytest.approx((0.2, 0.15))
 
 
 @pytest.mark.parametrize(
@@ -96,7 +95,7 @@ def test_a_map_in_utf_16_is_read(tmp_path):
 )
 def test_an_origin_turned_by_quarters_turns_the_cells_about_it(yaw, occupied, origin, tmp_path):
     shades = np.where(TRUTH.T[::-1], 0, 254).astype(np.uint8)
-    world = World.from_map(write_map(tmp_path, shades, origin=f"[-1.0, 2.0, {yaw}]"))
+    world = load_world(write_map(tmp_path, shades, origin=f"[-1.0, 2.0, {yaw}]"))
     assert np.argwhere(world.occupancy.occupied).tolist() == [occupied]
     assert world.occupancy.origin == pytest.approx(origin)
 
@@ -105,10 +104,8 @@ def test_a_turned_map_is_cut_as_one_that_is_not(tmp_path):
     shades = np.full((60, 50), 205, dtype=np.uint8)
     shades[10:30, 15:40] = 254
     shades[12, 20] = 0
-    straight = World.from_map(write_map(tmp_path, shades)).occupancy
-    turned = World.from_map(
-        write_map(tmp_path, shades, origin=f"[-1.0, 2.0, {math.pi / 2}]")
-    ).occupancy
+    straight = load_world(write_map(tmp_path, shades)).occupancy
+    turned = load_world(write_map(tmp_path, shades, origin=f"[-1.0, 2.0, {math.pi / 2}]")).occupancy
     np.testing.assert_array_equal(turned.occupied, np.rot90(straight.occupied))
     # Turned about (-1, 2), the middle (-1 + a, 2 + b) is at (-1 - b, 2 + a).
     along, up = straight.center[0] + 1.0, straight.center[1] - 2.0
@@ -119,6 +116,6 @@ def test_a_map_that_is_mostly_cut_off_may_be_large(tmp_path):
     shades = np.full((5000, 4000), 205, dtype=np.uint8)
     shades[2000:2010, 2000:2010] = 254
     # As a whole it has 20 million cells and is 2,500 m wide.
-    world = World.from_map(write_map(tmp_path, shades, resolution=0.5))
+    world = load_world(write_map(tmp_path, shades, resolution=0.5))
     assert world.occupancy.occupied.shape == (12, 12)
     assert world.occupancy.origin == pytest.approx((-1.0 + 1999 * 0.5, 2.0 + 2989 * 0.5))

@@ -17,6 +17,7 @@ from mpfa_envs import (
     World,
     WorldFileError,
     load_world,
+    save_map,
     save_world,
 )
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
@@ -94,8 +95,8 @@ def test_robots_share_a_map_and_unused_maps_go(scattered):
 def test_a_map_that_is_written_is_read_as_it_was(scattered, tmp_path):
     grid = OccupancyGrid(cells(), 0.2, origin=(-3.5, 12.25))
     world = World(name="floor", size=grid.size, occupancy=grid)
-    world.to_map(tmp_path / "floor.yaml")
-    assert World.from_map(tmp_path / "floor.yaml") == world
+    save_map(world, tmp_path / "floor.yaml")
+    assert load_world(tmp_path / "floor.yaml") == world
     assert load_world(tmp_path / "floor.yaml") == world
     assert hash(load_world(tmp_path / "floor.yaml")) == hash(world)
     assert world_from_plain(world_to_plain(world)) == world
@@ -105,8 +106,8 @@ def test_a_map_that_is_written_is_read_as_it_was(scattered, tmp_path):
 @pytest.mark.parametrize("name", ["D", "barn-3", "halls-2"])
 def test_shapes_become_cells_that_cover_them_and_little_more(name, tmp_path):
     world = NavigationEnv(world=name, physics="kinematic").world
-    world.to_map(tmp_path / "map.yaml", resolution=0.1)
-    found = World.from_map(tmp_path / "map.yaml")
+    save_map(world, tmp_path / "map.yaml", resolution=0.1)
+    found = load_world(tmp_path / "map.yaml")
     points = places(world, 500)[:, :2]
     gaps = found.clearances(points) - np.maximum(world.clearances(points), 0.0)
     assert gaps.max() <= 0.1  # A corner of an obstacle may stick out of its cell.
@@ -116,7 +117,7 @@ def test_shapes_become_cells_that_cover_them_and_little_more(name, tmp_path):
 def test_the_origin_of_an_image_is_its_lower_left_corner(tmp_path):
     shades = np.full((20, 40), 254, dtype=np.uint8)
     shades[0, 10] = 0  # At the top.
-    world = World.from_map(write_map(tmp_path, shades))
+    world = load_world(write_map(tmp_path, shades))
     assert world.size == (2.0, 1.0)
     assert world.occupancy.occupied[10, 19]
     assert world.occupancy.occupied.sum() == 1
@@ -128,10 +129,10 @@ def test_a_map_is_cut_to_its_free_cells(tmp_path):
     shades = np.full((60, 50), 205, dtype=np.uint8)
     shades[10:30, 15:40] = 254
     shades[10:30, 14] = 0
-    world = World.from_map(write_map(tmp_path, shades))
+    world = load_world(write_map(tmp_path, shades))
     assert world.occupancy.occupied.shape == (27, 22)
     assert world.occupancy.origin == pytest.approx((-1.0 + 14 * 0.05, 2.0 + 29 * 0.05))
-    whole = World.from_map(write_map(tmp_path, shades), unknown="free")
+    whole = load_world(write_map(tmp_path, shades), unknown="free")
     assert whole.size == (2.5, 3.0)
     assert whole.occupancy.occupied.sum() == 20
 
@@ -142,7 +143,7 @@ def test_unknown_cells_of_map_saver_are_not_free(tmp_path):
     shades[21:119, 21:139] = 254
     saved = write_map(tmp_path, shades, free_thresh=0.25)
     with pytest.warns(UserWarning, match=r"map\.yaml:6: free_thresh = 0\.25 .* unknown") as caught:
-        world = World.from_map(saved)
+        world = load_world(saved)
     assert len(caught) == 1
     assert world.size == pytest.approx((120 * 0.05, 100 * 0.05))
     env = VectorNavigationEnv(50, world=world, physics="kinematic")
@@ -151,8 +152,8 @@ def test_unknown_cells_of_map_saver_are_not_free(tmp_path):
         assert (np.abs(env.poses[:, :2]) < [59 * 0.05, 49 * 0.05]).all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert World.from_map(write_map(tmp_path, shades, free_thresh=0.196)) == world
-        assert World.from_map(saved, unknown="free").size == pytest.approx((8.0, 7.0))
+        assert load_world(write_map(tmp_path, shades, free_thresh=0.196)) == world
+        assert load_world(saved, unknown="free").size == pytest.approx((8.0, 7.0))
 
 
 @pytest.mark.filterwarnings("ignore:.*free_thresh = 0.[279]")
@@ -173,7 +174,7 @@ def test_unknown_cells_of_map_saver_are_not_free(tmp_path):
 def test_shades_mean_what_the_thresholds_and_the_mode_say(changes, occupied, tmp_path):
     shades = np.full((3, 12), 0 if occupied[0] == 0 else 254, dtype=np.uint8)
     shades[1, 1:12:3] = [0, 100, 205, 254]
-    world = World.from_map(write_map(tmp_path, shades, **changes))
+    world = load_world(write_map(tmp_path, shades, **changes))
     assert world.occupancy.occupied[1:12:3, 1].astype(int).tolist() == occupied
 
 
@@ -184,7 +185,7 @@ def test_images_may_have_comments_and_be_text(kind, tmp_path):
     body = " ".join(map(str, rows)).encode() if kind == "P2" else bytes(rows)
     path = write_map(tmp_path, None)
     (tmp_path / "map.pgm").write_bytes(head + body)
-    assert World.from_map(path).occupancy.occupied.T.tolist() == [[False] * 3, [False, True, False]]
+    assert load_world(path).occupancy.occupied.T.tolist() == [[False] * 3, [False, True, False]]
 
 
 @pytest.mark.parametrize(
@@ -212,19 +213,18 @@ def test_images_may_have_comments_and_be_text(kind, tmp_path):
 def test_a_bad_map_is_rejected_with_line_and_reason(changes, line, reason, tmp_path):
     shades = np.full((3, 4), 254, dtype=np.uint8)
     with pytest.raises(WorldFileError, match=reason) as caught:
-        World.from_map(write_map(tmp_path, shades, **changes))
+        load_world(write_map(tmp_path, shades, **changes))
     wrong = 1 if changes == {"resolution": 500} else line
     assert f"map.yaml:{wrong}: " in str(caught.value)
 
 
-@pytest.mark.parametrize("read", [World.from_map, load_world])
 @pytest.mark.parametrize("content", [b"P5\n2 1\n255\n\xfe\xfe", b"<?xml version='1.0'?>\n<sdf/>"])
-def test_a_file_of_another_kind_is_rejected_with_the_kinds_that_are_read(read, content, tmp_path):
+def test_a_file_of_another_kind_is_rejected_with_the_kinds_that_are_read(content, tmp_path):
     (tmp_path / "map.pgm").write_bytes(content)
     with pytest.raises(
         WorldFileError, match=r"(not UTF-8|mapping).*\.yml .* image of a ROS map.*\.sdf"
     ):
-        read(tmp_path / "map.pgm")
+        load_world(tmp_path / "map.pgm")
     with pytest.raises(ValueError, match=r"world must be .*\.yml .* image of a ROS map.*\.sdf"):
         NavigationEnv(world=str(tmp_path / "map.pgm"))
 
@@ -238,18 +238,18 @@ def test_huge_broken_or_full_images_are_rejected(tmp_path):
     ):
         (tmp_path / "map.pgm").write_bytes(f"P5\n{side} {side}\n255\n".encode())
         with pytest.raises(WorldFileError, match=reason):
-            World.from_map(path)
+            load_world(path)
     write_map(tmp_path, np.full((5000, 4000), 254, dtype=np.uint8), resolution=0.01)
     with pytest.raises(WorldFileError, match="at most 16000000 pixels in its free part"):
-        World.from_map(path)
+        load_world(path)
     (tmp_path / "map.pgm").write_bytes(b"P5\n100 100\n255\nshort")
     with pytest.raises(WorldFileError, match="cannot be read"):
-        World.from_map(path)
+        load_world(path)
     write_map(tmp_path, np.zeros((3, 3), dtype=np.uint8))
     with pytest.raises(WorldFileError, match="must have a free cell"):
-        World.from_map(path)
+        load_world(path)
     with pytest.raises(ValueError, match="unknown must be one of"):
-        World.from_map(path, unknown="maybe")
+        load_world(path, unknown="maybe")
 
 
 def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_path):
@@ -260,12 +260,12 @@ def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_p
         OccupancyGrid(np.zeros((3, 3), dtype=bool), 0.0)
     with pytest.raises(ValueError, match="size must be that of the occupancy"):
         World(name="map", size=(3.0, 3.0), occupancy=world.occupancy)
-    with pytest.raises(ValueError, match="must be written by to_map"):
+    with pytest.raises(ValueError, match="must be written by save_map"):
         save_world(world, tmp_path / "world.yaml")
     with pytest.raises(ValueError, match="path must end in"):
-        world.to_map(tmp_path / "map.pgm")
+        save_map(world, tmp_path / "map.pgm")
     with pytest.raises(ValueError, match="resolution must leave"):
-        WORLDS["A"].to_map(tmp_path / "map.yaml", resolution=0.001)
+        save_map(WORLDS["A"], tmp_path / "map.yaml", resolution=0.001)
     assert not list(tmp_path.iterdir())
     plain = {**world.occupancy.plain, "cells": "AAAA"}
     with pytest.raises(ValueError, match="occupancy must hold"):
@@ -320,8 +320,8 @@ def test_a_robot_drives_in_a_map_as_among_boxes(scattered, physics):
 def test_a_map_is_rendered(scattered):
     env = NavigationEnv(world=scattered[0], physics="kinematic", render_mode="rgb_array")
     env.reset(seed=0)
-    picture = env.render()
+    task, picture = env.task, env.render()
     env = NavigationEnv(world=scattered[1], physics="kinematic", render_mode="rgb_array")
-    env.reset(seed=0)
+    env.reset(options=task._asdict())
     # Boxes have an edge that cells have not.
     assert (picture != env.render()).any(axis=-1).mean() < 0.35

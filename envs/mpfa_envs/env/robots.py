@@ -26,9 +26,9 @@ from mpfa_envs.robots.motion_loops import scale_actions
 from mpfa_envs.sensing.map_memory import MapMemory
 from mpfa_envs.sensing.observation import FLAGS, NUMBERS
 from mpfa_envs.sensing.observation_loops import observe_all
-from mpfa_envs.tables import grown
 from mpfa_envs.tasks.reward import StepOutcome, payments_of, read_terms
 from mpfa_envs.walkers.batch import WalkerBatch
+from mpfa_envs.worlds.arrays import grown
 from mpfa_envs.worlds.batch import WorldBatch
 from mpfa_envs.worlds.walker import no_encounters
 

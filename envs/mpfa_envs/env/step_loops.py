@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mpfa_envs.paths.batch import FieldArrays
-    from mpfa_envs.worlds.batch import BatchArrays
+    from mpfa_envs.worlds.arrays import BatchArrays
 
 # Rows of the tables of a batch: the keys of the info dictionary in their order.
 SUCCESS: Final = 0

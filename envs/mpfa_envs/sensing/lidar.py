@@ -21,7 +21,7 @@ from mpfa_envs.worlds.batch import WorldBatch
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds.batch import BatchArrays
+    from mpfa_envs.worlds.arrays import BatchArrays
     from mpfa_envs.worlds.world import World
 
 Reduction = Literal["min", "median", "single"]

@@ -18,7 +18,7 @@ from mpfa_envs.worlds.cell_loops import cast_at_cells
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds.batch import BatchArrays
+    from mpfa_envs.worlds.arrays import BatchArrays
 
 _GUARD = 0.001
 """Error of a direction, at most: rays this near to a shape's outermost are tried as well [rad]."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from mpfa_envs.sensing.map_loops import BLOCKED, UNKNOWN, MapArrays, cell_of, follow_path, remember
-from mpfa_envs.tables import grown
+from mpfa_envs.worlds.arrays import grown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpfa_envs.tables import grown
 from mpfa_envs.walkers.loops import (
     ORCA,
     STRAIGHT,
@@ -18,6 +17,7 @@ from mpfa_envs.walkers.loops import (
     walk,
 )
 from mpfa_envs.walkers.orca import OrcaRoom
+from mpfa_envs.worlds.arrays import grown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mpfa_envs.worlds.batch import BatchArrays
+    from mpfa_envs.worlds.arrays import BatchArrays
 
 STRAIGHT: Final = 0
 WAYPOINTS: Final = 1

@@ -3,49 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mpfa_envs.worlds.arrays import BatchArrays, GridArrays, grown
 from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.world import World
-
-
-class GridArrays(NamedTuple):
-    """Maps of the robots' worlds; each fills the first columns and rows of its table."""
-
-    left: NDArray[np.int16]
-    """The nearest occupied column to the left, ``[maps, most columns, most rows]``."""
-    right: NDArray[np.int16]
-    """The nearest to the right."""
-    gaps: NDArray[np.uint8]
-    """Columns or rows to the nearest occupied cell."""
-    shapes: NDArray[np.int64]
-    """Numbers of columns and rows, ``[maps, 2]``."""
-    resolutions: NDArray[np.float64]
-    """Side of a cell [m], ``[maps]``."""
-
-
-class BatchArrays(NamedTuple):
-    """Shapes by robot; only the first ``counts`` of each row are read."""
-
-    half_sizes: NDArray[np.float64]
-    """Half the width and the depth of the rooms [m], ``[N, 2]``."""
-    boxes: NDArray[np.float64]
-    """(x_min, y_min, x_max, y_max) [m], ``[N, most boxes, 4]``."""
-    circles: NDArray[np.float64]
-    """(x, y, radius) [m], ``[N, most circles, 3]``; walkers come after the cylinders."""
-    segments: NDArray[np.float64]
-    """Edges of polygons (x0, y0, x1, y1) [m], ``[N, most edges, 4]``."""
-    polygon_ends: NDArray[np.int64]
-    """End of each polygon's edges in segments, ``[N, most polygons]``."""
-    counts: NDArray[np.int64]
-    """Numbers of boxes, circles, segments and polygons, ``[N, 4]``."""
-    grids: GridArrays
-    """Maps; robots in the same one share it."""
-    grid_of: NDArray[np.int64]
-    """Number of each robot's map, -1 without one, ``[N]``."""
 
 
 class WorldBatch:
@@ -101,7 +64,8 @@ class WorldBatch:
             count = len(getattr(rows, name))
             table = getattr(self._rooms, name)
             if count > table.shape[1]:
-                table = _widened(table, count)
+                # More than is needed, as larger worlds may follow.
+                table = grown(table, max(count, table.shape[1] * 3 // 2))
                 self._rooms = self._rooms._replace(**{name: table})  # type: ignore[arg-type]
             table[robot, :count] = getattr(rows, name)
             self._rooms.counts[robot, column] = count
@@ -139,11 +103,3 @@ def _grid_arrays(grids: Sequence[OccupancyGrid]) -> GridArrays:
             table[number, :columns, :rows] = values
     resolutions = np.array([grid.resolution for grid in grids], dtype=np.float64)
     return GridArrays(left, right, gaps, shapes, resolutions)
-
-
-def _widened(table: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """A copy with room for more shapes a robot, at least one and a half times as many."""
-    most = max(count, table.shape[1] * 3 // 2)
-    wider = np.zeros((len(table), most, *table.shape[2:]), dtype=table.dtype)
-    wider[:, : table.shape[1]] = table
-    return wider

@@ -12,7 +12,7 @@ from mpfa_envs.compiled import njit
 from mpfa_envs.worlds.cell_loops import clearance_of_cells
 
 if TYPE_CHECKING:
-    from mpfa_envs.worlds.batch import BatchArrays
+    from mpfa_envs.worlds.arrays import BatchArrays
 
 
 @njit

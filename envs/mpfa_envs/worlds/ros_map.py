@@ -31,7 +31,7 @@ from mpfa_envs.checks import check_positive
 from mpfa_envs.files import read_file
 from mpfa_envs.worlds.occupancy import LONGEST_SIDE, MOST_CELLS, OccupancyGrid
 from mpfa_envs.worlds.shapes import LARGEST_SIDE
-from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError, read_nodes
+from mpfa_envs.worlds.yaml_nodes import NodeReader, WorldFileError
 
 if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
@@ -72,14 +72,10 @@ class _Rule(NamedTuple):
     free: float
 
 
-def read_map(
-    path: Path, root: yaml.Node | None = None, *, unknown: Unknown = "occupied"
-) -> OccupancyGrid:
+def read_map(path: Path, root: yaml.Node | None, *, unknown: Unknown) -> OccupancyGrid:
     """Read the cells of a map of ROS."""
-    # The room ends one cell beyond the outermost free cells.
     if unknown not in get_args(Unknown):
         raise ValueError(f"unknown must be one of {get_args(Unknown)}, got {unknown!r}")
-    root = read_nodes(path) if root is None else root
     reader = _Reader(path)
     entries = reader.mapping(root, "the file", _KEYS)
     for key in _KEYS[:-1]:
@@ -112,7 +108,7 @@ def read_map(
             f"{_UNKNOWN} free, by which map_saver marks unknown cells: they are read as unknown; "
             f"write free_thresh: {0.196 if opacity is None else 0.147}, or pass unknown='free' if "
             "a robot may drive there",
-            stacklevel=2,
+            stacklevel=3,
         )
     if opacity is not None and rule.mode == "scale":
         occupied, free = occupied & (opacity > 0), free & (opacity > 0)
@@ -256,11 +252,20 @@ def _shades(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | 
 def save_map(
     world: World, path: str | os.PathLike[str], *, resolution: float | None = None
 ) -> None:
-    """Write the obstacles of a world as a map for ROS's map_server."""
-    # The cells of a map are written as they are, and :meth:`~mpfa_envs.World.from_map` reads an
-    # equal world. Of shapes a cell is occupied if its middle is within half a cell of an obstacle,
-    # and walls are one cell thick, so that nothing thin is lost. Walkers and regions are not in a
-    # map.
+    """Write the obstacles of a world as a map for ROS's map_server.
+
+    The cells of a map are written unchanged, and :func:`load_world` reads an equal world. A cell of
+    other worlds is occupied if its middle is within half a cell of an obstacle, and walls are one
+    cell thick. Walkers and regions are left out.
+
+    Args:
+        world: The world.
+        path: The YAML file; an image with the ending .pgm is written beside it.
+        resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
+
+    Raises:
+        ValueError: If the map would have too many cells, or the path does not end in .yaml.
+    """
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path must end in .yaml, got {str(path)!r}")

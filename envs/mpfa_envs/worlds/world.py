@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,47 +141,6 @@ class World:
                         "walkers must keep their radius from obstacles and walls between their "
                         f"waypoints, which {walker} does not from {leg[0]} to {leg[1]}"
                     )
-
-    @staticmethod
-    def from_map(
-        path: str | os.PathLike[str], *, unknown: Literal["occupied", "free"] = "occupied"
-    ) -> World:
-        """Read a map of ROS as a world, whose room is the known part of the map.
-
-        The room ends one cell beyond the outermost free cells.
-
-        Args:
-            path: The YAML file; the image's path in it is relative to its folder.
-            unknown: How unknown cells are read.
-
-        Returns:
-            The world, with the name of the file. ``world.occupancy.center`` is the position of its
-            (0, 0) on the map.
-
-        Raises:
-            WorldFileError: If a file cannot be read or is no map; the message names the line.
-            ValueError: If unknown is neither.
-        """
-        # Imported here because it needs Pillow and PyYAML, and most worlds come from elsewhere.
-        from mpfa_envs.worlds.ros_map import read_map
-
-        path = Path(path)
-        grid = read_map(path, unknown=unknown)
-        return World(name=path.stem, size=grid.size, occupancy=grid)
-
-    def to_map(self, path: str | os.PathLike[str], *, resolution: float | None = None) -> None:
-        """Write a map for ROS, with the walls one cell thick and without walkers and regions.
-
-        Args:
-            path: The YAML file; an image with the ending .pgm is written beside it.
-            resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
-
-        Raises:
-            ValueError: If the map would have too many cells, or the path does not end in .yaml.
-        """
-        from mpfa_envs.worlds.ros_map import save_map
-
-        save_map(self, path, resolution=resolution)
 
     def __hash__(self) -> int:
         """Hash once: worlds are keys of caches and may have hundreds of obstacles."""
