@@ -79,6 +79,6 @@ def fixed_seed():
 def built_in_generators():
     """A generator that a test registers, or a page that it runs, is gone afterwards."""
     yield
-    module = sys.modules.get("mpfa_envs.generators")
+    module = sys.modules.get("mpfa_envs.generators.generate")
     for name in set(module.GENERATORS) - set(module._BUILT_IN) if module else ():
         module._registered.pop(name, None)

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from mpfa_envs.evaluation.results import summarize as summarize
     from mpfa_envs.evaluation.runs import evaluate as evaluate
     from mpfa_envs.evaluation.runs import run_tasks as run_tasks
-    from mpfa_envs.generators import GENERATORS as GENERATORS
-    from mpfa_envs.generators import generate_world as generate_world
-    from mpfa_envs.generators import register_generator as register_generator
+    from mpfa_envs.generators.generate import GENERATORS as GENERATORS
+    from mpfa_envs.generators.generate import generate_world as generate_world
+    from mpfa_envs.generators.generate import register_generator as register_generator
     from mpfa_envs.planners import PLANNERS as PLANNERS
     from mpfa_envs.planners import make_planner as make_planner
     from mpfa_envs.policies.export import export_policy as export_policy
@@ -69,7 +69,7 @@ _NAMES = {
     "env.vector": "VectorNavigationEnv",
     "evaluation.results": "summarize",
     "evaluation.runs": "evaluate run_tasks",
-    "generators": "GENERATORS generate_world register_generator",
+    "generators.generate": "GENERATORS generate_world register_generator",
     "planners": "PLANNERS make_planner",
     "policies.export": "export_policy",
     "policies.files": "POLICIES load_policy save_policy",

@@ -24,7 +24,7 @@ from mpfa_envs import (
     generate_world,
     register_generator,
 )
-from mpfa_envs.generators import generator_tasks, split_worlds, world_seed
+from mpfa_envs.generators.generate import generator_tasks, split_worlds, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import is_reachable
@@ -209,12 +209,12 @@ def test_a_world_without_a_task_is_sampled_again_but_not_forever(
         made.append(difficulty)
         return World(name="closet", size=(1.0, 1.0) if len(made) < 4 else (5.0, 5.0))
 
-    monkeypatch.setattr("mpfa_envs.generators.GENERATORS", {"closets": closets})
+    monkeypatch.setattr("mpfa_envs.generators.generate.GENERATORS", {"closets": closets})
     assert generate_world("closets", 3).size == (5.0, 5.0)
     assert len(made) == 4
     made[:] = [0.0] * -1000
     monkeypatch.setattr(
-        "mpfa_envs.generators.GENERATORS",
+        "mpfa_envs.generators.generate.GENERATORS",
         {"closets": lambda rng, difficulty: World(name="closet", size=(1.0, 1.0))},
     )
     with pytest.raises(ValueError, match="'closets-3' cannot be made: none of 100 attempts"):

@@ -31,7 +31,7 @@ from mpfa_envs import (
     world_tasks,
 )
 from mpfa_envs.deploy import Pilot
-from mpfa_envs.generators import generator_tasks, split_worlds
+from mpfa_envs.generators.generate import generator_tasks, split_worlds
 from mpfa_envs.ros.controller import Controller
 from mpfa_envs.ros.simulated_robot import SimulatedRobot
 from mpfa_envs.sensing.binning import Binning

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.wrappers import RecordVideo
 
 from mpfa_envs import ROOMS_TASK, NavigationEnv, VectorNavigationEnv, generate_world
-from mpfa_envs.generators import generator_tasks
+from mpfa_envs.generators.generate import generator_tasks
 from mpfa_envs.sensing.observation import INFO_TYPES
 
 ACTIONS = np.random.default_rng(7).uniform(-1, 1, (60, 2)).astype(np.float32)

@@ -24,9 +24,7 @@ from mpfa_envs import (
     generate_world,
     navigation_reward,
 )
-from mpfa_envs.env.navigation import _warn_of_turns
 from mpfa_envs.sensing.observation import INFO_TYPES
-from mpfa_envs.worlds.barn import barn_task
 from tests.envs.busy import BUSY, POLITE, needs
 from tests.envs.plain_robot import PlainRobot
 from tests.envs.shapes import SCATTERED, random_shapes
@@ -105,7 +103,6 @@ def assert_infos_alike(infos: dict, expected: dict, atol: float) -> None:
     ],
     ids=lambda arguments: "-".join(arguments) or "defaults",
 )
-@pytest.mark.filterwarnings("ignore:several NavigationEnv take turns")
 def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments: dict) -> None:
     arguments = {"physics": "kinematic", "world": NAMES, "max_steps": 200} | arguments
     needs(arguments)
@@ -230,39 +227,6 @@ def test_what_was_given_does_not_change_with_the_next_step() -> None:
     for key, value in infos.items():
         np.testing.assert_array_equal(value, kept[1][key])
     assert set(INFO_TYPES) <= set(infos)
-
-
-def step_in_turn(envs: list[gymnasium.Env], rounds: int) -> None:
-    """As a vector of single environments steps them."""
-    for env in envs:
-        env.reset(seed=0, options=barn_task()._asdict())
-    for _ in range(rounds):
-        for env in envs:
-            env.step([-1.0, -1.0])  # Slowly, lest an episode ends.
-
-
-def test_single_environments_that_take_turns_name_the_vector_once() -> None:
-    _warn_of_turns.cache_clear()
-    env = gymnasium.make_vec(
-        "mpfa/Navigation-A-v1", num_envs=4, vectorization_mode="sync", physics="kinematic"
-    )
-    env.reset(seed=0)
-    with pytest.warns(UserWarning, match="vector_entry_point") as found:
-        for _ in range(150):
-            env.step(np.full((4, 2), 0.2, np.float32))
-    env.close()
-    assert len(found) == 1
-    step_in_turn([NavigationEnv(world="barn-0", physics="kinematic") for _ in range(4)], 150)
-
-
-def test_environments_for_training_and_tests_cause_no_warning() -> None:
-    _warn_of_turns.cache_clear()
-    train, test = (NavigationEnv(world="barn-0", physics="kinematic") for _ in range(2))
-    step_in_turn([train, test], 150)
-    many = [NavigationEnv(world="barn-0", physics="kinematic") for _ in range(5)]
-    step_in_turn(many, 50)
-    for env in many:  # One after another.
-        step_in_turn([env], 150)
 
 
 @pytest.mark.parametrize(

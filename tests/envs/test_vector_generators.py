@@ -16,7 +16,7 @@ from mpfa_envs import (
     World,
 )
 from mpfa_envs.env import episodes
-from mpfa_envs.generators import generate_world
+from mpfa_envs.generators.generate import generate_world
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mpfa_envs.checks import check_count, check_share, did_you_mean
 from mpfa_envs.env.state import Beginning, generator_at
-from mpfa_envs.generators import GENERATORS, generate_world, world_seed
+from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
 from mpfa_envs.paths.lengths import shortest_length

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from functools import cache
-from itertools import count
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -13,7 +10,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from mpfa_envs.checks import check_seed
-from mpfa_envs.env.inputs import read_view
+from mpfa_envs.env.reset_options import read_view
 from mpfa_envs.env.vector import VectorNavigationEnv
 from mpfa_envs.sensing.observation import INFO_TYPES
 
@@ -28,17 +25,13 @@ if TYPE_CHECKING:
     from mpfa_envs.worlds.world import World
 
 
-_TURNS: Final = 100
-"""After so many steps of an environment, between any two of which others stepped twice or more,
-it is one of many that take turns."""
-
-
 class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"]):
     """A two-wheeled robot drives to goals by lidar, in one world or in new ones.
 
     It is a :class:`~mpfa_envs.VectorNavigationEnv` of one robot behind gymnasium's interface of
     single environments. ``gymnasium.make("mpfa/Navigation-D-v1")`` is this class in world D,
-    ``"mpfa/Rooms-v1"`` with :data:`~mpfa_envs.ROOMS_TASK`, a new world in each episode.
+    ``"mpfa/Rooms-v1"`` with :data:`~mpfa_envs.ROOMS_TASK`, a new world in each episode. For many
+    robots ``gymnasium.make_vec`` gives the vector, several times as fast as as many of these.
 
     **Observation**, ``Box`` of shape ``[24]``, float32 (:data:`OBSERVATION` names the slices):
 
@@ -99,10 +92,6 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         **kwargs: Further arguments of :class:`~mpfa_envs.VectorNavigationEnv`, the fields of
             :class:`~mpfa_envs.TaskConfig` above all: ``NavigationEnv(world="D", **PAPER_TASK)``.
 
-    Warns:
-        UserWarning: If several of one process take turns, as those of
-            ``gymnasium.make_vec(..., vectorization_mode="sync")`` do: together they are faster.
-
     Raises:
         ImportError: If there is no PyBullet and physics is ``"wheels"``.
         ValueError: If an argument is out of its range, or a world has no task; nothing is built
@@ -145,7 +134,6 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         self.action_space = self.robots.single_action_space
         self._running = False
         self._window: Window | None = None
-        self._last_step = self._turns = 0
 
     @property
     def config(self) -> TaskConfig:
@@ -248,18 +236,9 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
         observations, rewards, *ends, infos = self.robots.step(np.asarray(action)[None])
         terminated, truncated = (bool(ended[0]) for ended in ends)
         self._running = not (terminated or truncated)
-        self._count_turns()
         if self.render_mode == "human":
             self.render()
         return observations[0], float(rewards[0]), terminated, truncated, _first(infos)
-
-    def _count_turns(self) -> None:
-        """Warn where environments take turns; one for training and one for tests do not."""
-        now = next(_steps)
-        self._turns = self._turns + 1 if now - self._last_step > 2 else 0
-        self._last_step = now
-        if self._turns >= _TURNS:
-            _warn_of_turns()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Render the room from above.
@@ -291,21 +270,6 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
             self._window.close()
             self._window = None
         self.robots.close()
-
-
-_steps = count(1)
-"""Numbers of the steps of all environments in this process."""
-
-
-@cache  # Once in a process.
-def _warn_of_turns() -> None:
-    """Name what is faster than many single environments."""
-    warnings.warn(
-        "several NavigationEnv take turns, and each is simulated alone: gymnasium.make_vec(..., "
-        'vectorization_mode="vector_entry_point"), its default for these ids, or '
-        "VectorNavigationEnv simulates them together, several times as fast",
-        stacklevel=4,
-    )
 
 
 def _first(infos: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.env.inputs import read_tasks
+from mpfa_envs.env.reset_options import read_tasks
 from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 from mpfa_envs.worlds.task import read_task
 

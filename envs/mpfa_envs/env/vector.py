@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from mpfa_envs.checks import check_count
 from mpfa_envs.env.config import TaskConfig
 from mpfa_envs.env.episodes import EpisodeSource, WorldChoice
-from mpfa_envs.env.inputs import (
+from mpfa_envs.env.reset_options import (
     read_mask,
     read_reset_mask,
     read_seed,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from mpfa_envs.checks import did_you_mean
-from mpfa_envs.generators import world_of_name
+from mpfa_envs.generators.generate import world_of_name
 from mpfa_envs.worlds.barn import barn_world
 from mpfa_envs.worlds.builtin import WORLDS
 from mpfa_envs.worlds.gazebo import load_gazebo_world

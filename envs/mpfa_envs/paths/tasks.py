@@ -35,8 +35,6 @@ def sample_task_on_grid(
     min_goal_distance: float = 2.0,
     max_goal_distance: float = math.inf,
     detour_chance: float = 0.0,
-    start_clearance: float | None = None,
-    goal_clearance: float | None = None,
 ) -> tuple[Task, DistanceField]:
     """Sample a goal, and a start from which there is a path to it, over the cells of a grid.
 
@@ -44,7 +42,8 @@ def sample_task_on_grid(
     :func:`~mpfa_envs.tasks.sampling.sample_task` tries points one by one.
 
     In a wide world (:func:`is_wide`) no path is longer than 20 m, and the field is that of a window
-    around the goal. In a map start and goal have the usual clearance.
+    around the goal. Start and goal keep 0.15 m more than the path, or the same as the path where
+    fewer than a tenth of the free cells have that.
 
     Args:
         place: A grid, or a world, of which one is made.
@@ -54,9 +53,6 @@ def sample_task_on_grid(
         max_goal_distance: Longest path between them [m].
         detour_chance: Chance that the task must be a detour, if the world has any: its path is more
             than 1.08 times the straight line and 0.3 m.
-        start_clearance: Least clearance of the start [m]. None: 0.15 m more than the path's, or the
-            same where fewer than a tenth of the free cells have that.
-        goal_clearance: The same of the goal.
 
     Returns:
         The task, its heading uniform; and the field of its goal.
@@ -81,11 +77,8 @@ def sample_task_on_grid(
         )
     check_share("detour_chance", detour_chance)
     grid = _as_grid(place, distance)
-    world, wide, in_map = grid.world, is_wide(grid.world), grid.world.occupancy is not None
-    start_room, goal_room = (
-        _clearance(grid, None if in_map else asked) for asked in (start_clearance, goal_clearance)
-    )
-    may_start, goals = _places(grid, start_room, goal_room)
+    world, wide, clearance = grid.world, is_wide(grid.world), _clearance(grid)
+    may_start, goals = _places(grid, clearance)
     longest = min(max_goal_distance, LONGEST_PATH) if wide else max_goal_distance
     slack = grid.resolution  # Start and goal leave the middle of their cells: by this much.
     detour = detour_chance > 0.0 and rng.random() < detour_chance
@@ -95,7 +88,7 @@ def sample_task_on_grid(
         if straight is not None and attempt >= _DETOURS:
             break
         i, j = np.unravel_index(goals[rng.integers(len(goals))], grid.free.shape)
-        goal = _within_cell(grid, rng, int(i), int(j), goal_room)
+        goal = _within_cell(grid, rng, int(i), int(j), clearance)
         far = np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1]) >= min_goal_distance + slack
         if not (may_start & far).any():  # The paths to this goal, which take time, are not needed.
             continue
@@ -111,7 +104,7 @@ def sample_task_on_grid(
             continue
         column, row = np.unravel_index(starts[rng.integers(len(starts))], fits.shape)
         cell = int(column) + field.first[0], int(row) + field.first[1]
-        start = _within_cell(grid, rng, *cell, start_room)
+        start = _within_cell(grid, rng, *cell, clearance)
         task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
         if wanted or not detour:
             return task, field
@@ -134,7 +127,7 @@ def has_task(grid: FreeGrid) -> bool:
     """Tell whether there is a start and a goal 2 m apart with a path between them."""
     # That is a connected part of the free cells that is wide enough in x or in y.
     parts, _ = label(grid.free)
-    parts = np.where(grid.clearance >= np.float32(_clearance(grid, None)), parts, 0)
+    parts = np.where(grid.clearance >= np.float32(_clearance(grid)), parts, 0)
     steps = 2.0 / grid.resolution + 1.0
     return any(
         place is not None and max(span.stop - span.start - 1 for span in place) > steps
@@ -153,26 +146,20 @@ def _as_grid(place: FreeGrid | World, distance: float | None) -> FreeGrid:
     return FreeGrid(place, distance=distance)
 
 
-def _clearance(grid: FreeGrid, wanted: float | None) -> float:
-    """The clearance that starts or goals keep [m]."""
-    if wanted is not None:
-        return max(check_positive("clearance", wanted), grid.distance)
+def _clearance(grid: FreeGrid) -> float:
+    """The clearance that starts and goals keep [m]."""
     usual = grid.distance + START_SLACK
     roomy = np.count_nonzero(grid.clearance >= np.float32(usual))
     return usual if roomy >= _ROOMY * np.count_nonzero(grid.free) else grid.distance
 
 
 @lru_cache(maxsize=8)
-def _places(
-    grid: FreeGrid, start_room: float, goal_room: float
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _places(grid: FreeGrid, clearance: float) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Cells where episodes may start, ``[nx, ny]``, and numbers of those where goals may lie."""
+    roomy = grid.free & (grid.clearance >= np.float32(clearance))
     starts, goals = (
-        grid.free & (grid.clearance >= np.float32(room)) & _inside(grid, regions)
-        for room, regions in (
-            (start_room, grid.world.start_regions),
-            (goal_room, grid.world.goal_regions),
-        )
+        roomy & _inside(grid, regions)
+        for regions in (grid.world.start_regions, grid.world.goal_regions)
     )
     return starts, np.flatnonzero(goals)
 

@@ -8,7 +8,7 @@ from itertools import islice
 from typing import Any, Final, NamedTuple, cast, get_args
 
 from mpfa_envs.checks import check_count
-from mpfa_envs.generators import GENERATORS, Split, generator_tasks
+from mpfa_envs.generators.generate import GENERATORS, Split, generator_tasks
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.robots.model import RobotModel
 from mpfa_envs.tasks.sampling import evaluation_pairs
