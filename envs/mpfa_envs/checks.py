@@ -27,7 +27,7 @@ def check_number(name: str, value: Any) -> float:
 
 
 def all_finite(values: Iterable[Any]) -> bool:
-    """Tell whether all are finite numbers, which text and truth values are not."""
+    """Return True if all are finite numbers, which text and truth values are not."""
     try:
         return all(math.isfinite(value) and not isinstance(value, bool) for value in values)
     except (TypeError, ValueError, OverflowError):

@@ -90,7 +90,7 @@ def test_sectors_without_a_valid_ray_are_rejected_or_free() -> None:
     assert found[8] == 10.0 and np.delete(found, 8).tolist() == [2.0] * 17
 
 
-@pytest.mark.parametrize("silent", ["refuse", "far"])
+@pytest.mark.parametrize("silent", ["reject", "far"])
 @pytest.mark.parametrize("near", [0.05, 0.119, -math.inf])
 def test_returns_too_near_to_measure_have_the_least_range(near: float, silent: str) -> None:
     ranges = np.full(360, 2.0)
@@ -140,7 +140,7 @@ def test_a_near_return_stays_while_the_lidar_is_silent_there(gone: float) -> Non
     assert [read(each) for each in (0.15, gone, math.inf, gone)] == [0.15, 0.15, 10.0, 10.0]
 
 
-@pytest.mark.parametrize("silent", ["refuse", "far"])
+@pytest.mark.parametrize("silent", ["reject", "far"])
 @pytest.mark.parametrize("mount", [(-0.04, 0.0, 0.0), (0.0, 0.03, 1.0)])
 def test_a_sensor_off_the_center_has_invalid_sectors_as_well(
     mount: tuple[float, float, float], silent: str
@@ -231,7 +231,7 @@ def test_a_scan_has_as_many_ranges_as_its_angles_say(count: int, off: int) -> No
         Sectors(card()).read(scan)
 
 
-@pytest.mark.parametrize("silent", ["refuse", "far"])
+@pytest.mark.parametrize("silent", ["reject", "far"])
 @pytest.mark.parametrize(
     ("scan", "message"),
     [

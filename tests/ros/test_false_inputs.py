@@ -91,7 +91,7 @@ def blind(range_min: float, tells: float | None) -> Sees:
     return sees
 
 
-@pytest.mark.parametrize("silent", ["refuse", "far"])
+@pytest.mark.parametrize("silent", ["reject", "far"])
 @pytest.mark.parametrize("world", [HALL, POST], ids=lambda world: world.name)
 @pytest.mark.parametrize("tells", [math.nan, 0.0, -1.0, -math.inf, None])
 def test_it_stops_for_what_is_too_near_for_its_sensor(

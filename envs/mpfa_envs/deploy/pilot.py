@@ -92,7 +92,7 @@ class Pilot:
         pace: float | None = None,
         mount: tuple[float, ...] = (0.0, 0.0, 0.0),
         unseen: float | None = None,
-        silent: Silent = "refuse",
+        silent: Silent = "reject",
         map_size: float = 40.0,
         clearance: float | None = None,
     ) -> None:
@@ -211,7 +211,7 @@ class Pilot:
                 self._map.look_again()
 
     def arrived(self, pose: tuple[float, float, float]) -> bool:
-        """Whether a pose is at the goal, as the training counted it."""
+        """Return True if a pose is at the goal, as the training counted it."""
         return self._goal is not None and math.dist(pose[:2], self._goal) <= self.card.goal_radius
 
     def observe(
@@ -235,7 +235,7 @@ class Pilot:
             The observation, ``[O]``.
 
         Raises:
-            ScanError: If the scan does not tell the range of every sector.
+            ScanError: If the scan lacks the range of a sector.
             ValueError: If there is no goal or it is not on the map, or a number is not finite.
         """
         if self._goal is None:
@@ -384,7 +384,7 @@ def _wheel_range(robot: RobotModel, learned: RobotModel) -> tuple[float, float]:
 
 
 def _tolerance(robot: RobotModel) -> float:
-    """By how much its wheels may be told to go beyond their range [m/s]."""
+    """Excess of commanded wheel speeds over their range [m/s]."""
     return _BEYOND * (robot.max_wheel_speed - robot.min_wheel_speed)
 
 

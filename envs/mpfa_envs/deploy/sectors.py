@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from mpfa_envs.deploy.card import Card
 
-Silent = Literal["refuse", "far"]
+Silent = Literal["reject", "far"]
 """Reading of a sector without a valid ray: the scan is rejected, or nothing is there."""
 _EDGE = 1e-4
 """By how much the outermost rays may miss the field of view: messages are rounded [rad]."""
@@ -65,7 +65,7 @@ class _Rays(NamedTuple):
     directions: NDArray[np.float64]
     """Directions in [-π, π) [rad], ``[R]``."""
     valid: NDArray[np.bool_]
-    """Whether they have measured something, ``[R]``."""
+    """True if they have measured something, ``[R]``."""
     step: float
     """Angle from ray to ray [rad]."""
 
@@ -93,7 +93,7 @@ class Points(NamedTuple):
 class Sectors:
     """Reads scans as a policy does.
 
-    All valid rays of a sector count, whatever their number: with ``min`` the nearest return,
+    All valid rays of a sector count: with ``min`` the nearest return,
     with ``median`` the median, with ``single`` the ray nearest to the middle. A sector between two
     rays of a coarse scan has the nearer one. To the policy, what is too near to be measured is at
     the scan's ``range_min``; for whether the robot may drive, :meth:`around`, it is at 0 m.
@@ -104,7 +104,7 @@ class Sectors:
             [m, m, rad], and its roll around that axis, if it has one: 0, or ±π upside down [rad].
         unseen: Range to report to the policy for sectors outside of the scan's field of view [m];
             None rejects such a scan.
-        silent: Reading of a sector without a valid ray: ``"refuse"`` rejects the scan, ``"far"``
+        silent: Reading of a sector without a valid ray: ``"reject"`` rejects the scan, ``"far"``
             holds that nothing is there, for a lidar that reports 0 or NaN for it. As such a lidar
             may report the same for what is too near, a return within 0.08 m of ``range_min`` then
             stays where it was until its ray is valid again. A scan without any valid ray is a hall
@@ -120,7 +120,7 @@ class Sectors:
         *,
         mount: tuple[float, ...] = (0.0, 0.0, 0.0),
         unseen: float | None = None,
-        silent: Silent = "refuse",
+        silent: Silent = "reject",
     ) -> None:
         self.card = card
         *place, roll = (*check_finite("mount", mount, max(min(len(mount), 4), 3)), 0.0)[:4]
@@ -147,7 +147,7 @@ class Sectors:
             Range of each sector, left to right [m], ``[sectors]``, and the points in view.
 
         Raises:
-            ScanError: If it is no scan, or does not tell the range of every sector.
+            ScanError: If it is no scan, or lacks the range of a sector.
         """
         rays, points, _ = self._measured(scan)
         card = self.card
@@ -248,7 +248,7 @@ class Sectors:
         if valid.any():
             self._met = bool((ranges[valid] < _SUDDEN * min(most, self.card.max_range)).any())
         # A lidar that breaks or is covered does not mean free space; a wide hall does.
-        elif self.silent == "refuse" or self._met or too_near.any():
+        elif self.silent == "reject" or self._met or too_near.any():
             before = ", and the one before met something near" if self._met else ""
             raise ScanError(f"none of the scan's {ranges.size} rays is valid{before}")
         ranges = np.where(too_near, least, ranges)
@@ -312,7 +312,7 @@ class Sectors:
             nearest = int(beside.argmin())
             if beside[nearest] <= reach + moved * half + _EDGE:
                 return float(points.ranges[nearest])
-        if self.silent == "refuse":
+        if self.silent == "reject":
             raise ScanError(f"no ray of the sector at {degrees} degrees is valid")
         return self.card.max_range
 

@@ -117,7 +117,7 @@ class TaskConfig:
     reward: RewardFunction | None = None
     """Computes the reward in place of Eq. (25), robot by robot and hence slowly, and without
     progress_scale; ``functools.partial(navigation_reward, goal_reward=20.0)``, say, which is as
-    fast. Another function pays as it likes; with ``progress="none"`` it is told the straight
+    fast. Another function pays as it likes; with ``progress="none"`` it gets the straight
     distances."""
     lidar: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of :class:`~mpfa_envs.Lidar` other than its defaults, ``{"noise": 0.02}``. Unless

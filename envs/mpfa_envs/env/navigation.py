@@ -185,7 +185,7 @@ class NavigationEnv(gymnasium.Env["NDArray[np.float32]", "NDArray[np.float32]"])
 
         Raises:
             ValueError: If the seed is negative or the options are not a task that can be driven;
-                the episode goes on then.
+                the episode continues then.
         """
         given = self._read(options or {})
         if seed is not None:

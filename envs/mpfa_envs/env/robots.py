@@ -75,7 +75,7 @@ class RobotBatch:
         )
         """Their episodes so far."""
         self.running = np.zeros(count, dtype=np.bool_)
-        """Whether an episode has begun and not ended, ``[N]``."""
+        """True if an episode has begun and not ended, ``[N]``."""
         self.trails = np.zeros((count, min(config.max_steps, _TRAIL) + 1, 4))
         """Positions since the start of the episode [m], and the wheel speeds that actions asked for
         until there [m/s], ``[N, steps, 4]``."""
@@ -215,7 +215,9 @@ class RobotBatch:
                 break
             if (ended := moving & ~self.running).any():
                 robots = np.flatnonzero(ended).tolist()
-                raise ValueError(f"speeds of the state go on after the episodes of robots {robots}")
+                raise ValueError(
+                    f"speeds of the state continue after the episodes of robots {robots}"
+                )
             self.advance(table[step], moving, rngs)
             self.sense(moving, rngs)
 

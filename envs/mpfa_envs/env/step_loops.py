@@ -102,7 +102,7 @@ def settle(
     running: NDArray[np.bool_],  # have moved, [N]
     payments: tuple[float, float, float, float],  # goal, collision, meter, cost of a step
 ) -> bool:
-    """Add the terms of Eq. (25), stop ended episodes, and tell whether any robot still runs."""
+    """Add the terms of Eq. (25), stop ended episodes, and return True if a robot still runs."""
     numbers, flags = episodes.numbers, episodes.flags
     left = False
     for robot in range(running.shape[0]):

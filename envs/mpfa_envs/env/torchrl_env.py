@@ -56,7 +56,7 @@ class NavigationTorchEnv(EnvBase):
         device: Where the tensors live; the simulation runs on the CPU.
         info_keys: Which entries of the info to pass on; None: all. Each costs TorchRL some 20 µs a
             step, which is more than it costs to compute.
-        hindsight: Whether to add ``"hindsight"``, for :class:`~mpfa_envs.GoalRelabeling`.
+        hindsight: If True, add ``"hindsight"``, for :class:`~mpfa_envs.GoalRelabeling`.
         **kwargs: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`.
 
     Raises:
@@ -249,7 +249,7 @@ class NavigationTorchEnv(EnvBase):
         return tensor if self.device is None else tensor.to(self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Release the physics servers; a second call does nothing, whatever raise_if_closed is."""
+        """Release the physics servers; a second call does nothing."""
         self.env.close()
         if not self.is_closed:
             super().close(raise_if_closed=raise_if_closed)

@@ -248,7 +248,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
 
         Raises:
             ValueError: If a seed is negative, or the options are not tasks that can be driven; the
-                episodes go on then.
+                episodes continue then.
         """
         seeded = read_seed(seed, self.num_envs)
         chosen = read_reset_mask(options, self.num_envs)
@@ -355,7 +355,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Give all that the environment needs to go on elsewhere in the middle of episodes.
+        """Return the state from which another environment can continue these episodes.
 
         Returns:
             Plain values and arrays: for each robot the state of its source of randomness where its
@@ -375,7 +375,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where another environment with the same arguments was.
+        """Continue where another environment with the same arguments was.
 
         The episodes so far are sampled and driven again, and what follows is the same to the bit;
         on wheels for up to 32 robots. Loading takes as long as the steps of the longest episode. A

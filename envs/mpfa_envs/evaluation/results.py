@@ -65,7 +65,7 @@ def spl(success: bool, *, path_length: float, shortest_path: float) -> float:
     """Success weighted by path length, of one episode (https://arxiv.org/abs/1807.06757).
 
     Args:
-        success: Whether the goal was reached.
+        success: True if the goal was reached.
         path_length: Distance driven [m].
         shortest_path: Shortest path of the task [m].
 
@@ -88,7 +88,7 @@ def barn_score(success: bool, *, time_s: float, reference_path: float) -> float:
     4 OT.
 
     Args:
-        success: Whether the goal was reached.
+        success: True if the goal was reached.
         time_s: Simulated time [s].
         reference_path: Length of the benchmark's reference path [m], which is positive.
 
@@ -117,7 +117,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
     """Rates and means with 95 % intervals; time and path count successes only.
 
     Rates have Wilson's interval, which stays right near 0 and 1, means that of the percentile
-    bootstrap; NaN where there are no two values to tell a spread from. Episodes count as
+    bootstrap; NaN where fewer than two values have no spread. Episodes count as
     independent: for worlds other than these, intervals are too narrow where a world has several.
 
     Args:

@@ -157,7 +157,7 @@ def evaluate(
         seed: Seed of the tasks in a world.
         physics: ``"wheels"`` or ``"kinematic"``; None: that of the policy.
         envs_at_once: As in :func:`run_tasks`.
-        progress_bar: Whether to show one.
+        progress_bar: If True, show one.
         **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv` in place of
             ``policy.env_arguments``; ``max_steps`` counts where a task has no time limit of its
             own, as those of generators and of the benchmark have.
@@ -212,7 +212,7 @@ def run_tasks(
             :class:`~mpfa_envs.Policy` but by what :class:`~mpfa_envs.VectorNavigationEnv` says of
             wheels; None: 64 for one, a :class:`Driver` or a
             :class:`~mpfa_envs.planners.DynamicWindow`, else one at a time.
-        progress_bar: Whether to show one.
+        progress_bar: If True, show one.
         on_end: Called at the end of every episode with the environment, the number of the robot,
             whose path is ``env.trail(robot)``, and that of the task.
         **env_arguments: Arguments of :class:`~mpfa_envs.VectorNavigationEnv`; ``max_steps``

@@ -82,7 +82,7 @@ def _grow(
 
 
 def _is_passable(filled: NDArray[np.bool_], cell: float) -> bool:
-    """Tell whether a disc gets from one end of the field to the other."""
+    """Return True if a disc gets from one end of the field to the other."""
     # From center to center: the needed distance and the cylinder's radius.
     reach = _NEEDED + cell / 2
     steps = np.arange(-int(reach / cell), int(reach / cell) + 1) * cell

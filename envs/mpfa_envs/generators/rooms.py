@@ -60,7 +60,7 @@ def _sample_box(rng: random.Random) -> Box:
 
 
 def _leaves_passages(box: Box, others: list[Box], passage: float) -> bool:
-    """Tell whether a box touches or is a passage away from each wall and every other box."""
+    """Return True if a box touches or is a passage away from each wall and every other box."""
     walls = (box.x_min + _HALF, _HALF - box.x_max, box.y_min + _HALF, _HALF - box.y_max)
     return not any(0.0 < gap < passage for gap in walls) and all(
         _gap(box, other) >= passage for other in others

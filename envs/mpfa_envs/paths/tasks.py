@@ -124,7 +124,7 @@ def is_wide(world: World) -> bool:
 
 
 def has_task(grid: FreeGrid) -> bool:
-    """Tell whether there is a start and a goal 2 m apart with a path between them."""
+    """Return True if there is a start and a goal 2 m apart with a path between them."""
     # That is a connected part of the free cells that is wide enough in x or in y.
     parts, _ = label(grid.free)
     parts = np.where(grid.clearance >= np.float32(_clearance(grid)), parts, 0)
@@ -165,7 +165,7 @@ def _places(grid: FreeGrid, clearance: float) -> tuple[NDArray[np.bool_], NDArra
 
 
 def _inside(grid: FreeGrid, regions: tuple[Box, ...]) -> NDArray[np.bool_]:
-    """Tell which cells lie in one of the regions, ``[nx, ny]``; all do if there are none."""
+    """Return the mask of cells in one of the regions, ``[nx, ny]``; all of them without any."""
     inside = np.full(grid.free.shape, not regions)
     for region in regions:
         columns = (region.x_min <= grid.xs) & (grid.xs <= region.x_max)

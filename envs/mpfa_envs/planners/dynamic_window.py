@@ -170,9 +170,9 @@ class DynamicWindow:
         self.arcs = (along * np.sinc(half / math.pi))[..., None] * directions
         """Places on each arc in the robot's frame [m], ``[K, T, 2]``."""
         self._bearings = np.linspace(-math.pi, math.pi, _LINES, endpoint=False)
-        ways = np.stack((np.cos(self._bearings), np.sin(self._bearings)), axis=1)
+        directions = np.stack((np.cos(self._bearings), np.sin(self._bearings)), axis=1)
         self._steps = np.arange(_STEP, _OPEN + 1e-9, _STEP)
-        self._lines = self._steps[:, None] * ways[:, None]
+        self._lines = self._steps[:, None] * directions[:, None]
         self.memory = memory
         self.env_arguments: dict[str, Any] = {
             "robot": robot,

@@ -61,7 +61,7 @@ def export_policy(
     Args:
         policy: The policy.
         path: The file, ``policy.onnx``; the card is ``policy.json`` then.
-        quantize: Whether to round the weights to eight bits.
+        quantize: If True, round the weights to eight bits.
         results: Plain values for the card: how well it drives.
 
     Returns:

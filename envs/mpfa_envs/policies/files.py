@@ -39,7 +39,7 @@ def save_policy(policy: Policy, path: str | os.PathLike[str], *, overwrite: bool
     Args:
         policy: The policy.
         path: The file; in a folder it is called ``policy.npz``. Another policy there is replaced.
-        overwrite: Whether anything else there is replaced, too.
+        overwrite: If True, replace any other file, too.
 
     Returns:
         The file.

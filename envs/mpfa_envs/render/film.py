@@ -49,7 +49,7 @@ def film_episode(
         policy: As for :func:`~mpfa_envs.run_tasks`; its ``env_arguments`` hold unless given here.
         episode: The task and its world.
         values: From observations, ``[T, O]``, to their values, ``[T]``, such as Q.
-        traces: Whether speeds and values are beside the picture.
+        traces: If True, put speeds and values next to the picture.
         most: Greatest number of pictures, besides the last one: of a long episode every second
             step, every fourth, and so on.
         seed: Of the lidar's noise and the walkers.

@@ -117,5 +117,5 @@ def _draw_panel(
 
 
 def _digits(low: float, high: float) -> int:
-    """Decimals that tell the ends of an axis apart."""
+    """Decimals by which the ends of an axis differ."""
     return min(max(1 - math.floor(math.log10(high - low)), 0), 3)

@@ -104,7 +104,7 @@ class RobotModel:
 
     @property
     def can_stop(self) -> bool:
-        """Whether it can stand still: both wheels may have a speed of zero."""
+        """True if it can stand still: both wheels may have a speed of zero."""
         return self.min_wheel_speed <= 0.0 <= self.max_wheel_speed
 
     @property

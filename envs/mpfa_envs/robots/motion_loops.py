@@ -49,7 +49,7 @@ def limited(left: float, right: float, limits: WheelLimits) -> tuple[float, floa
 def scale_actions(
     actions: NDArray[np.float64], limits: WheelLimits, speeds: NDArray[np.float64]
 ) -> bool:
-    """Turn clipped actions into speeds [m/s], both ``[N, 2]``; tell whether all are numbers."""
+    """Turn clipped actions into speeds [m/s], both ``[N, 2]``; return True if all are numbers."""
     middle, span = 0.5 * (limits.fast + limits.slow), 0.5 * (limits.fast - limits.slow)
     numbers = True
     for robot in range(actions.shape[0]):

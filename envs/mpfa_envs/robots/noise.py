@@ -79,7 +79,7 @@ class RobotNoise:
 
     @property
     def is_in_motion(self) -> bool:
-        """Whether more than the lidar is noisy."""
+        """True if more than the lidar is noisy."""
         return self.slip > 0.0 or self.latency > 0 or self.drift > 0.0
 
 
@@ -107,7 +107,7 @@ class NoisyMotion:
         self._wheel_base = wheel_base
         self._time_step = time_step
         self.has_odometry = noise.slip > 0.0 or noise.drift > 0.0
-        """Whether odometry may differ from the true poses."""
+        """True if odometry may differ from the true poses."""
         self._commands = np.zeros((robots, noise.latency + 1, 2))
         self._kept = np.ones((robots, 2))
         self._scales = np.ones((robots, 2))

@@ -3,11 +3,11 @@
 The robot stands still, and says so, while there is no goal, scan or odometry, while one of the two
 is older than it may be (or from the future), while something where it drives is nearer to its rim
 than the stop distance, or will be before the next check, and whenever a number cannot be true or a
-scan does not tell enough. A scan that repeats itself while the robot moves grows older. The goal
-stays, and the robot drives on once the reason is gone. Odometry that jumps or stands still gives up
-the goal, whose place is then unknown, and so do a policy that fails and one that drives for long
-without coming to a new place. Without a goal the node
-publishes one stop and then nothing, so that others may drive.
+scan lacks the range of a sector. A scan that repeats itself while the robot moves grows older. The
+goal stays, and the robot drives on once the reason is gone. Odometry that jumps or stands still
+gives up the goal, whose place is then unknown, and so do a policy that fails and one that drives
+for long without coming to a new place. Without a goal the node publishes one stop and then nothing,
+so that others may drive.
 """
 
 from __future__ import annotations

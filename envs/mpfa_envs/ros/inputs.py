@@ -45,7 +45,7 @@ class Seen(NamedTuple):
     fault: str = ""
     """Why it cannot be used; empty if it can."""
     repeated: bool = False
-    """Whether the robot has moved, and this scan has not changed."""
+    """True if the robot has moved, and this scan has not changed."""
 
 
 class Felt(NamedTuple):
@@ -102,7 +102,7 @@ class Sight:
         return self.last.fault
 
     def _repeats(self, scan: Scan, time: float, points: Points, track: Track) -> bool:
-        """Whether the robot has moved since the first scan with these numbers."""
+        """Return True if the robot has moved since the first scan with these numbers."""
         # Where nothing is in reach, scans are alike.
         # A copy, as the caller may reuse the array.
         ranges = np.array(scan.ranges, dtype=np.float64)
@@ -142,7 +142,7 @@ class Track:
         """Of numbers that are finite."""
 
     def take(self, felt: Felt, ordered: float) -> str:
-        """Take odometry and the last order [m/s]; tell why its poses cannot be trusted."""
+        """Take odometry and the last order [m/s]; return why its poses cannot be trusted."""
         self._finite = all(map(math.isfinite, (*felt.pose, *felt.speeds, felt.time)))
         if not self._finite:
             return ""
@@ -207,11 +207,11 @@ class Track:
         return self.last.pose
 
     def _too_far(self, moved: float, passed: float) -> bool:
-        """Whether the wheels do not come that far in a time [s]."""
+        """Return True if the wheels do not come that far in a time [s]."""
         return abs(moved) > self._limits[0] * passed + _SLACK[0]
 
     def _too_much(self, turned: float, passed: float) -> bool:
-        """Whether they do not turn the robot by that in a time [s]."""
+        """Return True if they do not turn the robot by that in a time [s]."""
         return abs(turned) > self._limits[1] * passed + _SLACK[1]
 
     def _jump(self, felt: Felt, past: tuple[Felt, ...]) -> str:
@@ -236,7 +236,7 @@ class Track:
 
 
 def _moved(start: Pose | None, end: Pose) -> bool:
-    """Whether what a robot sees from two poses differs."""
+    """Return True if what a robot sees from two poses differs."""
     if start is None:
         return False
     turned = abs(math.remainder(end[2] - start[2], math.tau))

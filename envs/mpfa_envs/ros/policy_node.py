@@ -28,7 +28,7 @@ PARAMETERS: Final[dict[str, Any]] = {
     "pace": 0.0,
     "mount": [0.0, 0.0, 0.0],
     "unseen": 0.0,
-    "silent": "refuse",
+    "silent": "reject",
     "map_size": 40.0,
     "clearance": 0.0,
     "stop_distance": 0.05,
@@ -214,7 +214,7 @@ class PolicyNode(Node):
 
 
 def main() -> None:
-    """Run the node until it is told to end."""
+    """Run the node until it is shut down."""
     # The signal handlers of rclpy would end all publishing before the robot is stopped.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -86,7 +86,7 @@ class RobotNode(Node):
 
 
 def main() -> None:
-    """Run the node until it is told to end."""
+    """Run the node until it is shut down."""
     rclpy.init()
     node = RobotNode()
     try:

@@ -85,7 +85,7 @@ class SimulatedRobot:
         self._drives.place(0, x, y, heading)
         self._motions = np.array([[x, y, heading, 0.0, 0.0]])
         self.touched = False
-        """Whether its rim has met an obstacle since it was placed."""
+        """True if its rim has met an obstacle since it was placed."""
         self._told = (0.0, 0.0)
         self._told_at = -math.inf
 

@@ -31,7 +31,7 @@ class SafetyFilter:
     place of any other action the nearest admissible one of a grid is taken; if there is none, the
     robot brakes, or turns.
 
-    It is a function of the observation and the action alone, so that whatever drives can have it:
+    It is a function of the observation and the action alone, so that every driver can have it:
     a policy, a planner, a training and a robot. :meth:`mpfa_envs.TaskConfig.make_filter` makes the
     one of a task.
 

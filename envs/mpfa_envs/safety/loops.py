@@ -122,7 +122,7 @@ def _is_admissible(
     points: NDArray[np.float64],  # [P, 3]
     body: Body,
 ) -> bool:
-    """Whether the robot stays off the points while it does this, and can do so afterwards.
+    """Return True if the robot stays off the points while it does this, and can do so afterwards.
 
     It can if it stands still in time or, where it cannot stand still, if a full circle is free.
     """

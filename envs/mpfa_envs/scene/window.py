@@ -40,7 +40,7 @@ class Window:
         """Set once the user has closed it or pressed Escape; it shows nothing more then."""
 
     def show(self, picture: NDArray[np.uint8]) -> bool:
-        """Show a picture, ``[height, width, 3]``, when due; tell whether the window is open."""
+        """Show a picture, ``[height, width, 3]``, when due; return True if the window is open."""
         if self.closed:
             return False
         pygame = self._pygame

@@ -48,7 +48,7 @@ class Lidar:
         noise: Standard deviation of Gaussian noise on each ray [m].
         field_of_view: Angle from the first edge of the first sector to the last of the last one
             [deg], at most 360: of sectors of 10 degrees a whole turn has 36.
-        dropout: Chance that a ray reports the greatest range, whatever it meets.
+        dropout: Chance that a ray reports the greatest range.
 
     Raises:
         ValueError: If a number is out of its range or the reduction is unknown.
@@ -190,7 +190,7 @@ class Lidar:
 
     @property
     def is_noisy(self) -> bool:
-        """Whether two scans from one place differ."""
+        """True if two scans from one place differ."""
         return self.noise > 0.0 or self.dropout > 0.0
 
     def disturb(self, ranges: NDArray[np.float64], rng: np.random.Generator) -> None:

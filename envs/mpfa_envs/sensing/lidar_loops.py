@@ -171,7 +171,7 @@ def _cast_at_box(
     beams: NDArray[np.float64],
     row: NDArray[np.float64],
 ) -> bool:
-    """Shorten the rays that meet a box, relative to the robot; tell whether it is in the box."""
+    """Shorten the rays that meet a box, relative to the robot; return True if it is in the box."""
     aside = 1 if x0 > 0.0 else -1 if x1 < 0.0 else 0
     above = 1 if y0 > 0.0 else -1 if y1 < 0.0 else 0
     if aside == 0 and above == 0:
@@ -210,7 +210,7 @@ def _cast_at_circle(
     beams: NDArray[np.float64],
     row: NDArray[np.float64],
 ) -> bool:
-    """Shorten the rays that meet a circle, relative to the robot; tell whether it is in it."""
+    """Shorten the rays that meet a circle, relative to the robot; return True if it is in it."""
     front = ahead[0] * dx + ahead[1] * dy
     square = dx * dx + dy * dy
     far = reach + radius
@@ -244,7 +244,7 @@ def _cast_at_polygon(
     beams: NDArray[np.float64],
     row: NDArray[np.float64],
 ) -> bool:
-    """Shorten the rays that meet the edges of a polygon; tell whether the robot is in it."""
+    """Shorten the rays that meet the edges of a polygon; return True if the robot is in it."""
     inside = False
     for edge in range(edges.shape[0]):
         x0, y0 = edges[edge, 0] - x, edges[edge, 1] - y

@@ -21,7 +21,7 @@ BLOCKED: Final = 3
 FACTORS: Final = np.array((1, 3, 30, 200), dtype=np.int64)
 """Cost of a step in a free cell, one near an obstacle, a tight and a blocked one. None is infinite:
 a robot may stand where it should not, and where all paths are blocked it goes on looking. But a
-wall, some five blocked cells thick, must cost more than any way round it."""
+wall, some five blocked cells thick, must cost more than any path around it."""
 STRAIGHT: Final = 10
 """Length of a straight step."""
 DIAGONAL: Final = 14
@@ -114,7 +114,7 @@ def cell_of(place: float, count: int) -> int:
 def _enter(
     levels: NDArray[np.uint8], u: float, v: float, bounds: tuple[float, float, float]
 ) -> bool:
-    """Enter a point that the lidar hit; tell whether the map has changed."""
+    """Enter a point that the lidar hit; return True if the map has changed."""
     blocked, tight, near = bounds
     nx, ny = levels.shape
     changed = False
@@ -144,7 +144,7 @@ def _step_cost(levels: NDArray[np.uint8], i: int, j: int, move: int) -> int:
 
 @njit
 def _costs_the_same(levels: NDArray[np.uint8], costs: NDArray[np.int32], i: int, j: int) -> bool:
-    """Tell whether the path from a cell still has the cost at which it was found."""
+    """Return True if the path from a cell still has the cost at which it was found."""
     # It is still the cheapest then: new hits make paths costlier, never cheaper.
     cells = follow_path(levels, costs, i, j)
     if len(cells) > 0:
@@ -279,7 +279,7 @@ def _look_ahead(
 
 @njit
 def _is_open(levels: NDArray[np.uint8], i: int, j: int, to_i: int, to_j: int) -> bool:
-    """Tell whether the line between two cells is no narrower than its ends."""
+    """Return True if the line between two cells is no narrower than its ends."""
     widest = max(levels[i, j], levels[to_i, to_j])
     steps = max(abs(to_i - i), abs(to_j - j))
     for step in range(1, steps):

@@ -24,8 +24,8 @@ SPEED_BOUND: Final = 2.0
 """Scaled speeds are clipped to this; a wheel that slips may exceed one for a moment."""
 
 PATH_BOUND: Final = 1.5
-"""The scaled length of the path is clipped to this. Longer ways are rare in training, and policies
-that were told of one stood or swung to and fro; farther ahead a meter changes nothing."""
+"""The scaled length of the path is clipped to this. Longer paths are rare in training, and policies
+that saw one stood or swung to and fro; farther ahead a meter changes nothing."""
 
 _BOUNDS: Final = {
     "lidar": (0.0, 1.0),

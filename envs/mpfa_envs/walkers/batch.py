@@ -89,7 +89,7 @@ class WalkerBatch:
 
     @property
     def present(self) -> bool:
-        """Whether there are any walkers."""
+        """True if there are any walkers."""
         return bool(self._arrays.counts.any())
 
     def of(self, index: int) -> NDArray[np.float64]:

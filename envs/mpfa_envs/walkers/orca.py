@@ -82,7 +82,7 @@ class OrcaRoom:
         speed_y: float,
         wanted: tuple[float, float] | None,
     ) -> None:
-        """Tell the library an agent's position, velocity and wanted velocity."""
+        """Give the library an agent's position, velocity and wanted velocity."""
         simulator = self._simulator
         simulator.set_agent_position(agent, (x, y))
         simulator.set_agent_velocity(agent, (speed_x, speed_y))

@@ -25,7 +25,7 @@ def cast_at_cells(
     max_range: float,  # [m]
     row: NDArray[np.float64],  # [rays] [m]
 ) -> bool:
-    """Shorten the rays that meet an occupied cell; tell whether the sensor is in one."""
+    """Shorten the rays that meet an occupied cell; return True if the sensor is in one."""
     columns, rows = gaps.shape
     # In cells from the lower left corner.
     u, v = x / resolution + 0.5 * columns, y / resolution + 0.5 * rows

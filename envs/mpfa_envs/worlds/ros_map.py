@@ -129,7 +129,7 @@ def read_map(path: Path, root: yaml.Node | None, *, unknown: Unknown) -> Occupan
 
 
 def _classify(shades: NDArray[np.uint8], rule: _Rule) -> tuple[NDArray[np.bool_], ...]:
-    """Tell which cells are occupied and which are free; those that are neither are unknown."""
+    """Return masks of the occupied and of the free cells; the others are unknown."""
     # Of each of the 256 shades once.
     shade = np.arange(256)
     if rule.mode == "raw":

@@ -182,7 +182,7 @@ def _signed_area(vertices: tuple[Point, ...]) -> float:
 
 
 def _is_convex(vertices: tuple[Point, ...]) -> bool:
-    """Tell whether counter-clockwise vertices turn left everywhere, once around in all."""
+    """Return True if counter-clockwise vertices turn left everywhere, once around in all."""
     count, turned = len(vertices), 0.0
     for i in range(count):
         (x0, y0), (x1, y1), (x2, y2) = vertices[i - 2], vertices[i - 1], vertices[i]
@@ -195,7 +195,7 @@ def _is_convex(vertices: tuple[Point, ...]) -> bool:
 
 
 def _is_simple(edges: list[tuple[float, float, float, float]]) -> bool:
-    """Tell whether edges meet only where one follows the other."""
+    """Return True if edges meet only where one follows the other."""
     count = len(edges)
     for i, (ax, ay, bx, by) in enumerate(edges):
         if (ax, ay) == (bx, by):
@@ -213,7 +213,7 @@ def _is_simple(edges: list[tuple[float, float, float, float]]) -> bool:
 
 
 def _meet(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
-    """Tell whether two closed segments have a point in common."""
+    """Return True if two closed segments have a point in common."""
     ax, ay, bx, by = one
     cx, cy, dx, dy = other
     if (

@@ -191,7 +191,7 @@ class World:
         return sum(obstacle.area for obstacle in self.obstacles) + cells
 
     def holds(self, shape: Shape) -> bool:
-        """Tell whether a shape lies in the room; it may touch the walls."""
+        """Return True if a shape lies in the room; it may touch the walls."""
         left, low, right, high = self.room.bounds
         x_min, y_min, x_max, y_max = shape.bounds
         return left <= x_min and x_max <= right and low <= y_min and y_max <= high

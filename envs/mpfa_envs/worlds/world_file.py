@@ -165,7 +165,7 @@ class _Reader(NodeReader):
 
 
 def has_room(world: World, region: Box, clearance: float) -> bool | None:
-    """Tell whether a region has a point with a clearance [m]; None if it is too large to tell."""
+    """Return True if a region has a point with a clearance [m]; None if it is too large."""
     # The region is cut in four again and again. Within a rectangle the clearance differs from that
     # of its middle by half its diagonal at most, so that most rectangles are decided at once.
     half = np.array([region.x_max - region.x_min, region.y_max - region.y_min]) / 2
@@ -190,7 +190,7 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
     Args:
         world: The world.
         path: The file; another world there is replaced.
-        overwrite: Whether anything else there is replaced, too.
+        overwrite: If True, replace any other file, too.
 
     Raises:
         FileExistsError: If there is a file that is no world, and overwrite is false.
@@ -209,7 +209,7 @@ def save_world(world: World, path: str | os.PathLike[str], *, overwrite: bool = 
     """
     if world.occupancy is not None:
         raise ValueError(
-            f"world {world.name!r} must be written by save_map, as it comes from a map"
+            f"world {world.name!r} must be written by save_map, as it has the cells of a map"
         )
     content: dict[str, object] = {
         "name": world.name,

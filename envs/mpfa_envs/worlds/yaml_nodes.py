@@ -79,7 +79,7 @@ def read_number(text: str) -> float:
 
 
 def is_map(root: yaml.Node | None) -> bool:
-    """Tell whether a file describes a map of ROS, which names an image."""
+    """Return True if a file describes a map of ROS, which names an image."""
     return isinstance(root, yaml.MappingNode) and any(
         key.value == "image" for key, _ in root.value if isinstance(key, yaml.ScalarNode)
     )
