@@ -55,10 +55,10 @@ def fingerprint(world: World) -> str:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_task_is_found_in_each_of_hundreds_of_worlds(name: str) -> None:
+def test_a_task_is_found_in_each_of_many_worlds(name: str) -> None:
     rng = np.random.default_rng(0)
     for split in ("train", "validation", "test"):
-        for index in range(50):
+        for index in range(20):
             world = generate_world(name, world_seed(split, 100 + index))
             grid = FreeGrid(world, distance=0.25)
             task, field = sample_task_on_grid(grid, rng, detour_chance=0.8)

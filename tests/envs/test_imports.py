@@ -35,8 +35,8 @@ def test_without_gymnasium_the_package_can_still_be_imported() -> None:
     [
         (
             "gymnasium",
-            "from mpfa_envs import make_navigation_env",
-            "mpfa_envs.make_navigation_env needs gymnasium: pip install 'torchrl-mpfa[envs]'",
+            "from mpfa_envs import NavigationEnv",
+            "mpfa_envs.NavigationEnv needs gymnasium: pip install 'torchrl-mpfa[envs]'",
         ),
         (
             "onnxruntime",
@@ -45,7 +45,8 @@ def test_without_gymnasium_the_package_can_still_be_imported() -> None:
         ),
         (
             "onnx",
-            f"from mpfa_envs import *;export_policy(load_policy({SHIPPED!r}), 'policy.onnx')",
+            "from mpfa_envs import export_policy, load_policy;"
+            f"export_policy(load_policy({SHIPPED!r}), 'policy.onnx')",
             "pip install 'torchrl-mpfa[onnx]'",
         ),
     ],

@@ -41,14 +41,15 @@ def cast_all(worlds: list[World], motions: np.ndarray, lidar: Lidar) -> np.ndarr
 
 
 @pytest.mark.parametrize("mix", MIXES, ids=str)
-@pytest.mark.parametrize("max_range", [10.0, 1.5])
-@pytest.mark.parametrize("view", [180.0, 90.0, 270.0, 360.0])
+@pytest.mark.parametrize(
+    ("view", "max_range"), [(180.0, 10.0), (180.0, 1.5), (90.0, 1.5), (270.0, 10.0), (360.0, 1.5)]
+)
 def test_rays_meet_what_plain_geometry_says(
     mix: dict[str, int], max_range: float, view: float
 ) -> None:
     rng = np.random.default_rng(1)
-    worlds = [random_shapes(rng, **mix) for _ in range(60)]
-    motions = somewhere(rng, 60)
+    worlds = [random_shapes(rng, **mix) for _ in range(24)]
+    motions = somewhere(rng, 24)
     lidar = Lidar(worlds[0], max_range=max_range, field_of_view=view)
     expected = [
         scan(lidar, world, *pose) for world, pose in zip(worlds, motions[:, :3], strict=True)

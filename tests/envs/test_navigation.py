@@ -50,10 +50,8 @@ def rolled(physics: str, *, world: str = "D", episodes_before: int = 0) -> str:
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize(
-    "env_id", ["mpfa/Rooms-v1", *(f"mpfa/Navigation-{name}-v1" for name in WORLDS)]
-)
-def test_every_id_passes_the_checker_without_a_warning(env_id: str, physics: str) -> None:
+@pytest.mark.parametrize("env_id", ["mpfa/Rooms-v1", "mpfa/Navigation-D-v1"])
+def test_an_id_passes_the_checker_without_a_warning(env_id: str, physics: str) -> None:
     env = gymnasium.make(env_id, physics=physics)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -93,9 +91,11 @@ def test_the_first_step_is_the_same_bits_after_a_reset(physics: str) -> None:
     assert seen[0] == seen[1] == seen[3] != seen[2]
 
 
-def test_the_same_seed_gives_the_same_bits_in_another_process(physics: str) -> None:
-    code = "from tests.envs.test_navigation import rolled; print(rolled(sys.argv[1]))"
-    assert run(code, physics).split()[-1] == rolled(physics)
+def test_the_same_seed_gives_the_same_bits_in_another_process() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels for Python 3.11 and earlier")
+    code = "from tests.envs.test_navigation import rolled; print(*map(rolled, sys.argv[1:]))"
+    both = "kinematic", "wheels"
+    assert run(code, *both).split()[-2:] == [rolled(physics) for physics in both]
 
 
 def test_environments_side_by_side_do_not_know_each_other(physics: str) -> None:

@@ -244,7 +244,7 @@ def test_the_followers_reach_the_goals_of_map_d(name: str) -> None:
 def test_robots_that_can_stop_reach_the_goals_of_map_d(name: str, robot: str) -> None:
     memory: Memory = "map" if name == "dwa" else "none"
     planner = make_planner(name, robot=robot, memory=memory)
-    results = evaluate(planner, "D", episodes=8, seed=3, max_steps=1500)
+    results = evaluate(planner, "D", episodes=4, seed=3, max_steps=1500)
     assert all(result.success for result in results)
 
 

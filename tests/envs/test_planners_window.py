@@ -67,7 +67,7 @@ def test_it_collides_with_nothing_however_long_the_robot_takes_to_stop(
 ) -> None:
     robot = cart(speed, braking, view)
     window = DynamicWindow(robot=robot, memory="map")
-    results = evaluate(window, "test", episodes=8, physics="kinematic", robot=robot)
+    results = evaluate(window, "test", episodes=5, physics="kinematic", robot=robot)
     assert not any(each.collision for each in results)
     assert np.mean([each.success for each in results]) > 0.5
 

@@ -81,14 +81,14 @@ def drive_at_random(
 @pytest.mark.parametrize("world", STANDING)
 @pytest.mark.parametrize("robot", ["kobuki", "burger"])
 def test_a_random_policy_touches_nothing(robot: str, world: str) -> None:
-    assert drive_at_random(robot, world, 4_000, physics="kinematic", robots=20) > 0.0
+    assert drive_at_random(robot, world, 2_000, physics="kinematic", robots=20) > 0.0
 
 
 @pytest.mark.parametrize("view", [90.0, 180.0, 270.0])
 @pytest.mark.parametrize("world", ["mazes", "rooms"])
 def test_a_random_policy_does_not_drive_into_what_it_does_not_see(world: str, view: float) -> None:
     arguments = {"physics": "kinematic", "robots": 20, "view": view}
-    assert drive_at_random("kobuki", world, 6_000, **arguments) > 0.0
+    assert drive_at_random("kobuki", world, 3_000, **arguments) > 0.0
 
 
 @pytest.mark.parametrize(("speed", "braking"), [(0.7, 0.2), (1.5, 0.5), (0.3, 4.0), (1.0, None)])

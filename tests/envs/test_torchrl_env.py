@@ -42,8 +42,8 @@ def test_the_specs_hold(num_envs: int | None, physics: str) -> None:
     env.close()
 
 
-# Each process imports PyTorch and TorchRL.
-@pytest.mark.parametrize("num_envs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow  # Each process imports PyTorch and TorchRL.
+@pytest.mark.parametrize("num_envs", [1, 2])
 def test_parallel_environments_have_the_same_face(num_envs: int) -> None:
     env = make_navigation_env("A", num_envs=num_envs, parallel=True, physics="kinematic", seed=0)
     try:
