@@ -38,7 +38,6 @@ import training.extra  # noqa: F401
 # isort: split
 from training import files
 from training.comparison.execution import add_options
-from training.comparison.ranges import read_ranges
 from training.settings.train import register
 
 RANGES = Path(__file__).with_suffix(".yaml")
@@ -79,6 +78,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     for seed in options.seeds:
         if options.seeds.count(seed) > 1:
             parser.error(f"--seeds has {seed} twice")
+    if find_spec("optuna") is None:
+        parser.error("it needs Optuna: pip install 'torchrl-mpfa[tune]'")
+    # Imports Optuna, an extra of its own.
+    from training.comparison.ranges import read_ranges
+
     register()
     try:
         files.check_folder(options.folder)
@@ -99,10 +103,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         search, 128 and the number of the signal that stopped it.
     """
     options = parse(arguments)
-    if find_spec("optuna") is None:
-        print("tune.py: it needs Optuna: pip install 'torchrl-mpfa[tune]'", file=sys.stderr)
-        return 2
-    # Imports Optuna, an extra of its own.
     from training.comparison.search import BEST, Plan, run_search
 
     if options.ray is not None:

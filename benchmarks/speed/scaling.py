@@ -17,7 +17,7 @@ from pathlib import Path
 
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
-from training.run.running import prepare_process
+from training.run.script import prepare_process
 from training.settings.command_line import composed
 from training.settings.train import register
 

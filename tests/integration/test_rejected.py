@@ -100,7 +100,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (
             train.main,
             "curriculum.stages=[{world:damaged.yaml,episodes:1}]",
-            r"curriculum.stages\[0\].world: damaged.yaml:2: is not YAML",
+            r"curriculum.stages\[0\].world .*: damaged.yaml:2: is not YAML",
         ),
         (evaluate.main, "", "give either the path of a trained policy or --policy"),
         (evaluate.main, f"{POLICY} --policy dwa", "give either the path of a trained policy or"),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from training.settings.command_line import parse_overrides
-from training.settings.rules import NAME
+from training.settings.rules import NAME, named
 
 DEFAULTS = ("tracking=off", "evaluation.every=5000")
 """What a comparison has unless its command line says otherwise."""
@@ -39,10 +39,8 @@ def parse_arms(texts: Sequence[str]) -> list[Arm]:
     """The arms on a command line; :data:`PLAIN` if there are none."""
     arms: list[Arm] = []
     for text in texts:
-        try:
+        with named(f"--arm {text}: "):
             arm = parse_arm(text)
-        except ValueError as error:
-            raise ValueError(f"--arm {text}: {error}") from error
         if arm.name in [other.name for other in arms]:
             raise ValueError(f"--arm has {arm.name} twice")
         arms.append(arm)

@@ -1,14 +1,15 @@
-"""The runs of a comparison: trained, then evaluated, and gone on with where one is lost."""
+"""Work for workers: runs that are trained and evaluated, and resumed where a worker is lost."""
 
 from __future__ import annotations
 
 import argparse
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Generic, TypeVar
 
 from tqdm import tqdm
 
@@ -17,16 +18,20 @@ from training.comparison.jobs import Comparison, Evaluation, Job, collect, other
 from training.comparison.workers import LocalWorker, Lost, Worker
 from training.stopping import Stop
 
+LOG = "output.log"
+"""Output of the scripts, in the folder of a run."""
 JOBS = 2
 """Runs at a time on one machine."""
 _PAUSE = 0.3
 """Between two looks at the runs [s]."""
 MOST_LOSSES = 10
-"""Workers that may be lost under a run, which may be what takes them down."""
+"""Workers that may be lost under a run, which may be the cause itself."""
+Item = TypeVar("Item")
+Commands = list[list[str]]
 
 
 def add_options(parser: argparse.ArgumentParser, *, folder: str, what: str) -> None:
-    """Where a script makes its runs or trials, and how many at a time."""
+    """Add the options of where a script makes its runs or trials, and how many at a time."""
     parser.add_argument("--folder", type=Path, default=Path(folder), help=f"(default: {folder})")
     parser.add_argument(
         "--jobs",
@@ -43,32 +48,30 @@ def add_options(parser: argparse.ArgumentParser, *, folder: str, what: str) -> N
 
 
 class Running:
-    """A run on its way: trained first, then evaluated, with a line on the screen.
+    """A run in progress: its commands one after another, with a line on the screen.
 
     Args:
         job: The run.
-        commands: What trains it, unless that is done, and what evaluates it.
-        worker: What runs the commands.
-        position: Its line.
+        commands: Commands that train the run, unless that is done, and evaluate it.
+        worker: Worker that runs the commands.
+        position: Line on the screen.
     """
 
-    def __init__(
-        self, job: Job, commands: list[list[str]], *, worker: Worker, position: int
-    ) -> None:
+    def __init__(self, job: Job, commands: Commands, *, worker: Worker, position: int) -> None:
         self.job, self.worker, self._commands = job, worker, commands
         job.path.mkdir(parents=True, exist_ok=True)
-        self.log = job.path / "output.log"
+        self.log = job.path / LOG
         self.bar = tqdm(desc=job.name, unit="episode", position=position, leave=False)
         self._start()
 
     def _start(self) -> None:
-        """Have the next command begin."""
+        """Start the next command."""
         command = self._commands.pop(0)
         self._evaluates = command[0].endswith("evaluate.py")
         self.worker.start(command, self.log)
 
     def ended(self) -> int | None:
-        """Exit status of the last command, or of one that failed; None while it runs."""
+        """Return the exit status of the last command, or of a failed one; None while it runs."""
         status = self.job.status()
         self.bar.total, self.bar.n = status.get("total"), status.get("done", 0)
         self.bar.unit = status.get("unit", "it")
@@ -80,33 +83,117 @@ class Running:
         return exit_status
 
 
-class Work(Protocol):
-    """Runs that workers make: true while there is something to do."""
+class Work(ABC, Generic[Item]):
+    """Items that workers make by runs, each worker one run after another.
 
-    def __bool__(self) -> bool: ...
+    Args:
+        waiting: Items to begin or to resume.
+        workers: The workers.
+        bar: Bar of all items.
+    """
+
+    def __init__(self, waiting: list[Item], workers: Sequence[Worker], bar: tqdm[Any]) -> None:
+        self.waiting, self.workers, self.bar = waiting, workers, bar
+        self.running: dict[int, tuple[Item, Running]] = {}
+        """Item and run by the number of the worker."""
+        self._losses: Counter[str] = Counter()
+
+    @property
+    def has_more(self) -> bool:
+        """True if there is an item to begin or to resume."""
+        return bool(self.waiting)
+
+    @abstractmethod
+    def take(self) -> tuple[Item, Job, Commands] | None:
+        """Return the next item, its run and its commands; None if there is none."""
+
+    @abstractmethod
+    def end(self, item: Item, status: int | None) -> None:
+        """End an item, or its present run; the status is None if it was given up."""
+
+    @abstractmethod
+    def fail(self, item: Item, why: str) -> None:
+        """End an item without a result."""
+
+    def name_of(self, item: Item) -> str:
+        """Return the name of an item."""
+        return str(item)
+
+    def is_hopeless(self, item: Item) -> bool:
+        """Return True if an item in progress is to be given up."""
+        return False
 
     def begin(self) -> None:
-        """Have the workers that have nothing to do begin the next ones, or end."""
-        ...
+        """Start the next runs on idle workers; release workers that are no longer needed."""
+        for number, worker in enumerate(self.workers):
+            if number in self.running or (self.has_more and not worker.ready()):
+                continue
+            taken = self.take()
+            if taken is None:
+                worker.stop()
+                worker.wait()
+            else:
+                item, job, commands = taken
+                run = Running(job, commands, worker=worker, position=number + 1)
+                run.bar.set_description(self.name_of(item))
+                self.running[number] = item, run
 
     def look(self) -> None:
-        """Take note of those that have ended."""
-        ...
+        """End or resume the items whose runs have ended, were lost, or are hopeless."""
+        for number, (item, run) in list(self.running.items()):
+            try:
+                status = run.ended()
+            except Lost as error:
+                self._lost(item, error)
+            else:
+                hopeless = self.is_hopeless(item)
+                if status is None and not hopeless:
+                    continue
+                if status is None:
+                    run.worker.stop()
+                    run.worker.wait()
+                self.end(item, None if hopeless else status)
+            run.bar.close()
+            del self.running[number]
 
-    def stop(self) -> None:
-        """Have all of them save and end."""
-        ...
+    def _lost(self, item: Item, error: Lost) -> None:
+        """Let a run resume on another worker."""
+        name = self.name_of(item)
+        self._losses[name] += 1
+        if self._losses[name] > MOST_LOSSES:
+            self.fail(item, f"lost {MOST_LOSSES} workers: {error}")
+            return
+        tqdm.write(f"{name}: its worker is gone, resumes at its last checkpoint: {error}")
+        self.waiting.insert(0, item)
+
+    def run(self) -> Stop:
+        """Make all items, some at a time; return how that was stopped."""
+        stop = Stop("saving the runs; the same command continues them")
+        with stop.listening():
+            try:
+                while (self.has_more or self.running) and not stop:
+                    self.begin()
+                    time.sleep(_PAUSE)
+                    self.look()
+            finally:
+                for worker in self.workers:
+                    worker.stop()
+                for worker in self.workers:
+                    worker.wait()
+                for bar in (*(run.bar for _, run in self.running.values()), self.bar):
+                    bar.close()
+        return stop
 
 
-class Runs:
-    """The runs of a comparison that are not done, some of them on their way at a time.
+class Runs(Work[Job]):
+    """The runs of a comparison that are not done.
 
     Args:
         waiting: The runs.
         overrides: Settings of all of them.
-        wanted: What their policies shall do.
+        wanted: Evaluation of their policies.
         anew: Runs to train again from the start.
-        workers: What makes them, each one run after another.
+        workers: The workers.
     """
 
     def __init__(
@@ -118,89 +205,53 @@ class Runs:
         anew: set[Job],
         workers: Sequence[Worker],
     ) -> None:
-        self.waiting, self.overrides, self.wanted = waiting, overrides, wanted
-        self.anew, self.workers = anew, workers
-        self.running: dict[int, Running] = {}
-        """By the number of their worker."""
-        self.failed: list[Job] = []
-        self._losses: Counter[Job] = Counter()
         # The average of the runs that are done tells how long the others will take.
-        self._bar = tqdm(desc="runs", total=len(waiting), unit="run", smoothing=0, leave=False)
+        bar = tqdm(desc="runs", total=len(waiting), unit="run", smoothing=0, leave=False)
+        super().__init__(waiting, workers, bar)
+        self.overrides, self.wanted, self.anew = overrides, wanted, anew
+        self.failed: list[Job] = []
 
-    def __bool__(self) -> bool:
-        return bool(self.waiting or self.running)
+    def name_of(self, item: Job) -> str:
+        """Return the name of a run."""
+        return item.name
 
-    def begin(self) -> None:
-        """Have the workers that have nothing to do begin the next ones, or end."""
-        for number, worker in enumerate(self.workers):
-            if number in self.running:
-                continue
-            if not self.waiting:
-                worker.stop()
-                worker.wait()
-            elif worker.ready():
-                job = self.waiting.pop(0)
-                anew = job in self.anew
-                trained = job.is_trained() and not anew
-                commands = [] if trained else [job.trains(self.overrides, anew=anew)]
-                commands.append(job.evaluates(self.wanted))
-                self.running[number] = Running(job, commands, worker=worker, position=number + 1)
+    def take(self) -> tuple[Job, Job, Commands] | None:
+        """Return the next run, and the commands that are left of it."""
+        if not self.waiting:
+            return None
+        job = self.waiting.pop(0)
+        # After a lost worker, a run that has begun again has the settings that are asked for.
+        anew = job in self.anew and bool(other_than_asked([job], self.overrides))
+        commands = [job.evaluates(self.wanted)]
+        if anew or not job.is_trained():
+            commands.insert(0, job.trains(self.overrides, anew=anew))
+        return job, job, commands
 
-    def look(self) -> None:
-        """Take note of those that have ended."""
-        for number, each in list(self.running.items()):
-            job = each.job
-            try:
-                status = each.ended()
-            except Lost as error:
-                self._lost(job, error)
-            else:
-                if status is None:
-                    continue
-                if status == 0:
-                    tqdm.write(f"{job.name}: trained and evaluated")
-                else:
-                    self._fail(job, f"see {each.log}")
-            self._bar.update(job not in self.waiting)
-            each.bar.close()
-            del self.running[number]
+    def end(self, item: Job, status: int | None) -> None:
+        """Report the end of a run."""
+        if status:
+            self.fail(item, f"see {item.path / LOG}")
+        else:
+            self.bar.update()
+            tqdm.write(f"{item.name}: trained and evaluated")
 
-    def _fail(self, job: Job, why: str) -> None:
-        self.failed.append(job)
-        tqdm.write(f"{job.name}: failed, {why}")
-
-    def _lost(self, job: Job, error: Lost) -> None:
-        """Have a run go on elsewhere."""
-        self._losses[job] += 1
-        if self._losses[job] > MOST_LOSSES:
-            self._fail(job, f"lost {MOST_LOSSES} workers: {error}")
-            return
-        tqdm.write(f"{job.name}: its worker is gone, goes on at its last checkpoint: {error}")
-        # Once it has begun anew, it has the settings that are asked for.
-        if job in self.anew and not other_than_asked([job], self.overrides):
-            self.anew.discard(job)
-        self.waiting.insert(0, job)
-
-    def stop(self) -> None:
-        """Have all of them save and end."""
-        for worker in self.workers:
-            worker.stop()
-        for worker in self.workers:
-            worker.wait()
-        for bar in (*(each.bar for each in self.running.values()), self._bar):
-            bar.close()
+    def fail(self, item: Job, why: str) -> None:
+        """Report a run that failed."""
+        self.bar.update()
+        self.failed.append(item)
+        tqdm.write(f"{item.name}: failed, {why}")
 
 
 def make_runs(
     comparison: Comparison, *, most: int | None = None, ray: str | None = None, anew: bool = False
 ) -> int:
-    """Train what is not trained, evaluate it, collect the rows.
+    """Train and evaluate the runs that are not done, and collect their rows.
 
     Args:
         comparison: The runs.
-        most: How many at a time; None: :data:`JOBS`, or on a cluster as many as there are.
-        ray: Address of a Ray cluster, empty for the one that there is; None: on this machine.
-        anew: Whether runs with other settings are trained again.
+        most: Runs at a time; None: :data:`JOBS`, or on a cluster as many as there are.
+        ray: Address of a Ray cluster, empty for the present cluster; None: this machine.
+        anew: True to train runs with other settings again.
 
     Returns:
         Exit status: 1 if a run failed, 128 and the number of the signal that stopped it.
@@ -223,7 +274,7 @@ def make_runs(
         most = min(most or (JOBS if ray is None else len(waiting)), len(waiting))
         with workers_of(ray if waiting else None, most) as workers:
             runs = Runs(waiting, comparison.settings, wanted, anew=set(others), workers=workers)
-            stop = run_all(runs)
+            stop = runs.run()
         if stop:
             return stop.exit_status
         collect(jobs, wanted, comparison.folder)
@@ -232,7 +283,7 @@ def make_runs(
 
 @contextmanager
 def workers_of(address: str | None, count: int) -> Iterator[list[Worker]]:
-    """Workers on this machine, or on a cluster."""
+    """Make workers on this machine, or on a cluster."""
     if address is None:
         yield [LocalWorker() for _ in range(count)]
         return
@@ -245,17 +296,3 @@ def workers_of(address: str | None, count: int) -> Iterator[list[Worker]]:
             yield [RemoteWorker() for _ in range(count)]
     except ConnectionError as error:
         raise ValueError(f"--ray {address}: {error}") from error
-
-
-def run_all(runs: Work) -> Stop:
-    """Do all of it, some runs at a time; whether it was stopped."""
-    stop = Stop("saving the runs; the same command continues them")
-    with stop.listening():
-        try:
-            while runs and not stop:
-                runs.begin()
-                time.sleep(_PAUSE)
-                runs.look()
-        finally:
-            runs.stop()
-    return stop

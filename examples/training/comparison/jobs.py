@@ -20,7 +20,7 @@ from training.records import read_table, write_table
 from training.settings.command_line import composed
 from training.settings.environment import EnvironmentSettings
 from training.settings.resuming import LAWFUL, OF_THE_CALL
-from training.settings.rules import settings_by_name
+from training.settings.rules import named, settings_by_name
 from training.settings.train import TrainSettings, as_settings
 
 SCRIPTS = Path(__file__).resolve().parents[2]
@@ -84,11 +84,8 @@ class Job:
 
     def asked(self, overrides: Sequence[str]) -> TrainSettings:
         """Its settings."""
-        try:
+        with named(f"--arm {self.arm.name}: " if self.arm.name else ""):
             first, *others = composed(self.overrides(overrides))
-        except ValueError as error:
-            where = f"--arm {self.arm.name}: " if self.arm.name else ""
-            raise ValueError(f"{where}{error}") from error
         if others:
             raise ValueError("a comparison takes one value for each setting, not a sweep")
         return first

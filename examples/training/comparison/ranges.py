@@ -1,68 +1,34 @@
-"""Which settings a search may change, and between which values: a file, checked at the start."""
+"""The ranges of a search, read from a file as Optuna's distributions and checked at the start."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 
 from torchrl_mpfa.spelling import unknown
 from training.comparison.arms import with_defaults
 from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import as_text, read_names
-from training.settings.rules import settings_by_name
+from training.settings.rules import named, settings_by_name
 from training.settings.train import TrainSettings
 from training.worlds import is_of_a_test
 
-if TYPE_CHECKING:
-    from optuna import Trial
-
-Value = str | int | float | bool | None
 OF_THE_SEARCH = ("seed", "run_dir", "overwrite", "resume", "checkpoint_every")
 """Settings that a search gives each of its runs."""
 _ALIKE = ("evaluation", "curriculum", "regime", "tracking", "ray", "device", "threads")
 """What the trials of a search have in common: how they are compared, and where they run."""
 
 
-@dataclass(frozen=True)
-class Range:
-    """Numbers from ``low`` to ``high``, both included; integers if both are."""
-
-    low: float
-    high: float
-    log: bool = False
-    """Whether their logarithms are searched evenly."""
-
-    @property
-    def ends(self) -> tuple[Value, ...]:
-        """What is tried before the search: if these are allowed, so is what is between them."""
-        return self.low, self.high
-
-    def suggest(self, trial: Trial, name: str) -> Value:
-        """A value for a trial."""
-        if isinstance(self.low, int) and isinstance(self.high, int):
-            return trial.suggest_int(name, self.low, self.high, log=self.log)
-        return trial.suggest_float(name, self.low, self.high, log=self.log)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of some values."""
-
-    values: tuple[Value, ...]
-
-    @property
-    def ends(self) -> tuple[Value, ...]:
-        """All of them."""
-        return self.values
-
-    def suggest(self, trial: Trial, name: str) -> Value:
-        """A value for a trial."""
-        return trial.suggest_categorical(name, self.values)
-
-
-Ranges = Mapping[str, Range | Choice]
+Ranges = Mapping[str, BaseDistribution]
+"""Optuna's distribution of each setting."""
 
 
 def fixed_settings(settings: Sequence[str]) -> TrainSettings:
@@ -112,33 +78,43 @@ def read_ranges(path: Path, settings: Sequence[str]) -> Ranges:
     fixed = dict(settings_by_name(fixed_settings(settings)))
     given = {override.key_or_group for override in parse_overrides(settings)}
     written = read_names(path)
-    try:
+    with named(f"{path}: "):
         ranges = {name: _range(name, each, fixed) for name, each in written.items()}
         for name in ranges:
             if name in given:
                 raise ValueError(f"{name} is given to all trials: leave it out here or there")
-        for ends in _corners(ranges):
-            list(composed([*settings, *as_lines(ends)]))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        for corner in _corners(ranges):
+            list(composed([*settings, *as_lines(corner)]))
     return ranges
 
 
-def as_lines(values: Mapping[str, Value]) -> list[str]:
-    """Settings as on the command line of ``train.py``."""
+def as_lines(values: Mapping[str, Any]) -> list[str]:
+    """Write settings as on the command line of ``train.py``."""
     return [f"{name}={as_text(value)}" for name, value in values.items()]
 
 
-def _corners(ranges: Ranges) -> Iterator[dict[str, Value]]:
-    """The first value of every range together, then the second of each, and so on."""
-    for number in range(max(len(each.ends) for each in ranges.values())):
-        yield {name: each.ends[min(number, len(each.ends) - 1)] for name, each in ranges.items()}
+def _corners(ranges: Ranges) -> Iterator[dict[str, Any]]:
+    """Yield the first value of all ranges together, then the second values, and so on.
+
+    If the ends of a range are allowed, the numbers between them are.
+    """
+    ends = {name: _ends(each) for name, each in ranges.items()}
+    for number in range(max(map(len, ends.values()))):
+        yield {name: each[min(number, len(each) - 1)] for name, each in ends.items()}
 
 
-def _range(name: str, written: Any, fixed: Mapping[str, Any]) -> Range | Choice:
-    """The range of a setting, from what the file has for it."""
+def _ends(found: BaseDistribution) -> Sequence[Any]:
+    """Return the ends of a range of numbers, or all choices."""
+    if isinstance(found, IntDistribution | FloatDistribution):
+        return found.low, found.high
+    assert isinstance(found, CategoricalDistribution)
+    return found.choices
+
+
+def _range(name: str, written: Any, fixed: Mapping[str, Any]) -> BaseDistribution:
+    """Return the range of a setting, as the file has it."""
     texts = [as_text(each) for each in written] if isinstance(written, list) else []
-    # It says which setting may have been meant, and which choices a group has.
+    # Its error suggests the nearest setting, or the choices of a group.
     overrides = parse_overrides([f"{name}={text}" for text in texts or ["null"]])
     if name in OF_THE_SEARCH or name.split(".")[0] in _ALIKE:
         raise ValueError(f"{name} cannot be searched: it must be the same in all trials")
@@ -151,14 +127,16 @@ def _range(name: str, written: Any, fixed: Mapping[str, Any]) -> Range | Choice:
         )
     if any(override.is_sweep_override() for override in overrides):
         raise ValueError(f"{name} must have single values, got {as_text(written)}")
-    # Optuna keeps words and numbers; what else there is becomes one as on the command line.
-    return Choice(
-        tuple(each if each is None or _is_number(each) else as_text(each) for each in written)
+    # Optuna keeps words and numbers; other values become words as on the command line.
+    return CategoricalDistribution(
+        [each if each is None or _is_number(each) else as_text(each) for each in written]
     )
 
 
-def _numbers(name: str, written: Mapping[Any, Any], *, whole: bool) -> Range:
-    """A range of numbers, whole ones if the setting is one."""
+def _numbers(
+    name: str, written: Mapping[Any, Any], *, whole: bool
+) -> IntDistribution | FloatDistribution:
+    """Return a range of numbers, whole numbers if the setting is one."""
     for word in written:
         if word not in ("low", "high", "log"):
             raise ValueError(f"{name}: {unknown('word', word, ['low', 'high', 'log'])}")
@@ -170,7 +148,7 @@ def _numbers(name: str, written: Mapping[Any, Any], *, whole: bool) -> Range:
         raise ValueError(f"{name} must have {kind} low < high, got low={low}, high={high}")
     if not isinstance(log, bool) or (log and low <= 0):
         raise ValueError(f"{name}: log must be true, with low above 0, or false, got {log}")
-    return Range(low, high, log) if whole else Range(float(low), float(high), log)
+    return IntDistribution(low, high, log) if whole else FloatDistribution(low, high, log)
 
 
 def _is_number(value: Any) -> bool:

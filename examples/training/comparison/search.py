@@ -1,12 +1,12 @@
-"""A search of settings: Optuna says what to try, workers train it, and a folder keeps it all."""
+"""A search of settings: Optuna suggests trials, workers train them, a folder keeps them."""
 
 from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 import optuna
 import pandas as pd
 import yaml
+from optuna.distributions import distribution_to_json
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from tqdm import tqdm
@@ -22,10 +23,10 @@ from tqdm import tqdm
 from torchrl_mpfa.files import write_text_atomically
 from training import files
 from training.comparison.arms import Arm
-from training.comparison.execution import JOBS, MOST_LOSSES, Running, run_all, workers_of
+from training.comparison.execution import JOBS, LOG, Commands, Work, workers_of
 from training.comparison.jobs import Job
 from training.comparison.ranges import Ranges, as_lines, fixed_settings
-from training.comparison.workers import Lost, Worker
+from training.comparison.workers import Worker
 from training.figures import plot_search
 from training.records import area_under, read_table, write_table
 from training.settings.train import TrainSettings
@@ -44,7 +45,7 @@ _BEST_TRIALS = 5
 
 @dataclass(frozen=True)
 class Plan:
-    """What a search asks for, the same whenever it goes on."""
+    """Plan of a search, the same whenever the search resumes."""
 
     settings: tuple[str, ...]
     """Of all trials, as on the command line of ``train.py``."""
@@ -62,26 +63,28 @@ class Plan:
 
     @cached_property
     def evaluations(self) -> int:
-        """Evaluations of a trial; 0 if its runs count episodes, so that nobody knows."""
+        """Number of evaluations of a trial; 0 if its runs count episodes, and it is not known."""
         actions = sum(stage.actions for stage in self.fixed.curriculum.stages)
         return len(self.seeds) * (actions // self.fixed.evaluation.every)
 
     def score(self, curves: Sequence[pd.DataFrame]) -> float:
-        """The mean over the runs of a trial, by their evaluations so far."""
+        """Return the mean over the runs of a trial, by their evaluations so far."""
         if self.objective == "last":
             return float(np.mean([curve["success"].iloc[-1] for curve in curves]))
         return float(np.mean([area_under(each["total_steps"], each["success"]) for each in curves]))
 
     def as_json(self) -> dict[str, Any]:
-        """What is kept of it, to know it again."""
-        ranges = {name: asdict(each) for name, each in self.ranges.items()}
+        """Return what identifies the plan in a folder."""
+        ranges = {
+            name: json.loads(distribution_to_json(each)) for name, each in self.ranges.items()
+        }
         kept: dict[str, Any] = {"settings": sorted(self.settings), "ranges": ranges}
         kept |= {"seeds": self.seeds, "objective": self.objective}
         kept["sampler seed"] = self.sampler_seed
         return dict(json.loads(json.dumps(kept)))
 
     def sampler(self, number: int) -> optuna.samplers.TPESampler:
-        """What suggests a trial; a search that goes on has the trials that it would have had."""
+        """Return the sampler of a trial; a resumed search suggests what it would have suggested."""
         (seed,) = np.random.SeedSequence((self.sampler_seed, number)).generate_state(1)
         return optuna.samplers.TPESampler(seed=int(seed))
 
@@ -90,34 +93,40 @@ class Trial:
     """The runs of a trial, the same settings with each seed, one after another.
 
     Args:
-        trial: Optuna's, new or under way.
-        plan: Of the search.
-        folder: Of the search.
-        reported: Evaluations that Optuna knows already.
+        trial: Optuna's, new or in progress.
+        values: Values of the searched settings.
+        plan: Plan of the search.
+        folder: Folder of the search.
+        reported: Number of evaluations that Optuna has.
     """
 
-    def __init__(self, trial: optuna.Trial, plan: Plan, folder: Path, *, reported: int = 0) -> None:
+    def __init__(
+        self,
+        trial: optuna.Trial,
+        values: Mapping[str, Any],
+        plan: Plan,
+        folder: Path,
+        *,
+        reported: int = 0,
+    ) -> None:
         self.trial, self.plan = trial, plan
-        # A trial that is under way has the values that it had.
-        values = {name: each.suggest(trial, name) for name, each in plan.ranges.items()}
         own = dict(line.split("=", 1) for line in (*plan.settings, *as_lines(values)))
         learner = own.pop("learner", plan.fixed.learner.name)
         method = own.pop("method", plan.fixed.method.name)
-        # What an evaluation has found is known once it is saved.
+        # An evaluation is known once it is saved.
         own["checkpoint_every"] = str(plan.fixed.evaluation.every)
         arm = Arm("", tuple(f"{name}={text}" for name, text in own.items()))
         self.path = folder / f"trial-{trial.number:04}"
         self.jobs = [Job(learner, method, seed, self.path, arm) for seed in plan.seeds]
-        self.losses = 0
         self._known, self._seen = reported, max(reported - 1, 0)
 
     @property
     def left(self) -> Job | None:
-        """Its first run that is not at its end."""
+        """First run of the trial that is not at its end."""
         return next((job for job in self.jobs if not job.is_trained()), None)
 
     def curves(self, most: int | None = None) -> list[pd.DataFrame]:
-        """Evaluations of its runs, the first ones only if so many are asked for."""
+        """Return the evaluations of its runs; of the first ``most`` only, if given."""
         found = []
         for job in self.jobs:
             table = read_table(job.path / files.EVALUATIONS).iloc[:most]
@@ -126,26 +135,26 @@ class Trial:
         return found
 
     def is_hopeless(self) -> bool:
-        """Report evaluations that are new, and tell whether most trials were better by then."""
+        """Report new evaluations; return True to prune the trial."""
         for step in range(self._seen + 1, sum(map(len, self.curves())) + 1):
             self._seen = step
             if step > self._known:
                 self.trial.report(self.plan.score(self.curves(step)), step)
-            # One that is at its end has cost all that it can.
+            # A trial at its end has cost all that it can.
             if step != self.plan.evaluations and self.trial.should_prune():
                 return True
         return False
 
 
-class Search:
-    """The trials of a search, some of them on their way at a time.
+class Search(Work[Trial]):
+    """The trials of a search.
 
     Args:
         study: Optuna's.
-        plan: What it asks for.
-        folder: Where the trials go.
-        trials: How many there shall be.
-        workers: What makes their runs.
+        plan: Plan of the search.
+        folder: Folder of the trials.
+        trials: Number of trials in all.
+        workers: Workers that make their runs.
     """
 
     def __init__(
@@ -157,99 +166,70 @@ class Search:
         trials: int,
         workers: Sequence[Worker],
     ) -> None:
-        self.study, self.plan, self.folder = study, plan, folder
-        self.trials, self.workers = trials, workers
-        self.running: dict[int, tuple[Trial, Running]] = {}
-        """By the number of their worker."""
+        self.study, self.plan, self.folder, self.trials = study, plan, folder, trials
         known = study.get_trials(deepcopy=False)
         self._asked = len(known)
-        self._waiting = [self._again(each) for each in known if not each.state.is_finished()]
+        waiting = [self._again(each) for each in known if not each.state.is_finished()]
         self.failures = 0
         """Trials that failed, one after another."""
-        done = self._asked - len(self._waiting)
-        self._bar = tqdm(
-            desc="trials", total=max(trials, self._asked), initial=done, unit="trial", smoothing=0
-        )
+        total, done = max(trials, self._asked), self._asked - len(waiting)
+        bar = tqdm(desc="trials", total=total, initial=done, unit="trial", smoothing=0)
+        super().__init__(waiting, workers, bar)
 
     def _again(self, found: FrozenTrial) -> Trial:
-        """A trial that was under way when the search was stopped or killed."""
+        """Resume a trial that was in progress when the search was stopped or killed."""
         self.study.sampler = self.plan.sampler(found.number)
         trial = optuna.Trial(self.study, found._trial_id)
-        return Trial(trial, self.plan, self.folder, reported=len(found.intermediate_values))
+        reported = len(found.intermediate_values)
+        return Trial(trial, found.params, self.plan, self.folder, reported=reported)
 
     def _ask(self) -> Trial:
-        """A new trial."""
+        """Begin a new trial."""
         self.study.sampler = self.plan.sampler(self._asked)
         self._asked += 1
-        return Trial(self.study.ask(), self.plan, self.folder)
+        trial = self.study.ask(dict(self.plan.ranges))
+        return Trial(trial, trial.params, self.plan, self.folder)
+
+    def name_of(self, item: Trial) -> str:
+        """Return the name of a trial."""
+        return item.path.name
 
     @property
-    def _has_more(self) -> bool:
-        """Whether there is a trial to begin or to go on with."""
+    def has_more(self) -> bool:
+        """True if there is a trial to begin or to resume."""
         new = self._asked < self.trials and self.failures < _MOST_FAILURES
-        return bool(self._waiting) or new
+        return bool(self.waiting) or new
 
-    def __bool__(self) -> bool:
-        return self._has_more or bool(self.running)
+    def take(self) -> tuple[Trial, Job, Commands] | None:
+        """Return the next trial with a run to make; end those that have none."""
+        while self.has_more:
+            trial = self.waiting.pop(0) if self.waiting else self._ask()
+            job = trial.left
+            if job is not None:
+                return trial, job, [job.trains(())]
+            self._end(trial, TrialState.COMPLETE)
+        return None
 
-    def begin(self) -> None:
-        """Have the workers that have nothing to do begin the next runs, or end."""
-        for number, worker in enumerate(self.workers):
-            if number in self.running:
-                continue
-            job: Job | None = None
-            while job is None and self._has_more:
-                trial = self._waiting.pop(0) if self._waiting else self._ask()
-                job = trial.left
-                if job is None:
-                    self._end(trial, TrialState.COMPLETE)
-            if job is None:
-                worker.stop()
-                worker.wait()
-            elif worker.ready():
-                run = Running(job, [job.trains(())], worker=worker, position=number + 1)
-                run.bar.set_description(f"{trial.path.name}/{job.name}")
-                self.running[number] = trial, run
-            else:
-                self._waiting.insert(0, trial)
+    def is_hopeless(self, item: Trial) -> bool:
+        """Report new evaluations of a trial; return True to prune the trial."""
+        return item.is_hopeless()
 
-    def look(self) -> None:
-        """Report what was evaluated, and take note of runs that have ended."""
-        for number, (trial, run) in list(self.running.items()):
-            try:
-                status = run.ended()
-            except Lost as error:
-                self._lost(trial, error)
-            else:
-                hopeless = trial.is_hopeless()
-                if status is None and not hopeless:
-                    continue
-                if hopeless:
-                    if status is None:
-                        run.worker.stop()
-                        run.worker.wait()
-                    self._end(trial, TrialState.PRUNED)
-                elif status == 0:
-                    # To be ended, or to go on with its next seed.
-                    self._waiting.insert(0, trial)
-                else:
-                    self._end(trial, TrialState.FAIL, f"see {run.log}")
-            run.bar.close()
-            del self.running[number]
+    def end(self, item: Trial, status: int | None) -> None:
+        """Prune or fail a trial, or let it make its next run."""
+        if status is None:
+            self._end(item, TrialState.PRUNED)
+        elif status:
+            job = item.left or item.jobs[-1]
+            self.fail(item, f"see {job.path / LOG}")
+        else:
+            self.waiting.insert(0, item)
 
-    def _lost(self, trial: Trial, error: Lost) -> None:
-        """Have a run go on elsewhere."""
-        trial.losses += 1
-        if trial.losses > MOST_LOSSES:
-            self._end(trial, TrialState.FAIL, f"lost {MOST_LOSSES} workers: {error}")
-            return
-        tqdm.write(
-            f"{trial.path.name}: its worker is gone, goes on at its last checkpoint: {error}"
-        )
-        self._waiting.insert(0, trial)
+    def fail(self, item: Trial, why: str) -> None:
+        """End a trial that failed."""
+        self._end(item, TrialState.FAIL, why)
 
     def _end(self, trial: Trial, state: TrialState, why: str = "") -> None:
-        """Tell Optuna how a trial ended, and keep its settings if they are the best."""
+        """Report the end of a trial to Optuna, and keep its settings if they are the best."""
         curves = trial.curves()
         if state == TrialState.COMPLETE and not curves:
             state, why = TrialState.FAIL, "no run was long enough for an evaluation"
@@ -259,38 +239,29 @@ class Search:
         if state == TrialState.FAIL:
             said = f"failed, {why}"
         else:
-            # What it would take to go on is most of its size.
+            # Most of the size of a run is the state to resume it from.
             for job in trial.jobs:
                 (job.path / files.CHECKPOINT).unlink(missing_ok=True)
             said = f"{self.plan.objective} {ended.value:.3f}"
         tqdm.write(f"{trial.path.name}: {said}{', pruned' * (state == TrialState.PRUNED)}")
-        self._bar.update()
+        self.bar.update()
         best = best_of(self.study)
         if best is not None:
-            self._bar.set_postfix_str(f"best {best.value:.3f}")
+            self.bar.set_postfix_str(f"best {best.value:.3f}")
             write_best(best, self.plan, self.folder / BEST)
-
-    def stop(self) -> None:
-        """Have all runs save and end."""
-        for worker in self.workers:
-            worker.stop()
-        for worker in self.workers:
-            worker.wait()
-        for bar in (*(run.bar for _, run in self.running.values()), self._bar):
-            bar.close()
 
 
 def run_search(
     plan: Plan, folder: Path, *, trials: int, most: int | None = None, ray: str | None = None
 ) -> int:
-    """Make the trials that are missing, and keep what they found.
+    """Make the trials that are missing, and write the results.
 
     Args:
-        plan: What is searched.
-        folder: Of the search, begun or new.
-        trials: How many there shall be in it, whatever became of them.
-        most: How many at a time; None: :data:`JOBS`, or on a cluster as many as there are.
-        ray: Address of a Ray cluster, empty for the one that there is; None: on this machine.
+        plan: Plan of the search.
+        folder: Folder of the search, begun or new.
+        trials: Number of trials in all, failed and pruned ones included.
+        most: Trials at a time; None: :data:`JOBS`, or on a cluster as many as there are.
+        ray: Address of a Ray cluster, empty for the present cluster; None: this machine.
 
     Returns:
         Exit status: 1 if the last trials failed, 128 and the number of the signal that stopped it.
@@ -305,7 +276,7 @@ def run_search(
         most = min(most or (JOBS if ray is None else left), left)
         with workers_of(ray if left else None, most) as workers:
             search = Search(study, plan, folder, trials=trials, workers=workers)
-            stop = run_all(search)
+            stop = search.run()
         write_results(study, plan, folder)
     if stop:
         return stop.exit_status
@@ -314,7 +285,7 @@ def run_search(
 
 @contextmanager
 def _study(plan: Plan, folder: Path) -> Iterator[optuna.Study]:
-    """The study of a folder, which nobody else writes in."""
+    """Hold the study of a folder; no other process can write there."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     with files.lock(folder):
         file = folder / STUDY
@@ -345,13 +316,13 @@ def _study(plan: Plan, folder: Path) -> Iterator[optuna.Study]:
 
 
 def best_of(study: optuna.Study) -> FrozenTrial | None:
-    """The trial with the highest value of those that came to their end."""
+    """Return the complete trial with the highest value."""
     ended = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
     return max(ended, key=lambda trial: trial.value or 0.0, default=None)
 
 
 def write_best(best: FrozenTrial, plan: Plan, path: Path) -> None:
-    """Keep settings as a file of ``train.py``."""
+    """Write settings as a file of ``train.py``."""
     command = shlex.join([f"settings={path}", *plan.settings])
     head = (
         f"# trial {best.number}: {plan.objective} {best.value:.4f} in validation, as trained by\n"
@@ -372,7 +343,7 @@ def write_results(study: optuna.Study, plan: Plan, folder: Path) -> None:
 
 
 def _importances(study: optuna.Study) -> dict[str, float]:
-    """How far the best trials differ from all of them by each setting; empty for few trials."""
+    """Return the importance of each setting by PED-ANOVA; empty for few trials."""
     # Optuna leaves out pruned trials, by which an important setting is told: they are not the best.
     trials = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE, TrialState.PRUNED])
     if len(trials) < 2 * _BEST_TRIALS:

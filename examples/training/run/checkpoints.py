@@ -1,20 +1,22 @@
-"""The checkpoint of a run: everything that its next iteration depends on."""
+"""What a run saves: its checkpoint, its policy and its records."""
 
 from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
-from torchrl_mpfa.files import load_safely
-from training.files import CHECKPOINT
-from training.records import EpisodeRecord, EvaluationRecord
+from mpfa_envs import save_policy
+from torchrl_mpfa import Learner
+from torchrl_mpfa.files import load_safely, save_atomically
+from training import files
+from training.records import EpisodeRecord, EvaluationRecord, as_table, write_table
+from training.run.evaluations import kept_policy
+from training.run.hooks import Hook
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
@@ -23,11 +25,42 @@ FORMAT = 5
 """5: many robots, in the middle of their episodes."""
 
 
+class Checkpoints(Hook):
+    """Saves the run every ``checkpoint_every`` actions and at its end."""
+
+    def on_iteration(self, run: TrainingRun) -> None:
+        """Save if it is due."""
+        if run.crossed(run.settings.checkpoint_every):
+            save(run)
+
+    def on_end(self, run: TrainingRun) -> None:
+        """Save."""
+        save(run)
+
+
+def save(run: TrainingRun) -> None:
+    """Write checkpoint, policy and records, each of them whole or not at all."""
+    folder = run.folder
+    # A run that resumes here does not log the same entries again.
+    run.tracker.flush()
+    save_atomically(state_of(run), folder / files.CHECKPOINT)
+    save_policy(kept_policy(run), folder / files.POLICY, overwrite=True)
+    write_table(as_table(run.records, EpisodeRecord), folder / files.EPISODES)
+    if run.evaluations:
+        write_table(as_table(run.evaluations, EvaluationRecord), folder / files.EVALUATIONS)
+    write_table(run.log.table(), folder / files.UPDATES)
+
+
+def is_sound(learner: Learner) -> bool:
+    """Return True if all parameters are finite."""
+    return all(bool(value.isfinite().all()) for value in learner.state_dict()["loss"].values())
+
+
 def read_checkpoint(folder: Path) -> dict[str, Any]:
     """Read a run's checkpoint without executing anything in it."""
-    file = folder / CHECKPOINT
+    file = folder / files.CHECKPOINT
     if not file.exists():
-        raise FileNotFoundError(f"resume: there is no {CHECKPOINT} in {folder}")
+        raise FileNotFoundError(f"resume: there is no {files.CHECKPOINT} in {folder}")
     try:
         state: Any = load_safely(file)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
@@ -39,7 +72,7 @@ def read_checkpoint(folder: Path) -> dict[str, Any]:
 
 
 def state_of(run: TrainingRun) -> dict[str, Any]:
-    """A run's state: everything that its next iteration depends on, and its records."""
+    """Return everything that the next iteration of a run depends on, and its records."""
     return {
         "format": FORMAT,
         "settings": asdict(run.settings),
@@ -62,7 +95,7 @@ def state_of(run: TrainingRun) -> dict[str, Any]:
 
 
 def restore(run: TrainingRun, state: dict[str, Any]) -> None:
-    """Take over everything but where the robots are, which depends on how they go on."""
+    """Load a state into a run, but for the robots: these may begin new episodes."""
     run.schedule.load_state_dict(state["schedule"])
     run.updates = state["updates"]
     run.waiting = state.get("waiting", 0) * run.settings.robots
@@ -83,36 +116,16 @@ def restore(run: TrainingRun, state: dict[str, Any]) -> None:
 
 
 def random_state(device: str) -> Any:
-    """Where PyTorch's random numbers are."""
+    """Return the state of PyTorch's random numbers."""
     if torch.device(device).type != "cuda":
         return torch.get_rng_state()
     return {"cpu": torch.get_rng_state(), "cuda": torch.cuda.get_rng_state(device)}
 
 
 def set_random_state(device: str, state: Any) -> None:
-    """Go on where :func:`random_state` was called."""
+    """Restore what :func:`random_state` returned."""
     if not isinstance(state, dict):
         state = {"cpu": state}
     torch.set_rng_state(state["cpu"])
     if "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"], device)
-
-
-def as_tensors(value: Any) -> Any:
-    """A state with tensors in place of NumPy's arrays, which a safe loader takes for code."""
-    return _replaced(value, np.ndarray, torch.from_numpy)
-
-
-def as_arrays(value: Any) -> Any:
-    """What :func:`as_tensors` was given."""
-    return _replaced(value, torch.Tensor, torch.Tensor.numpy)
-
-
-def _replaced(value: Any, kind: type[Any], convert: Callable[[Any], Any]) -> Any:
-    if isinstance(value, kind):
-        return convert(value)
-    if isinstance(value, dict):
-        return {name: _replaced(each, kind, convert) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_replaced(each, kind, convert) for each in value]
-    return value

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -20,7 +21,6 @@ from training.environments import (
     vector_of,
 )
 from training.records import EpisodeRecord
-from training.run.checkpoints import as_arrays, as_tensors
 from training.run.exploration import Explorer
 from training.settings.learners import is_discrete
 from training.settings.train import TrainSettings
@@ -33,7 +33,7 @@ TRANSITION = (
     ("next", "done"),
     ("next", "terminated"),
 )
-"""What a buffer keeps of a step."""
+"""Entries of a step that a buffer keeps."""
 _UNIFORM_SIGMA = 3**-0.5
 """Standard deviation of actions that are uniform in [-1, 1]."""
 
@@ -65,7 +65,7 @@ class Robots:
         self._begun = 0
 
     def make_replay(self, method: Method, *, seed: int, **policy: Any) -> Replay:
-        """The buffer that their transitions go to, and what is drawn from it."""
+        """Make the buffer of the transitions, and the selection of batches from it."""
         return make_replay(method, generator=torch.Generator().manual_seed(seed), **policy)
 
     def environment(self, world: str) -> EnvBase:
@@ -83,17 +83,21 @@ class Robots:
         return self._env
 
     def begin(self, world: str, explorer: Explorer, *, seed: int) -> None:
-        """Begin an episode with each robot; those that were on their way are given up."""
+        """Begin an episode with each robot; episodes in progress are given up."""
         env = self.environment(world)
         env.set_seed(seed)
-        self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
+        self._give_up(explorer)
         self._state = env.reset()
+
+    def _give_up(self, explorer: Explorer) -> None:
+        """Count the episodes in progress as given up, and number new ones."""
         self.given_up += int((self._steps > 0).sum())
+        self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
         self._rewards.zero_()
         self._steps.zero_()
 
     def _begin_episodes(self, begun: Tensor, explorer: Explorer) -> None:
-        """Number the episodes that begin, and tell the explorer of them."""
+        """Number the episodes that begin, and signal them to the explorer."""
         count = int(begun.sum())
         self._numbers[begun, 0] = torch.arange(self._begun, self._begun + count)
         self._begun += count
@@ -108,9 +112,9 @@ class Robots:
             explorer: What acts.
             actions: Of the run before these.
             episode: Episodes of the run that have ended.
-            entries: What else the transitions must have: ``"episode"``; ``"behavior_mean"`` and
-                ``"behavior_sigma"``, the actions without noise and the spread of that; or entries
-                of the environment.
+            entries: Further entries of the transitions: ``"episode"``; ``"behavior_mean"`` and
+                ``"behavior_sigma"``, the actions without noise and the spread of the noise; or
+                entries of the environment.
 
         Returns:
             The entries of :data:`TRANSITION` and those others, batch size ``[robots]``, and the
@@ -137,7 +141,7 @@ class Robots:
         episode: int,
         total_steps: int,
     ) -> list[EpisodeRecord]:
-        """Take note of what an action of some robots brought; their records if episodes ended."""
+        """Count an action of some robots; return the records of the episodes that ended."""
         self._rewards[robots] += after["reward"].squeeze(-1)
         self._steps[robots] += 1
         done = after["done"].squeeze(-1)
@@ -194,14 +198,20 @@ class Robots:
         return self.seconds + time.perf_counter() - self._started
 
     def state_dict(self) -> dict[str, Any]:
-        """Where every robot is, and what its next observation and record depend on."""
+        """Return where every robot is, and what its next observation and record depend on."""
         assert self._env is not None and self._state is not None
         observation: Tensor = self._state["observation"]
         hindsight: Tensor | None = self._state.get("hindsight", None)
         return {
-            "environment": as_tensors(vector_of(self._env).state_dict()),
+            "environment": _as_tensors(vector_of(self._env).state_dict()),
             "observation": observation.clone(),
             "hindsight": None if hindsight is None else hindsight.clone(),
+            **self._counts(),
+        }
+
+    def _counts(self) -> dict[str, Any]:
+        """Return what counts for the whole run, and which episodes are in progress."""
+        return {
             "rewards": self._rewards.clone(),
             "steps": self._steps.clone(),
             "numbers": self._numbers.clone(),
@@ -211,7 +221,7 @@ class Robots:
         }
 
     def recall(self, state: dict[str, Any]) -> None:
-        """Take over what counts for the whole run, and which episodes were under way."""
+        """Restore what counts for the whole run, and which episodes were in progress."""
         self.seconds = state["seconds"]
         self.given_up = state.get("given_up", 0)
         self._rewards, self._steps = state["rewards"].clone(), state["steps"].clone()
@@ -219,15 +229,15 @@ class Robots:
             self._numbers, self._begun = state["numbers"].clone(), state["begun"]
 
     def can_go_on(self, state: dict[str, Any]) -> bool:
-        """Whether a state tells where the robots are, or episodes must begin anew."""
+        """Return True if a state has the places of the robots; else episodes must begin again."""
         return state["environment"] is not None
 
     def load_state_dict(self, world: str, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was called."""
+        """Restore a state of :meth:`state_dict`."""
         env = self.environment(world)
         # A reset makes the entries that a step wants; what is in them is replaced.
         self._state = env.reset()
-        vector_of(env).load_state_dict(as_arrays(state["environment"]))
+        vector_of(env).load_state_dict(_as_arrays(state["environment"]))
         self._state["observation"] = state["observation"].clone()
         if self.settings.method.hindsight:
             self._state["hindsight"] = state["hindsight"].clone()
@@ -238,3 +248,23 @@ class Robots:
         if self._env is not None:
             self._env.close()
             self._env = None
+
+
+def _as_tensors(value: Any) -> Any:
+    """Replace NumPy arrays, which a safe loader takes for code, by tensors."""
+    return _replaced(value, np.ndarray, torch.from_numpy)
+
+
+def _as_arrays(value: Any) -> Any:
+    """Replace tensors by NumPy arrays."""
+    return _replaced(value, torch.Tensor, torch.Tensor.numpy)
+
+
+def _replaced(value: Any, kind: type[Any], convert: Callable[[Any], Any]) -> Any:
+    if isinstance(value, kind):
+        return convert(value)
+    if isinstance(value, dict):
+        return {name: _replaced(each, kind, convert) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replaced(each, kind, convert) for each in value]
+    return value

@@ -60,7 +60,7 @@ class ExploringPolicy(TensorDictModuleBase):
         self._explorer = make_explorer(policy, self._settings, action_spec)  # type: ignore[arg-type]
 
     def follow(self, policy: nn.Module, actions: int) -> None:
-        """Take over the weights of a policy, and how many actions the run has behind it."""
+        """Copy the weights of a policy, and the number of actions of the run so far."""
         self.policy.load_state_dict(policy.state_dict())
         self.actions.fill_(actions)
 
@@ -79,7 +79,7 @@ class ExploringPolicy(TensorDictModuleBase):
 
 
 class RobotCollector(Collector):
-    """TorchRL's collector in a worker: writes transitions, and tells the run how the robots fare.
+    """TorchRL's collector in a worker: writes transitions, and reports rewards and ends to the run.
 
     Args:
         *args: Of :class:`~torchrl.collectors.Collector`.
@@ -108,8 +108,8 @@ class RobotCollector(Collector):
 class Fleet(Robots):
     """The robots of a run, in equal parts on the workers of a Ray cluster.
 
-    A worker that is gone is replaced: all of them are begun anew, which costs the episodes that are
-    under way, as the connections by which TorchRL sends weights have their members for life.
+    A lost worker is replaced: all workers are restarted, which costs the episodes in progress, as
+    the connections by which TorchRL sends weights have their members for life.
 
     Args:
         settings: Of the run.
@@ -158,12 +158,6 @@ class Fleet(Robots):
         self._seed = seed
         self._give_up(explorer)
 
-    def _give_up(self, explorer: Explorer) -> None:
-        self.given_up += int((self._steps > 0).sum())
-        self._begin_episodes(torch.ones(self.count, dtype=torch.bool), explorer)
-        self._rewards.zero_()
-        self._steps.zero_()
-
     def _begin_episodes(self, begun: Tensor, explorer: Explorer) -> None:
         """Number the episodes; the policies of the workers see for themselves that they begin."""
         count = int(begun.sum())
@@ -200,7 +194,7 @@ class Fleet(Robots):
         return TensorDict(rows, [report.numel()]), records
 
     def _report(self, explorer: Explorer, actions: int) -> TensorDictBase:
-        """What a worker tells, or one of those in the place of workers that are gone."""
+        """Return the report of a worker; restart the workers if one is lost."""
         for _ in range(_MOST_LOSSES):
             try:
                 if self._collector is None:
@@ -262,19 +256,11 @@ class Fleet(Robots):
                 collector.shutdown()
 
     def state_dict(self) -> dict[str, Any]:
-        """Which episodes are under way; where the robots are stays on the workers."""
-        return {
-            "environment": None,
-            "rewards": self._rewards.clone(),
-            "steps": self._steps.clone(),
-            "numbers": self._numbers.clone(),
-            "begun": self._begun,
-            "seconds": self.elapsed(),
-            "given_up": self.given_up,
-        }
+        """Return which episodes are in progress; the places of the robots stay on the workers."""
+        return {"environment": None, **self._counts()}
 
     def can_go_on(self, state: dict[str, Any]) -> bool:
-        """Never: the robots begin new episodes."""
+        """Return False: the robots begin new episodes."""
         return False
 
     def close(self) -> None:
@@ -294,7 +280,7 @@ def _make_env(settings: TrainSettings, robots: int, world: str) -> EnvBase:
 
 
 def _make_worker_env(settings: TrainSettings, robots: int, world: str, seed: int) -> EnvBase:
-    """The environment of a worker, in whose process actions are random by the same seed."""
+    """Make the environment of a worker, whose process gets the same seed."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     env = _make_env(settings, robots, world)

@@ -1,16 +1,26 @@
-"""What is called on the way of a run: its log, its checkpoints, its progress, and one's own."""
+"""Hooks that a run calls, and the hook that shows its progress."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import json
+import time
+from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
+from tqdm import tqdm
 
+from torchrl_mpfa.files import write_text_atomically
+from training import files
 from training.records import EpisodeRecord, EvaluationRecord
 
 if TYPE_CHECKING:
     from training.run.loop import TrainingRun
+
+_RECENT = 100
+"""Episodes whose success is shown."""
+_REPORT_EVERY = 1.0
+"""Time between two reports of progress [s]."""
 
 
 class Hook:
@@ -57,3 +67,62 @@ class Hook:
 
     def close(self) -> None:
         """Release what the hook holds, however the run ended."""
+
+
+class Progress(Hook):
+    """Shows the progress of a run: a bar in the terminal, and ``status.json`` in its folder."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm[Any] | None = None
+        self._reported = 0.0
+
+    def on_begin(self, run: TrainingRun) -> None:
+        """Show the bar."""
+        done = run.schedule
+        self._bar = tqdm(total=done.total, initial=done.done, unit=done.unit, smoothing=0.05)
+
+    def on_iteration(self, run: TrainingRun) -> None:
+        """Move the bar, and report the success and the speed once a second."""
+        assert self._bar is not None
+        self._bar.update(run.schedule.done - self._bar.n)
+        if time.monotonic() - self._reported > _REPORT_EVERY:
+            self._reported = time.monotonic()
+            self._bar.set_postfix_str(report(run))
+
+    def on_end(self, run: TrainingRun) -> None:
+        """Report the end once all is saved: a reader may then remove the checkpoint."""
+        assert self._bar is not None
+        self._bar.set_postfix_str(report(run, saved=True))
+        self.close()
+
+    def close(self) -> None:
+        """End the line of the bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def report(run: TrainingRun, *, saved: bool = False) -> str:
+    """Write ``status.json``; return the success and the speed in a few words."""
+    summary = summary_of(run)
+    status = {
+        "unit": run.schedule.unit,
+        "done": run.schedule.done,
+        "total": run.schedule.total,
+        "episodes": run.schedule.episodes,
+        "steps": run.actions,
+        "summary": summary,
+        "given_up": run.robots.given_up,
+        "finished": run.schedule.finished and saved,
+    }
+    write_text_atomically(json.dumps(status), run.folder / files.STATUS)
+    return summary
+
+
+def summary_of(run: TrainingRun) -> str:
+    """Return the recent success and the speed, in a few words."""
+    speed = f"{run.updates / max(run.robots.elapsed(), 1e-9):.0f} updates/s"
+    recent = run.records[-_RECENT:]
+    if not recent:
+        return f"no episode yet, {speed}"
+    success = sum(record.success for record in recent) / len(recent)
+    return f"{recent[-1].world}: success {success:.0%} of last {len(recent)}, {speed}"

@@ -22,13 +22,17 @@ from torchrl_mpfa.selection import SampledBatch
 from training.environments import vector_of
 from training.records import EpisodeRecord, EvaluationRecord
 from training.run.assembly import make_curiosity, make_learner, make_robots, method_of
-from training.run.checkpoints import restore, set_random_state
+from training.run.checkpoints import (
+    Checkpoints,
+    is_sound,
+    restore,
+    save,
+    set_random_state,
+)
 from training.run.compiling import is_compiled
 from training.run.evaluations import evaluate_policy
 from training.run.exploration import make_explorer
-from training.run.hooks import Hook
-from training.run.progress import Progress
-from training.run.saving import Checkpoints, is_sound, save
+from training.run.hooks import Hook, Progress
 from training.run.schedule import Schedule
 from training.run.showing import show_policy
 from training.run.tracking import Tracker

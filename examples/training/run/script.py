@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NoReturn
 
 import hydra
+import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
+from torch._dynamo.exc import BackendCompilerFailed
 
-from training.files import check_folder
+from torchrl_mpfa.files import write_text_atomically
+from training import files
+from training.finished import after_the_end, is_finished
+from training.records import EpisodeRecord, as_table
+from training.run.assembly import method_of
+from training.run.checkpoints import read_checkpoint
+from training.run.compiling import prepare_compiler
 from training.run.hooks import Hook
-from training.run.running import Refused, resume, start
+from training.run.loop import TrainingRun
+from training.settings.checks import check_settings
 from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import with_lines
-from training.settings.train import as_settings, register
+from training.settings.resuming import changed, check_lawful, check_single
+from training.settings.train import TrainSettings, as_settings, register
 
-REFUSED = 2
+WRONG = 2
+"""Exit status of a command line that cannot be."""
 _SWEEP = ("-m", "--multirun")
 
 
-def refuse(error: Exception) -> NoReturn:
-    """Say in one line what is wrong."""
-    print(f"train.py: {error}", file=sys.stderr)
-    raise SystemExit(REFUSED)
+class Rejected(Exception):
+    """A run that does not begin, with the reason in one sentence."""
 
 
 def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
@@ -33,7 +48,7 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
 
     Args:
         arguments: The settings, ``sys.argv[1:]``.
-        hooks: What is called on the way; each run of a sweep calls the same ones.
+        hooks: Hooks to call during the run; each run of a sweep calls the same hooks.
 
     Raises:
         SystemExit: Unless the exit status is 0; ``train.py`` lists the others.
@@ -51,15 +66,15 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
                 "folder hydra.sweep.dir=FOLDER"
             )
         for settings in runs:
-            check_folder(Path(settings.run_dir))
+            files.check_folder(Path(settings.run_dir))
     except ValueError as error:
-        refuse(error)
+        _exit(error)
     if resumes:
         _end_with(lambda: resume(Path(str(folders[-1])), overrides, hooks))
     elif len(runs) == 1 and not any(text.startswith(("-", "hydra")) for text in arguments):
         _end_with(lambda: start(runs[0], Path(runs[0].run_dir), hooks))
     else:
-        # Sweeps, and whatever else Hydra can; it composes the settings once more.
+        # Sweeps, and Hydra's other modes; Hydra composes the settings once more.
         def run(config: DictConfig) -> None:
             folder = Path(HydraConfig.get().runtime.output_dir)
             _end_with(lambda: start(as_settings(config), folder, hooks))
@@ -69,10 +84,169 @@ def train(arguments: list[str], hooks: Sequence[Hook] = ()) -> None:
 
 
 def _end_with(run: Callable[[], int]) -> None:
-    """Run; the exit status of the script is that of the run."""
+    """Run; exit with the status of the run."""
     try:
         status = run()
-    except Refused as error:
-        refuse(error)
+    except Rejected as error:
+        _exit(error)
     if status:
         raise SystemExit(status)
+
+
+def _exit(error: Exception) -> NoReturn:
+    """Print an error in one line, and exit."""
+    print(f"train.py: {error}", file=sys.stderr)
+    raise SystemExit(WRONG)
+
+
+def start(settings: TrainSettings, folder: Path, hooks: Sequence[Hook] = ()) -> int:
+    """Begin a run.
+
+    Args:
+        settings: The settings, checked.
+        folder: Folder of the run.
+        hooks: Hooks to call during the run.
+
+    Returns:
+        Exit status: 0, or 128 and the number of the signal that stopped the run.
+
+    Raises:
+        Rejected: If the folder holds a run and ``overwrite`` is false, if another run is using
+            it, or if the parts reject a setting.
+    """
+    with ExitStack() as held:
+        with _rejecting():
+            held.enter_context(files.lock(folder))
+            if (folder / files.CHECKPOINT).exists() and not settings.overwrite:
+                raise ValueError(
+                    f"{folder} holds a run: continue it with resume={folder}, or start again with "
+                    "overwrite=true"
+                )
+            prepare_process(settings)
+            settings = replace(settings, run_dir=str(folder))
+            training = TrainingRun(settings, folder, hooks=hooks)
+            # Only now: a setting that the parts reject leaves the old run in its place.
+            files.set_aside(folder)
+            write_settings(settings, folder / files.SETTINGS)
+        if method_of(settings) != settings.method:
+            print(f"learner={settings.learner.name} has no action gradient: it is left out")
+        return _train(training)
+
+
+def resume(folder: Path, overrides: list[Override], hooks: Sequence[Hook] = ()) -> int:
+    """Resume a run at its checkpoint."""
+    with ExitStack() as held:
+        with _rejecting():
+            check_single(overrides)
+            if not folder.is_dir():
+                raise FileNotFoundError(f"resume: there is no folder {folder}")
+            for name in (each.key_or_group for each in overrides):
+                if name in ("run_dir", "overwrite"):
+                    raise ValueError(f"resume: {name} has no effect, a run resumes in its folder")
+            held.enter_context(files.lock(folder))
+            state = read_checkpoint(folder)
+            settings = changed(state["settings"], overrides)
+            check_settings(settings)
+            before = as_settings(state["settings"])
+            check_lawful(before, settings, folder)
+            if is_finished(folder) and settings.curriculum.stages == before.curriculum.stages:
+                print(after_the_end(folder))
+                return 0
+            prepare_process(settings)
+            training = TrainingRun(settings, folder, state, hooks)
+            # A finished run that gets more episodes is unfinished.
+            (folder / files.STATUS).unlink(missing_ok=True)
+            write_settings(settings, folder / files.SETTINGS)
+        return _train(training)
+
+
+def prepare_process(settings: TrainSettings) -> None:
+    """Set threads, arithmetic and logging."""
+    torch.set_num_threads(settings.threads)
+    # Weights that no gradient reaches decay until they are denormal numbers; after some five
+    # thousand updates a CPU takes twice as long for each because of them.
+    torch.set_flush_denormal(True)
+    prepare_compiler()
+    # TorchRL announces each storage in the middle of the progress bar.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    # The compiler of programs for a CPU warns that a CUDA toolkit is there and no GPU.
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
+
+
+def _train(training: TrainingRun) -> int:
+    """Train to the end, plot the run, print how it ended; return the exit status."""
+    folder, failure = training.folder, None
+    try:
+        finished = training.train()
+    except KeyboardInterrupt:
+        # An earlier signal asked to save first; this one ends the run.
+        training.stop.signal = training.stop.signal or signal.SIGINT
+        finished = False
+    except Exception as error:
+        failure = outside_cause(error)
+        if failure is None:
+            raise
+        finished = False
+    finally:
+        training.close()
+    # Charts are made of tables and by matplotlib, which take a second to import.
+    from mpfa_envs.render.charts import plot_histograms
+    from training.figures import plot_learning_curve
+
+    curve = folder / files.CURVE
+    if training.records:
+        plot_learning_curve(as_table(training.records, EpisodeRecord), curve)
+    if histograms := training.log.history.histograms():
+        plot_histograms(histograms, folder / files.HISTOGRAMS)
+    if training.tracker.upload is not None:
+        print(f"wandb: upload with: {training.tracker.upload}")
+    if finished:
+        print(f"policy: {folder / files.POLICY}   curve: {curve}")
+        return 0
+    saved = (folder / files.CHECKPOINT).exists()
+    how = f"continue with: train.py resume={folder}" if saved else "nothing of it was saved"
+    if failure is not None:
+        print(f"train.py: {failure}", file=sys.stderr)
+    print(f"stopped after {training.actions} actions; {how}")
+    return training.stop.exit_status if failure is None else 1
+
+
+def write_settings(settings: TrainSettings, path: Path) -> None:
+    """Write the settings of a run as JSON."""
+    values = {k: v for k, v in asdict(settings).items() if k not in ("defaults", "hydra")}
+    write_text_atomically(json.dumps(values, indent=2) + "\n", path)
+
+
+@contextmanager
+def _rejecting() -> Iterator[None]:
+    """Turn errors before the first step into :class:`Rejected`."""
+    try:
+        yield
+    except (ValueError, OSError, files.FolderInUse) as error:
+        raise Rejected(" ".join(str(error).split())) from error
+    except (MemoryError, RuntimeError) as error:
+        cause = outside_cause(error)
+        if cause is None:
+            raise
+        raise Rejected(cause) from error
+
+
+def outside_cause(error: Exception) -> str | None:
+    """Return what the machine lacks, in one sentence; None for other errors."""
+    said = str(error).partition("\n")[0].strip()
+    if isinstance(error, BackendCompilerFailed):
+        return (
+            f"the update could not be compiled, {said}: install a C++ compiler and the headers of "
+            "Python, or begin again with learner.compile=false"
+        )
+    if isinstance(error, MemoryError | torch.OutOfMemoryError) or "allocate memory" in said:
+        how_much = said.rpartition("memory: ")[2]
+        return (
+            "not enough memory for method.capacity, learner.width, method.batch_size and robots "
+            f"as they are ({how_much})"
+        )
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    # By name, as Ray is an extra; its RayTaskError is an error in what a worker did.
+    if "RayError" in kinds and "RayTaskError" not in kinds:
+        return f"the Ray cluster has lost what the run needs: {said}"
+    return None

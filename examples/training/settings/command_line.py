@@ -1,12 +1,12 @@
-"""The command line of ``train.py``: every mistake in it is one sentence, before anything starts."""
+"""The command line of ``train.py``: each error is one sentence, raised before anything starts."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
+from functools import cache
 from itertools import pairwise, product
-from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -18,43 +18,39 @@ from torchrl_mpfa.methods import METHODS, Method
 from training.settings.checks import check_settings
 from training.settings.from_file import lines_of, quoted
 from training.settings.resuming import choices_of
+from training.settings.rules import named, settings_by_name
 from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
 
 _WITH_A_WORD = ("--cfg", "-c", "--package", "-p", "--info", "-i")
 """Options of Hydra that are followed by a word of their own."""
 
 
-def known_settings(settings: Any = TrainSettings, prefix: str = "") -> Iterator[str]:
-    """Every setting by its dotted name."""
-    for entry in fields(settings):
-        if not prefix and entry.name in ("hydra", "defaults"):
-            continue
-        name = prefix + entry.name
-        yield name
-        default = entry.default_factory() if callable(entry.default_factory) else entry.default
-        if name == "method":
-            yield from {f"method.{each.name}" for kind in METHODS.values() for each in fields(kind)}
-        elif is_dataclass(default):
-            yield from known_settings(default, f"{name}.")
+@cache
+def known_settings() -> tuple[str, ...]:
+    """Return the dotted names of all settings, of all methods, and of their sections."""
+    names: dict[str, None] = {}
+    for method in METHODS.values():
+        for name, _ in settings_by_name(TrainSettings(method=method)):
+            section, _, _ = name.rpartition(".")
+            names |= dict.fromkeys((section.partition(".")[0], section, name))
+    return tuple(filter(None, names))
 
 
 def parse_overrides(arguments: Sequence[str]) -> list[Override]:
-    """The settings on a command line, those of its file first."""
+    """Parse the settings on a command line, those of its file first."""
     file, lines = lines_of(arguments)
     texts = [
         text
         for before, text in pairwise(["", *arguments])
         if not text.startswith("-") and before not in _WITH_A_WORD and text != f"settings={file}"
     ]
-    try:
+    with named(f"{file}: "):
         of_file = _parsed(lines)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
     return [*of_file, *_parsed(texts)]
 
 
 def _parsed(texts: Sequence[str]) -> list[Override]:
-    """Settings whose names and choices there are."""
+    """Parse settings; raise for unknown names and choices."""
     parser = OverridesParser.create()
     parsed = []
     for text in texts:
@@ -62,7 +58,7 @@ def _parsed(texts: Sequence[str]) -> list[Override]:
             parsed.append(parser.parse_override(quoted(text)))
         except HydraException as error:
             raise ValueError(f"{text!r} is not NAME=VALUE: {_one_line(error)}") from error
-    known = list(known_settings())
+    known = known_settings()
     overrides = [each for each in parsed if not each.key_or_group.startswith("hydra")]
     for override in overrides:
         key = override.key_or_group
@@ -74,7 +70,7 @@ def _parsed(texts: Sequence[str]) -> list[Override]:
 
 
 def _check_choices(group: str, words: Sequence[str]) -> None:
-    """Refuse unknown choices of a group, and several that exclude each other."""
+    """Raise for unknown choices of a group, and choices that exclude each other."""
     for word in words:
         if word not in GROUPS[group]:
             raise ValueError(
@@ -95,7 +91,7 @@ def _check_choices(group: str, words: Sequence[str]) -> None:
 
 
 def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
-    """The settings of each run that a command line asks for, checked."""
+    """Yield the settings of each run of a command line, checked."""
     alternatives = []
     for override in parse_overrides(arguments):
         text = override.input_line or ""
@@ -116,7 +112,7 @@ def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:
 
 
 def _one_line(error: Exception) -> str:
-    """What OmegaConf or Hydra has to say, without what only its developers can use."""
+    """Return the cause of an error of OmegaConf or Hydra in one line."""
     cause: BaseException = error
     while cause.__cause__ is not None:
         cause = cause.__cause__
@@ -133,6 +129,7 @@ def _one_line(error: Exception) -> str:
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:
+    """Suggest the nearest known name."""
     # Most mistakes are typos, or settings without the section they are in.
     names = list(known)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.5)

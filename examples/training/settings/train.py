@@ -29,7 +29,16 @@ from training.settings.learners import (
     SACSettings,
     TD3Settings,
 )
-from training.settings.rules import NAME, WORD, at_least, between, choice, setting, up_to
+from training.settings.rules import (
+    NAME,
+    WORD,
+    at_least,
+    between,
+    choice,
+    named,
+    setting,
+    up_to,
+)
 
 MOST_ROBOTS = 4096
 """On wheels these take 6.4 GB."""
@@ -348,11 +357,9 @@ def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
         structure.method = method_named(values.method.name)
     merged = OmegaConf.merge(structure, values)
     merged.pop("hydra", None)
-    try:
+    # A method checks its own settings.
+    with named("method."):
         settings = OmegaConf.to_object(merged)
-    except (TypeError, ValueError) as error:
-        # What a method checks itself.
-        raise ValueError(f"method.{error}") from error
     assert isinstance(settings, TrainSettings)
     curriculum = settings.curriculum
     curriculum.name = curriculum.name or curriculum_name(curriculum.stages)

@@ -54,7 +54,7 @@ def test_a_comparison_loses_a_machine_and_gives_the_rows_of_one_machine(
     thread.start()
     assert compare.main(arguments) == 0
     assert not thread.is_alive()
-    assert capsys.readouterr().out.count("its worker is gone, goes on at its last") == 1
+    assert capsys.readouterr().out.count("its worker is gone, resumes at its last") == 1
     # Neither run was begun twice.
     assert not list((tmp_path / "ray").glob(f"*/{files.PREVIOUS}"))
 

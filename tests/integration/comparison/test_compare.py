@@ -22,8 +22,8 @@ from training.comparison.arms import parse_arm, with_defaults
 from training.comparison.jobs import Job, other_than_asked
 from training.comparison.workers import Lost
 from training.records import read_table
-from training.run import running
-from training.run.running import Refused, resume, start
+from training.run import script
+from training.run.script import Rejected, resume, start
 from training.settings.command_line import composed
 
 EPISODES = "curriculum.stages=[{{world: A, episodes: {}}}]"
@@ -57,7 +57,7 @@ class InThisProcess:
             else:
                 (settings,) = composed(arguments)
                 self.status = start(settings, Path(settings.run_dir))
-        except Refused as error:
+        except Rejected as error:
             log.write_text(str(error))
             self.status = 2
 
@@ -138,7 +138,7 @@ def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
     job = Job("ddpg", "per", 0, tmp_path)
     job.path.mkdir()
     many = [*OVERRIDES, "robots=4", EPISODES.format(1)]
-    running.write_settings(job.asked(many), job.path / files.SETTINGS)
+    script.write_settings(job.asked(many), job.path / files.SETTINGS)
     assert not other_than_asked([job], many)
     assert (job in other_than_asked([job], [*many, setting])) == matters
 

@@ -161,7 +161,7 @@ def test_a_comparison_whose_worker_is_killed_gives_the_rows_of_one_that_is_not(
     arguments.append("checkpoint_every=20")
     monkeypatch.setattr(execution, "LocalWorker", Killed)
     assert compare.main(arguments) == 0
-    assert capsys.readouterr().out.count("its worker is gone, goes on at its last") == 1
+    assert capsys.readouterr().out.count("its worker is gone, resumes at its last") == 1
     assert not list((tmp_path / "killed").glob(f"*/{files.PREVIOUS}"))
     arguments[1] = str(tmp_path / "whole")
     monkeypatch.setattr(execution, "LocalWorker", InThisProcess)

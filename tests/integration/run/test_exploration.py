@@ -81,11 +81,11 @@ def test_a_choice_at_random_becomes_as_rare_as_it_is_told_and_each_robot_has_its
         assert explorer.epsilon == pytest.approx(expected)
         for _ in range(100):
             explorer.act(OBSERVATION)
-    explorer.shares = torch.tensor([0.0, 0.5, 1.0])
+    explorer.shares = torch.tensor([[0.0], [0.5], [1.0]])
     others = torch.stack([(explorer.act(OBSERVATION) != best).any(1) for _ in range(2000)])
     # One in four of what is chosen at random is the best.
     torch.testing.assert_close(
-        others.float().mean(0), 0.75 * 0.2 * explorer.shares, rtol=0.0, atol=0.02
+        others.float().mean(0), 0.75 * 0.2 * explorer.shares[:, 0], rtol=0.0, atol=0.02
     )
 
 

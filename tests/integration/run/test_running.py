@@ -18,7 +18,7 @@ from training.files import CHECKPOINT
 from training.run import loop
 from training.run.assembly import make_learner
 from training.run.loop import TrainingRun
-from training.run.running import Refused, prepare_process, start
+from training.run.script import Rejected, prepare_process, start
 from training.settings.command_line import composed
 from training.settings.train import TrainSettings
 
@@ -119,7 +119,7 @@ def test_a_run_that_the_machine_ends_says_so_in_one_sentence_and_is_status_1(
     if isinstance(error, MemoryError | RuntimeError):
         # Before the first step it is a setting that cannot be.
         monkeypatch.setattr(TrainingRun, "_build", fails)
-        with pytest.raises(Refused, match=message):
+        with pytest.raises(Rejected, match=message):
             begin(tmp_path / "other")
 
 

@@ -24,10 +24,9 @@ from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.records import read_table
 from training.run import progress, saving
-from training.run.checkpoints import read_checkpoint
+from training.run.checkpoints import read_checkpoint, save
 from training.run.loop import TrainingRun
-from training.run.running import Refused, resume, start
-from training.run.saving import save
+from training.run.script import Rejected, resume, start
 from training.settings.command_line import composed, parse_overrides
 from training.settings.resuming import changed
 from training.settings.train import LAST_SEED
@@ -108,7 +107,7 @@ def test_a_second_run_in_the_same_folder_is_rejected_while_the_first_is_at_work(
     with lock(tmp_path):
         before = contents(tmp_path)
         for again in (lambda: begin(tmp_path, "overwrite=true"), lambda: go_on(tmp_path)):
-            with pytest.raises(Refused, match=f"another process is using {tmp_path}"):
+            with pytest.raises(Rejected, match=f"another process is using {tmp_path}"):
                 again()
         assert contents(tmp_path) == before
         with pytest.raises(FolderInUse), lock(tmp_path):
@@ -126,7 +125,7 @@ def test_what_a_killed_save_left_is_removed(tmp_path: Path) -> None:
 def test_a_folder_with_a_run_is_not_written_over_unless_asked_to(tmp_path: Path) -> None:
     begin(tmp_path, "seed=1", episodes=1)
     before = contents(tmp_path)
-    with pytest.raises(Refused, match=f"{tmp_path} holds a run: continue it with resume="):
+    with pytest.raises(Rejected, match=f"{tmp_path} holds a run: continue it with resume="):
         begin(tmp_path, "seed=2", episodes=1)
     assert contents(tmp_path) == before
 
@@ -144,7 +143,7 @@ def test_a_run_begun_again_and_killed_at_once_cannot_resume_the_old_one(
     with pytest.raises(SystemExit):
         begin(tmp_path, "seed=2", "overwrite=true")
     monkeypatch.undo()
-    with pytest.raises(Refused, match=f"there is no {CHECKPOINT} in {tmp_path}"):
+    with pytest.raises(Rejected, match=f"there is no {CHECKPOINT} in {tmp_path}"):
         go_on(tmp_path)
     assert not (tmp_path / files.POLICY).exists()
     assert (tmp_path / files.PREVIOUS / CHECKPOINT).read_bytes() == old
@@ -153,7 +152,7 @@ def test_a_run_begun_again_and_killed_at_once_cannot_resume_the_old_one(
 def test_a_setting_that_the_parts_reject_leaves_the_old_run_in_its_place(tmp_path: Path) -> None:
     begin(tmp_path, episodes=1)
     before = contents(tmp_path)
-    with pytest.raises(Refused, match="layers must be at least 2"):
+    with pytest.raises(Rejected, match="layers must be at least 2"):
         begin(tmp_path, "overwrite=true", "learner.layers=1")
     assert contents(tmp_path) == before
 
@@ -205,7 +204,7 @@ def test_what_a_run_cannot_change_on_its_way_is_rejected_by_name(
     override: str, message: str, two_episodes: Path
 ) -> None:
     before = contents(two_episodes)
-    with pytest.raises(Refused, match=message) as caught:
+    with pytest.raises(Rejected, match=message) as caught:
         go_on(two_episodes, override)
     assert "\n" not in str(caught.value)
     assert contents(two_episodes) == before

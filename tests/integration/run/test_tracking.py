@@ -18,8 +18,8 @@ import yaml
 from tests.integration.tiny_runs import go_on, tiny, train
 from training import files
 from training.records import EpisodeRecord, EvaluationRecord
+from training.run.checkpoints import save
 from training.run.loop import TrainingRun
-from training.run.saving import save
 from training.run.showing import show_policy
 from training.run.tracking import Tracker
 from training.settings.command_line import composed

@@ -29,10 +29,9 @@ from torchrl_mpfa.methods import ALIASES, METHODS
 from training.files import CHECKPOINT
 from training.records import EvaluationRecord
 from training.run import checkpoints, loop
-from training.run.checkpoints import random_state, read_checkpoint, set_random_state
+from training.run.checkpoints import random_state, read_checkpoint, save, set_random_state
 from training.run.hooks import Hook
 from training.run.loop import TrainingRun
-from training.run.saving import save
 from training.settings.train import GROUPS, Stage, TrainSettings
 
 

@@ -240,7 +240,7 @@ def usual() -> TrainSettings:
         ("method.capacity=100", "method.capacity must hold a batch of 256, got 100"),
         ("method.population=bufer", "method.population must be one of buffer, batch, got 'bufer'"),
         ("method.alpha=inf", "method.alpha must be finite and not negative, got inf"),
-        ("environment.robot=burgr", "environment.robot: robot must be .*did you mean 'burger'"),
+        ("environment.robot=burgr", "environment.robot must be .*'burgr' .did you mean 'burger'"),
         (
             "environment.physics=magic",
             "environment.physics must be one of .*'magic'",
@@ -289,11 +289,11 @@ def test_a_value_that_cannot_be_is_one_sentence_with_its_name(
         ("method.name=mine", "unknown method 'mine'"),
         (
             "curriculum=A environment.clearance=99",
-            r"stages\[0\].world, environment.clearance=99.0: world 'A' has no start",
+            r"stages\[0\].world \(environment.clearance=99.0\): world 'A' has no start",
         ),
         (
             "curriculum=A environment.max_goal_distance=0.5",
-            r"stages\[0\].world, environment.max_goal_distance=0.5: max_goal_distance must be",
+            r"stages\[0\].world .*: max_goal_distance must be above .*, got 0.5",
         ),
         ("method.positive_above=high", "method.positive_above must be a finite number or 'mean'"),
         ("learner=dqn learner.compile=true", "learner.compile must be false with dqn"),
