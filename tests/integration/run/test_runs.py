@@ -23,7 +23,7 @@ from training import files
 from training.comparison.jobs import Job
 from training.files import CHECKPOINT, FolderInUse, lock
 from training.records import read_table
-from training.run import progress, saving
+from training.run import checkpoints, hooks
 from training.run.checkpoints import read_checkpoint, save
 from training.run.loop import TrainingRun
 from training.run.script import Rejected, resume, start
@@ -70,8 +70,8 @@ def test_a_run_is_not_finished_before_all_of_it_is_saved(
     assert begin(job.path, episodes=1) == 0
     assert job.is_trained()
     with monkeypatch.context() as patch:
-        patch.setattr(saving, lost, full)
-        patch.setattr(progress, "_TELL_EVERY", 0.0)
+        patch.setattr(checkpoints, lost, full)
+        patch.setattr(hooks, "_REPORT_EVERY", 0.0)
         with pytest.raises(OSError, match="no space"):
             go_on(job.path, STAGES.format(2))
     status = job.status()
@@ -187,8 +187,8 @@ def test_the_words_that_began_a_run_may_be_said_again_when_it_goes_on(learner: s
         ("regime=rooms", r"cannot change regime=rooms \(it has paper\)"),
         ("robots=4", r"cannot change robots=4 \(it has 1\)"),
         (STAGES.format(1), r"curriculum.stages may have more .* has \[A: 2\], got \[A: 1\]"),
-        ("run_dir=elsewhere", "resume: run_dir is of no use, a run goes on in its folder"),
-        ("overwrite=true", "resume: overwrite is of no use"),
+        ("run_dir=elsewhere", "resume: run_dir has no effect, a run resumes in its folder"),
+        ("overwrite=true", "resume: overwrite has no effect"),
         # Sums over two threads have other last bits.
         ("threads=2", r"cannot change threads=2 \(it has 1\)"),
         ("tracking=csv,wandb", r"takes one value, got tracking=.*: several are tracking=\[csv,wan"),
