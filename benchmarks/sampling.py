@@ -31,10 +31,10 @@ from tqdm import tqdm
 
 from mpfa_envs.render.charts import finish, look, new_figure
 from torchrl_mpfa import SignalReplayBuffer, SignalSampler, make_actor
+from torchrl_mpfa.checks import unknown
 from torchrl_mpfa.methods import ALIASES, METHODS, Method, make_replay
 from torchrl_mpfa.methods.catalogue import MW
 from torchrl_mpfa.methods.ref_er import ReFERSampler
-from torchrl_mpfa.spelling import unknown
 from training.files import check_folder
 
 COUNT = 2_000

@@ -35,7 +35,7 @@ from collections.abc import Sequence
 import training.extra  # noqa: F401
 
 # isort: split
-from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.checks import unknown
 from training import files
 from training.comparison.arms import check_free, parse_arms
 from training.comparison.execution import add_options, make_runs

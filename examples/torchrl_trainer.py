@@ -34,7 +34,7 @@ from torchrl_mpfa import (
     make_critic,
     make_ddpg_loss,
 )
-from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
+from torchrl_mpfa.integrations.trainer import PriorityStepper
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +173,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         progress_bar=not options.no_progress,
     )
     PriorityStepper().register(trainer)  # The step, and then the priorities of its batch.
-    PriorityGuard().register(trainer)  # An error, if another stepper did without the latter.
     trainer.train()
     close_progress_bar(trainer)
     print(*report(trainer), sep="\n")

@@ -8,9 +8,11 @@ if TYPE_CHECKING:
     from torchrl_mpfa.adjustment import Adjustment as Adjustment
     from torchrl_mpfa.adjustment import PositiveBoost as PositiveBoost
     from torchrl_mpfa.adjustment import PositiveDecay as PositiveDecay
+    from torchrl_mpfa.buffer import SignalReplayBuffer as SignalReplayBuffer
     from torchrl_mpfa.fusion import EntropyFusion as EntropyFusion
     from torchrl_mpfa.fusion import FixedFusion as FixedFusion
     from torchrl_mpfa.fusion import Fusion as Fusion
+    from torchrl_mpfa.fusion import ScaledFusion as ScaledFusion
     from torchrl_mpfa.history import ReplayHistory as ReplayHistory
     from torchrl_mpfa.learners import DDPGLearner as DDPGLearner
     from torchrl_mpfa.learners import DQNLearner as DQNLearner
@@ -25,13 +27,10 @@ if TYPE_CHECKING:
     from torchrl_mpfa.losses import make_ddpg_loss as make_ddpg_loss
     from torchrl_mpfa.losses import make_sac_loss as make_sac_loss
     from torchrl_mpfa.losses import make_td3_loss as make_td3_loss
-    from torchrl_mpfa.moving_fusion import ScaledFusion as ScaledFusion
-    from torchrl_mpfa.moving_fusion import ScheduledFusion as ScheduledFusion
     from torchrl_mpfa.networks import make_actor as make_actor
     from torchrl_mpfa.networks import make_critic as make_critic
     from torchrl_mpfa.networks import make_stochastic_actor as make_stochastic_actor
     from torchrl_mpfa.networks import make_value_network as make_value_network
-    from torchrl_mpfa.replay import SignalReplayBuffer as SignalReplayBuffer
     from torchrl_mpfa.samplers import MPFASampler as MPFASampler
     from torchrl_mpfa.samplers import SignalSampler as SignalSampler
     from torchrl_mpfa.samplers import SignalSliceSampler as SignalSliceSampler
@@ -48,23 +47,22 @@ __version__ = "0.3.0"
 
 _NAMES = {
     "adjustment": "Adjustment PositiveBoost PositiveDecay",
-    "fusion": "EntropyFusion FixedFusion Fusion",
+    "buffer": "SignalReplayBuffer",
+    "fusion": "EntropyFusion FixedFusion Fusion ScaledFusion",
     "history": "ReplayHistory",
     "learners": "DDPGLearner DQNLearner Learner SACLearner TabularQLearner TD3Learner",
     "losses": (
         "SignalDDPGLoss SignalDQNLoss SignalSACLoss SignalTD3Loss make_ddpg_loss make_sac_loss "
         "make_td3_loss"
     ),
-    "moving_fusion": "ScaledFusion ScheduledFusion",
     "networks": "make_actor make_critic make_stochastic_actor make_value_network",
-    "replay": "SignalReplayBuffer",
     "samplers": "MPFASampler SignalSampler SignalSliceSampler",
     "signals": "ACTION_GRADIENT MPFA_SIGNALS REWARD TD_ERROR Signal",
     "storages": "SignalMemmapStorage SignalTensorStorage",
     "updates": "run_updates",
 }
 """Public names by module. A module is imported when a name of it is first used, as TorchRL's
-buffers take half a second, which whoever asks for help need not wait."""
+buffers take half a second, for which a command's help need not wait."""
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))
 

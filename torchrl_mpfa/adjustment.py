@@ -1,13 +1,15 @@
-r"""Change of a priority by what the transition is: Eqs. (22)-(24).
+r"""Change of priorities of positive transitions: Eqs. (22)-(24).
 
 An adjustment takes the fused priorities of a batch and gives new ones. The paper has two, both
-for *positive* transitions (reward above zero): they are boosted, then those above the average of
-their batch decay. Equation numbers: Cheng et al. (2023),
+for *positive* transitions (reward above a level, zero in the paper): they are boosted, then those
+above the average of their batch decay. Equation numbers: Cheng et al. (2023),
 https://doi.org/10.3389/fnbot.2023.1281166. Shapes: ``B`` transitions in a batch.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
@@ -16,15 +18,32 @@ import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import BELOW_ONE, POSITIVE, check
-from torchrl_mpfa.positive import Level, check_level, is_positive
 
 if TYPE_CHECKING:
     from torchrl_mpfa.storages.table import SignalTable
 
+Level = float | Literal["mean"]
+"""A reward, or ``"mean"``: the mean reward of the buffer."""
+_ENOUGH = 1000
+"""With fewer rewards there is no warning that all are on one side."""
 Bound = Literal["floor", "cap", "none"]
 Position = Literal["batch", "rank", "count"]
 _ROUNDING = 64
 """Units in the last place by which a priority has to exceed the mean of its batch."""
+
+
+def check_level(positive_above: Level) -> None:
+    """Reject a level that is neither a finite number nor ``"mean"``."""
+    number = isinstance(positive_above, int | float) and not isinstance(positive_above, bool)
+    if positive_above != "mean" and not (number and math.isfinite(positive_above)):
+        raise ValueError(
+            f"positive_above must be a finite number or 'mean', got {positive_above!r}"
+        )
+
+
+def is_positive(reward: Tensor, positive_above: Level, *, mean: float) -> Tensor:
+    """Mask of positive transitions, :math:`r_i > 0` in the paper (Eqs. 17, 22-24), ``[B]``."""
+    return reward > (mean if positive_above == "mean" else positive_above)
 
 
 def boost_positive(
@@ -155,7 +174,7 @@ class Counting(Protocol):
 
     @property
     def counts(self) -> bool:
-        """Whether it wants to count at all."""
+        """True if the adjustment counts at all."""
         ...
 
     def count(self, table: SignalTable, priority: Tensor) -> Tensor:
@@ -173,7 +192,7 @@ class Counting(Protocol):
 
 
 def counts_buffer(adjustment: object) -> bool:
-    """Whether an adjustment is to count the buffer."""
+    """Return True if an adjustment counts the buffer."""
     return bool(getattr(adjustment, "counts", False))
 
 
@@ -215,7 +234,7 @@ class PositiveBoost:
 
     @property
     def counts(self) -> bool:
-        """Whether the factor follows the buffer."""
+        """True if the factor is estimated from the buffer."""
         return self.target_share > 0
 
     def count(self, table: SignalTable, priority: Tensor) -> Tensor:
@@ -299,3 +318,33 @@ def _factors_by_place(
     """Factors of places 1 to ``count``: the same for every batch of that size."""
     places = torch.arange(1, count + 1, dtype=dtype, device=device)
     return decay_factor(places, sharpness=sharpness)
+
+
+def level_of(parts: Iterable[object]) -> Level:
+    """Return the first ``positive_above`` among the parts, or 0."""
+    levels = (getattr(getattr(part, "fusion", part), "positive_above", None) for part in parts)
+    return next((level for level in levels if level is not None), 0.0)
+
+
+def one_sided(rewards: Tensor, parts: Iterable[object]) -> str | None:
+    """Return a warning if all rewards of a buffer are on one side of a level of the parts.
+
+    There is none for few rewards, nor for rewards that are all equal, which no level separates.
+    """
+    if len(rewards) < _ENOUGH or bool((rewards == rewards[0]).all()):
+        return None
+    # A fusion may stand around another one.
+    inner = [getattr(part, "fusion", part) for part in parts]
+    found = [(getattr(part, "positive_above", "mean"), hasattr(part, "weights")) for part in inner]
+    for level in {level for level, _ in found if level != "mean"}:
+        above = int((rewards > float(level)).sum())
+        # A boost of goals alone waits for the first of them; the weights of Eq. (17) cannot.
+        waits = above == 0 and float(level) > 0 and (level, True) not in found
+        if above in (0, len(rewards)) and not waits:
+            return (
+                f"{'all' if above else 'none'} of the {len(rewards)} rewards in the buffer are "
+                f"above {level}: by Eq. (17) TD error and gradient get no weight next to the "
+                "reward, and boost and decay separate no transitions. Set positive_above to a "
+                "level between the rewards, or to 'mean', with which all weights are equal"
+            )
+    return None

@@ -1,9 +1,10 @@
-"""Argument checks, and the default random generator."""
+"""Argument checks and their errors, and the default random generator."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
 from numbers import Integral
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 Rule = tuple[Callable[[Any], bool], str]
-"""Whether a value can be, and in words what it must be."""
+"""Test of a value, and in words what the value must be."""
 
 POSITIVE: Rule = (lambda value: 0.0 < value < math.inf, "positive and finite")
 NOT_NEGATIVE: Rule = (lambda value: 0.0 <= value < math.inf, "finite and not negative")
@@ -33,7 +34,7 @@ COUNT_OR_ZERO: Rule = (
 def seeded_generator(
     source: torch.Generator | None = None, device: torch.device | str = "cpu"
 ) -> torch.Generator:
-    """A new generator on a device, seeded by another one, by default that of PyTorch."""
+    """Return a new generator on a device, seeded by another one, by default PyTorch's."""
     generator = torch.Generator(device)
     where = "cpu" if source is None else source.device
     generator.manual_seed(int(torch.randint(2**62, (), generator=source, device=where)))
@@ -41,9 +42,9 @@ def seeded_generator(
 
 
 def generator_on(device: torch.device, source: torch.Generator | None) -> torch.Generator | None:
-    """A generator for one call: itself on its own device, elsewhere a new one that it seeds.
+    """Return a generator for one call: the source on its own device, else one that it seeds.
 
-    All state is in the source, so that a state saved beside a GPU loads where there is none.
+    All state is in the source, so that a state saved on a GPU loads without one.
     """
     own = source is None or source.device == device
     return source if own else seeded_generator(source, device)
@@ -73,6 +74,21 @@ def check(rule: Rule, **values: Any) -> None:
             raise ValueError(f"{name} must be {wanted}, got {value!r}")
 
 
+def unknown(word: str, name: object, known: Iterable[str]) -> str:
+    """Return the error of an unknown name, with the nearest known one, or all if none is near.
+
+    Examples:
+        >>> unknown("method", "mpfa-per", ["mpfa_per", "per"])
+        "unknown method 'mpfa-per': did you mean 'mpfa_per'?"
+        >>> unknown("fusion", "x", ["fixed", "entropy"])
+        "unknown fusion 'x': must be one of ['entropy', 'fixed']"
+    """
+    names = sorted(known)
+    near = get_close_matches(str(name), names, n=1)
+    cure = f"did you mean {near[0]!r}?" if near else f"must be one of {names}"
+    return f"unknown {word} {name!r}: {cure}"
+
+
 def rules_of(kind: type) -> dict[str, Rule]:
     """Return the rules in the metadata of a dataclass's fields.
 
@@ -91,7 +107,7 @@ def check_counts(**counts: Any) -> None:
 
 
 def bounds(values: Tensor) -> tuple[float, float]:
-    """Lowest and highest value; both NaN if any is."""
+    """Return the lowest and the highest value; both NaN if any value is."""
     low, high = values.aminmax()
     if not values.is_cpu:
         low, high = torch.stack((low, high)).cpu()  # Waits for the device once.
@@ -100,7 +116,7 @@ def bounds(values: Tensor) -> tuple[float, float]:
 
 
 def check_index(index: Tensor, size: int) -> Tensor:
-    """The slots without -1, by which TorchRL's writers mark what was not stored."""
+    """Return the slots without -1, by which TorchRL's writers mark what was not stored."""
     low, high = bounds(index) if len(index) else (0, -1)
     if low < -1 or high >= size:
         raise IndexError(f"index must be in [0, {size}), got {low if low < -1 else high}")
@@ -108,7 +124,7 @@ def check_index(index: Tensor, size: int) -> Tensor:
 
 
 def as_mask(name: str, value: Any) -> Tensor:
-    """Booleans, given as such or as 0 and 1; anything else is rejected by name."""
+    """Return booleans given as such or as 0 and 1; reject anything else by name."""
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor of booleans, got {type(value).__name__}")
     # A compiled program looks at no values.

@@ -1,7 +1,7 @@
-"""Which steps belong together: a step follows another one if it begins with what that ended with.
+"""Episodes of steps: a step follows another if it begins with the observation that ended the other.
 
-Numbers of episodes and trajectories begin again with every collector and process; what a robot
-observes does not.
+Numbers of episodes and trajectories begin again with every collector and process; observations do
+not.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _STEPS = "steps_to_next_obs"
 
 
 def follows(storage: Any, table: SignalTable, before: Tensor, after: Tensor) -> Tensor:
-    """Whether stored steps can follow others, by their slots, shape ``[B]``.
+    """Mask of stored steps that can follow others, by their slots, shape ``[B]``.
 
-    Without observations, those that were written since a load follow none of before.
+    Without observations, steps that were written since a load follow none from before.
     """
     old, new = (
         table.written_at(slots.to(table.device)) < table.loaded for slots in (before, after)
@@ -51,10 +51,10 @@ def episodes_of(
         steps: All steps, ``ndim`` dimensions of them.
         places: Places of those to number along the flattened dimensions, shape ``[B]``.
         number: Numbers of their episodes, which may begin again, shape ``[B]``.
-        last: Whether an episode ends with a step, shape ``[B]``.
-        loaded: Whether steps are from before a load, across which no episode continues without
-            an observation that says so, shape ``[B]``.
-        ndim: How many dimensions there are.
+        last: True for the last step of an episode, shape ``[B]``.
+        loaded: True for steps from before a load, across which no episode continues without an
+            observation that says so, shape ``[B]``.
+        ndim: Number of dimensions.
 
     Returns:
         The position of the first step of each one's episode, shape ``[B]``.
@@ -91,7 +91,7 @@ def episodes_of(
 
 
 def _seen(steps: TensorDictBase) -> Iterator[tuple[Tensor, Tensor]]:
-    """Entries that steps have at their beginning and at their end."""
+    """Yield the entries that steps have at their beginning and at their end."""
     ends = steps.get("next", None)
     # What several steps make of one is not what the next one begins with.
     if not isinstance(ends, TensorDictBase) or steps.get(_STEPS, None) is not None:
@@ -104,12 +104,12 @@ def _seen(steps: TensorDictBase) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def _rows(entry: Tensor, places: Tensor, ndim: int) -> Tensor:
-    """An entry of some steps, shape ``[B, M]``."""
+    """Return an entry of some steps, shape ``[B, M]``."""
     return entry.flatten(0, ndim - 1)[places.to(entry.device)].unsqueeze(-1).flatten(1)
 
 
 def _hash(rows: Tensor) -> Tensor:
-    """A number for each row, on the CPU, which differs for different ones, shape ``[B]``."""
+    """Return a number for each row, on the CPU, which differs for different rows, shape ``[B]``."""
     # Adding zero makes one zero of the two that there are.
     bits = (rows.nan_to_num(nan=1e30).double() + 0.0).view(torch.long)
     factor = torch.randint(2**62, (rows.shape[1],), generator=torch.Generator().manual_seed(0))

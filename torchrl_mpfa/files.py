@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 MANIFEST = "manifest.json"
-_FORMAT = 1
+_FORMAT = 2
 _LOCK = ".lock"
 _ENDINGS = {".json", ".memmap", ".pt"}
 """Of tensors and plain values. TensorDict unpickles what has others, also inside of archives."""
@@ -100,7 +100,7 @@ def load_safely(
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def check_saved(part: str, state: Any, names: Iterable[str] = (), **exact: Any) -> None:
+def check_saved(part: str, state: Any, names: Iterable[str] = (), /, **exact: Any) -> None:
     """Reject the saved state of a part that lacks entries, or is of another kind of part.
 
     Args:
@@ -130,7 +130,7 @@ def check_saved(part: str, state: Any, names: Iterable[str] = (), **exact: Any) 
 
 
 def check_saved_numbers(part: str, state: Any) -> None:
-    """Reject a saved state with a number that is not finite, in whatever entry it is.
+    """Reject a saved state with a number that is not finite, in any entry.
 
     Raises:
         ValueError: If there is one.

@@ -38,8 +38,8 @@ from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.adjustment import Level, check_level
 from torchrl_mpfa.checks import BELOW_ONE, NOT_NEGATIVE, check, check_finite
-from torchrl_mpfa.positive import Level, check_level
 
 if TYPE_CHECKING:
     from torchrl_mpfa.storages.table import SignalTable
@@ -194,6 +194,15 @@ class Fusion(Protocol):
         ...
 
 
+@runtime_checkable
+class Annealed(Protocol):
+    """A part with a schedule over the training."""
+
+    def anneal(self, fraction: float) -> None:
+        """Move to a share of the training that is done, from 0 to 1."""
+        ...
+
+
 def checked_weights(
     fusion: Fusion, names: Sequence[str], table: SignalTable, index: Tensor
 ) -> Tensor:
@@ -314,3 +323,48 @@ class FixedFusion:
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
         """The fixed weights in the order of ``names``, shape ``[K]``."""
         return torch.tensor([self.values.get(name, 0.0) for name in names], dtype=torch.double)
+
+
+@dataclass(frozen=True)
+class ScaledFusion:
+    """Weights of another fusion for signals that are first divided by their mean in the buffer.
+
+    Signals of different units then have the shares in a priority that their weights say.
+
+    Args:
+        fusion: Source of the weights.
+
+    Examples:
+        >>> ScaledFusion(FixedFusion({"reward": 0.5, "td_error": 0.5})).every_batch
+        False
+    """
+
+    fusion: Fusion
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.fusion, Fusion):
+            raise TypeError(f"fusion must have a method 'weights', got {self.fusion!r}")
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """As the other fusion."""
+        return tuple(getattr(self.fusion, "signal_names", ()))
+
+    @property
+    def every_batch(self) -> bool:
+        """As the other fusion."""
+        return bool(getattr(self.fusion, "every_batch", False))
+
+    def anneal(self, fraction: float) -> None:
+        """Move the other fusion, if it has a schedule."""
+        if isinstance(self.fusion, Annealed):
+            self.fusion.anneal(fraction)
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """Weights divided by the means of the signals, shape ``[K]``."""
+        weights = self.fusion.weights(names, table, index)
+        places = torch.tensor([table.column[name] for name in names])
+        signals = table.rows[: table.size, places]
+        mean = signals.nanmean(0).to(weights.dtype)
+        # A signal that is zero everywhere, or known of no transition yet, has no scale.
+        return weights.to(mean.device) / torch.where(mean > 0, mean, 1.0)

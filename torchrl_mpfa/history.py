@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.replay import SignalReplayBuffer
 
 _LOW, _HIGH = 1e-6, 1e6
 """Ends of the bins; what lies beyond counts to the outermost ones."""

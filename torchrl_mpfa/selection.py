@@ -26,8 +26,8 @@ class SampledBatch:
         trains: The networks that learn from them: ``"both"``, the ``"critic"`` or the ``"actor"``.
             The target networks move with the actor.
         loss_function: Distance of the critic's loss; None: the loss's own.
-        new_step: Whether a new training step begins; false for further batches of the same step,
-            which a delay of the actor does not count.
+        new_step: True for the first batch of a training step; a delay of the actor does not count
+            further batches of the same step.
 
     Raises:
         ValueError: If ``trains`` is unknown.
@@ -49,7 +49,7 @@ class SampledBatch:
 
     @property
     def gives_signals(self) -> bool:
-        """Whether the update writes signals in the batch: the actor's loss has none."""
+        """True if the update writes signals in the batch: the actor's loss has none."""
         return self.trains != "actor"
 
 

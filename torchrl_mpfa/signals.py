@@ -30,8 +30,8 @@ class Signal:
         known_at: ``"update"`` (default): it comes with the batch after the loss, and is unknown
             for a fresh transition. ``"write"``: it is read when the transition is stored.
         priority: Function from what is read, shape ``[B]``, to a non-negative number, shape
-            ``[B]``; of a learned signal it sees one batch at a time. By default the size of what
-            is known at the write; a learned signal is stored as it comes.
+            ``[B]``; of a learned signal it sees one batch at a time. By default the absolute value
+            of a signal that is known at the write; a learned signal is stored unchanged.
 
     Raises:
         TypeError: If ``priority`` is no function.

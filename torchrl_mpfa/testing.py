@@ -25,10 +25,9 @@ from tensordict import TensorDict, is_tensor_collection
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import Adjustment, BatchFacts, Counting, counts_buffer
-from torchrl_mpfa.fusion import Fusion
-from torchrl_mpfa.moving_fusion import Annealed
-from torchrl_mpfa.replay import SignalReplayBuffer
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.buffer import SignalReplayBuffer
+from torchrl_mpfa.fusion import Annealed, Fusion
+from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.signals import Signal, as_signals
 from torchrl_mpfa.storages.table import SignalTable
 from torchrl_mpfa.storages.tensor import SignalTensorStorage
@@ -86,10 +85,10 @@ def check_adjustment(adjustment: Adjustment) -> None:
 def check_fusion(
     fusion: Fusion, signals: Sequence[Signal | str] = ("reward", "td_error", "action_gradient")
 ) -> None:
-    """Check that a fusion gives one weight a signal, whatever the rewards are.
+    """Check that a fusion gives one weight a signal, for rewards of any sign and scale.
 
     Weights are finite, not negative, not all zero, and the same for the same buffer; the buffer
-    stays as it is; and a signal gets the same weight in whatever order signals are asked for.
+    stays as it is; and a signal gets the same weight in any order of signals.
 
     Args:
         fusion: The fusion.
@@ -133,7 +132,7 @@ def _check_weights(fusion: Fusion, table: SignalTable, index: Tensor) -> None:
 
 
 def _table(signals: Sequence[Signal | str], *, scale: float, offset: float) -> SignalTable:
-    """Forty filled slots out of fifty; the first ten have no learned signals yet."""
+    """Return a table with forty of fifty slots filled, ten of them without learned signals."""
     generator = torch.Generator().manual_seed(0)
     table = SignalTable(50, signals)
     reward = torch.randn(40, generator=generator, dtype=torch.double) * scale + offset
@@ -177,7 +176,7 @@ def check_sampler(make_sampler: Callable[[], SignalSampler], *, batch_size: int 
 
 
 def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalReplayBuffer:
-    """A buffer that has wrapped, with a random reward and every signal known at the write."""
+    """Return a buffer that has wrapped, with random rewards and signals known at the write."""
     generator = torch.Generator().manual_seed(seed)
     capacity = sampler.max_size
     buffer = SignalReplayBuffer(
@@ -196,7 +195,7 @@ def _buffer(sampler: SignalSampler, batch_size: int, *, seed: int) -> SignalRepl
 
 
 def _train(buffer: SignalReplayBuffer, rounds: int, *, seed: int = 2) -> Tensor:
-    """Sample and update; all slots that were sampled."""
+    """Sample and update for some rounds; return the sampled slots."""
     generator = torch.Generator().manual_seed(seed)
     sampled = []
     for _ in range(rounds):
@@ -301,7 +300,7 @@ def _check_frequencies(buffer: SignalReplayBuffer) -> None:
 
 
 def _same(first: Any, second: Any) -> bool:
-    """Whether two states are equal to the last bit, with NaN equal to NaN."""
+    """Return True if two states are equal to the last bit, with NaN equal to NaN."""
     if isinstance(first, Tensor):
         fits = isinstance(second, Tensor) and (first.shape, first.dtype) == (
             second.shape,

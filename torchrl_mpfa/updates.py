@@ -16,7 +16,7 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.learners.base import Learner
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.selection import SampledBatch, Selection, one_batch
 
 Prepare = Callable[[SampledBatch], SampledBatch]
@@ -161,9 +161,9 @@ def _at(batch: TensorDictBase, device: torch.device | None) -> TensorDictBase:
 
 
 def _divides(buffer: TensorDictReplayBuffer) -> bool:
-    """Whether ``U * B`` rows, sampled at once, are ``U`` batches of ``B``."""
+    """Return True if ``U * B`` rows, sampled at once, are ``U`` batches of ``B``."""
     sampler = buffer.sampler
-    drawn_alone = type(sampler) in (RandomSampler, PrioritizedSampler)
-    alone = drawn_alone or bool(getattr(sampler, "divisible", False))
+    of_torchrl = type(sampler) in (RandomSampler, PrioritizedSampler)
+    alone = of_torchrl or bool(getattr(sampler, "divisible", False))
     # TorchRL's buffer may sample ahead, each batch by itself.
     return alone and not getattr(buffer, "_prefetch", False)

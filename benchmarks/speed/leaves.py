@@ -10,8 +10,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers.prioritized import SumSegmentTreeFp64
 
 from benchmarks.speed.timing import MICROSECONDS, Call, Entry, entry, take_turns
-from torchrl_mpfa.samplers.leaves import SumLeaves
-from torchrl_mpfa.samplers.slots import leaves_of, set_leaves
+from torchrl_mpfa.samplers.trees import SumLeaves, leaves_of, set_leaves
 
 BATCH_SIZE = 256
 

@@ -23,7 +23,7 @@ from benchmarks.values.capture import capture_all
 from benchmarks.values.frozen import FOLDER, frozen_buffers
 from benchmarks.values.report import missing, write_report
 from benchmarks.values.running import make_rows, read_rows
-from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.checks import unknown
 
 ROWS = "rows.csv"
 

@@ -15,11 +15,11 @@ from torch import Tensor
 from benchmarks.values.frozen import FrozenBuffer
 from mpfa_envs import RandomMirror
 from torchrl_mpfa import run_updates
+from torchrl_mpfa.checks import unknown
 from torchrl_mpfa.learners import ActorCriticLearner
 from torchrl_mpfa.methods import METHODS, Method, Prioritized, Replay, make_replay
 from torchrl_mpfa.selection import SampledBatch
 from torchrl_mpfa.signals import SIGNALS_KEY
-from torchrl_mpfa.spelling import unknown
 from training.run.assembly import make_learner
 
 BATCH = 256

@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torchrl.data import LazyMemmapStorage, RandomSampler
 from torchrl.objectives import DDPGLoss, SACLoss, TD3Loss
-from torchrl.trainers import DefaultOptimizationStepper, Trainer
+from torchrl.trainers import Trainer
 
 from tests.integration.test_torchrl_trainer import assert_learned
 from torchrl_config import main, register, train
@@ -50,8 +50,8 @@ from torchrl_mpfa.configs import (
     SignalTensorStorageConfig,
     StochasticActorConfig,
 )
+from torchrl_mpfa.integrations.trainer import PriorityStepper
 from torchrl_mpfa.losses import SignalLoss
-from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*Trainer is an experimental"),
@@ -147,14 +147,6 @@ def test_torchrls_own_networks_fit_the_loss() -> None:
         f"loss.value_network={critic}",
     )
     assert_learned(trainer)
-
-
-def test_the_guard_of_the_configuration_names_a_silent_stepper() -> None:
-    config = compose("torchrl_config", [*TINY, "trainer.hooks=['${guard}']"])
-    trainer = instantiate(config.trainer)
-    trainer.optimization_stepper = DefaultOptimizationStepper()
-    with pytest.raises(RuntimeError, match="DefaultOptimizationStepper does not update priorities"):
-        trainer.train()
 
 
 def test_a_storage_without_signals_is_rejected_by_name() -> None:
@@ -313,7 +305,6 @@ def test_td3_in_torchrls_td3_trainer_updates_priorities() -> None:
     more = ["loss._partial_=true", "collector._partial_=true"]
     more += ["trainer.actor_network=${actor}", "trainer.qvalue_network=${critic}"]
     trainer = instantiate(compose(overrides=parts_of("td3") + more).trainer)
-    PriorityGuard().register(trainer)
     trainer.train()
     assert type(trainer.loss_module) is SignalTD3Loss
     assert_learned(trainer)
@@ -325,7 +316,6 @@ def test_sac_in_torchrls_sac_trainer_updates_priorities() -> None:
     more += ["trainer.log_rewards=false"]
     trainer = instantiate(compose(overrides=parts_of("sac") + more).trainer)
     PriorityStepper().register(trainer)
-    PriorityGuard().register(trainer)
     trainer.train()
     assert type(trainer.loss_module) is SignalSACLoss
     assert float(trainer.loss_module.alpha_init) == pytest.approx(0.2)

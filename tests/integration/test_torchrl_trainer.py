@@ -11,16 +11,12 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import PrioritizedSampler
 from torchrl.trainers import (
     DefaultOptimizationStepper,
     MixedPrecisionOptimizationStepper,
-    ReplayBufferTrainer,
     Trainer,
 )
 from torchrl.trainers.algorithms import DDPGTrainer
-from torchrl.trainers.algorithms.td3 import TD3OptimizationStepper
 
 from mpfa_envs import make_navigation_env
 from torchrl_mpfa import (
@@ -33,7 +29,7 @@ from torchrl_mpfa import (
     make_ddpg_loss,
     run_updates,
 )
-from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper, check_priority_updates
+from torchrl_mpfa.integrations.trainer import PriorityStepper
 from torchrl_trainer import Sizes, main, make_trainer
 
 pytestmark = [
@@ -70,7 +66,6 @@ def assert_learned(trainer: Trainer, *names: str) -> None:
 def test_many_robots_in_the_worlds_of_a_generator_are_collected_flat() -> None:
     trainer = make_trainer(TINY, world="mixed", num_envs=5, progress_bar=False)
     PriorityStepper().register(trainer)
-    PriorityGuard().register(trainer)
     trainer.train()
     assert trainer.collected_frames == len(trainer.replay_buffer) == 60
     assert trainer.replay_buffer[:]["observation"].shape == (60, 24)
@@ -89,7 +84,6 @@ def test_the_stepper_updates_the_signals_of_every_transition_that_is_replayed() 
     trainer = tiny_trainer()
     stepper = PriorityStepper()
     stepper.register(trainer)
-    PriorityGuard().register(trainer)
     trainer.train()
     known, replayed = known_and_replayed(trainer)
     assert known.equal(replayed)
@@ -102,7 +96,6 @@ def test_the_stepper_updates_the_signals_of_every_transition_that_is_replayed() 
 
 def test_without_a_stepper_the_trainers_own_hook_updates_them() -> None:
     trainer = tiny_trainer()
-    PriorityGuard().register(trainer)
     trainer.train()
     assert_learned(trainer)
 
@@ -130,52 +123,12 @@ def test_the_trap_is_there_a_silent_stepper_leaves_all_priorities_as_they_were()
     assert trainer.replay_buffer.sampler.weights == {}
 
 
-def test_the_guard_names_a_silent_stepper_before_anything_is_collected() -> None:
-    trainer = tiny_trainer()
-    PriorityGuard().register(trainer)
-    trainer.optimization_stepper = DefaultOptimizationStepper()
-    with pytest.raises(RuntimeError, match="DefaultOptimizationStepper does not update priorities"):
-        trainer.train()
-    assert trainer.collected_frames == len(trainer.replay_buffer) == 0
-
-
-def test_the_guard_names_a_stepper_that_does_not_do_what_it_declares() -> None:
-    trainer = tiny_trainer()
-    PriorityGuard().register(trainer)
-    trainer.optimization_stepper = Forgetful()
-    with pytest.raises(RuntimeError, match=r"step\(\) of Forgetful does not call it"):
-        trainer.train()
-    assert trainer._optim_count == 1
-
-
-def test_the_guard_finds_a_trainer_without_the_hook_that_updates() -> None:
-    parts = tiny_trainer()
-    trainer = Trainer(
-        collector=parts.collector,
-        total_frames=60,
-        frame_skip=1,
-        optim_steps_per_batch=3,
-        loss_module=parts.loss_module,
-        optimizer=parts.optimizer,
-        progress_bar=False,
-    )
-    hook = ReplayBufferTrainer(parts.replay_buffer, batch_size=4, flatten_tensordicts=True)
-    trainer.register_op("pre_epoch", hook.extend)
-    trainer.register_op("process_optim_batch", hook.sample)
-    with pytest.raises(ValueError, match="replay_buffer of the trainer must not be None"):
-        PriorityGuard().register(trainer)
-    PriorityGuard(parts.replay_buffer).register(trainer)
-    with pytest.raises(RuntimeError, match="no hook does at the stage 'post_loss'"):
-        trainer.train()
-
-
 def test_another_stepper_takes_the_step_where_one_is_given() -> None:
     trainer = tiny_trainer()
     inner = MixedPrecisionOptimizationStepper(trainer.optimizer)
     stepper = PriorityStepper(inner)
     assert stepper.optimizer_step_count == 0
     stepper.register(trainer)
-    PriorityGuard().register(trainer)
     trainer.train()
     assert (stepper.priority_updates, stepper.optimizer_step_count) == (9, 9)
     state = stepper.state_dict()
@@ -213,29 +166,6 @@ def test_a_stepper_that_cannot_be_wrapped_raises() -> None:
 def test_a_step_without_a_replay_buffer_raises_before_it_is_taken() -> None:
     with pytest.raises(ValueError, match="replay_buffer of the trainer must not be None"):
         PriorityStepper().step(SimpleNamespace(loss_module=None), None)
-
-
-@pytest.mark.parametrize("prioritized", [True, False])
-def test_the_check_asks_of_prioritized_samplers_of_torchrl_alone(prioritized: bool) -> None:
-    sampler = PrioritizedSampler(10, 0.6, 0.4) if prioritized else RandomSampler()
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=2)
-    trainer = SimpleNamespace(
-        replay_buffer=buffer, optimization_stepper=DefaultOptimizationStepper()
-    )
-    if prioritized:
-        with pytest.raises(RuntimeError, match="PrioritizedSampler would sample by the priorities"):
-            check_priority_updates(trainer)
-        assert TD3OptimizationStepper.updates_replay_priority
-        trainer.optimization_stepper = PriorityStepper()
-    check_priority_updates(trainer)
-
-
-def test_a_learner_elsewhere_updates_priorities_itself() -> None:
-    trainer = SimpleNamespace(
-        learner_backend="ray", optimization_stepper=DefaultOptimizationStepper()
-    )
-    check_priority_updates(trainer)
-    PriorityGuard().register(trainer)
 
 
 def test_the_example_trains_and_says_what_happened(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.methods.replays import make_buffer, make_transitions
-from torchrl_mpfa.methods.cer import CERSampler
+from torchrl_mpfa.samplers.uniform import CERSampler
 
 
 def make_combined(capacity, batch_size, filled):
@@ -38,10 +38,3 @@ def test_a_buffer_that_is_emptied_has_no_newest_transition():
         buffer.sample()
     buffer.extend(make_transitions(1))
     assert buffer.sample()["index"].tolist() == [0, 0]
-
-
-def test_a_file_of_an_earlier_version_has_the_place_without_its_name(tmp_path):
-    (tmp_path / "newest.json").write_text("[3]", encoding="utf-8")
-    sampler = CERSampler()
-    sampler.loads(tmp_path)
-    assert sampler.newest == [3]

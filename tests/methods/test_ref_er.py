@@ -233,9 +233,9 @@ def test_the_weight_is_saved(way, tmp_path):
     first.sampler.policy_weight, first.sampler.batches = 0.25, 7
     restore(second, first, tmp_path if way == "folder" else None)
     assert (second.sampler.policy_weight, second.sampler.batches) == (0.25, 7)
-    for state in ({"_batches": 1}, {"_policy_weight": 1.5, "_batches": 1}):
-        with pytest.raises(ValueError, match="'_policy_weight'"):
-            second.sampler.load_state_dict(state)
+    for name, wrong in (("policy_weight", 1.5), ("batches", -1)):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            second.sampler.load_state_dict({**first.sampler.state_dict(), name: wrong})
     assert second.sampler.policy_weight == 0.25
 
 

@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_map_only
 
 from torchrl_mpfa import checks
 from torchrl_mpfa.samplers import TreeSampler
-from torchrl_mpfa.samplers.leaves import MinLeaves, SumLeaves
+from torchrl_mpfa.samplers.trees import MinLeaves, SumLeaves
 
 DEVICE = torch.device("cuda:0")
 WAITS = (

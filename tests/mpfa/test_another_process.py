@@ -12,7 +12,7 @@ from torchrl_mpfa import SignalMemmapStorage
 
 CODE = """
 import sys
-import torchrl_mpfa, torchrl_mpfa.trainer
+import torchrl_mpfa, torchrl_mpfa.integrations.trainer
 print('hydra' in sys.modules)
 torchrl_mpfa.SignalMemmapStorage(3, scratch_dir=sys.argv[1], existsok=True)
 """

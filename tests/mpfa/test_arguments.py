@@ -12,7 +12,6 @@ from torchrl_mpfa import (
     PositiveBoost,
     PositiveDecay,
     ScaledFusion,
-    ScheduledFusion,
     Signal,
     SignalMemmapStorage,
     SignalReplayBuffer,
@@ -25,6 +24,7 @@ from torchrl_mpfa import (
     run_updates,
 )
 from torchrl_mpfa.fusion import entropy_weights, positive_entropy, reward_entropy
+from torchrl_mpfa.methods.hvper import ScheduledFusion
 from torchrl_mpfa.priorities import action_gradient_priority
 from torchrl_mpfa.samplers import TreeSampler
 from torchrl_mpfa.signals import as_signals

@@ -68,7 +68,6 @@ def test_whatever_is_called_first_makes_the_parts(tmp_path):
         "distributions": lambda buffer: buffer.distributions(),
         "anneal": lambda buffer: buffer.anneal(0.5, 0.5),
         "state_dict": lambda buffer: buffer.state_dict(),
-        "check_state": lambda buffer: buffer.check_state(snapshot(filled)),
         "load_state_dict": lambda buffer: buffer.load_state_dict(snapshot(filled)),
         "loads": lambda buffer: buffer.loads(tmp_path / "buffer"),
     }

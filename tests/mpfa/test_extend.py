@@ -313,7 +313,6 @@ def test_whatever_is_done_in_inference_mode_the_buffer_works_outside_of_it(part)
         again.load_state_dict(snapshot(buffer))
     for each in (buffer, again):
         each.extend(make_full_transitions(5, 3.0))
-        each["next", "reward"] = torch.full((CAPACITY, 1), 2.0)
     assert torch.equal(train_rounds(buffer, 3), train_rounds(again, 3))
 
 

@@ -12,8 +12,7 @@ from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
-from torchrl_mpfa.samplers.leaves import MinLeaves, SumLeaves
-from torchrl_mpfa.samplers.slots import last_of_each, leaves_of, set_leaves
+from torchrl_mpfa.samplers.trees import MinLeaves, SumLeaves, last_of_each, leaves_of, set_leaves
 
 MASSES = torch.linspace(0.0, 1.0, 101, dtype=torch.double)[:-1]
 

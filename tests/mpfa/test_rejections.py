@@ -154,7 +154,7 @@ PARTS = [
                 "sampler": SignalSampler(8, 0.6, 0.4, signals=NOVELTY),
                 "priority_key": key,
             },
-            "priority_key must not be where a reward .*, got ",
+            "priority_key must not be the key of a reward .*, got ",
         )
         for key in (("next", "reward"), "novelty", ("novelty",))
     ),

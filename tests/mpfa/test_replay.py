@@ -14,6 +14,7 @@ from tests.mpfa.transitions import (
     make_buffer,
     make_filled,
     make_transitions,
+    rejected,
     same,
     seeded,
     snapshot,
@@ -304,3 +305,27 @@ def test_a_priority_is_stored_with_the_transition_where_no_signals_are_fused(mak
 
 def test_the_paper_signal_of_the_reward_is_its_absolute_value():
     assert REWARD.priority(torch.tensor([-2.0])).tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda b: b.set_("observation", torch.ones(8, 1)),
+        lambda b: b.set_at_("observation", torch.ones(1, 1), torch.tensor([2])),
+        lambda b: b.update_({"observation": torch.ones(8, 1)}),
+        lambda b: b.update_if_present(index=0, generation=0, patch={}),
+        lambda b: b.__setitem__(("next", "reward"), torch.ones(8, 1)),
+        lambda b: b.__setitem__("observation", torch.ones(8, 1)),
+    ],
+)
+def test_write_in_place_is_rejected_and_changes_nothing(write):
+    buffer = make_filled(8)
+    with rejected(buffer, NotImplementedError, r"cannot be changed in place, .* by extend"):
+        write(buffer)
+
+
+def test_whole_transition_is_written_in_its_slot_with_its_signals():
+    buffer = make_filled(8)
+    buffer[torch.tensor([2])] = make_transitions(1, rewards=[50.0])
+    assert buffer.rewards()[2] == 50.0
+    assert buffer[2]["next", "reward"] == 50.0

@@ -1,12 +1,13 @@
-"""Save, kill and load: what comes after is equal to the last bit, generator included."""
+"""Save, kill and load: the rest is equal to the last bit, and a wrong state changes nothing."""
 
 import pickle
 import shutil
-from pathlib import Path
+from copy import deepcopy
 
 import pytest
 import torch
 from torchrl.checkpoint import Checkpoint
+from torchrl.data import ImmutableDatasetWriter, LazyMemmapStorage, LazyTensorStorage
 
 from tests.mpfa.transitions import (
     MISSING,
@@ -18,26 +19,31 @@ from tests.mpfa.transitions import (
     snapshot,
     spoil,
     train_rounds,
+    write_signals,
 )
 from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.files import load_safely, save_atomically, seal_dump
 
-ROUNDS = 100
+CAPACITY = 24
+UNALLOCATED = pytest.mark.filterwarnings(
+    "ignore:Loading the storage on an uninitialized:UserWarning"
+)
+"""TorchRL recommends a memory map that was allocated before; ours is new on purpose."""
 
 
 def make_kind(kind, folder, seed=0):
     """A buffer whose entropies are counted again every third of its size."""
     if kind == "memory":
-        storage = SignalTensorStorage(24)
+        storage = SignalTensorStorage(CAPACITY)
     else:
-        storage = SignalMemmapStorage(24, scratch_dir=folder)
-    return make_buffer(24, 6, seed=seed, storage=storage, entropy_refresh=1 / 3)
+        storage = SignalMemmapStorage(CAPACITY, scratch_dir=folder)
+    return make_buffer(CAPACITY, 6, seed=seed, storage=storage, entropy_refresh=1 / 3)
 
 
-def go_on(buffer):
-    """A hundred more rounds with new transitions among them; everything that was sampled."""
+def resume(buffer):
+    """Train for a hundred rounds with new transitions among them; return all that was sampled."""
     sampled = []
-    for number in range(ROUNDS // 10):
+    for number in range(10):
         buffer.extend(make_transitions(2, seed=number, first=1000 + number))
         sampled.append(train_rounds(buffer, 10, seed=number))
     return torch.cat(sampled)
@@ -58,17 +64,25 @@ def by_folder(first, second, folder):
     second.loads(folder / "buffer")
 
 
+def by_moved_folder(first, second, folder):
+    first.dumps(folder / "here")
+    shutil.move(folder / "here", folder / "there")
+    second.loads(folder / "there")
+
+
 def by_checkpoint(first, second, folder):
     Checkpoint(buffer=first).save(folder / "checkpoint")
     Checkpoint(buffer=second).load(folder / "checkpoint")
 
 
-# TorchRL recommends a memory map that was allocated before; ours is a fresh one on purpose.
-@pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized TensorDict")
-@pytest.mark.parametrize("way", [by_state_dict, by_own_file, by_folder, by_checkpoint])
+WAYS = [by_state_dict, by_own_file, by_folder, by_moved_folder, by_checkpoint]
+
+
+@UNALLOCATED
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("kind", ["memory", "memmap"])
 @pytest.mark.parametrize("rows", [11, 40], ids=["half full", "wrapped"])
-def test_training_goes_on_bit_for_bit(way, kind, rows, tmp_path):
+def test_restored_buffer_trains_like_the_uninterrupted_one(way, kind, rows, tmp_path):
     first = make_kind(kind, tmp_path / "first")
     first.extend(make_transitions(rows))
     train_rounds(first, 7)
@@ -80,138 +94,282 @@ def test_training_goes_on_bit_for_bit(way, kind, rows, tmp_path):
     second = make_kind(kind, tmp_path / "second", seed=99)
     way(first, second, tmp_path)
     assert same(snapshot(first), snapshot(second))
-    assert go_on(first).equal(go_on(second))
+    assert resume(first).equal(resume(second))
     assert same(snapshot(first), snapshot(second))
 
 
-def test_a_restored_buffer_does_not_share_memory_with_the_first(tmp_path):
+def test_restored_buffer_shares_no_memory_with_the_first(tmp_path):
     first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
-    first.extend(make_transitions(24))
+    first.extend(make_transitions(CAPACITY))
     state = first.state_dict()
     second.load_state_dict(state)
     before = snapshot(second)
-    go_on(first)
+    resume(first)
     assert same(before, snapshot(second))
     assert same(state["_sampler"], second.state_dict()["_sampler"])
 
 
-def test_priorities_set_after_saving_are_forgotten_by_loading(tmp_path):
+@pytest.mark.parametrize("way", ["state", "folder"])
+def test_load_forgets_what_came_after_the_save(way, tmp_path):
     buffer = make_kind("memory", tmp_path)
-    buffer.extend(make_transitions(24))
+    buffer.extend(make_transitions(CAPACITY))
     train_rounds(buffer, 5)
     buffer.dumps(tmp_path / "buffer")
     before = snapshot(buffer)
     buffer.extend(make_transitions(20, seed=8))
     train_rounds(buffer, 5)
-    buffer.loads(tmp_path / "buffer")
+    buffer.load_state_dict(before) if way == "state" else buffer.loads(tmp_path / "buffer")
     assert same(before, snapshot(buffer))
 
 
-def seal_again(folder):
-    """Make the checksums of a dump those of what is in it now, as an attacker could."""
-    seal_dump(folder / "dump-1/storage", folder / "dump-1/storage")
-    seal_dump(folder, folder / "dump-1")
-
-
-SAMPLER, STORAGE, TABLE = ("_sampler",), ("_storage",), ("_storage", "_signals")
-SPOILS = [
-    ((*SAMPLER, "_max_capacity"), 25, "'_max_capacity' of the saved sampler must be 24, got 25"),
-    (
-        (*SAMPLER, "_signals"),
-        ["novelty", "td_error"],
-        r"'_signals' of the saved sampler must be .*, got \['novelty', 'td_error'\]",
-    ),
-    ((*SAMPLER, "_format"), 99, "'_format' of .* must be 2, which this version reads, got 99"),
-    ((*TABLE, "capacity"), 25, "'capacity' of the saved signals must be 24, got 25"),
-    ((*TABLE, "names"), ["td_error"], r"'names' of the saved signals .*, got \['td_error'\]"),
-    ((*STORAGE, "_signals_format"), 7, "'_signals_format' of .* must be 1, which .*, got 7"),
-    ((*STORAGE, "_signals"), MISSING, "'_signals' is missing in the saved storage"),
-]
-
-
-@pytest.mark.parametrize(("path", "value", "message"), SPOILS)
-@pytest.mark.parametrize("way", ["state", "folder"])
-def test_a_state_that_does_not_fit_is_rejected_and_nothing_changes(
-    path, value, message, way, tmp_path
-):
-    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
-    first.extend(make_transitions(24))
-    second.extend(make_transitions(9, seed=3))
-    train_rounds(second, 4)
-    state = snapshot(first)
-    spoil(state, path, value)
-    if way == "folder":
-        first.dumps(tmp_path / "buffer")
-        folder = tmp_path / "buffer/dump-1"
-        save_atomically(state["_sampler"], folder / "sampler/sampler.pt")
-        signals = {key: state["_storage"].get(key) for key in ("_signals", "_signals_format")}
-        save_atomically(signals, folder / "storage/signals.pt")
-        if value is MISSING:
-            (folder / "storage/signals.pt").unlink()
-        seal_again(tmp_path / "buffer")
-    with rejected(second, (KeyError, ValueError), message):
-        if way == "state":
-            second.load_state_dict(state)
-        else:
-            second.loads(tmp_path / "buffer")
-
-
-def test_a_buffer_of_other_signals_is_rejected(tmp_path):
-    first = make_kind("memory", tmp_path)
-    first.extend(make_transitions(9))
-    other = SignalReplayBuffer(
-        storage=SignalTensorStorage(24, signals=["td_error"]),
-        sampler=MPFASampler(24, signals=["td_error"]),
-        batch_size=6,
-    )
-    with pytest.raises(
-        ValueError, match=r"of the saved sampler must be \['td_error'\], got \['action_gradient',"
-    ):
-        other.load_state_dict(first.state_dict())
-
-
-@pytest.mark.parametrize("file", ["sampler/sampler.pt", "storage/signals.pt"])
-def test_a_folder_with_code_in_it_is_rejected_and_nothing_changes(file, tmp_path):
-    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
-    first.extend(make_transitions(24))
-    second.extend(make_transitions(9, seed=3))
-    first.dumps(tmp_path / "buffer")
-    path, trap = tmp_path / "buffer/dump-1" / file, tmp_path / "trap"
-    save_atomically({"_format": 1, "x": Trap(trap)}, path)
-    seal_again(tmp_path / "buffer")
-    before = snapshot(second)
-    with pytest.raises(pickle.UnpicklingError, match=f"{path.name} holds more than tensors"):
-        second.loads(tmp_path / "buffer")
-    assert not trap.exists()
-    assert same(before, snapshot(second))
-
-
-def test_what_is_saved_of_the_sampler_can_be_read_by_a_person(tmp_path):
-    buffer = make_kind("memory", tmp_path)
-    buffer.extend(make_transitions(24))
-    train_rounds(buffer, 2)
-    buffer.dumps(tmp_path / "buffer")
-    text = Path(tmp_path / "buffer/dump-1/sampler/sampler_metadata.json").read_text()
-    assert '"_alpha": 0.6' in text
-    assert '"td_error"' in text
-
-
-def test_a_folder_may_be_moved_before_it_is_loaded(tmp_path):
-    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path)
-    first.extend(make_transitions(24))
-    first.dumps(tmp_path / "here")
-    shutil.move(tmp_path / "here", tmp_path / "there")
-    second.loads(tmp_path / "there")
-    assert first.sample()["index"].equal(second.sample()["index"])
-
-
-@pytest.mark.parametrize("way", [by_state_dict, by_folder], ids=lambda way: way.__name__)
-def test_a_restored_storage_knows_the_device_that_it_was_to_find_out(tmp_path, way):
+@pytest.mark.parametrize("way", [by_state_dict, by_folder])
+def test_restored_storage_finds_its_device(tmp_path, way):
     first, second = (
-        SignalReplayBuffer(storage=SignalTensorStorage(24, device="auto"), batch_size=4)
+        SignalReplayBuffer(storage=SignalTensorStorage(CAPACITY, device="auto"), batch_size=4)
         for _ in range(2)
     )
     first.extend(make_transitions(10))
     way(first, second, tmp_path)
     assert second._storage.device == torch.device("cpu")
     assert len(second.sample()) == 4
+
+
+def test_empty_buffer_is_restored_and_filled():
+    first, second = make_buffer(8), make_buffer(8, seed=5)
+    second.load_state_dict(snapshot(first))
+    second.extend(make_transitions(3))
+    assert len(second) == 3
+
+
+def test_data_that_no_one_may_write_are_restored_without_a_cursor():
+    buffers = []
+    for seed in (0, 5):
+        storage = SignalTensorStorage(8)
+        storage.set(torch.arange(8), make_transitions(8, seed=seed))
+        buffers.append(make_buffer(8, seed=seed, storage=storage))
+        buffers[-1].set_writer(ImmutableDatasetWriter())
+        train_rounds(buffers[-1], 2)
+    first, second = buffers
+    second.load_state_dict(snapshot(first))
+    assert train_rounds(first, 2).equal(train_rounds(second, 2))
+
+
+@pytest.fixture
+def pair():
+    """The state of one buffer, and another buffer in the middle of its training."""
+    first, second = make_buffer(8), make_buffer(8, seed=5)
+    first.extend(make_transitions(8))
+    train_rounds(first, 2)
+    second.extend(make_transitions(6, seed=3))
+    train_rounds(second, 2)
+    return snapshot(first), second
+
+
+STORAGE, TABLE, SAMPLER = ("_storage",), ("_storage", "_signals"), ("_sampler",)
+OBSERVATION = ("_storage", "_storage", "observation")
+NAN = float("nan")
+SPOILS = [
+    *[
+        ((name,), MISSING, f"'{name}' is missing in the saved buffer")
+        for name in ("_storage", "_sampler", "_writer", "_transforms", "_rng", "_batch_size")
+    ],
+    (("_rng",), (torch.zeros(3), "cpu"), "RNG state|expected"),
+    (("_batch_size",), 0, "batch_size must be an integer from 1"),
+    (("_transforms",), {"x": torch.ones(1)}, "Unexpected key"),
+    (("_writer", "_cursor"), MISSING, "'_cursor' is missing in the saved writer"),
+    (("_writer", "_cursor"), 8, "cursor of the saved writer must be below 8, got 8"),
+    (("_writer", "_cursor"), "1", "cursor must be"),
+    ((*STORAGE, "_len"), MISSING, "'_len' is missing in the saved storage"),
+    ((*STORAGE, "_len"), 10**18, r"'_len' of the saved storage must be in \[0, 8\], got 1000"),
+    ((*STORAGE, "_len"), 7, "the saved storage has 7 rows, its signals 8"),
+    ((*STORAGE, "initialized"), MISSING, "'initialized' is missing in the saved storage"),
+    ((*STORAGE, "_signals_format"), 7, "'_signals_format' of the saved storage must be 1, got 7"),
+    ((*STORAGE, "_signals_format"), MISSING, "'_signals_format' is missing in the saved stor"),
+    ((*STORAGE, "_signals"), MISSING, "'_signals' is missing in the saved storage"),
+    (OBSERVATION, MISSING, "entry 'observation' is missing"),
+    (OBSERVATION, torch.ones(8, 2), r"'observation' must have the shape \[1\] .*, got \[2\]"),
+    (OBSERVATION, torch.ones(8, 1).double(), "'observation' must be torch.float32 as in the sto"),
+    (OBSERVATION, torch.tensor([[NAN]] + [[1.0]] * 7), "'observation' must be finite, got nan in"),
+    (("_storage", "_storage", "more"), torch.ones(8, 1), "'more' is not in the storage"),
+    ((*TABLE, "capacity"), 25, "'capacity' of the saved signals must be 8, got 25"),
+    ((*TABLE, "names"), ["td_error"], r"'names' of the saved signals .*, got \['td_error'\]"),
+    ((*TABLE, "rows"), MISSING, "'rows' is missing in the saved signals"),
+    ((*TABLE, "rows"), torch.ones(7, 6).double(), r"'rows' of the saved .* be \[8, 6\] doubles"),
+    ((*TABLE, "rows"), torch.ones(8, 6), r"'rows' of the saved signals must be \[8, 6\] doubles"),
+    ((*TABLE, "size"), 9, r"'rows' of the saved signals must be \[8, 6\] doubles|its signals 9"),
+    ((*TABLE, "writes"), -1, "writes must be an integer from 0|written to since"),
+    ((*TABLE, "writes"), 7, "times of the saved signals must be below 7, got 7|written to since"),
+    ((*SAMPLER, "_eps"), MISSING, "'_eps' is missing"),
+    ((*SAMPLER, "_signals"), ["novelty", "td_error"], r"'_signals' of .*, got \['novelty', 'td_"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), SPOILS)
+@pytest.mark.parametrize("clock", [True, False])
+def test_wrong_state_is_rejected_and_changes_nothing(pair, path, value, message, clock):
+    state, buffer = pair
+    spoil(state, path, value)
+    if not clock:  # As in a folder.
+        state.get("_storage", {}).pop("_signals_clock", None)
+    twin = deepcopy(buffer)
+    with rejected(buffer, (KeyError, ValueError, TypeError, RuntimeError), message):
+        buffer.load_state_dict(state)
+    assert train_rounds(buffer, 3).equal(train_rounds(twin, 3))
+
+
+@pytest.mark.parametrize("column", range(6))
+@pytest.mark.parametrize("wrong", [torch.inf, -1.0])
+def test_impossible_signals_are_rejected(pair, column, wrong):
+    state, buffer = pair
+    if column == buffer.storage.signal_table.reward_column and wrong == -1.0:
+        return
+    state["_storage"]["_signals"]["rows"][3, column] = wrong
+    with rejected(buffer, ValueError, "of the saved signals must be finite and not negative"):
+        buffer.load_state_dict(state)
+
+
+def seal_again(folder):
+    """Make the checksums of a dump those of its present files, as an attacker could."""
+    seal_dump(folder / "dump-1/storage", folder / "dump-1/storage")
+    seal_dump(folder, folder / "dump-1")
+
+
+@pytest.mark.parametrize(
+    ("file", "path", "value", "message"),
+    [
+        ("sampler/sampler.pt", ("_format",), 99, "'_format' of the saved sampler must be 3, got"),
+        ("storage/signals.pt", ("_signals",), MISSING, "'_signals' is missing"),
+        ("storage/signals.pt", ("_signals", "capacity"), 9, "'capacity' of the saved signals"),
+        ("buffer.pt", ("_batch_size",), "4", "batch_size must be"),
+    ],
+)
+def test_wrong_folder_is_rejected_and_changes_nothing(file, path, value, message, tmp_path):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
+    first.extend(make_transitions(CAPACITY))
+    second.extend(make_transitions(9, seed=3))
+    train_rounds(second, 4)
+    first.dumps(tmp_path / "buffer")
+    file = tmp_path / "buffer/dump-1" / file
+    state = load_safely(file)
+    spoil(state, path, value)
+    save_atomically(state, file)
+    seal_again(tmp_path / "buffer")
+    with rejected(second, (KeyError, ValueError, TypeError), message):
+        second.loads(tmp_path / "buffer")
+
+
+@pytest.mark.parametrize("file", ["sampler/sampler.pt", "storage/signals.pt", "buffer.pt"])
+def test_folder_with_code_in_it_is_rejected_and_not_executed(file, tmp_path):
+    first, second = make_kind("memory", tmp_path), make_kind("memory", tmp_path, seed=5)
+    first.extend(make_transitions(CAPACITY))
+    second.extend(make_transitions(9, seed=3))
+    first.dumps(tmp_path / "buffer")
+    path, trap = tmp_path / "buffer/dump-1" / file, tmp_path / "trap"
+    save_atomically({"_format": 1, "x": Trap(trap)}, path)
+    seal_again(tmp_path / "buffer")
+    with rejected(second, pickle.UnpicklingError, f"{path.name} holds more than tensors"):
+        second.loads(tmp_path / "buffer")
+    assert not trap.exists()
+
+
+def test_buffer_of_other_signals_is_rejected(pair):
+    other = SignalReplayBuffer(
+        storage=SignalTensorStorage(8, signals=["td_error"]),
+        sampler=MPFASampler(8, signals=["td_error"]),
+    )
+    with pytest.raises(ValueError, match=r"must be \['td_error'\], got \['action_gradient',"):
+        other.load_state_dict(pair[0])
+
+
+@pytest.mark.parametrize("way", ["extend", "load another"])
+def test_state_whose_data_were_overwritten_since_is_rejected(pair, way):
+    other, buffer = pair
+    buffer.extend(make_transitions(2))
+    state, copy = buffer.state_dict(), snapshot(buffer)
+    if way == "extend":
+        buffer.extend(make_transitions(8, rewards=[50.0] * 8))
+    else:
+        buffer.load_state_dict(other)
+        while buffer.storage.signal_table.writes < copy["_storage"]["_signals"]["writes"]:
+            buffer.extend(make_transitions(1))
+    for reader in (buffer, make_buffer(8)):
+        with rejected(reader, ValueError, "was written to since this state of it was made"):
+            reader.load_state_dict(state)
+    buffer.load_state_dict(copy)
+    assert same(copy, snapshot(buffer))
+
+
+def test_state_is_loaded_several_times_before_a_write(pair):
+    _, buffer = pair
+    state, other = buffer.state_dict(), make_buffer(8)
+    train_rounds(buffer, 2)
+    for _ in range(2):
+        buffer.load_state_dict(state)
+        other.load_state_dict(state)
+        assert train_rounds(buffer, 2).equal(train_rounds(other, 2))
+
+
+def state_of_torchrl(kind=LazyTensorStorage, *, count=6, without=None):
+    """The state of one of TorchRL's own storages, which has no signals."""
+    storage = kind(8)
+    data = make_transitions(count).set("index", torch.arange(count))  # As a writer does.
+    storage.set(torch.arange(count), data if without is None else data.exclude(without))
+    return deepcopy(storage.state_dict())
+
+
+@UNALLOCATED
+@pytest.mark.parametrize("ours", [SignalTensorStorage, SignalMemmapStorage])
+@pytest.mark.parametrize("theirs", [LazyTensorStorage, LazyMemmapStorage])
+def test_transitions_of_torchrl_count_as_written_now(ours, theirs):
+    storage, written = ours(8), ours(8)
+    storage.load_state_dict(state_of_torchrl(theirs))
+    written.set(torch.arange(6), make_transitions(6).set("index", torch.arange(6)))
+    assert same(storage.signal_table.state_dict(), written.signal_table.state_dict())
+    assert (storage.get(torch.arange(6)) == written.get(torch.arange(6))).all()
+    if ours is SignalTensorStorage:
+        buffer = make_buffer(8, storage=storage)
+        train_rounds(buffer, 3)
+        assert sorted(buffer.sampler.weights) == ["action_gradient", "reward", "td_error"]
+
+
+def test_rewards_of_torchrl_in_two_dimensions_find_their_slots():
+    trajectories = make_transitions(12).reshape(4, 3)
+    theirs, ours = LazyTensorStorage(24, ndim=2), SignalTensorStorage(24, ndim=2)
+    theirs.set(range(4), trajectories)
+    ours.load_state_dict(theirs.state_dict())
+    rewards = trajectories["next", "reward"].flatten().double()
+    assert ours.signal_table.rewards.equal(rewards)
+
+
+def test_batch_from_before_a_load_of_torchrls_data_is_stale():
+    buffer = make_buffer(8)
+    buffer.extend(make_transitions(6, seed=3))
+    batch = write_signals(buffer.sample())
+    buffer.storage.load_state_dict(state_of_torchrl())
+    buffer.update_tensordict_priority(batch)
+    assert buffer.stale_updates == 4
+
+
+REWARD = ("_storage", "next.reward")
+
+
+@pytest.mark.parametrize("filled", [0, 5])
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (REWARD, MISSING, r"the transitions lack 'reward'|reward'\) is missing"),
+        (REWARD, torch.full((8, 1), torch.nan), "reward.*must be finite"),
+        (REWARD, torch.ones(8, 2), r"one real number per transition, got|the shape \[1\]"),
+        (("_len",), 9, r"'_len' of the saved storage must be in \[0, 8\], got 9"),
+        (("_storage",), {}, "the saved storage must have 8 slots|the transitions lack"),
+    ],
+)
+def test_transitions_of_torchrl_that_cannot_be_fused_are_rejected(filled, path, value, message):
+    buffer = make_buffer(8)
+    if filled:
+        buffer.extend(make_transitions(filled, seed=3))
+        train_rounds(buffer, 2)
+    state = state_of_torchrl()
+    spoil(state, path, value)
+    with rejected(buffer, (KeyError, ValueError), message):
+        buffer.storage.load_state_dict(state)

@@ -10,10 +10,15 @@ from torchrl_mpfa import (
     PositiveBoost,
     PositiveDecay,
     ScaledFusion,
-    ScheduledFusion,
     SignalSampler,
 )
-from torchrl_mpfa.methods.hvper import RELATIVE_ERROR, RELATIVE_VALUE, HVPERPenalty, value_schedule
+from torchrl_mpfa.methods.hvper import (
+    RELATIVE_ERROR,
+    RELATIVE_VALUE,
+    HVPERPenalty,
+    ScheduledFusion,
+    value_schedule,
+)
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.lap import LAPFloor
 from torchrl_mpfa.methods.mw import MWSampler

@@ -16,7 +16,6 @@ from torchrl_mpfa.configs.parts import (
     ActorConfig,
     CriticConfig,
     MPFASamplerConfig,
-    PriorityGuardConfig,
     PriorityStepperConfig,
     SignalDDPGLossConfig,
     SignalMemmapStorageConfig,
@@ -33,7 +32,6 @@ __all__ = [
     "ActorConfig",
     "CriticConfig",
     "MPFASamplerConfig",
-    "PriorityGuardConfig",
     "PriorityStepperConfig",
     "SignalDDPGLossConfig",
     "SignalMemmapStorageConfig",
@@ -59,7 +57,6 @@ CONFIGS: dict[tuple[str, str], type] = {
     ("network", "signal_stochastic_actor"): StochasticActorConfig,
     ("network", "signal_critic"): CriticConfig,
     ("hook", "priority_stepper"): PriorityStepperConfig,
-    ("hook", "priority_guard"): PriorityGuardConfig,
     **METHOD_CONFIGS,
 }
 """The configurations by group, TorchRL's or ``replay``, and by name."""

@@ -7,9 +7,9 @@ from typing import Any, get_type_hints
 
 from torchrl.trainers.algorithms.configs.data import ReplayBufferBaseConfig
 
+from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.configs.signatures import field_default
 from torchrl_mpfa.methods import METHODS, Replay, make_replay
-from torchrl_mpfa.replay import SignalReplayBuffer
 
 _PLACE = "torchrl_mpfa.configs.methods"
 _BESIDE = ("storage", "device", "policy", "sigma", "generator")

@@ -17,7 +17,9 @@ from torchrl.trainers.algorithms.configs.hooks import HookConfig
 from torchrl.trainers.algorithms.configs.modules import NetworkConfig
 from torchrl.trainers.algorithms.configs.objectives import LossConfig
 
+from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.configs.signatures import config_of
+from torchrl_mpfa.integrations.trainer import PriorityStepper
 from torchrl_mpfa.losses import (
     SignalDDPGLoss,
     SignalSACLoss,
@@ -27,11 +29,9 @@ from torchrl_mpfa.losses import (
     make_td3_loss,
 )
 from torchrl_mpfa.networks import make_actor, make_critic, make_stochastic_actor
-from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.samplers import MPFASampler, SignalSampler
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
 from torchrl_mpfa.storages import SignalMemmapStorage, SignalTensorStorage
-from torchrl_mpfa.trainer import PriorityGuard, PriorityStepper
 
 _HERE = "torchrl_mpfa.configs.parts"
 
@@ -125,8 +125,5 @@ SignalSACLossConfig = _loss_config(
     leave_out=[*_NOT_OF_A_LOSS, "value_network", "delay_value", "delay_actor"],
 )
 PriorityStepperConfig = config_of(
-    PriorityStepper, HookConfig, "torchrl_mpfa.trainer.PriorityStepper"
-)
-PriorityGuardConfig = config_of(
-    PriorityGuard, HookConfig, "torchrl_mpfa.trainer.PriorityGuard", leave_out=["replay_buffer"]
+    PriorityStepper, HookConfig, "torchrl_mpfa.integrations.trainer.PriorityStepper"
 )

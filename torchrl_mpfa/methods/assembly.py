@@ -10,10 +10,10 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.data import Storage
 
+from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.checks import SHARE, check
 from torchrl_mpfa.methods.base import Method
 from torchrl_mpfa.methods.catalogue import method_named
-from torchrl_mpfa.replay import SignalReplayBuffer
 from torchrl_mpfa.selection import Selection
 from torchrl_mpfa.signals import MPFA_SIGNALS
 from torchrl_mpfa.storages.table import signal_table_of

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from torchrl_mpfa.adjustment import Adjustment
     from torchrl_mpfa.fusion import Fusion
-    from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+    from torchrl_mpfa.samplers.fused import SignalSampler
     from torchrl_mpfa.selection import Selection
     from torchrl_mpfa.signals import Signal
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE
+from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, unknown
 from torchrl_mpfa.methods.base import Method, Prioritized, within
 from torchrl_mpfa.methods.mpfa import MPFA, Adjusted, Scaled
-from torchrl_mpfa.spelling import unknown
 
 if TYPE_CHECKING:
     from torchrl_mpfa.adjustment import Adjustment
@@ -34,7 +33,7 @@ class MW(Prioritized):
 
     def fusion(self) -> Fusion:
         """Make the fusion in equal shares."""
-        from torchrl_mpfa.moving_fusion import ScaledFusion
+        from torchrl_mpfa.fusion import ScaledFusion
 
         return ScaledFusion(super().fusion())
 
@@ -174,7 +173,7 @@ class PAL(Method):
 class CER(Method):
     """Uniform replay with the newest transition in every batch."""
 
-    kind: ClassVar[str] = "torchrl_mpfa.methods.cer.CERSampler"
+    kind: ClassVar[str] = "torchrl_mpfa.samplers.uniform.CERSampler"
 
     name: str = "cer"
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl.data import Storage
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, check, generator_on
-from torchrl_mpfa.samplers.newest import NewestSampler
+from torchrl_mpfa.samplers.uniform import NewestSampler
 
 
 def geometric_age(share: Tensor, *, rate: float, count: int) -> Tensor:

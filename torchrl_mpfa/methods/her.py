@@ -5,10 +5,10 @@ After Andrychowicz et al. (2017), "Hindsight experience replay", https://arxiv.o
 
 from __future__ import annotations
 
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
@@ -78,6 +78,7 @@ class HindsightGoals(Transform):
         ValueError: If ``goals`` is not a positive integer.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
         >>> class ReachPlace:
         ...     entries = ("place",)
@@ -154,21 +155,3 @@ class HindsightGoals(Transform):
     def _in_hindsight(self, episode: TensorDictBase) -> TensorDictBase:
         steps = future_goals(len(episode), self.goals, self.generator)
         return self._relabel(episode.exclude(self._episode_key), steps)
-
-    def get_extra_state(self) -> dict[Any, Tensor]:
-        """The transitions of the episodes under way, by key."""
-        if not self._pending:
-            return {}
-        rows = cast(TensorDictBase, torch.cat(self._pending))
-        return dict(rows.items(include_nested=True, leaves_only=True))
-
-    def set_extra_state(self, state: dict[Any, Tensor]) -> None:
-        """Go on from what :meth:`get_extra_state` gave."""
-        if not state:
-            self._pending = ()
-            return
-        count = len(next(iter(state.values())))
-        rows = TensorDict({}, [count])
-        for key, value in state.items():
-            rows.set(key, value.clone())
-        self._pending = (rows,)

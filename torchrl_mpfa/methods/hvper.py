@@ -13,15 +13,20 @@ to [0, 1] within a batch, the schedule of the weights and the penalty on replays
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.adjustment import BatchFacts
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.moving_fusion import ScheduledFusion
+from torchrl_mpfa.fusion import FixedFusion
 from torchrl_mpfa.signals import Signal
+
+if TYPE_CHECKING:
+    from torchrl_mpfa.storages.table import SignalTable
 
 
 def relative_value(value: Tensor) -> Tensor:
@@ -63,6 +68,52 @@ RELATIVE_VALUE = Signal("relative_value", key=("signals", "value"), priority=rel
 """V: the loss writes ``"value"``, and the table keeps its place within the batch."""
 RELATIVE_ERROR = Signal("relative_td_error", key=("signals", "td_error"), priority=relative_error)
 """T, likewise."""
+
+
+@dataclass
+class ScheduledFusion:
+    """Weights that are interpolated linearly from one set to another over the training.
+
+    Args:
+        start: Weight of each signal at the start, by name; a signal without one is not counted.
+        end: Weight of each signal at the end.
+
+    Raises:
+        ValueError: As :class:`~torchrl_mpfa.FixedFusion`.
+
+    Examples:
+        >>> fusion = ScheduledFusion({"td_error": 1.0}, {"td_error": 0.5, "value": 0.5})
+        >>> fusion.anneal(0.5)
+        >>> fusion.weights(["td_error", "value"], None, None).tolist()
+        [0.75, 0.25]
+    """
+
+    start: dict[str, float]
+    end: dict[str, float]
+    every_batch: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        self._ends = FixedFusion(self.start), FixedFusion(self.end)
+        self._fraction = 0.0
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Signals that must be fused."""
+        return tuple(dict.fromkeys((*self.start, *self.end)))
+
+    def anneal(self, fraction: float) -> None:
+        """Move to a share of the training that is done, from 0 to 1.
+
+        Raises:
+            ValueError: If ``fraction`` is outside.
+        """
+        check(SHARE, fraction=fraction)
+        self._fraction = fraction
+
+    def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
+        """Return the present weights in the order of ``names``, shape ``[K]``."""
+        start, end = (each.weights(names, table, index) for each in self._ends)
+        return start.lerp(end, self._fraction)
 
 
 def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:

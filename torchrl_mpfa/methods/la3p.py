@@ -17,9 +17,8 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from torchrl_mpfa.checks import check
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.slots import leaves_of, set_leaves
-from torchrl_mpfa.saved import wrong
+from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.trees import empty_tree_like, leaves_of, set_leaves
 from torchrl_mpfa.selection import SampledBatch
 
 Part = Literal["uniform", "prioritized", "inverse"]
@@ -57,7 +56,7 @@ class LA3PSampler(SignalSampler):
 
     def _init(self) -> None:
         super()._init()
-        self._inverse_tree = self._another(self._sum_tree)
+        self._inverse_tree = empty_tree_like(self._sum_tree, self._max_capacity, self.device)
 
     def _write_leaves(self, slots: Tensor, leaf: Tensor) -> None:
         super()._write_leaves(slots, leaf)
@@ -110,19 +109,14 @@ class LA3PSampler(SignalSampler):
         """All 1, see :meth:`TreeSampler.batch_weights`."""
         return torch.ones(size, dtype=torch.double, device=self.device)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
-        super().load_state_dict(state_dict)
+    def _restore(self, state: dict[str, Any]) -> None:
+        super()._restore(state)
         slots = self._priorities.isfinite().nonzero().squeeze(1)
+        leaves = leaves_of(self._sum_tree, slots) if len(slots) else self._priorities[slots]
+        if not bool((leaves > 0).all()):
+            raise ValueError("'_sum_tree' of the saved sampler must be positive, got 0")
         if len(slots):
-            set_leaves(slots, 1.0 / leaves_of(self._sum_tree, slots), self._inverse_tree)
-
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Reject a state that does not fit, before anything changes."""
-        super().check_state(state_dict)
-        shares = state_dict["_sum_tree"][~state_dict["_priorities"].isnan()]
-        if not bool((shares > 0).all()):
-            raise wrong("sampler", "_sum_tree", "positive where something was written", 0.0)
+            set_leaves(slots, 1.0 / leaves, self._inverse_tree)
 
 
 def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:

@@ -109,6 +109,6 @@ class Scaled(Adjusted):
 
     def fusion(self) -> Fusion:
         """Make the fusion in equal shares."""
-        from torchrl_mpfa.moving_fusion import ScaledFusion
+        from torchrl_mpfa.fusion import ScaledFusion
 
         return ScaledFusion(super().fusion())

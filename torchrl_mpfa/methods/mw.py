@@ -9,16 +9,14 @@ paper; that both are divided by their means and count the same, and the number, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.slots import set_leaves
-from torchrl_mpfa.saved import Entry
+from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.trees import set_leaves
 
 _NO_LEAF = float("inf")
 
@@ -83,12 +81,3 @@ class MWSampler(SignalSampler):
         if left >= batch_size:
             return super()._sample_slots(size, batch_size)
         return self._uniform(size, batch_size), torch.ones(batch_size, device=self.device)
-
-    def _entries(self) -> list[Entry]:
-        return [
-            *super()._entries(),
-            Entry("_spent", dtype=torch.bool, shape=(self._max_capacity,)),
-        ]
-
-    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        return super()._saved_leaves(state, written).masked_fill(state["_spent"][written], 0.0)

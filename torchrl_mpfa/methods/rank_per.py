@@ -5,15 +5,13 @@ Schaul et al. (2016), "Prioritized experience replay", https://arxiv.org/abs/151
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, check
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.saved import Entry, count
+from torchrl_mpfa.samplers.fused import SignalSampler
 
 
 def rank_share(rank: Tensor, *, alpha: float) -> Tensor:
@@ -101,16 +99,7 @@ class RankPERSampler(SignalSampler):
         if len(self._order):
             self._sort()
 
-    def _entries(self) -> list[Entry]:
-        most = self._max_capacity
-        order = Entry(
-            "_order",
-            lambda found: len(found) <= most and bool((found.diff() >= 0).all()),
-            f"at most {most} rising numbers",
-            dtype=torch.double,
-            shape=(None,),
-        )
-        return [*super()._entries(), order, count("_written")]
-
-    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        return _share_in(state["_order"], state["_priorities"][written], alpha=state["_alpha"])
+    def _restore(self, state: dict[str, Any]) -> None:
+        super()._restore(state)
+        if not bool((self._order.diff() >= 0).all()):
+            raise ValueError("'_order' of the saved sampler must be of rising numbers")

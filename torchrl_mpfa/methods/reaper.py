@@ -26,8 +26,8 @@ from torchrl.data import Storage
 
 from torchrl_mpfa.checks import POSITIVE, check
 from torchrl_mpfa.episodes import episodes_of
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.slots import as_slots
+from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.trees import as_slots
 from torchrl_mpfa.signals import TD_ERROR, Signal
 from torchrl_mpfa.storages.table import SignalTable
 
@@ -174,10 +174,6 @@ class ReaPERSampler(SignalSampler):
             raise ValueError(f"the storage must keep the signals {absent}, got {table.names}")
         return table
 
-    def reread(self, storage: Storage) -> None:
-        """Number all episodes again, after a write in place."""
-        self._numbered = 0
-
     def _number(self, table: SignalTable) -> None:
         """Number the episodes of the rows that were written since this was last done."""
         if not 0 < self._numbered <= table.writes:
@@ -224,12 +220,6 @@ class ReaPERSampler(SignalSampler):
         share = reliability(errors[mine], ordered, time[mine], total=totals[of])
         leaf = self._leaf(priority[mine]) * share.clamp_min(_LEAST).pow(self.exponent)
         self._write_leaves(mine, leaf)
-
-    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        # Reliabilities follow from the signals of the storage, and are at most 1.
-        highest = super()._saved_leaves(state, written)
-        found = state["_sum_tree"][written]
-        return torch.where((found > 0) & (found <= highest * (1 + 1e-9)), found, highest)
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
         super()._retransform_priority_trees(old_alpha, new_alpha)

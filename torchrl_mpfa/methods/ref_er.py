@@ -16,13 +16,14 @@ policy counts as a Gaussian around its action, as wide as the behavior was.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import RandomSampler, TensorDictReplayBuffer
 
-from torchrl_mpfa.checks import POSITIVE, SHARE, check
+from torchrl_mpfa.checks import COUNT_OR_ZERO, POSITIVE, SHARE, check
 from torchrl_mpfa.losses.functional import (
     BEHAVIOR_MEAN,
     BEHAVIOR_SIGMA,
@@ -30,8 +31,7 @@ from torchrl_mpfa.losses.functional import (
     POLICY_WEIGHT,
 )
 from torchrl_mpfa.methods.acting import actions_of
-from torchrl_mpfa.samplers.states import SavedValues
-from torchrl_mpfa.saved import count, number
+from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.selection import SampledBatch
 
 LEAST_SIGMA = 0.2
@@ -72,7 +72,7 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
     return kept if far > allowed else kept + min(rate, 1.0 - weight)
 
 
-class ReFERSampler(SavedValues):
+class ReFERSampler(SavedSampler, RandomSampler):
     r"""Uniform sampling by a sampler that keeps and saves what ReF-ER adapts.
 
     Examples:
@@ -80,8 +80,8 @@ class ReFERSampler(SavedValues):
         0.0001
     """
 
-    FILE = "trust.json"
-    ENTRIES = (number("_policy_weight", high=1.0), count("_batches"))
+    KIND = "ref_er"
+    SAVED = ("policy_weight", "batches")
 
     def __init__(self) -> None:
         super().__init__()
@@ -90,8 +90,13 @@ class ReFERSampler(SavedValues):
 
     def _empty(self) -> None:
         super()._empty()
-        # The batches go on: they are the training's.
+        # The count of batches is the training's, and stays.
         self.policy_weight = _FIRST_WEIGHT
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        super()._restore(state)
+        check(SHARE, policy_weight=self.policy_weight)
+        check(COUNT_OR_ZERO, batches=self.batches)
 
 
 class ReFERSelection:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_mpfa.adjustment import PositiveBoost, PositiveDecay
+from torchrl_mpfa.adjustment import Level, PositiveBoost, PositiveDecay, check_level
 from torchrl_mpfa.fusion import EntropyFusion
-from torchrl_mpfa.positive import Level, check_level
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
+from torchrl_mpfa.samplers.fused import SignalSampler
 from torchrl_mpfa.signals import MPFA_SIGNALS
 
 
@@ -68,7 +67,7 @@ class MPFASampler(SignalSampler):
         if all(own) and positive_above != 0.0:
             raise ValueError(
                 f"positive_above must be given to a fusion and adjustments of your own, got "
-                f"{positive_above!r} beside them"
+                f"{positive_above!r} with them"
             )
         if not own[0]:
             kwargs["fusion"] = EntropyFusion(positive_above=positive_above)

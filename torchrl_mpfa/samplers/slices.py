@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import torch
@@ -11,12 +10,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.checks import check_counts, check_index
+from torchrl_mpfa.checks import check_counts, check_index, unknown
 from torchrl_mpfa.episodes import follows
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.slots import as_slots, leaves_of, set_leaves
-from torchrl_mpfa.saved import Entry, exactly
-from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.files import check_saved
+from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.trees import as_slots, leaves_of, set_leaves
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
 
@@ -54,13 +52,13 @@ class SignalSliceSampler(SignalSampler):
         *args: As :class:`SignalSampler`, in its order.
         slice_len: Steps ``L`` of a slice. A batch has ``batch_size / L`` slices.
         slice_priority: ``"mean"`` or ``"start"``, as above.
-        strict_length: Whether all slices have ``L`` steps; if false, those that begin closer than
-            that to the end of a trajectory are sampled, too, and are shorter.
+        strict_length: True to sample only slices of ``L`` steps; false to sample shorter ones, too,
+            which begin closer than that to the end of a trajectory.
         end_key: Where the last step of a trajectory is marked.
         traj_key: Number of the trajectory of each step: a slice also ends where it changes. By
             default that of TorchRL's collectors, ``("collector", "traj_ids")``, where it is stored.
         truncated_key: Where the batch marks the last step of each slice, ``[B, 1]``, as well as
-            under ``"done"`` beside it, for estimators of values; None: nowhere.
+            under ``"done"`` next to it, for estimators of values; None: nowhere.
         **kwargs: As :class:`SignalSampler`.
 
     Raises:
@@ -116,7 +114,7 @@ class SignalSliceSampler(SignalSampler):
         if self.device.type != "cpu":
             raise ValueError(f"device must be that of a storage on the CPU, got {self.device}")
         super()._init()
-        # Whether the step after each slot is the next of its trajectory, and lies one stride on.
+        # True if the step one stride after a slot is the next of its trajectory.
         self._joined = torch.zeros(self._max_capacity, dtype=torch.bool)
         self._stride = 1
         self._lengths = torch.empty(0, dtype=torch.long)
@@ -133,7 +131,7 @@ class SignalSliceSampler(SignalSampler):
 
     @property
     def _done_key(self) -> NestedKey:
-        """Where a batch marks the last step of each slice as an end of any kind."""
+        """Key under which a batch marks the last step of each slice as an end of any kind."""
         return (*as_path(self.truncated_key or "")[:-1], "done")
 
     @property
@@ -188,7 +186,7 @@ class SignalSliceSampler(SignalSampler):
 
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
         starts = super()._proportional(tree, size, batch_size)
-        # Rounding can end at a leaf of 0 beside the one that was meant.
+        # Rounding can end at a leaf of 0 next to the right one.
         while len(wrong := (leaves_of(tree, starts) == 0).nonzero().squeeze(1)):
             starts[wrong] = super()._proportional(tree, size, len(wrong))
         return starts
@@ -198,17 +196,20 @@ class SignalSliceSampler(SignalSampler):
         before = self._table
         table = super().bind(storage)
         if table is not before and table.size:
-            self.reread(storage)
+            slots = torch.arange(self._max_capacity)
+            for part in slots.split(_AT_ONCE):
+                self._join(part, storage)
+            self._refresh(slots)
         return table
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
-        """Give new steps the highest priority, and take note of where trajectories end.
+        """Give new steps the highest priority, and record where trajectories end.
 
         Raises:
             ValueError: If there is no storage, where the ends are read.
         """
         if storage is None:
-            raise ValueError("storage must be given, which tells where trajectories end, got None")
+            raise ValueError("storage must be given, as it says where trajectories end, got None")
         slots = check_index(as_slots(index, storage), self._max_capacity)
         if len(slots) == 0:
             return
@@ -217,13 +218,6 @@ class SignalSliceSampler(SignalSampler):
         super().mark_update(index, storage=storage)
         if self.slice_priority == "start":  # Slices that begin before these steps have changed too.
             self._refresh(self._starts_around(slots))
-
-    def reread(self, storage: Storage) -> None:
-        """Read again where trajectories end, after a write in place."""
-        slots = torch.arange(self._max_capacity)
-        for part in slots.split(_AT_ONCE):
-            self._join(part, storage)
-        self._refresh(slots)
 
     def _join(self, slots: Tensor, storage: Any) -> None:
         """Find out which slots, or those before them, the next step of a trajectory follows."""
@@ -284,26 +278,14 @@ class SignalSliceSampler(SignalSampler):
             return priorities[starts], whole
         return priorities[slots].where(inside, 0.0).sum(1) / length, whole
 
-    def _entries(self) -> list[Entry]:
-        slots = self._max_capacity
-        return [
-            *super()._entries(),
-            *(exactly(name, getattr(self, name)) for name in _SETTINGS),
-            Entry(
-                "_stride",
-                lambda value: type(value) is int and value >= 1 and slots % value == 0,
-                f"a divisor of {slots}",
-            ),
-            Entry("_joined", dtype=torch.bool, shape=(slots,)),
-        ]
-
-    def _saved_leaves(self, state: Mapping[str, Any], written: Tensor) -> Tensor:
-        rest = [state[name] for name in ("_priorities", "_joined", "_stride")]
-        found = []
-        for part in written.nonzero().squeeze(1).split(_AT_ONCE):
-            priority, whole = self._of_slices(part, *rest)
-            found.append(priority.pow(state["_alpha"]).where(whole, 0.0))
-        return torch.cat(found) if found else torch.empty(0, dtype=torch.double)
+    def _restore(self, state: dict[str, Any]) -> None:
+        check_saved("sampler", state, **{name: getattr(self, name) for name in _SETTINGS})
+        super()._restore(state)
+        if type(self._stride) is not int or self._stride < 1 or self._max_capacity % self._stride:
+            raise ValueError(
+                f"'_stride' of the saved sampler must be a divisor of {self._max_capacity}, got "
+                f"{self._stride!r}"
+            )
 
 
 def _column(
@@ -313,7 +295,7 @@ def _column(
     entry = storage._storage.get(key, None)
     if entry is None:
         if default is None:
-            raise KeyError(f"the transitions have no {key!r}, which tells where trajectories end")
+            raise KeyError(f"the transitions have no {key!r}, which says where trajectories end")
         return default
     chosen: Tensor = entry.flatten(0, storage.ndim - 1)[slots.to(entry.device)]
     return chosen.reshape(len(slots), -1).amax(1, keepdim=True).cpu()

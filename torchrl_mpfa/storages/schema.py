@@ -1,4 +1,4 @@
-"""Keys, shapes and dtypes of stored transitions, which those that are written must have."""
+"""Keys, shapes and dtypes of stored transitions, which new transitions must have."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 INDEX_KEY = "index"
-"""Entry in which TorchRL's writers put the slot; in-place writes come without it."""
+"""Entry in which TorchRL's writers put the slot."""
 
 Pairs = list[tuple[Tensor, Tensor]]
 _Path = tuple[str, ...]
@@ -25,7 +25,7 @@ class _Entry:
     stored: Tensor
     row: torch.Size  # Shape of one transition's.
     dtype: torch.dtype
-    finite: bool  # Whether NaN and infinities are rejected.
+    finite: bool  # True if NaN and infinities are rejected.
 
 
 class Schema:
@@ -41,18 +41,18 @@ class Schema:
         self._first = next(((k, e) for k, e in self._tree.items() if type(e) is _Entry), None)
 
     def describes(self, stored: TensorDictBase) -> bool:
-        """Whether the tensors of a storage are still those that were described."""
+        """True if the tensors of a storage are still those that were described."""
         return self._first is not None and stored.get(self._first[0]) is self._first[1].stored
 
-    def check(self, data: TensorDictBase, lead: int, *, whole: bool, some: bool = False) -> Pairs:
-        """Pairs of a stored entry and its new values, whose first ``lead`` dimensions count rows.
+    def check(self, data: TensorDictBase, lead: int, *, whole: bool) -> Pairs:
+        """Return pairs of a stored entry and its new values, of ``lead`` dimensions of rows.
 
         Raises:
-            KeyError: If ``whole`` and an entry is unknown, or missing without ``some``.
+            KeyError: If ``whole`` and an entry is unknown or missing.
             ValueError: If shape or dtype differ, or, if ``whole``, a number is not finite.
         """
         pairs: Pairs = []
-        _match(self._tree, data, lead, whole, (), pairs, some)
+        _match(self._tree, data, lead, whole, (), pairs)
         return pairs
 
 
@@ -68,7 +68,7 @@ def check_finite_entries(
 
 
 def as_path(key: NestedKey) -> _Path:
-    """A key of a tensordict as a tuple."""
+    """Return a key of a tensordict as a tuple."""
     return (key,) if isinstance(key, str) else tuple(key)
 
 
@@ -88,13 +88,7 @@ def _count(tree: _Tree) -> int:
 
 
 def _match(
-    tree: _Tree,
-    data: TensorDictBase,
-    lead: int,
-    whole: bool,
-    path: _Path,
-    pairs: Pairs,
-    some: bool,
+    tree: _Tree, data: TensorDictBase, lead: int, whole: bool, path: _Path, pairs: Pairs
 ) -> None:
     known = 0
     for key, value in data.items():
@@ -107,14 +101,14 @@ def _match(
         elif isinstance(expected, dict):
             if not isinstance(value, TensorDictBase):
                 raise ValueError(f"entry {_name(path, key)} must hold entries, got {_kind(value)}")
-            _match(expected, value, lead, whole, (*path, key), pairs, some)
+            _match(expected, value, lead, whole, (*path, key), pairs)
         elif whole and isinstance(value, Tensor | TensorDictBase) and key != INDEX_KEY:
             raise KeyError(
                 f"entry {_name(path, key)} is not in the storage, whose first transitions did not "
                 "have it: leave it out, or write it from the start"
             )
         known += expected is not None
-    if whole and not some and known != len(tree):
+    if whole and known != len(tree):
         for key in tree:
             if key != INDEX_KEY and data.get(key, None) is None:
                 raise KeyError(f"entry {_name(path, key)} is missing in the transitions")

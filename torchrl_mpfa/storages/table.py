@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_mpfa.checks import bounds, check_counts, check_finite, check_index
-from torchrl_mpfa.saved import Entry, check_entries, count, exactly
+from torchrl_mpfa.checks import (
+    COUNT_OR_ZERO,
+    bounds,
+    check,
+    check_counts,
+    check_finite,
+    check_index,
+)
+from torchrl_mpfa.files import check_saved
 from torchrl_mpfa.signals import Signal, as_signals
 
 Priority = Callable[[Tensor], Tensor] | None
@@ -36,7 +43,7 @@ class SignalTable:
         reward_key: Where the signed reward of a transition is read.
         file: Memory-map the table to this file in place of keeping it in memory. No other table
             may be mapped to it as long as this one lives.
-        existsok: Whether the file may be there already, and is overwritten.
+        existsok: True to overwrite a file that is there already.
 
     Raises:
         FileExistsError: If the file is there and ``existsok`` is false, or another table, of this
@@ -73,32 +80,24 @@ class SignalTable:
             self.rows = torch.from_numpy(_map(file, (capacity, width), existsok=existsok))
         self._blank = torch.full((1, width), torch.nan, dtype=torch.double)
         self._blank[0, self.count_column] = 0.0
-        self.clock = [0]
         self.size = self.cleared = 0
-        self.loaded = 0
-        """Count of writes when a state was loaded."""
+        self.writes = self.loaded = 0
+        """Count of all writes, and the same when a state was loaded."""
+        self.clock = [0]
+        """Count of writes that saved states share, and see change."""
         self.clear()
-
-    @property
-    def writes(self) -> int:
-        """Count of all writes; saved states share ``clock``, which has it, and see it change."""
-        return self.clock[0]
-
-    @writes.setter
-    def writes(self, count: int) -> None:
-        self.clock[0] = count
 
     def stop_clock(self) -> None:
         """Invalidate states that share the clock: the data are no longer those of its writes."""
-        count, self.clock[0] = self.writes, -1
-        self.clock = [count]
+        self.clock[0] = -1
+        self.clock = [self.writes]
 
     def to(self, device: torch.device) -> None:
         """Move to the device of the data."""
         self.rows, self.device = self.rows.to(device), device
 
     def clear(self) -> None:
-        """Forget every slot; the count of writes goes on, so that earlier batches stay stale."""
+        """Forget every slot; the count of writes continues, so that earlier batches stay stale."""
         self.rows.copy_(self._blank)
         self.cleared = max(self.cleared, self.size)
         self.size = 0
@@ -107,11 +106,6 @@ class SignalTable:
         """Add slots at the end; only for a table in memory."""
         more = self.blank(capacity - self.capacity, self.device)
         self.rows, self.capacity = torch.cat([self.rows, more]), capacity
-
-    @property
-    def known(self) -> int:
-        """Slots, counted from the front, that are filled or were before the table was cleared."""
-        return max(self.size, self.cleared)
 
     @property
     def rewards(self) -> Tensor:
@@ -170,7 +164,7 @@ class SignalTable:
         """Reject rows whose signals cannot be fused: missing, negative or not finite."""
         if len(rows) == 0:
             return
-        # A NaN makes both of these NaN, so that one pass finds whatever is wrong.
+        # A NaN makes both of these NaN, so that one pass finds any wrong number.
         chosen = rows[:, columns]
         low, high = bounds(chosen)
         if low >= 0 and high < math.inf:
@@ -185,13 +179,13 @@ class SignalTable:
         self, slots: Tensor, written_at: Tensor | None, batches: int
     ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
         """Rows and slots that are not stale, which of the slots they are, and sizes of batches."""
+        # A batch from before the table was cleared is stale, as its times of writing show.
+        filled = self.size if written_at is None else max(self.size, self.cleared)
         check_counts(batches=batches)
-        if len(slots) % batches:
-            raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
-        # A batch from before the table was cleared is stale, as its times of writing tell.
-        filled = self.size if written_at is None else self.known
         if len(check_index(slots, filled)) < len(slots):
             raise IndexError(f"index must be in [0, {filled}), the filled slots, got -1")
+        if len(slots) % batches:
+            raise ValueError(f"{len(slots)} slots cannot make {batches} equal batches")
         rows, sizes = self.rows.index_select(0, slots), [len(slots) // batches] * batches
         if written_at is None:
             return rows, slots, None, sizes
@@ -221,7 +215,7 @@ class SignalTable:
         count = len(rows)
         if count > self.capacity:
             # Of a slot that is named twice the last row must win, which indexing leaves open.
-            self.writes += count - self.capacity
+            self._count_writes(count - self.capacity)
             index, rows = index[-self.capacity :], rows[-self.capacity :]
             count = self.capacity
         index, rows = index.to(self.device), rows.to(self.device)
@@ -231,18 +225,11 @@ class SignalTable:
             times = torch.arange(self.writes, self.writes + count, device=self.device)
             rows[:, self.time_column] = times
         self.rows[index] = rows
+        self._count_writes(count)
+
+    def _count_writes(self, count: int) -> None:
         self.writes += count
-
-    def rewrite(self, rows: Tensor) -> None:
-        """Take from rows that were read what is known at the write, for all filled slots.
-
-        What the learner gave stays until its next update; a row that changes counts as a write.
-        """
-        known = [*(self.column[s.name] for s in self.written), self.reward_column]
-        before, after = self.rows[: self.size, known], rows[:, known].to(self.device)
-        same = (before == after) | (before.isnan() & after.isnan())
-        self.rows[: self.size, known] = after
-        self.writes += int((~same.all(1)).sum())
+        self.clock[0] = self.writes
 
     def count_replay(self, index: Tensor) -> None:
         """Count one replay for each sampled slot, duplicates included."""
@@ -265,60 +252,46 @@ class SignalTable:
         return {**vars(self), "rows": self.rows.clone(), "in_memory": True}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that restores the table; tensors and plain values only."""
-        return {
-            "capacity": self.capacity,
-            "names": list(self.names),
-            "size": self.size,
-            "writes": self.writes,
-            "rows": self.rows[: self.size].to("cpu", copy=True),
-        }
+        """Return everything that restores the table; tensors and plain values only."""
+        return self._state(self.rows[: self.size].to("cpu", copy=True), self.writes)
+
+    def state_of_new(self, rows: Tensor) -> dict[str, Any]:
+        """Return the state of a table in whose first slots these rows are written now."""
+        # Times continue, so that a batch sampled before is known to be old.
+        writes = self.writes + len(rows)
+        rows[:, self.time_column] = torch.arange(self.writes, writes)
+        return self._state(rows, writes)
+
+    def _state(self, rows: Tensor, writes: int) -> dict[str, Any]:
+        kept = {"capacity": self.capacity, "names": list(self.names)}
+        return {**kept, "size": len(rows), "writes": writes, "rows": rows}
 
     def check_state(self, state: dict[str, Any]) -> None:
-        """Reject a state that does not belong to this table, before anything changes.
-
-        Raises:
-            KeyError: If an entry is missing.
-            ValueError: If capacity or signals differ, or a value cannot be.
-        """
-        plain = [
-            exactly("capacity", self.capacity),
-            exactly("names", self.names),
-            count("size", high=self.capacity),
-            count("writes"),
-        ]
-        check_entries("signals", state, plain)
-        shape = (state["size"], self.rows.shape[1])
-        check_entries("signals", state, [Entry("rows", dtype=torch.double, shape=shape)])
-        columns = dict(zip(self._columns(), state["rows"].unbind(1), strict=True))
-        check_entries("signals", columns, self._column_entries(state["writes"]))
-
-    def _columns(self) -> list[str]:
-        return [*self.names, "signed reward", "replay count", "time of writing"]
-
-    def _column_entries(self, writes: int) -> list[Entry]:
-        """The entries of a saved table, by column; NaN stands for what is not known yet."""
-        *signals, reward, replays, times = self._columns()
-
-        def below(high: float, found: Tensor) -> Tensor:
-            return (found >= 0) & (found < high)
-
-        return [
-            *(
-                Entry(name, lambda v: v.isnan() | below(math.inf, v), "finite and not negative")
-                for name in signals
-            ),
-            Entry(reward, lambda v: ~v.isinf(), "finite"),
-            Entry(replays, lambda v: below(math.inf, v), "finite and not negative"),
-            Entry(times, lambda v: below(writes, v), f"in [0, {writes})"),
-        ]
+        """Reject the state of a table of other signals or capacity, or with impossible numbers."""
+        kept = {"capacity": self.capacity, "names": self.names}
+        check_saved("signals", state, ("size", "writes", "rows"), **kept)
+        check(COUNT_OR_ZERO, size=state["size"], writes=state["writes"])
+        rows, shape = state["rows"], (min(state["size"], self.capacity), self.rows.shape[1])
+        form = (rows.shape, rows.dtype) if isinstance(rows, Tensor) else rows
+        if form != (shape, torch.double):
+            raise ValueError(f"'rows' of the saved signals must be {[*shape]} doubles, got {form}")
+        # NaN stands for what is not known yet.
+        known = rows[:, : self.count_column].clone()
+        known[:, self.reward_column].abs_()
+        check_finite("signals and rewards of the saved signals", known[~known.isnan()])
+        rest = rows[:, self.count_column :]
+        check_finite("counts and times of the saved signals", rest)
+        if len(rest) and (latest := rest[:, -1].max().item()) >= state["writes"]:
+            raise ValueError(
+                f"times of the saved signals must be below {state['writes']}, got {latest}"
+            )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
+        """Restore the result of :meth:`state_dict`, or raise as :meth:`check_state`."""
         self.check_state(state)
         self.clear()
         self.size, self.writes = state["size"], state["writes"]
-        self.loaded = self.writes
+        self.loaded = self.clock[0] = self.writes
         self.rows[: self.size] = state["rows"]
 
 

@@ -1,25 +1,27 @@
-"""The storage whose data and signals lie in memory."""
+"""The storages: data and signals in memory, or in memory-mapped files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from multiprocessing.context import get_spawning_popen
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, is_tensor_collection
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import LazyTensorStorage
+from torch.utils._pytree import tree_map
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 
 from torchrl_mpfa.checks import bounds, check_counts
 from torchrl_mpfa.signals import MPFA_SIGNALS, Signal
-from torchrl_mpfa.storages.base import SignalStorageMixin
+from torchrl_mpfa.storages.storage import SignalStorageMixin
 from torchrl_mpfa.storages.table import SignalTable
 
 
 class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
-    """:class:`~torchrl.data.LazyTensorStorage` with the signals of every slot beside the data.
+    """:class:`~torchrl.data.LazyTensorStorage` with the signals of every slot next to the data.
 
     Args:
         max_size: Capacity ``N``.
@@ -74,24 +76,15 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
             return _rows_of(self._storage, index)
         return super().get(index)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore data and signals, or raise as :meth:`check_state` does."""
-        super().load_state_dict(state_dict)
-        self._settle_loaded()
-
-    def loads(self, path: str | Path) -> None:
-        """Restore data and signals from a folder, or raise as :meth:`check_state` does."""
-        super().loads(path)
-        self._settle_loaded()
-
-    def _settle_loaded(self) -> None:
+    def _settle_loaded(self, signals: dict[str, Any]) -> None:
         found = self._device_of_tensors() if self.initialized else None
         if getattr(self, "device", None) == "auto":
             # TorchRL finds it out at the first write, which a restored storage has had.
             self.device = (found or torch.device("cpu")) if self.initialized else "auto"
         elif found not in (None, self.device):
-            # What was saved beside another device.
+            # What was saved on another device.
             self._storage = self._storage.to(self.device)
+        super()._settle_loaded(signals)
         self._settle_device()
 
     def _device_of_tensors(self) -> torch.device | None:
@@ -99,6 +92,72 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         if self._looked_at is not self._storage:
             self._looked_at, self._where = self._storage, _common_device(self._storage)
         return self._where
+
+
+class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
+    """:class:`~torchrl.data.LazyMemmapStorage` with the signals of every slot next to the data.
+
+    With ``scratch_dir`` the signals are memory-mapped too, to ``scratch_dir/signals.memmap``;
+    without it they stay in memory, 8 bytes a column and slot. A pickled or copied storage has
+    temporary files of its own. A load writes into the files once the state was found to fit; if
+    the disk then fails, the storage is left half loaded.
+
+    Args:
+        max_size: Capacity ``N``.
+        signals: The signals to keep, as objects or names; those of the paper by default.
+        reward_key: Where the signed reward of a transition is read.
+        allow_nonfinite: As in :class:`SignalTensorStorage`.
+        scratch_dir: Folder of the memory-mapped files; a temporary one by default.
+        existsok: True to overwrite files that an earlier storage left in ``scratch_dir``.
+        **kwargs: As in :class:`SignalTensorStorage`, for :class:`~torchrl.data.LazyMemmapStorage`.
+
+    Raises:
+        ValueError: As :class:`SignalTensorStorage`.
+        FileExistsError: If ``scratch_dir`` holds the files of an earlier storage and ``existsok``
+            is false, or a living storage, of this process or another, uses it.
+
+    Examples:
+        >>> import tempfile
+        >>> storage = SignalMemmapStorage(1000, scratch_dir=tempfile.mkdtemp())
+        >>> storage.signal_table.rows.shape
+        torch.Size([1000, 6])
+    """
+
+    _storage: Any
+
+    def __init__(
+        self,
+        max_size: int,
+        *,
+        signals: Sequence[Signal | str] = MPFA_SIGNALS,
+        reward_key: NestedKey = ("next", "reward"),
+        allow_nonfinite: Sequence[NestedKey] = (),
+        scratch_dir: str | Path | None = None,
+        existsok: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        check_counts(max_size=max_size)
+        self._allow_nonfinite = tuple(allow_nonfinite)
+        file = None if scratch_dir is None else Path(scratch_dir) / "signals.memmap"
+        self.signal_table = SignalTable(
+            max_size, signals, reward_key=reward_key, file=file, existsok=existsok
+        )
+        super().__init__(max_size, scratch_dir=scratch_dir, existsok=existsok, **kwargs)
+
+    def __getstate__(self) -> Any:
+        state = super().__getstate__()
+        if get_spawning_popen() is None:
+            # The copy has files of its own. Processes that TorchRL starts share those of this one.
+            state |= {"scratch_dir": None, "_scratch_dir_is_temp": True}
+            if self.initialized:
+                state["_storage"] = tree_map(lambda entry: entry.clone(), self._storage)
+        return state
+
+    def __setstate__(self, state: Any) -> None:
+        super().__setstate__(state)
+        data: Any = self._storage if self.initialized else None
+        if is_tensor_collection(data) and not data.is_memmap():
+            self._storage = data.memmap()
 
 
 def _common_device(data: Any) -> torch.device | None:
@@ -123,6 +182,6 @@ def _rows_of(data: TensorDict, index: Tensor) -> TensorDict:
 
 
 def _within(index: Tensor, size: int) -> bool:
-    """Whether all slots are filled ones, counted from the front."""
+    """Return True if all slots are filled ones, counted from the front."""
     low, high = bounds(index)
     return low >= 0 and high < size

@@ -13,7 +13,7 @@ from optuna.distributions import (
     IntDistribution,
 )
 
-from torchrl_mpfa.spelling import unknown
+from torchrl_mpfa.checks import unknown
 from training.comparison.arms import with_defaults
 from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import as_text, read_names

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, and read without executing anything."""
+"""Files: written whole or not at all, read without executing anything; loads that fit or raise."""
 
 import os
 import pickle
@@ -10,11 +10,20 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from tests.mpfa.transitions import Trap, same
-from torchrl_mpfa.files import load_safely, save_atomically, write_text_atomically
+from tests.mpfa.transitions import (
+    Trap,
+    same,
+)
+from torchrl_mpfa.files import (
+    check_saved_numbers,
+    load_safely,
+    load_together,
+    save_atomically,
+    write_text_atomically,
+)
 
 
-def test_what_is_saved_is_read_again(tmp_path):
+def test_saved_state_is_read_again(tmp_path):
     state = {"a": torch.arange(3), "b": {"c": [1, 2.5, None, "text"]}}
     save_atomically(state, tmp_path / "state.pt")
     found = load_safely(tmp_path / "state.pt")
@@ -34,7 +43,7 @@ def crash(*_):
 
 @pytest.mark.parametrize("rename", [crash, os.replace], ids=["at the rename", "in the write"])
 @pytest.mark.parametrize("kind", ["state", "text"])
-def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch, kind, rename):
+def test_failed_write_leaves_the_old_file_alone(tmp_path, monkeypatch, kind, rename):
     path, text = tmp_path / "file", kind == "text"
     write = write_text_atomically if text else save_atomically
     write("α\n" if text else {"step": 1}, path)
@@ -48,7 +57,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path, monkeypatc
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_a_save_removes_the_leftovers_of_killed_processes_alone(tmp_path):
+def test_save_removes_the_leftovers_of_killed_processes_alone(tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     for name in (f"{gone.pid}", f"{gone.pid}-0123456789abcdef"):
@@ -59,11 +68,11 @@ def test_a_save_removes_the_leftovers_of_killed_processes_alone(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [alive.name, "state.pt"]
 
 
-def test_of_saves_at_once_the_last_one_counts_and_none_is_damaged(tmp_path):
+def test_concurrent_saves_damage_no_file(tmp_path):
     path = tmp_path / "state.pt"
 
     def save(number):
-        for _ in range(40):
+        for _ in range(15):
             save_atomically({"of": torch.full((5000,), number)}, path)
             assert len(load_safely(path)["of"].unique()) == 1
 
@@ -72,7 +81,7 @@ def test_of_saves_at_once_the_last_one_counts_and_none_is_damaged(tmp_path):
     assert os.listdir(tmp_path) == ["state.pt"]
 
 
-def test_a_link_at_the_name_of_the_temporary_file_is_not_followed(tmp_path, monkeypatch):
+def test_link_at_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     monkeypatch.setattr("secrets.token_hex", lambda _: "known")
@@ -84,7 +93,7 @@ def test_a_link_at_the_name_of_the_temporary_file_is_not_followed(tmp_path, monk
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])
-def test_a_file_gets_the_permissions_that_any_file_gets(tmp_path, mask):
+def test_saved_file_has_ordinary_permissions(tmp_path, mask):
     before = os.umask(mask)
     try:
         save_atomically({}, tmp_path / "state.pt")
@@ -93,7 +102,7 @@ def test_a_file_gets_the_permissions_that_any_file_gets(tmp_path, mask):
     assert (tmp_path / "state.pt").stat().st_mode & 0o777 == 0o666 & ~mask
 
 
-def test_a_file_with_code_in_it_is_rejected_by_name_and_not_executed(tmp_path):
+def test_file_with_code_in_it_is_rejected_and_not_executed(tmp_path):
     trap, path = tmp_path / "trap", tmp_path / "state.pt"
     save_atomically({"a": Trap(trap)}, path)
     with pytest.raises(pickle.UnpicklingError, match=r"state\.pt holds more than tensors"):
@@ -104,7 +113,7 @@ def test_a_file_with_code_in_it_is_rejected_by_name_and_not_executed(tmp_path):
     assert trap.exists()
 
 
-def test_every_file_that_something_else_wrote_is_rejected_by_name(tmp_path):
+def test_foreign_file_is_rejected_by_name(tmp_path):
     trap, path = tmp_path / "trap", tmp_path / "state.pt"
     for content in (pickle.dumps({"a": Trap(trap)}, protocol=2), b"", b"a,b\n1,2\n" * 50):
         path.write_bytes(content)
@@ -114,7 +123,7 @@ def test_every_file_that_something_else_wrote_is_rejected_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("size", [0, 10, 200, -1])
-def test_a_truncated_file_is_an_error_with_its_name(tmp_path, size):
+def test_truncated_file_is_rejected_by_name(tmp_path, size):
     path = tmp_path / "state.pt"
     save_atomically({"a": torch.arange(100)}, path)
     path.write_bytes(path.read_bytes()[:size])
@@ -122,13 +131,13 @@ def test_a_truncated_file_is_an_error_with_its_name(tmp_path, size):
         load_safely(path)
 
 
-def test_every_bit_that_flips_is_noticed_or_harmless(tmp_path):
+def test_flipped_bit_is_noticed_or_harmless(tmp_path):
     path = tmp_path / "state.pt"
     state = {"a": torch.rand(300), "b": {"c": [1, 2.5, None, "text"]}, "d": torch.arange(99)}
     save_atomically(state, path)
     whole = path.read_bytes()
     noticed = 0
-    for bit in random.Random(0).sample(range(len(whole) * 8), 300):
+    for bit in random.Random(0).sample(range(len(whole) * 8), 200):
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
@@ -137,15 +146,35 @@ def test_every_bit_that_flips_is_noticed_or_harmless(tmp_path):
         except ValueError as error:
             assert "state.pt is" in str(error)
             noticed += 1
-    assert noticed > 290
+    assert noticed > 190
 
 
-def test_tensors_may_stay_in_the_file_until_they_are_read(tmp_path):
+def test_tensors_stay_in_the_file_until_they_are_read(tmp_path):
     path = tmp_path / "state.pt"
     save_atomically({"a": torch.arange(100)}, path)
     assert load_safely(path, mmap=True)["a"].tolist() == list(range(100))
 
 
-def test_a_file_that_is_not_there_is_an_error(tmp_path):
+def test_missing_file_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_safely(tmp_path / "none.pt")
+
+
+def test_load_together_changes_no_part_if_one_state_does_not_fit():
+    parts = [torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)]
+    before = [part.weight.clone() for part in parts]
+    states = [{"weight": torch.ones(1, size), "bias": torch.ones(1)} for size in (2, 4)]
+    with pytest.raises(RuntimeError, match="size mismatch for weight"):
+        load_together(*zip(parts, states, strict=True))
+    assert all(map(torch.equal, before, [part.weight for part in parts]))
+    load_together((parts[0], states[0]))
+    assert parts[0].weight.eq(1).all()
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.tensor([0.0, torch.inf])])
+def test_saved_number_that_is_not_finite_is_found_in_any_depth(wrong):
+    state = {"groups": [{"lr": 1.0, "params": (3, "a", None)}], "weight": torch.zeros(2)}
+    check_saved_numbers("learner", state)
+    state["groups"].append({"lr": wrong})
+    with pytest.raises(ValueError, match=r"saved learner must be finite, got (nan|inf) in 'lr'"):
+        check_saved_numbers("learner", state)

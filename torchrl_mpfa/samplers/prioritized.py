@@ -20,19 +20,23 @@ from torchrl_mpfa.checks import (
     seeded_generator,
 )
 from torchrl_mpfa.priorities import importance_weights
-from torchrl_mpfa.samplers.leaves import Leaves, MinLeaves, SumLeaves
-from torchrl_mpfa.samplers.slots import (
+from torchrl_mpfa.samplers.states import SavedTrees
+from torchrl_mpfa.samplers.trees import (
+    Leaves,
+    MinLeaves,
+    SumLeaves,
     as_slots,
+    empty_tree_like,
     in_dimensions_of,
     last_of_each,
     leaves_of,
     set_leaves,
 )
-from torchrl_mpfa.samplers.states import SavedTrees
 
 _LOG_LARGEST = math.log(torch.finfo(torch.double).max) - 1.0
 _LOG_POSITIVE = math.log(1e-200)
-"""A leaf with a logarithm above this is not rounded to zero, whatever a sampler makes of it."""
+"""A leaf with a logarithm above this is not rounded to zero by any sampler."""
+_CPU = torch.device("cpu")
 _ALPHA = NOT_NEGATIVE[0], "greater or equal to 0 and finite"  # As TorchRL says it.
 
 
@@ -44,22 +48,22 @@ class TreeSampler(SavedTrees):
     a million slots; the highest priority in the buffer costs O(log N) instead of O(N); randomness
     comes from a generator that ``torch.manual_seed`` reaches and that is saved; a priority that is
     negative or not finite is rejected where it enters; a saved state holds tensors and numbers
-    only, and one that does not fit is rejected before anything changes.
+    only, and a state that does not fit changes nothing.
 
     Args:
         max_capacity: Capacity of the storage ``N``.
         alpha: Priority exponent :math:`\alpha` of Eq. (8); 0 samples uniformly.
         beta: Importance exponent :math:`\beta` of Eq. (10).
         eps: :math:`\epsilon` of Eq. (9).
-        dtype: Type of the importance weights, single or double precision. Unlike TorchRL's, the
-            trees are in double precision whatever it is.
+        dtype: Type of the importance weights, single or double precision. The trees are in double
+            precision.
         reduction: As in TorchRL.
-        max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
-            transition *in the buffer* was given by an update; if false, the highest ever.
-        device: Device of priorities and sampled slots; by default that of the storage. Where it is
-            not the CPU, passes over all priorities take the place of segment trees.
-        stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
-            priority, as the PER paper does, in place of ``B`` independent ones.
+        max_priority_within_buffer: True to give a fresh transition the highest priority that an
+            update gave to a transition *in the buffer*; false to give it the highest ever.
+        device: Device of priorities and sampled slots; by default that of the storage. On devices
+            other than the CPU, passes over all priorities take the place of segment trees.
+        stratified: True to sample one slot from each of ``B`` equal parts of the total priority, as
+            the PER paper does, in place of ``B`` independent ones.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -71,6 +75,7 @@ class TreeSampler(SavedTrees):
     """
 
     _rng: torch.Generator | None
+    _device: torch.device | None
     _alpha: float
     _beta: float
 
@@ -122,7 +127,7 @@ class TreeSampler(SavedTrees):
         # TorchRL finds the highest priority in the buffer by reading every leaf. A minimum tree
         # over the negated priorities has it at its root. It leaves out fresh transitions: they
         # would hand on the highest priority that they were given, and one outlier would stay.
-        self._max_tree = self._another(self._min_tree)
+        self._max_tree = empty_tree_like(self._min_tree, self._max_capacity, self.device)
         # Priorities with eps, before alpha; NaN where nothing was written.
         self._priorities = torch.full(
             (self._max_capacity,), torch.nan, dtype=torch.double, device=self.device
@@ -132,13 +137,28 @@ class TreeSampler(SavedTrees):
         self._positive = False
 
     @property
-    def alpha(self) -> float:
-        r"""Priority exponent :math:`\alpha` of Eq. (8); setting it follows in all leaves.
+    def device(self) -> torch.device:
+        """Device of priorities and sampled slots."""
+        return self._device or torch.device("cpu")
 
-        Raises:
-            TypeError: If it is set to anything but a number.
-            ValueError: If the number is negative, not finite, or leaves priorities of zero or
-                without a finite sum; nothing is changed then.
+    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
+        """Move to the device of a storage, once it is known."""
+        device = getattr(storage, "device", None)
+        if device == (self._device or _CPU) or not isinstance(device, torch.device):
+            return
+        if not self._follows:
+            raise ValueError(
+                f"device must be that of the storage, {device}, or None, got {self.device}"
+            )
+        state, self._device = self.state_dict(), device
+        self.load_state_dict(state)
+
+    @property
+    def alpha(self) -> float:
+        r"""Priority exponent :math:`\alpha` of Eq. (8); a new value changes all leaves.
+
+        A value that is negative or not finite, or by which priorities vanish or overflow, is
+        rejected, and changes nothing.
         """
         return self._alpha
 
@@ -164,12 +184,7 @@ class TreeSampler(SavedTrees):
 
     @property
     def beta(self) -> float:
-        r"""Importance exponent :math:`\beta` of Eq. (10).
-
-        Raises:
-            TypeError: If it is set to anything but a number.
-            ValueError: If the number is negative or not finite; nothing is changed then.
-        """
+        r"""Importance exponent :math:`\beta` of Eq. (10), finite and not negative."""
         return self._beta
 
     @beta.setter
@@ -179,7 +194,7 @@ class TreeSampler(SavedTrees):
 
     @property
     def _max_priority(self) -> tuple[float | None, int | None]:
-        """Highest priority without eps, and the slot that has or had it: TorchRL's bookkeeping."""
+        """Return the highest priority without eps and its slot, as TorchRL's sampler has them."""
         highest = self._highest_priority()
         if highest is None:
             return None, None
@@ -195,7 +210,7 @@ class TreeSampler(SavedTrees):
         self._highest_slot = slot
 
     def _highest_priority(self) -> float | None:
-        """Highest priority, eps included; None if no update was made."""
+        """Return the highest priority, eps included; None before the first update."""
         # With alpha = 0 all slots are sampled alike, and TorchRL keeps the highest ever seen.
         if self._max_priority_within_buffer and self._alpha > 0:
             highest = -self._max_tree.query(0, self._max_capacity)
@@ -209,25 +224,19 @@ class TreeSampler(SavedTrees):
         return 1.0 if highest is None else max(highest - self._eps, 0.0)
 
     def priorities(self, index: Tensor | None = None) -> Tensor:
-        """Priorities with eps, before alpha, in double precision; NaN where nothing was written.
+        """Return priorities with eps, before alpha; NaN where nothing was written.
 
         Args:
             index: Slots, shape ``[B]``; by default all of them.
 
         Returns:
-            Priorities, shape ``[B]``.
-
-        Examples:
-            >>> sampler = TreeSampler(3, 1.0, 0.4, eps=0.5)
-            >>> sampler.update_priority([0, 2], torch.tensor([1.0, 2.0]))
-            >>> sampler.priorities().tolist()
-            [1.5, nan, 2.5]
+            Priorities in double precision, shape ``[B]``.
         """
         return self._priorities.clone() if index is None else self._priorities[index]
 
     @property
     def divisible(self) -> bool:
-        """Whether ``U * B`` slots, sampled at once, are as good as ``U`` batches of ``B``."""
+        """True if ``U * B`` slots, sampled at once, are as good as ``U`` batches of ``B``."""
         return not self.stratified
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Tensor]]:
@@ -238,8 +247,8 @@ class TreeSampler(SavedTrees):
             batch_size: ``B``.
 
         Returns:
-            Slots, shape ``[B]``, or for a storage of several dimensions a tuple of places along
-            each; and ``{"priority_weight": ...}``, shape ``[B]``.
+            Slots ``[B]``, or a tuple of places for several dimensions; and ``{"priority_weight":
+            ...}``, shape ``[B]``.
 
         Raises:
             RuntimeError: If the storage is empty.
@@ -249,7 +258,7 @@ class TreeSampler(SavedTrees):
         return in_dimensions_of(storage, slots), {"priority_weight": weight}
 
     def _sampled(self, storage: Storage, batch_size: int) -> tuple[Tensor, Tensor]:
-        """Slots along the flattened storage and their weights, each of shape ``[B]``."""
+        """Sample slots of the flattened storage and their weights, both of shape ``[B]``."""
         self._maybe_init_from_storage(storage)
         if self._rng is None:
             # TorchRL would fall back on NumPy's global generator, which torch.manual_seed
@@ -263,7 +272,7 @@ class TreeSampler(SavedTrees):
         return slots, weight.to(self.dtype)
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:
-        """Slots and their weights, each of shape ``[B]``, out of the first ``size`` slots."""
+        """Sample out of the first ``size`` slots: slots and weights, both of shape ``[B]``."""
         lowest = self._min_tree.query(0, size)
         if not self._positive:
             total = self._sum_tree.query(0, size)
@@ -279,7 +288,7 @@ class TreeSampler(SavedTrees):
         return index, importance_weights(leaf, beta=self._beta, lowest=lowest)
 
     def batch_weights(self, size: int) -> Tensor:
-        """Weight of Eq. (10) that each of the first slots would have in a batch.
+        """Return the weight of Eq. (10) that each of the first slots would have in a batch.
 
         Args:
             size: Number of slots ``N``, all of them filled.
@@ -298,29 +307,29 @@ class TreeSampler(SavedTrees):
         return torch.where(leaf > 0, weight, torch.nan)
 
     def _uniform(self, size: int, batch_size: int) -> Tensor:
-        """Slots sampled uniformly, shape ``[B]``."""
+        """Sample slots uniformly, shape ``[B]``."""
         if self.stratified:
             return self._mass(batch_size).mul_(size).long().clamp_max_(size - 1)
         return torch.randint(size, (batch_size,), **self._random())
 
     def _proportional(self, tree: Any, size: int, batch_size: int) -> Tensor:
-        """Slots sampled in proportion to the leaves of a tree of sums, shape ``[B]``."""
+        """Sample slots in proportion to the leaves of a tree of sums, shape ``[B]``."""
         mass = self._mass(batch_size).mul_(tree.query(0, size))
         index: Tensor = tree.scan_lower_bound(mass)
         # Rounding can carry the last bit of mass past the last slot.
         return index.clamp_max_(size - 1)
 
     def _mass(self, batch_size: int) -> Tensor:
-        """Shares of the total priority to look up, in [0, 1), shape ``[B]``."""
+        """Sample shares of the total priority to look up, in [0, 1), shape ``[B]``."""
         random = self._random()
         mass = torch.rand(batch_size, dtype=torch.double, **random)
         if not self.stratified:
             return mass
-        # In random order: a batch sorted by slot would tell its place in it by its age.
+        # In random order: in a batch sorted by slot, a place would depend on the age.
         return mass.add_(torch.randperm(batch_size, **random)).div_(batch_size)
 
     def _random(self) -> dict[str, Any]:
-        """The device, and a generator on it for the random numbers of one call."""
+        """Return the device, and a generator on it for the random numbers of one call."""
         return {"device": self.device, "generator": generator_on(self.device, self._rng)}
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
@@ -336,7 +345,7 @@ class TreeSampler(SavedTrees):
         self._write(slots, fresh, learned=False)
 
     def _fresh_priority(self) -> float | Tensor:
-        """Priority of a fresh transition, eps included; a GPU is not waited for."""
+        """Return the priority of a fresh transition, eps included; a GPU is not waited for."""
         first = 1.0 + self._eps
         if (
             isinstance(self._max_tree, MinLeaves)
@@ -361,10 +370,9 @@ class TreeSampler(SavedTrees):
         """Set priorities directly, as TorchRL's sampler does: neither fused nor adjusted.
 
         Args:
-            index: Slots, shape ``[B]``, or places in a storage of ``D`` dimensions, shape
-                ``[B, D]``; -1 is skipped.
+            index: Slots ``[B]``, or places in ``D`` dimensions ``[B, D]``; -1 is skipped.
             priority: Priorities before eps and alpha, shape ``[B]``, ``[B, 1]`` or ``[]``.
-            storage: The storage, which places in several dimensions need.
+            storage: The storage, for places in several dimensions.
 
         Raises:
             IndexError: If a slot is outside the buffer.
@@ -397,12 +405,12 @@ class TreeSampler(SavedTrees):
             self._set(kept, value, highest)
 
     def check_priority(self, priority: Tensor) -> None:
-        """Reject priorities of new transitions, before eps, as :meth:`update_priority` does."""
+        """Reject priorities of new transitions, before eps, as :meth:`update_priority`."""
         check_finite("priority", priority)
         self._checked(priority.to(torch.double) + self._eps)
 
     def _inherited(self, slots: Tensor, value: Tensor) -> Tensor:
-        """Rows that only get the highest priority, which fresh ones have anyway, shape ``[B]``.
+        """Mask of rows that only get the highest priority, as fresh ones have, shape ``[B]``.
 
         TorchRL's buffers read ``default_priority``, and hand it on in single precision, for
         transitions that they find in a storage, and for batches without a priority.
@@ -411,7 +419,7 @@ class TreeSampler(SavedTrees):
         return fresh & (value.float() == torch.tensor(self.default_priority).float())
 
     def _checked(self, priority: Tensor, name: str = "priority") -> float:
-        """The highest of priorities, eps included; those that poison a tree are rejected."""
+        """Return the highest of priorities, eps included; reject those that poison a tree."""
         low, high = bounds(priority)
         if not (low >= 0 and high < math.inf):
             check_finite(name, priority)
@@ -438,7 +446,7 @@ class TreeSampler(SavedTrees):
         set_leaves(slots, leaf, self._sum_tree, self._min_tree)
 
     def _leaf(self, priority: Tensor) -> Tensor:
-        """Leaves of slots, their priorities to the power of alpha, shape ``[B]``."""
+        """Return leaves, priorities to the power of alpha, shape ``[B]``."""
         return priority.pow(self._alpha)
 
     def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:

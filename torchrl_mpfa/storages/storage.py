@@ -1,9 +1,10 @@
-"""Signals beside the data of a TorchRL storage: checks and writes of transitions, and files."""
+"""Signals of every slot of a TorchRL storage: checks and writes of transitions, and files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import json
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_mpfa.checks import as_mask, generator_on
-from torchrl_mpfa.files import load_safely, open_dump, save_atomically, seal_dump
-from torchrl_mpfa.saved import Entry, check_entries, exactly
+from torchrl_mpfa.files import check_saved, load_safely, open_dump, save_atomically, seal_dump
 from torchrl_mpfa.storages.schema import INDEX_KEY, Pairs, Schema, check_finite_entries
-from torchrl_mpfa.storages.states import (
-    check_data_state,
-    check_length,
-    of_any_device,
-    read_metadata,
-    rows_of_data,
-    signals_of_data,
-)
 from torchrl_mpfa.storages.table import SignalTable
 
 _FORMAT = 1
@@ -118,40 +110,6 @@ class SignalStorageMixin:
         table, slots = self.signal_table, self._slots(cursor)
         table.write(slots, table.blank(len(slots)) if rows is None else rows)
         table.size = len(self)  # type: ignore[arg-type]
-
-    @contextmanager
-    def rewriting(self, entries: Any, index: Any) -> Iterator[None]:
-        """Check entries that are written in place inside of it, and read the signals again.
-
-        All entries are as they were if it raises. Without an ``index`` of slots TorchRL checks the
-        entries, but not whether their numbers are finite.
-        """
-        schema = self._known_schema() if self.strict else None
-        if schema is not None and index is None:
-            check_finite_entries(TensorDict(dict(entries)), 1, self._allow_nonfinite)
-        elif schema is not None:
-            filled = self.get(slice(None)).shape[: self.ndim]
-            slots = torch.zeros(()).expand(filled)[index].shape
-            try:
-                given = TensorDict(dict(entries), slots)
-            except RuntimeError as error:
-                raise ValueError(
-                    f"entries {[*dict(entries)]} must be of {[*slots]} transitions: {error}"
-                ) from None
-            schema.check(given, len(slots), whole=True, some=True)
-        stored = self._storage if self.initialized else None  # type: ignore[attr-defined]
-        kept = []
-        if isinstance(stored, TensorDictBase):
-            found = (stored.get(key, None) for key in self.signal_table.read_keys)
-            kept = [(entry, entry.clone()) for entry in found if entry is not None]
-        try:
-            yield
-            rows = rows_of_data(self.signal_table, stored, len(self))  # type: ignore[arg-type]
-        except BaseException:
-            for entry, before in kept:
-                entry.copy_(before)
-            raise
-        self.signal_table.rewrite(rows)
 
     def _settle_device(self) -> None:
         """Move the signals to the device of the data, once it is known."""
@@ -250,90 +208,47 @@ class SignalStorageMixin:
         self.signal_table.clear()
 
     def state_dict(self) -> dict[str, Any]:
-        """The data, and the signals under ``"_signals"``.
+        """Return the data, and the signals under ``"_signals"``.
 
         As in TorchRL the data are not copied: save or copy the state before more is written, after
-        which it is rejected.
+        which the state is rejected.
         """
         state: dict[str, Any] = super().state_dict()  # type: ignore[misc]
         table = self.signal_table
         own = {"_signals": table.state_dict(), "_signals_format": _FORMAT, _CLOCK: table.clock}
         return {**state, **own}
 
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Reject a state that does not fit, before anything changes.
-
-        Raises:
-            KeyError: If the state lacks an entry, or a reward or signal that the sampler needs.
-            ValueError: If format, capacity, signals, or the form of the data differ, the data are
-                not finite, or they were overwritten since the state was made.
-        """
-        self._checked_signals(state_dict)
-
-    def _checked_signals(self, state: dict[str, Any]) -> dict[str, Any]:
-        """The signals of a state that was checked, saved or, in TorchRL's own, made of the data."""
-        foreign = "_signals" not in state and "_signals_format" not in state
-        if not foreign:
-            self._check_signals(state)
-        check_entries("storage", state, map(Entry, ("_storage", "_len", "initialized")))
-        rows = None if foreign else state["_signals"]["size"]
-        length = check_length(state["_len"], self.max_size, rows)
-        filled = Entry(
-            "initialized",
-            lambda found: isinstance(found, bool) and found >= bool(length),
-            f"true with {length} rows",
-        )
-        check_entries("storage", state, [filled])
-        self._check_data(state["_storage"], length)
-        if not foreign:
-            signals: dict[str, Any] = state["_signals"]
-            return signals
-        signals = signals_of_data(self.signal_table, state["_storage"], length)
-        self._check_known(signals["rows"])
-        return signals
-
-    def _check_signals(self, state: dict[str, Any]) -> None:
-        known = [
-            exactly("_signals_format", _FORMAT, ", which this version reads"),
-            Entry("_signals"),
-        ]
-        check_entries("storage", state, known)
-        self.signal_table.check_state(state["_signals"])
-        # The signals of a folder have none.
-        if state.get(_CLOCK) not in (None, [state["_signals"]["writes"]]):
-            raise ValueError(
-                "the storage was written to since this state of it was made, whose data are the "
-                "storage's own: save or copy a state before more is written"
-            )
-
-    def _check_data(self, data: Any, length: int) -> None:
-        check_data_state(
-            data,
-            getattr(self, "_storage", None),
-            length=length,
-            ndim=self.ndim,
-            max_size=self.max_size,
-            allow_nonfinite=self._allow_nonfinite if self.strict else None,
-        )
-
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore data and signals.
+        """Restore data and signals; the saved transitions are checked as new ones are.
 
         The state of one of TorchRL's own storages has no signals: its transitions count as written
-        now, in the order of their slots. Their rewards are read from the data, and what a learner
-        would have computed is not known yet.
+        now, in the order of their slots. Their rewards are read from the data, and learned signals
+        are unknown.
 
         Raises:
-            KeyError: See :meth:`check_state`.
-            ValueError: See :meth:`check_state`.
+            KeyError: If an entry, or a reward or signal that the sampler needs, is missing; nothing
+                is changed.
+            ValueError: If format, capacity, signals or the form of the data differ, a number is not
+                finite, or the data were overwritten since the state was made; nothing is changed.
         """
-        signals = self._checked_signals(state_dict)
+        check_saved("storage", state_dict, ("_storage", "_len", "initialized"))
+        data = _of_any_device(state_dict["_storage"])
+        signals: Any = state_dict.get("_signals")
+        if not {"_signals", "_signals_format"}.isdisjoint(state_dict):
+            check_saved("storage", state_dict, ("_signals",), _signals_format=_FORMAT)
+            # The signals of a folder have no clock.
+            if state_dict.get(_CLOCK) not in (None, [signals["writes"]]):
+                raise ValueError(
+                    "the storage was written to since this state of it was made, whose data are "
+                    "the storage's own: save or copy a state before more is written"
+                )
+        tree = TensorDict()
+        found = tree.load_state_dict(data, strict=False) if isinstance(data, Mapping) else data
+        signals = self._checked(found, state_dict["_len"], signals)
         if state_dict.get(_CLOCK) is not self.signal_table.clock:
             self.signal_table.stop_clock()
-        data = of_any_device(state_dict["_storage"])
         super().load_state_dict({**state_dict, "_storage": data})  # type: ignore[misc]
-        self._schema = None
-        self.signal_table.load_state_dict(signals)
+        self._settle_loaded(signals)
 
     def dumps(self, path: str | Path) -> None:
         """Save data and signals in a folder, with a checksum of each of its files."""
@@ -343,32 +258,51 @@ class SignalStorageMixin:
         save_atomically(state, path / _FILE)
         seal_dump(path, path)
 
-    def check_dump(self, path: str | Path) -> dict[str, Any]:
-        """Read the saved signals, and reject the folder as :meth:`check_state` does a state.
+    def loads(self, path: str | Path) -> None:
+        """Restore data and signals from a folder.
 
         Raises:
-            KeyError: See :meth:`check_state`.
-            ValueError: See :meth:`check_state`; or if a file is damaged, missing, or one that
-                could execute something.
+            KeyError: As :meth:`load_state_dict`.
+            ValueError: As :meth:`load_state_dict`; or if a file is damaged, missing, or could
+                execute something.
         """
         path = open_dump(path)
         if not (path / _FILE).exists():
             raise KeyError(f"'_signals' is missing in the saved storage: no {path / _FILE}")
-        state: dict[str, Any] = load_safely(path / _FILE)
-        self._check_signals(state)
-        found, is_tree = read_metadata(path)
-        length = check_length(found, self.max_size, state["_signals"]["size"])
-        if not is_tree:
-            self._check_data(TensorDict.load_memmap(path, allow_pickle=False), length)
-        return state
-
-    def loads(self, path: str | Path) -> None:
-        """Restore data and signals from a folder, or raise as :meth:`check_dump` does."""
-        state = self.check_dump(path)
+        state = load_safely(path / _FILE)
+        check_saved("storage", state, ("_signals",), _signals_format=_FORMAT)
+        notes = json.loads((path / "storage_metadata.json").read_text(encoding="utf-8"))
+        data = None if notes["is_pytree"] else TensorDict.load_memmap(path, allow_pickle=False)
+        signals = self._checked(data, notes["len"], state["_signals"])
         self.signal_table.stop_clock()
         super().loads(path)  # type: ignore[misc]
+        self._settle_loaded(signals)
+
+    def _checked(self, data: Any, length: Any, signals: Any) -> dict[str, Any]:
+        """Check saved transitions as new ones, and return their signals, saved or read again."""
+        rows = None
+        if type(length) is not int or not 0 <= length <= self.max_size:
+            raise ValueError(
+                f"'_len' of the saved storage must be in [0, {self.max_size}], got {length!r}"
+            )
+        if length and isinstance(data, TensorDictBase):
+            slots = data.shape[: self.ndim]
+            if slots.numel() != self.max_size:
+                raise ValueError(
+                    f"the saved storage must have {self.max_size} slots, got {[*slots]}"
+                )
+            rows, _ = self.check(data[: length // slots[1:].numel()])
+        table = self.signal_table
+        if signals is None:
+            signals = table.state_of_new(table.blank(length) if rows is None else rows)
+        table.check_state(signals)
+        if signals["size"] != length:
+            raise ValueError(f"the saved storage has {length} rows, its signals {signals['size']}")
+        return signals
+
+    def _settle_loaded(self, signals: dict[str, Any]) -> None:
         self._schema = None
-        self.signal_table.load_state_dict(state["_signals"])
+        self.signal_table.load_state_dict(signals)
 
     def __getstate__(self) -> Any:
         # The copy describes its own data.
@@ -390,3 +324,13 @@ def _as_batch(data: Any) -> Any:
     if isinstance(data, list) and data and is_tensor_collection(data[0]):
         return torch.stack(data)
     return data
+
+
+def _of_any_device(data: Any) -> Any:
+    """Return saved data without the name of their device, for which another one rejects them."""
+    found = getattr(data, "_metadata", None)
+    if found is None:
+        return data
+    copied = OrderedDict(data)
+    copied._metadata = {name: {**each, "device": None} for name, each in found.items()}  # type: ignore[attr-defined]
+    return copied

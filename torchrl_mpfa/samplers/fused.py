@@ -12,16 +12,21 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Storage
 
-from torchrl_mpfa.adjustment import Adjustment, BatchFacts, PositiveBoost, counts_buffer
-from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts, check_finite
-from torchrl_mpfa.fusion import FixedFusion, Fusion, checked_weights, fuse
-from torchrl_mpfa.moving_fusion import Annealed
-from torchrl_mpfa.positive import is_positive, level_of, one_sided
-from torchrl_mpfa.samplers.slots import as_slots, in_dimensions_of, last_of_each
-from torchrl_mpfa.samplers.tree import TreeSampler
-from torchrl_mpfa.saved import Entry, count, exactly, finite, number
+from torchrl_mpfa.adjustment import (
+    Adjustment,
+    BatchFacts,
+    PositiveBoost,
+    counts_buffer,
+    is_positive,
+    level_of,
+    one_sided,
+)
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts, check_finite, unknown
+from torchrl_mpfa.files import check_saved
+from torchrl_mpfa.fusion import Annealed, FixedFusion, Fusion, checked_weights, fuse
+from torchrl_mpfa.samplers.prioritized import TreeSampler
+from torchrl_mpfa.samplers.trees import as_slots, in_dimensions_of, last_of_each
 from torchrl_mpfa.signals import Signal, as_signals
-from torchrl_mpfa.spelling import unknown
 from torchrl_mpfa.storages.table import Columns, SignalTable, by_batch, signal_table_of
 
 _USE = "Use SignalReplayBuffer, with SignalTensorStorage or SignalMemmapStorage"
@@ -58,23 +63,22 @@ class SignalSampler(TreeSampler):
     Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
 
     Args:
-        max_capacity: Capacity of the storage ``N``.
-        alpha: Priority exponent :math:`\alpha` of Eq. (8); 0 samples uniformly.
+        max_capacity: As in :class:`~torchrl_mpfa.samplers.TreeSampler`, like all arguments up to
+            ``device``, and ``stratified``.
+        alpha: Priority exponent :math:`\alpha` of Eq. (8).
         beta: Importance exponent :math:`\beta` of Eq. (10).
         eps: :math:`\epsilon` of Eqs. (9) and (21), added once, before the adjustments.
-        dtype: As in :class:`~torchrl_mpfa.samplers.TreeSampler`.
-        reduction: As in TorchRL.
-        max_priority_within_buffer: Whether a fresh transition gets the highest priority that a
-            transition *in the buffer* was given by an update; if false, the highest ever.
-        device: As in :class:`~torchrl_mpfa.samplers.TreeSampler`.
+        dtype: See above.
+        reduction: See above.
+        max_priority_within_buffer: See above.
+        device: See above.
         signals: The signals to fuse, as objects or names.
-        fusion: How they are weighted, see :class:`~torchrl_mpfa.Fusion`.
-        adjustments: What is done to the fused priorities, in order.
+        fusion: Weights of the signals, see :class:`~torchrl_mpfa.Fusion`; by default equal ones.
+        adjustments: Changes of the fused priorities, in order.
         entropy_refresh: Share of the buffer that may be rewritten before the fusion counts its
             probabilities again; 0 counts at every update. The default costs a constant time per
             written transition, whatever the capacity.
-        stratified: Whether a batch takes one slot from each of ``B`` equal parts of the total
-            priority, as the PER paper does, in place of ``B`` independent ones.
+        stratified: See above.
 
     Raises:
         ValueError: If an argument is out of its range, or the fusion names a signal that is not
@@ -144,19 +148,19 @@ class SignalSampler(TreeSampler):
 
     @property
     def weights(self) -> dict[str, float]:
-        """The weight of each signal at the last count; empty before the first update."""
+        """Weight of each signal at the last count; empty before the first update."""
         if self._weighing is None:
             return {}
         return dict(zip(self._names, self._weighing.weights.tolist(), strict=True))
 
     def anneal(self, fraction: float) -> None:
-        """Tell a fusion with a schedule how much of the training is done, from 0 to 1."""
+        """Move a fusion with a schedule to a share of the training that is done, from 0 to 1."""
         if isinstance(self.fusion, Annealed):
             self.fusion.anneal(fraction)
 
     @property
     def needed_keys(self) -> list[NestedKey]:
-        """Entries that transitions must have beside reward and signals."""
+        """Entries that transitions must have in addition to reward and signals."""
         return []
 
     @property
@@ -168,13 +172,10 @@ class SignalSampler(TreeSampler):
         """Reject a batch size that cannot be sampled."""
         check_counts(batch_size=batch_size)
 
-    def reread(self, storage: Storage) -> None:
-        """Take note of a write in place; nothing to do, as signals lie in the storage."""
-
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[Any, Tensor]]:
         """Sample slots by Eq. (8), and count a replay for each.
 
-        As :meth:`TreeSampler.sample`; ``"written_at"``, shape ``[B]``, tells overwritten slots.
+        As :meth:`TreeSampler.sample`; ``"written_at"``, shape ``[B]``, marks overwritten slots.
         """
         slots, weight = self._sampled(storage, batch_size)
         info: dict[Any, Tensor] = {"priority_weight": weight}
@@ -238,7 +239,8 @@ class SignalSampler(TreeSampler):
                 not finite, or the slots are not so many equal batches.
             TypeError: If the storage keeps no signals, or the index holds anything but integers.
         """
-        table, slots = self.bind(storage), as_slots(index, storage).to(self.device)
+        table = self.bind(storage)
+        slots = as_slots(index, storage).to(table.device)
         if slots.numel() == 0:
             return 0
         rows, slots, live, sizes = table.live_rows(slots, written_at, batches)
@@ -275,8 +277,8 @@ class SignalSampler(TreeSampler):
             written_at=rows.select(1, table.time_column),
         )
         for place, adjust in enumerate(self.adjustments):
-            told = replace(facts, counted=weighing.counted[place]) if weighing.counted else facts
-            priority = adjust(priority, told)
+            own = replace(facts, counted=weighing.counted[place]) if weighing.counted else facts
+            priority = adjust(priority, own)
         if priority.shape != slots.shape:
             raise ValueError(
                 f"adjusted priorities must have shape {[*slots.shape]}, got {[*priority.shape]}"
@@ -395,43 +397,37 @@ class SignalSampler(TreeSampler):
             state["_learned_since"] = last.learned_since
         return state
 
-    def _entries(self) -> list[Entry]:
+    def _restore(self, state: dict[str, Any]) -> None:
         names = sorted(self._names)
-
-        def fit_signals(weights: Any) -> bool:
-            known = isinstance(weights, Mapping) and (not weights or sorted(weights) == names)
-            return known and all(number("weight").holds(value) for value in weights.values())
-
-        def fit_adjustments(counted: Any) -> bool:
-            fit = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
-            return isinstance(counted, list) and (not counted or fit == self._counting)
-
-        entries = [
-            *super()._entries(),
-            exactly("_signals", names),
-            Entry("_weights", fit_signals, f"empty, or one number for each of {names}"),
-            count("_weighed_at"),
-            finite("_mean_reward"),
-        ]
+        check_saved("sampler", state, ("_weights", "_weighed_at", "_mean_reward"), _signals=names)
+        super()._restore(state)
+        counted = []
         if any(self._counting):
-            words = f"empty, or finite numbers for {sum(self._counting)} adjustments"
-            entries += [Entry("_counted", fit_adjustments, words)]
-            entries += [count("_counted_writes"), count("_learned_since")]
-        return entries
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave, or raise as :meth:`check_state` does."""
-        super().load_state_dict(state_dict)
-        if state_dict["_weights"]:
-            self._weighing = Weighing(
-                self._ordered(state_dict["_weights"]),
-                state_dict["_mean_reward"],
-                state_dict["_weighed_at"],
-                tuple(
-                    v if v is None else v.to(self.device) for v in state_dict.get("_counted", ())
-                ),
-                *(state_dict.get(name, 0) for name in ("_counted_writes", "_learned_since")),
+            check_saved("sampler", state, ("_counted", "_counted_writes", "_learned_since"))
+            counted = state["_counted"]
+            fit = [isinstance(v, Tensor) and bool(v.isfinite().all()) for v in counted or ()]
+            if counted is None or (counted and fit != self._counting):
+                raise ValueError(
+                    f"'_counted' of the saved sampler must be empty, or finite numbers for "
+                    f"{sum(self._counting)} adjustments, got {counted}"
+                )
+        if not state["_weights"]:
+            return
+        if sorted(state["_weights"]) != names:
+            raise ValueError(
+                f"'_weights' of the saved sampler must be of the signals {names}, got "
+                f"{sorted(state['_weights'])}"
             )
+        weights, mean = self._ordered(state["_weights"]), torch.tensor(state["_mean_reward"])
+        check_finite("'_weights' of the saved sampler", weights)
+        check_finite("mean reward of the saved sampler", mean.abs())
+        self._weighing = Weighing(
+            weights,
+            state["_mean_reward"],
+            state["_weighed_at"],
+            tuple(v if v is None else v.to(self.device) for v in counted),
+            *(state.get(name, 0) for name in ("_counted_writes", "_learned_since")),
+        )
 
     def _ordered(self, weights: Mapping[str, float]) -> Tensor:
         ordered = torch.tensor([weights[name] for name in self._names], dtype=torch.double)

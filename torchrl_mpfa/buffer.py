@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -14,36 +15,37 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer, Transition
 from torchrl.data.replay_buffers import PrioritizedSampler
 
-from torchrl_mpfa.checks import check_counts, seeded_generator
-from torchrl_mpfa.files import load_safely, new_dump, open_dump, save_atomically
-from torchrl_mpfa.replay_writes import FollowedReplayBuffer
-from torchrl_mpfa.samplers.signal_sampler import SignalSampler
-from torchrl_mpfa.samplers.tree import TreeSampler
-from torchrl_mpfa.saved import Entry, check_entries, count, generator
-from torchrl_mpfa.storages.base import SignalStorageMixin
+from torchrl_mpfa.checks import COUNT_OR_ZERO, check, check_counts, seeded_generator
+from torchrl_mpfa.files import check_saved, load_safely, new_dump, open_dump, save_atomically
+from torchrl_mpfa.samplers.fused import SignalSampler
+from torchrl_mpfa.samplers.prioritized import TreeSampler
 from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
+from torchrl_mpfa.transforms import KEPT
+from torchrl_mpfa.writes import CheckedReplayBuffer
 
 _MISSING = (
     "signal {name!r} is missing: the batch has no {key!r}. SignalDDPGLoss, SignalTD3Loss and "
     "SignalSACLoss write td_error and action_gradient; with another loss, or a signal of your own, "
     "write batch[{key!r}] = ..., one number per transition"
 )
-_KEPT, _TRANSFORMS = "_kept", "transforms.pt"
-"""Where a saved buffer has what waits in its transforms, and the file of a dump with that."""
+_FILE = "buffer.pt"
+"""File of a dump with the state of all that has no folder."""
+_FOLDERS = ("storage", "sampler", "writer")
+"""Parts that save themselves in folders of a dump."""
 _UNRETURNED = 100
 """Batches in a row without an update of priorities after which a warning is given."""
 
 
-class SignalReplayBuffer(FollowedReplayBuffer):
+class SignalReplayBuffer(CheckedReplayBuffer):
     """:class:`~torchrl.data.TensorDictReplayBuffer` for samplers that fuse several signals.
 
-    TorchRL's buffer reduces whatever a batch brings to one number per transition. This one reads
+    TorchRL's buffer reduces the signals of a batch to one number per transition. This buffer reads
     each signal that the sampler fuses, drops the rows whose slot was overwritten since they were
-    sampled, and hands the rest on. With any other sampler it is TorchRL's buffer.
+    sampled, and hands the rest on. With any other storage it is TorchRL's buffer.
 
-    A reward that is written in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``,
-    ``buffer["next", "reward"] = ...``) counts in the next update of its transition's priority.
+    Signals are read when a transition is written. Entries of stored transitions cannot be changed
+    in place (``set_``, ``set_at_``, ``update_``, ``update_if_present``, ``buffer[key] = ...``).
 
     Args:
         generator: Source of all randomness of the buffer; by default a new one, seeded by
@@ -114,7 +116,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
     def _check_priority_key(self, table: SignalTable) -> None:
         if as_path(self.priority_key) in map(as_path, table.read_keys):
             raise ValueError(
-                f"priority_key must not be where a reward or a signal is read, got "
+                f"priority_key must not be the key of a reward or a signal, got "
                 f"{self.priority_key!r}: first priorities are not stored with the transitions"
             )
 
@@ -123,68 +125,9 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         # Not the attribute: the property has the parts made, where that was put off to their use.
         return isinstance(self.sampler, SignalSampler)
 
-    @property
-    def _checks(self) -> bool:
-        return isinstance(self.storage, SignalStorageMixin) and not self._is_consuming()
-
-    def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Write transitions, and return their slots.
-
-        Args:
-            tensordicts: Transitions, batch size ``[B]``, or ``[B, T]`` from ``B`` environments. In
-                a storage of one dimension each of the latter is a row of its own, environment by
-                environment.
-            update_priority: As in TorchRL.
-
-        Returns:
-            Slots, shape ``[B]``; ``[B * T, 2]`` for a storage of two dimensions.
-
-        Raises:
-            KeyError: If an entry is missing or unknown; nothing is changed.
-            ValueError: If an entry has another shape or dtype than in the storage, a number is not
-                finite, a first priority cannot be, or there is no batch size; nothing is changed,
-                in the transforms neither.
-        """
-        if not self._checks or not isinstance(tensordicts, TensorDictBase):
-            with self._memory.at_a_write(tensordicts) as (given, _):
-                return super().extend(given, update_priority=update_priority)
-        if tensordicts.ndim < self._storage.ndim:
-            raise ValueError(
-                f"tensordicts must have a batch size of {self._storage.ndim} or more dimensions, "
-                f"got {[*tensordicts.shape]}: write a single step by add(...)"
-            )
-        # What is made here must be of use where the caller has no inference mode.
-        outside = torch.inference_mode(False), torch.no_grad()
-        with outside[0], outside[1], self._memory.at_a_write(tensordicts) as (given, check):
-            data = self._transform.inv(given)
-            check()
-            return self._extend_checked(data, update_priority is not False)
-
-    def add(self, data: TensorDictBase) -> Any:
-        """Write one transition, and return its slot.
-
-        In a storage of several dimensions, one of each environment, batch size ``[E]``, and return
-        their places, ``[E, 2]``.
-
-        Raises:
-            KeyError: See :meth:`extend`.
-            ValueError: See :meth:`extend`; or if ``data`` has no dimension of environments.
-        """
-        if not self._checks:
-            with self._memory.at_a_write(data) as (given, _):
-                return super().add(given)
-        if data.ndim < self.dim_extend:
-            raise ValueError(
-                f"data must be one step of each environment, batch size [E], got {[*data.shape]}"
-            )
-        # TorchRL's add would ask the new transition for learned signals, which it cannot have.
-        # Where there are several environments, time comes after them.
-        index = self.extend(data.unsqueeze(self.dim_extend))
-        return int(index[0]) if index.shape == (1,) and index[0] >= 0 else index
-
     def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
         data, info = super()._sample(batch_size)
-        # Written here, where the batch is made: on its way out TorchRL's buffer would move each
+        # Written here, where the batch is made: afterwards TorchRL's buffer would move each
         # entry to the device that it is on already, at a tenth of the cost of the whole call.
         if self._fuses:
             with data.unlock_() if data.is_locked else nullcontext():
@@ -202,8 +145,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
         Args:
             batch_size: ``B``; by default that of the constructor.
-            return_info: Whether to return the sampler's information as well.
-            include_info: As in TorchRL, where it is about to go.
+            return_info: True to return the sampler's information as well.
+            include_info: As in TorchRL, where it is deprecated.
 
         Returns:
             The batch, or the batch and the information.
@@ -232,7 +175,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         warnings.warn(
             f"{_UNRETURNED} batches in a row were sampled and no priority was updated: call "
             "update_tensordict_priority(batch) after the loss. TorchRL's trainers with an "
-            "optimization stepper do not call it; use torchrl_mpfa.trainer.PriorityStepper",
+            "optimization stepper do not call it: use "
+            "torchrl_mpfa.integrations.trainer.PriorityStepper",
             stacklevel=3,
         )
 
@@ -247,8 +191,8 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         Args:
             data: A batch from :meth:`sample` in which the loss wrote the learned signals, each of
                 shape ``[B]`` or ``[B, 1]``, under the keys that the sampler's signals name.
-            batches: How many batches of one size ``data`` is, one after the other: of each, the
-                positions and the mean in Eqs. (23)-(24) are its own.
+            batches: Number of batches of one size in ``data``, one after the other: each has
+                positions and a mean of its own in Eqs. (23)-(24).
 
         Raises:
             KeyError: If a signal or the index is missing; nothing is changed.
@@ -286,7 +230,7 @@ class SignalReplayBuffer(FollowedReplayBuffer):
 
         Args:
             beta: Exponent of the importance weights, Eq. (10).
-            fraction: How much of the training is done, from 0 to 1.
+            fraction: Share of the training that is done, from 0 to 1.
         """
         if self._fuses:
             with self._replay_lock:
@@ -322,57 +266,72 @@ class SignalReplayBuffer(FollowedReplayBuffer):
                 found.update(self._sampler.stats(self._storage))
         return found
 
-    def check_state(self, state_dict: dict[str, Any]) -> None:
-        """Reject a state that does not fit, before anything changes.
-
-        Raises:
-            KeyError: If the state of a part or an entry of it is missing.
-            ValueError: If a part cannot be restored from its state.
-        """
-        own = ("_storage", "_sampler", "_writer", "_transforms")
-        batch_size = Entry(
-            "_batch_size",
-            lambda size: size is None or (type(size) is int and size >= 1),
-            "positive or None",
-        )
-        check_entries("buffer", state_dict, [*map(Entry, own), batch_size, generator("_rng")])
-        found = state_dict["_sampler"]
-        if hasattr(self.sampler, "check_state"):
-            self.sampler.check_state(found)
-        elif isinstance(found, Mapping) and "_kind" in found:
-            # One of TorchRL's own has no check, and would leave out what it lacks.
-            raise ValueError(
-                f"the saved sampler is {found['_kind']!r}, this one a {type(self.sampler).__name__}"
-            )
-        self._storage.check_state(state_dict["_storage"])
-        # A writer of data that no one may write has no cursor, nor has its state.
-        self._memory.check_state(state_dict.get(_KEPT, {}))
-        if hasattr(self._writer, "_cursor"):
-            slots = self._storage._max_size_along_dim0() if self._storage.ndim == 1 else None
-            last = None if slots is None else slots - 1
-            check_entries("writer", state_dict["_writer"], [count("_cursor", high=last)])
-            if "_write_count" in state_dict["_writer"]:
-                check_entries("writer", state_dict["_writer"], [count("_write_count")])
-
     def state_dict(self) -> dict[str, Any]:
-        """All parts as TorchRL has them, and what waits in the transforms."""
+        """Return the state of all parts as in TorchRL, and the memory of the transforms."""
         with self._replay_lock:
-            return {**super().state_dict(), _KEPT: self._memory.state_dict()}
+            return {**super().state_dict(), KEPT: self._memory.state_dict()}
 
     @torch.inference_mode(False)
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore storage, signals, priorities, writer, generator, and what waits in transforms.
+        """Restore storage, signals, priorities, writer, generator, and memory of the transforms.
 
         Raises:
-            KeyError: See :meth:`check_state`.
-            ValueError: See :meth:`check_state`.
+            KeyError: If an entry is missing; nothing is changed.
+            ValueError: If the state of a part does not fit the part; nothing is changed.
         """
-        if self._checks:
-            self.check_state(state_dict)
-        super().load_state_dict(state_dict)
-        # A state of an earlier version has none: nothing waits.
-        self._memory.load_state_dict(state_dict.get(_KEPT, {}))
-        self._tell_last_cursor()
+        check_saved("buffer", state_dict, ("_storage", "_sampler", "_writer"))
+        kind = state_dict["_sampler"].get("_kind")
+        if kind is not None and not hasattr(self.sampler, "KIND"):
+            # TorchRL's own would leave out what it does not know.
+            raise ValueError(
+                f"the saved sampler is {kind!r}, this one a {type(self.sampler).__name__}"
+            )
+        # A writer of data that no one may write has no cursor, nor has its state.
+        if hasattr(self._writer, "_cursor"):
+            check_saved("writer", state_dict["_writer"], ("_cursor",))
+            check(COUNT_OR_ZERO, cursor=(cursor := state_dict["_writer"]["_cursor"]))
+            if self._storage.ndim == 1 and cursor >= self._storage.max_size:
+                raise ValueError(
+                    f"cursor of the saved writer must be below {self._storage.max_size}, got "
+                    f"{cursor}"
+                )
+        self._load(state_dict, lambda name, part: part.load_state_dict(state_dict[f"_{name}"]))
+
+    def _load(self, state: dict[str, Any], load: Callable[[str, Any], None]) -> None:
+        """Load all parts, storage and writer once the others have been found to fit."""
+        check_saved("buffer", state, ("_transforms", "_batch_size", "_rng"))
+        if state["_batch_size"] is not None:
+            check_counts(batch_size=state["_batch_size"])
+        generator = None
+        if state["_rng"] is not None:
+            numbers, device = state["_rng"]
+            generator = torch.Generator(device=device)
+            generator.set_state(numbers)
+        with self._replay_lock, self._write_lock:
+            before = deepcopy(self._transform.state_dict()), self._memory.state_dict()
+            # A sampler's load gives it new tensors: its twin shares none that is written in.
+            twin = object.__new__(type(self._sampler))
+            vars(twin).update(vars(self._sampler))
+            try:
+                self._transform.load_state_dict(state["_transforms"])
+                # TorchRL's buffer saves none.
+                self._memory.load_state_dict(state.get(KEPT, {}))
+                load("sampler", twin)
+                load("storage", self._storage)
+            except BaseException:
+                self._transform.load_state_dict(before[0])
+                self._memory.load_state_dict(before[1])
+                raise
+            self._sampler.__dict__.update(vars(twin))
+            load("writer", self._writer)
+            self._batch_size = state["_batch_size"]
+            self._consume_after_n_samples = state.get("_consume_after_n_samples")
+            if generator is not None:
+                self.set_rng(generator)
+            # TorchRL keeps no record of what was written last.
+            cursor = getattr(self._writer, "_cursor", None)
+            if self._checks and cursor is not None and len(self._storage):
+                self._storage._set_last_cursor((cursor - 1) % self._storage._len_along_dim0)
 
     def dumps(self, path: str | Path) -> None:
         """Save in a folder, whole or not at all, with a checksum of each file.
@@ -381,12 +340,18 @@ class SignalReplayBuffer(FollowedReplayBuffer):
             ValueError: If the data hold anything but tensors and plain values.
         """
         with new_dump(path) as folder, self._replay_lock:
-            super().dumps(folder)
-            # TorchRL's would be unpickled, and execute anything.
-            (folder / "transform.t").unlink(missing_ok=True)
-            kept = {"_transforms": self._transform.state_dict(), _KEPT: self._memory.state_dict()}
-            save_atomically(kept, folder / _TRANSFORMS)
-            load_safely(folder / _TRANSFORMS)
+            for name in _FOLDERS:
+                getattr(self, f"_{name}").dumps(folder / name)
+            source = self._rng
+            state = {
+                "_transforms": self._transform.state_dict(),
+                KEPT: self._memory.state_dict(),
+                "_batch_size": self._batch_size,
+                "_consume_after_n_samples": self._consume_after_n_samples,
+                "_rng": None if source is None else (source.get_state(), str(source.device)),
+            }
+            save_atomically(state, folder / _FILE)
+            load_safely(folder / _FILE)
 
     @torch.inference_mode(False)
     def loads(self, path: str | Path) -> None:
@@ -395,31 +360,9 @@ class SignalReplayBuffer(FollowedReplayBuffer):
         Raises:
             FileNotFoundError: If there is no such folder.
             KeyError: If an entry is missing; nothing is changed.
-            ValueError: If a file is damaged, missing, or one that could execute something, or
-                anything does not fit this buffer; nothing is changed.
+            ValueError: If a file is damaged, missing, or could execute something, or the state of a
+                part does not fit the part; nothing is changed.
         """
         folder = open_dump(path)
-        for part, name in ((self.sampler, "sampler"), (self.storage, "storage")):
-            if hasattr(part, "check_dump"):
-                part.check_dump(folder / name)
-        file = folder / _TRANSFORMS
-        saved = load_safely(file) if file.exists() else {}
-        self._memory.check_state(saved.get(_KEPT, {}))
-        super().loads(folder)
-        if "_transforms" in saved:
-            self._transform.load_state_dict(saved["_transforms"])
-        self._memory.load_state_dict(saved.get(_KEPT, {}))
-        self._tell_last_cursor()
-
-    def _dump_prefetch_state(self, path: Path, prefetch_state: dict[str, Any]) -> None:
-        """Write nothing: TorchRL would pickle it, and what is pickled can execute anything."""
-
-    def _load_prefetch_state(self, path: Path) -> None:
-        """Read nothing: TorchRL would unpickle it."""
-
-    def _tell_last_cursor(self) -> None:
-        """Tell the storage what was written last, which TorchRL keeps no record of."""
-        cursor = getattr(self._writer, "_cursor", None)
-        if self._checks and cursor is not None and len(self._storage):
-            around = self._storage._len_along_dim0
-            self._storage._set_last_cursor((cursor - 1) % around)
+        state = load_safely(folder / _FILE)
+        self._load(state, lambda name, part: part.loads(folder / name))

@@ -1,0 +1,167 @@
+"""Slots and leaves: slots in TorchRL's forms, and their leaves in segment trees or flat arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.data import Storage
+
+_ORDERED = 2048
+"""Rows up to which writing by index keeps their order."""
+
+
+class Leaves:
+    """Leaves of all slots, with the interface of TorchRL's segment trees but for an ``end``.
+
+    They take the place of the trees on devices other than the CPU, and pass over all leaves. A GPU
+    takes as long to start a kernel as to pass over some hundred thousand numbers, and a tree over
+    a million slots asks for several kernels on each of its twenty levels.
+
+    Args:
+        capacity: Number of slots.
+        device: Device of the leaves and of all arguments and results.
+    """
+
+    EMPTY: float
+    """Leaf of a slot that was never written."""
+
+    def __init__(self, capacity: int, device: torch.device | str = "cpu") -> None:
+        self._leaves = torch.full((capacity,), self.EMPTY, dtype=torch.double, device=device)
+
+    def __getitem__(self, slots: Tensor) -> Tensor:
+        return self._leaves.index_select(0, slots)
+
+    def __setitem__(self, slots: Tensor, leaf: Tensor) -> None:
+        self._leaves.index_copy_(0, slots, leaf)
+
+
+class SumLeaves(Leaves):
+    """Leaves in place of a tree of sums.
+
+    Examples:
+        >>> tree = SumLeaves(3)
+        >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
+        >>> tree.query(0, 3), tree.scan_lower_bound(torch.tensor([0.5, 1.5], dtype=torch.double))
+        (tensor(3., dtype=torch.float64), tensor([0, 2]))
+    """
+
+    EMPTY = 0.0
+
+    def query(self, start: int, end: int) -> Tensor:
+        """Return the sum of the leaves from ``start`` to before ``end``, shape ``[]``."""
+        return self._leaves[start:end].sum()
+
+    def scan_lower_bound(self, mass: Tensor) -> Tensor:
+        """Return the first slots up to which the leaves sum to more than a mass, shape ``[B]``."""
+        sums = self._leaves.cumsum(0)
+        # Rounded otherwise than query(), the mass may be past the last slot that has a leaf.
+        most = torch.nextafter(sums[-1], sums.new_zeros(()))
+        return torch.searchsorted(sums, mass.minimum(most), right=True)
+
+
+class MinLeaves(Leaves):
+    """Leaves in place of a tree of minima.
+
+    Examples:
+        >>> tree = MinLeaves(3)
+        >>> tree[torch.tensor([0, 2])] = torch.tensor([1.0, 2.0], dtype=torch.double)
+        >>> tree.query(1, 3)
+        tensor(2., dtype=torch.float64)
+    """
+
+    EMPTY = torch.finfo(torch.double).max
+
+    def query(self, start: int, end: int) -> Tensor:
+        """Return the lowest leaf from ``start`` to before ``end``, shape ``[]``."""
+        return self._leaves[start:end].amin()
+
+
+def empty_tree_like(tree: Any, capacity: int, device: torch.device) -> Any:
+    """Return an empty tree of the same kind, with a leaf for each of ``capacity`` slots."""
+    return type(tree)(capacity, *((device,) if isinstance(tree, Leaves) else ()))
+
+
+def in_dimensions_of(storage: Storage, slots: Tensor) -> Any:
+    """Unravel flat slots into TorchRL's index: a tuple for several dimensions, else the slots."""
+    if getattr(storage, "ndim", 1) == 1:
+        return slots
+    return torch.unravel_index(slots, storage.shape)
+
+
+def as_slots(index: Any, storage: Any = None) -> Tensor:
+    """Return flat slots ``[B]`` of slots, of places ``[B, D]``, or of a tuple of ``D`` places."""
+    if isinstance(index, tuple):
+        index = torch.stack([torch.as_tensor(each).reshape(-1) for each in index], -1)
+    if isinstance(index, Tensor) and index.dtype is torch.long and index.ndim == 1:
+        return index
+    slots = torch.as_tensor(index)
+    if slots.numel() == 0:
+        return slots.new_empty(0, dtype=torch.long)
+    # A mask would be read as slots 0 and 1.
+    if slots.dtype is torch.bool or slots.is_floating_point() or slots.is_complex():
+        raise TypeError(f"index must hold integers, got {slots.dtype}")
+    slots = slots.long()
+    if slots.ndim <= 1:
+        return slots.reshape(-1)
+    # Not the filled part of it: a batch may be from before the storage was emptied.
+    shape = getattr(storage, "_total_shape", None)
+    if shape is None or len(shape) < 2 or len(shape) != slots.shape[-1]:
+        raise RuntimeError(
+            f"index must have one dimension, or one place for each dimension of a storage, got "
+            f"shape {[*slots.shape]} for a storage of shape {None if shape is None else [*shape]}"
+        )
+    places = slots.reshape(-1, len(shape))
+    # TorchRL's writers mark with -1 what was not stored.
+    skipped = (places == -1).all(-1)
+    wrong = ((places < 0) | (places >= places.new_tensor(shape))).any(-1) & ~skipped
+    if bool(wrong.any()):
+        raise IndexError(
+            f"index must be within the storage's shape {[*shape]}, got {places[wrong][0].tolist()}"
+        )
+    slots = places[:, 0]
+    for dimension in range(1, len(shape)):
+        slots = slots * shape[dimension] + places[:, dimension]
+    return torch.where(skipped, -1, slots)
+
+
+def last_of_each(slots: Tensor) -> Tensor | None:
+    """Return the last position of each slot, by slot, shape ``[U]``, or None if order is kept.
+
+    A slot that is written twice keeps its last value, which index writes of many rows do not
+    ensure. On devices other than the CPU the result is the last position of the slot at each
+    position, ``[B]``: the host does not wait for the number of slots.
+    """
+    if not slots.is_cpu:
+        ordered, position = slots.sort(stable=True)
+        return position[torch.searchsorted(ordered, slots, right=True) - 1]
+    count = len(slots)
+    if count <= _ORDERED:
+        return None
+    # One number for slot and position, as sorting numbers costs half of what unique() does.
+    width = count.bit_length()
+    both = (slots.numpy() << width) + np.arange(count)
+    both.sort()
+    slot = both >> width
+    last = np.append(slot[1:] != slot[:-1], True)
+    return None if last.all() else torch.from_numpy(both[last] & ((1 << width) - 1))
+
+
+def leaves_of(tree: Any, slots: Tensor) -> Tensor:
+    """Return the leaves of slots, shape ``[B]``."""
+    if isinstance(tree, Leaves):
+        return tree[slots]
+    # Given a tensor, the binding first tries it as a number, and spends ten times as long on the
+    # error as on the leaves. Of an array it reads the memory from the start, without strides.
+    return torch.from_numpy(tree[slots.contiguous().numpy()])
+
+
+def set_leaves(slots: Tensor, leaf: Tensor, *trees: Any) -> None:
+    """Write leaves of slots, shape ``[B]``; the last leaf of a repeated slot counts."""
+    flat = isinstance(trees[0], Leaves)
+    places = slots if flat else slots.contiguous().numpy()
+    values = leaf if flat else leaf.contiguous().numpy()
+    for tree in trees:
+        tree[places] = values
