@@ -307,11 +307,12 @@ class SignalReplayBuffer(CheckedReplayBuffer):
             numbers, device = state["_rng"]
             generator = torch.Generator(device=device)
             generator.set_state(numbers)
+        sampler: Any = self.sampler  # Made here, if the parts were put off to their first use.
         with self._replay_lock, self._write_lock:
             before = deepcopy(self._transform.state_dict()), self._memory.state_dict()
             # A sampler's load gives it new tensors: its twin shares none that is written in.
-            twin = object.__new__(type(self._sampler))
-            vars(twin).update(vars(self._sampler))
+            twin = object.__new__(type(sampler))
+            vars(twin).update(vars(sampler))
             try:
                 self._transform.load_state_dict(state["_transforms"])
                 # TorchRL's buffer saves none.
@@ -322,7 +323,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 self._transform.load_state_dict(before[0])
                 self._memory.load_state_dict(before[1])
                 raise
-            self._sampler.__dict__.update(vars(twin))
+            vars(sampler).update(vars(twin))
             load("writer", self._writer)
             self._batch_size = state["_batch_size"]
             self._consume_after_n_samples = state.get("_consume_after_n_samples")
@@ -341,7 +342,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         """
         with new_dump(path) as folder, self._replay_lock:
             for name in _FOLDERS:
-                getattr(self, f"_{name}").dumps(folder / name)
+                getattr(self, name).dumps(folder / name)
             source = self._rng
             state = {
                 "_transforms": self._transform.state_dict(),
