@@ -3,8 +3,9 @@
 import torch
 from tensordict import TensorDict
 
+from tests.mpfa.transitions import make_buffer as make_any_buffer
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import SignalTensorStorage
 
 SPREAD = 4.5
 """Standard deviations by which a frequency may miss its probability."""
@@ -18,12 +19,8 @@ def make_transitions(count, *, seed=0):
 
 def make_buffer(sampler, capacity, batch_size, *, filled=None, signals=None, seed=0):
     """A buffer with this many random transitions."""
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(capacity, signals=signals or ["td_error"]),
-        sampler=sampler,
-        batch_size=batch_size,
-        generator=seeded(seed),
-    )
+    storage = SignalTensorStorage(capacity, signals=signals or ["td_error"])
+    buffer = make_any_buffer(capacity, batch_size, storage=storage, sampler=sampler, seed=seed)
     if filled is None:
         filled = capacity
     if filled:

@@ -1,10 +1,11 @@
-"""Arguments that cannot be: each error names the argument and its value."""
+"""One table of wrong arguments: each error names the argument and its value."""
 
 import math
 
 import pytest
 import torch
 
+from tests.mpfa.transitions import make_buffer
 from torchrl_mpfa import (
     EntropyFusion,
     FixedFusion,
@@ -16,6 +17,7 @@ from torchrl_mpfa import (
     SignalMemmapStorage,
     SignalReplayBuffer,
     SignalSampler,
+    SignalSliceSampler,
     SignalTensorStorage,
     make_actor,
     make_critic,
@@ -44,6 +46,14 @@ def tree_sampler(**given):
 def sampler(**given):
     signals = {"signals": ["reward", "td_error"]}
     return SignalSampler(**{"max_capacity": 8, "alpha": 0.6, "beta": 0.4, **signals, **given})
+
+
+def slice_sampler(**given):
+    return SignalSliceSampler(**{"max_capacity": 8, "alpha": 0.6, "beta": 0.4, **given})
+
+
+def slice_buffer(batch_size):
+    make_buffer(8, batch_size, sampler=slice_sampler(slice_len=4))
 
 
 def mpfa_sampler(**given):
@@ -88,6 +98,22 @@ ROWS = [
     (tree_sampler, {"alpha": -1.0}, "alpha must be greater or equal to 0 and finite, got -1.0"),
     (tree_sampler, {"beta": NAN}, f"beta {NEGATIVE}, got nan"),
     (tree_sampler, {"eps": INF}, f"eps {NEGATIVE}, got inf"),
+    (tree_sampler, {"dtype": torch.long}, "dtype must be torch.float32 or .*, got torch.int64"),
+    *[(slice_sampler, {"slice_len": n}, f"slice_len {NO_COUNT} {n}") for n in (0, 2.0)],
+    (slice_sampler, {"slice_len": 9}, "slice_len must be at most max_capacity, 8, got 9"),
+    (slice_sampler, {"slice_len": 2, "slice_priority": "max"}, "unknown slice_priority 'max'"),
+    (
+        slice_sampler,
+        {"slice_len": 2, "device": "meta"},
+        "device must be that of a storage on the CPU, got meta",
+    ),
+    (slice_buffer, {"batch_size": 6}, "batch_size must be a multiple of slice_len, 4, got 6"),
+    (
+        mpfa_sampler,
+        {"positive_above": 1.0, "fusion": EntropyFusion(), "adjustments": []},
+        "positive_above must be given to a fusion and adjustments of your own, got 1.0",
+    ),
+    (mpfa_sampler, {"positive_above": "meen"}, "positive_above must be a finite number or 'mean'"),
     (mpfa_sampler, {"max_capacity": 2.5}, f"max_capacity {NO_COUNT} 2.5"),
     (mpfa_sampler, {"max_capacity": 10**30}, f"max_capacity {NO_COUNT} 1000"),
     (mpfa_sampler, {"alpha": -0.1}, "alpha must be greater or equal to 0 and finite, got -0.1"),
@@ -187,6 +213,6 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("make", "given", "message"), ROWS)
-def test_an_argument_that_cannot_be_is_named_with_its_value(make, given, message):
+def test_wrong_argument_is_named_with_its_value(make, given, message):
     with pytest.raises((TypeError, ValueError), match=message):
         make(**given)

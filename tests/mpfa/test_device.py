@@ -7,8 +7,8 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.mpfa.second_device import DEVICE
 from tests.mpfa.test_leaves import MADE
-from tests.mpfa.transitions import make_transitions, rejected, same, seeded
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage, make_actor
+from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same, seeded
+from torchrl_mpfa import MPFASampler, SignalTensorStorage, make_actor
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.samplers import TreeSampler
 
@@ -24,12 +24,8 @@ METHODS_THERE = (
 
 def make_there(kind="mpfa", device=DEVICE, count=CAPACITY):
     """A buffer with its storage there, and some transitions, which come from the CPU."""
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(CAPACITY, device=device),
-        sampler=MADE[kind](CAPACITY),
-        batch_size=BATCH,
-        generator=seeded(),
-    )
+    storage = SignalTensorStorage(CAPACITY, device=device)
+    buffer = make_buffer(CAPACITY, BATCH, storage=storage, sampler=MADE[kind](CAPACITY))
     buffer.extend(make_transitions(count))
     return buffer
 
@@ -163,11 +159,8 @@ def test_an_update_waits_four_times_and_a_write_not_at_all(second_device):
 
 def test_a_sampler_follows_a_storage_to_the_device_of_its_first_transitions():
     assert make_there(device="auto").sampler.device == CPU
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(CAPACITY, device="auto"),
-        sampler=MPFASampler(CAPACITY),
-        batch_size=BATCH,
-    )
+    storage = SignalTensorStorage(CAPACITY, device="auto")
+    buffer = make_buffer(CAPACITY, BATCH, storage=storage)
     buffer.extend(make_transitions(CAPACITY).to(DEVICE))
     assert buffer.sampler.device == buffer.storage.signal_table.rows.device == DEVICE
     assert buffer.sample()["index"].device == DEVICE
@@ -192,9 +185,7 @@ def test_torchrls_buffer_with_a_tree_sampler_samples_there_by_priority():
 def test_a_device_other_than_that_of_the_storage_is_rejected():
     sampler = MPFASampler(CAPACITY, device="cpu")
     with pytest.raises(ValueError, match="device must be that of the storage, cuda:0, or None"):
-        SignalReplayBuffer(
-            storage=SignalTensorStorage(CAPACITY, device=DEVICE), sampler=sampler, batch_size=BATCH
-        )
+        make_buffer(storage=SignalTensorStorage(CAPACITY, device=DEVICE), sampler=sampler)
 
 
 @pytest.mark.parametrize("kind", MADE)
@@ -216,11 +207,8 @@ def test_a_state_of_one_device_loads_on_the_other(kind, first):
 
 def test_a_new_storage_there_takes_a_state_of_the_cpu():
     saved = make_there(device=CPU)
-    loaded = SignalReplayBuffer(
-        storage=SignalTensorStorage(CAPACITY, device=DEVICE),
-        sampler=MPFASampler(CAPACITY),
-        batch_size=BATCH,
-    )
+    storage = SignalTensorStorage(CAPACITY, device=DEVICE)
+    loaded = make_buffer(CAPACITY, BATCH, storage=storage)
     loaded.load_state_dict(saved.state_dict())
     assert loaded.sample()["observation"].device == DEVICE
     assert loaded.storage.signal_table.rows.device == DEVICE

@@ -4,8 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.mpfa.transitions import restore, seeded, snapshot
-from torchrl_mpfa import SignalReplayBuffer, SignalSliceSampler, SignalTensorStorage
+from tests.mpfa.transitions import make_buffer, restore, seeded, snapshot
+from torchrl_mpfa import SignalSliceSampler
 from torchrl_mpfa.episodes import episodes_of
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.methods.her import HindsightGoals
@@ -38,12 +38,8 @@ class Robot:
 
 
 def make_slices():
-    return SignalReplayBuffer(
-        storage=SignalTensorStorage(CAPACITY),
-        sampler=SignalSliceSampler(CAPACITY, 0.6, 0.4, slice_len=LENGTH, signals=["td_error"]),
-        batch_size=100 * LENGTH,
-        generator=seeded(),
-    )
+    sampler = SignalSliceSampler(CAPACITY, 0.6, 0.4, slice_len=LENGTH, signals=["td_error"])
+    return make_buffer(CAPACITY, 100 * LENGTH, sampler=sampler)
 
 
 def starts(buffer):

@@ -15,7 +15,6 @@ from torchrl_mpfa import (
     FixedFusion,
     MPFASampler,
     SignalMemmapStorage,
-    SignalReplayBuffer,
     SignalSliceSampler,
     SignalTensorStorage,
 )
@@ -131,12 +130,7 @@ BAD = {
 def buffer(request, tmp_path):
     """A full ring in the middle of its training."""
     if request.param == "uniform":
-        buffer = SignalReplayBuffer(
-            storage=SignalTensorStorage(CAPACITY),
-            sampler=RandomSampler(),
-            batch_size=4,
-            generator=seeded(),
-        )
+        buffer = make_buffer(CAPACITY, sampler=RandomSampler())
         buffer.extend(make_full_transitions(CAPACITY))
         return buffer
     kind = SignalTensorStorage if request.param == "memory" else SignalMemmapStorage
@@ -179,12 +173,8 @@ def test_what_is_written_is_what_torchrl_would_have_written(buffer):
 
 @pytest.mark.parametrize("kind", [TreeSampler, MPFASampler])
 def test_a_rejected_extend_is_not_remembered_by_a_writer_that_keeps_the_best(kind):
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(4),
-        sampler=kind(4, 0.6, 0.4),
-        writer=TensorDictMaxValueWriter(rank_key=("next", "reward")),
-        batch_size=4,
-    )
+    writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
+    buffer = make_buffer(4, sampler=kind(4, 0.6, 0.4), writer=writer)
     for value in (1.0, 2.0, 3.0, 4.0):
         buffer.extend(make_full_transitions(1, value))
     bad = make_full_transitions(2, 100.0)
@@ -263,7 +253,7 @@ FIRST = {
 def test_first_priorities_that_cannot_be_are_rejected_before_anything_is_stored(name, fuses):
     alpha = {"alpha": 1.0} if "high" in name else {}
     sampler = MPFASampler(CAPACITY, **alpha) if fuses else TreeSampler(CAPACITY, 1.0, 0.4)
-    buffer = SignalReplayBuffer(storage=SignalTensorStorage(CAPACITY), sampler=sampler)
+    buffer = make_buffer(CAPACITY, sampler=sampler)
     buffer.extend(make_full_transitions(3))
     rows = make_full_transitions(2)
     rows["td_error"] = FIRST[name]
@@ -333,9 +323,7 @@ def test_ends_as_numbers_are_booleans_and_other_numbers_are_rejected_by_name(kin
         elif method != "slices":
             sampler = MPFASampler(CAPACITY, signals=names, fusion=FixedFusion({"td_error": 1.0}))
         storage = SignalTensorStorage(CAPACITY, signals=signals)
-        buffer = SignalReplayBuffer(
-            storage=storage, sampler=sampler, generator=seeded(), batch_size=4
-        )
+        buffer = make_buffer(CAPACITY, storage=storage, sampler=sampler)
         if method == "her":
             buffer.append_transform(HindsightGoals(Nothing(), goals=1, generator=seeded()))
         if method == "n-step":

@@ -5,7 +5,7 @@ import torch
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from tests.mpfa.transitions import make_buffer, make_transitions, seeded, write_signals
-from torchrl_mpfa import FixedFusion, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import FixedFusion, SignalTensorStorage
 from torchrl_mpfa.methods import make_replay
 from torchrl_mpfa.samplers import TreeSampler
 
@@ -109,8 +109,6 @@ def test_what_torchrls_buffer_hands_on_is_not_learned():
 def test_a_storage_that_was_filled_before_has_learned_nothing():
     storage = SignalTensorStorage(8)
     storage.set(torch.arange(4), make_transitions(4))
-    buffer = SignalReplayBuffer(
-        storage=storage, sampler=make_plain(8).sampler, batch_size=2, generator=seeded()
-    )
+    buffer = make_buffer(8, 2, storage=storage, sampler=make_plain(8).sampler)
     update(buffer, [0], [0.25])
     assert buffer.sampler.default_priority == 0.25

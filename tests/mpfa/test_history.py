@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import RandomSampler
 
+from tests.mpfa.transitions import make_buffer
 from torchrl_mpfa import (
     MPFASampler,
     ReplayHistory,
-    SignalReplayBuffer,
     SignalSampler,
     SignalTensorStorage,
 )
@@ -20,7 +20,7 @@ from torchrl_mpfa.methods.rank_per import RankPERSampler
 
 def filled(sampler, rows=200):
     torch.manual_seed(0)
-    buffer = SignalReplayBuffer(storage=SignalTensorStorage(rows), sampler=sampler, batch_size=rows)
+    buffer = make_buffer(rows, rows, storage=SignalTensorStorage(rows), sampler=sampler)
     buffer.extend(TensorDict({"next": {"reward": torch.rand(rows, 1) - 0.5}}, [rows]))
     return buffer
 
@@ -94,10 +94,7 @@ def test_what_lies_beyond_the_bins_counts_to_the_outermost():
 def test_a_buffer_without_priorities_adds_nothing():
     history = ReplayHistory()
     history.add(0, filled(RandomSampler()))
-    history.add(
-        0,
-        SignalReplayBuffer(storage=SignalTensorStorage(9), sampler=MPFASampler(9), batch_size=2),
-    )
+    history.add(0, make_buffer(9))
     assert history.histograms() == {}
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from torchrl.data.replay_buffers.samplers.prioritized import MinSegmentTreeFp64, SumSegmentTreeFp64
 
 from tests.mpfa.second_device import DEVICE, SecondDevice, use_leaves
-from tests.mpfa.transitions import make_transitions, seeded, train_rounds
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from tests.mpfa.transitions import make_buffer, make_transitions, train_rounds
+from torchrl_mpfa import MPFASampler, SignalTensorStorage
 from torchrl_mpfa.methods.la3p import LA3PSampler
 from torchrl_mpfa.methods.mw import MWSampler
 from torchrl_mpfa.methods.rank_per import RankPERSampler
@@ -89,12 +89,8 @@ def test_training_samples_the_same_batches_from_leaves_as_from_trees(kind, monke
         with monkeypatch.context() as patched:
             if leaves:
                 use_leaves(patched)
-            buffer = SignalReplayBuffer(
-                storage=SignalTensorStorage(37),
-                sampler=MADE[kind](37),
-                batch_size=8,
-                generator=seeded(),
-            )
+            storage = SignalTensorStorage(37)
+            buffer = make_buffer(37, 8, storage=storage, sampler=MADE[kind](37))
             assert isinstance(buffer.sampler._sum_tree, SumLeaves) == leaves
             for count in (20, 17, 9):
                 buffer.extend(make_transitions(count, seed=count))

@@ -18,8 +18,8 @@ from hypothesis.stateful import (
 )
 from tensordict import TensorDict
 
-from tests.mpfa.transitions import rejected, same, seeded, snapshot, write_signals
-from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
+from tests.mpfa.transitions import make_buffer, rejected, same, snapshot, write_signals
+from torchrl_mpfa import SignalMemmapStorage, SignalTensorStorage
 from torchrl_mpfa.files import load_safely, save_atomically
 
 CAPACITY = 7
@@ -86,12 +86,7 @@ class Replay(RuleBasedStateMachine):
             storage = SignalMemmapStorage(CAPACITY, scratch_dir=self.folder / f"data-{self.made}")
         else:
             storage = SignalTensorStorage(CAPACITY)
-        return SignalReplayBuffer(
-            storage=storage,
-            sampler=MPFASampler(CAPACITY, entropy_refresh=0.5),
-            batch_size=4,
-            generator=seeded(seed),
-        )
+        return make_buffer(CAPACITY, storage=storage, seed=seed, entropy_refresh=0.5)
 
     def teardown(self):
         if hasattr(self, "folder"):

@@ -120,10 +120,6 @@ def test_one_argument_reaches_entropy_boost_and_decay():
     sampler = make_replay("mpfa_per", capacity=8, positive_above=-2).buffer.sampler
     found = {part.positive_above for part in (sampler.fusion, *sampler.adjustments)}
     assert found == {-2}
-    with pytest.raises(ValueError, match="positive_above must be given to a fusion"):
-        MPFASampler(8, positive_above=1.0, fusion=EntropyFusion(), adjustments=[])
-    with pytest.raises(ValueError, match="positive_above must be a finite number or 'mean', got"):
-        MPFASampler(8, positive_above="meen")
 
 
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")

@@ -4,16 +4,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.mpfa.transitions import make_transitions, rejected, same, seeded
+from tests.mpfa.transitions import make_buffer, make_transitions, rejected, same
 from torchrl_mpfa import (
     REWARD,
     TD_ERROR,
     FixedFusion,
-    MPFASampler,
     Signal,
-    SignalReplayBuffer,
     SignalSampler,
-    SignalTensorStorage,
 )
 
 NOVELTY = Signal("novelty", key=("curiosity", "novelty"))
@@ -48,12 +45,7 @@ def make_own_buffer(**kwargs):
         "eps": 0.0,
         **kwargs,
     }
-    return SignalReplayBuffer(
-        storage=SignalTensorStorage(8, signals=signals),
-        sampler=MPFASampler(8, **arguments),
-        batch_size=4,
-        generator=seeded(),
-    )
+    return make_buffer(8, **arguments)
 
 
 def make_own_transitions(count):

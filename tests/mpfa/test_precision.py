@@ -102,5 +102,3 @@ def test_the_type_of_the_weights_is_the_one_asked_for():
         sampler = TreeSampler(10, 0.6, 0.4, dtype=dtype)
         storage, _ = filled(sampler, 10)
         assert sampler.sample(storage, 4)[1]["priority_weight"].dtype is dtype
-    with pytest.raises(ValueError, match=r"dtype must be torch.float32 or .*, got torch.int64"):
-        TreeSampler(10, 0.6, 0.4, dtype=torch.long)

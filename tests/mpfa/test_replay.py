@@ -16,7 +16,6 @@ from tests.mpfa.transitions import (
     make_transitions,
     rejected,
     same,
-    seeded,
     snapshot,
     train_rounds,
     write_signals,
@@ -195,13 +194,7 @@ def test_nothing_is_written_while_the_buffer_is_emptied(monkeypatch):
 
 def test_transforms_act_on_batches_and_signals_stay_as_they_were_written():
     transform = Compose(RewardScaling(loc=0.0, scale=10.0, in_keys=[("next", "reward")]))
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(8),
-        sampler=MPFASampler(8),
-        batch_size=4,
-        transform=transform,
-        generator=seeded(),
-    )
+    buffer = make_buffer(8, transform=transform)
     data = make_transitions(8)
     buffer.extend(data)
     batch = buffer.sample()
@@ -229,9 +222,7 @@ def test_reading_through_a_transform_does_not_change_the_storage(kind):
 
 def test_inverse_transforms_act_before_the_reward_is_read():
     transform = DoubleToFloat(in_keys=["observation"], in_keys_inv=["observation"])
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(8), sampler=MPFASampler(8), batch_size=4, transform=transform
-    )
+    buffer = make_buffer(8, transform=transform)
     buffer.extend(make_transitions(8))
     assert buffer.sample()["observation"].dtype == torch.float32
 
@@ -247,9 +238,7 @@ def test_inverse_transforms_act_before_the_reward_is_read():
 )
 @pytest.mark.parametrize("make_storage", [LazyTensorStorage, SignalTensorStorage])
 def test_with_any_other_sampler_it_is_torchrls_buffer(make_sampler, make_storage):
-    buffer = SignalReplayBuffer(
-        storage=make_storage(16), sampler=make_sampler(), batch_size=8, generator=seeded()
-    )
+    buffer = make_buffer(16, 8, storage=make_storage(16), sampler=make_sampler())
     buffer.extend(make_transitions(10))
     buffer.add(make_transitions(1)[0])
     batch = buffer.sample()
@@ -291,9 +280,7 @@ def test_transitions_that_bring_a_priority_of_their_own_start_with_it():
     ],
 )
 def test_a_priority_is_stored_with_the_transition_where_no_signals_are_fused(make_sampler, key):
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(16), sampler=make_sampler(), batch_size=4, priority_key=key
-    )
+    buffer = make_buffer(16, sampler=make_sampler(), priority_key=key)
     data = make_transitions(6).set("td_error", torch.arange(6.0) + 1)
     for row in range(2):
         buffer.extend(data[3 * row : 3 * row + 3])

@@ -7,7 +7,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs.transforms import Compose, DoubleToFloat, MultiStepTransform
 
 from tests.mpfa.transitions import make_buffer, make_transitions, write_signals
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import MPFASampler, SignalTensorStorage
 from torchrl_mpfa.samplers import TreeSampler
 
 PRIORITIZED = {
@@ -18,8 +18,7 @@ PRIORITIZED = {
 
 
 def buffer_with(sampler, **options):
-    storage = SignalTensorStorage(20, signals=["reward", "td_error", "action_gradient"])
-    return SignalReplayBuffer(storage=storage, sampler=sampler, batch_size=4, **options)
+    return make_buffer(20, sampler=sampler, storage=SignalTensorStorage(20), **options)
 
 
 def filled_buffer(sampler):

@@ -21,7 +21,7 @@ from tests.mpfa.transitions import (
     train_rounds,
     write_signals,
 )
-from torchrl_mpfa import MPFASampler, SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import SignalMemmapStorage, SignalReplayBuffer, SignalTensorStorage
 from torchrl_mpfa.files import load_safely, save_atomically, seal_dump
 
 CAPACITY = 24
@@ -273,10 +273,7 @@ def test_folder_with_code_in_it_is_rejected_and_not_executed(file, tmp_path):
 
 
 def test_buffer_of_other_signals_is_rejected(pair):
-    other = SignalReplayBuffer(
-        storage=SignalTensorStorage(8, signals=["td_error"]),
-        sampler=MPFASampler(8, signals=["td_error"]),
-    )
+    other = make_buffer(8, signals=["td_error"])
     with pytest.raises(ValueError, match=r"must be \['td_error'\], got \['action_gradient',"):
         other.load_state_dict(pair[0])
 

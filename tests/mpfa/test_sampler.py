@@ -23,9 +23,7 @@ from torchrl_mpfa import (
     MPFASampler,
     PositiveBoost,
     PositiveDecay,
-    SignalReplayBuffer,
     SignalSampler,
-    SignalTensorStorage,
 )
 
 
@@ -135,11 +133,8 @@ def test_importance_weights_of_a_batch_equal_the_oracle():
 
 
 def test_one_signal_is_torchrls_prioritized_replay():
-    ours = SignalReplayBuffer(
-        storage=SignalTensorStorage(32, signals=["td_error"]),
-        sampler=SignalSampler(32, 0.6, 0.4, 0.05, fusion=FixedFusion({"td_error": 1.0})),
-        batch_size=8,
-    )
+    sampler = SignalSampler(32, 0.6, 0.4, 0.05, fusion=FixedFusion({"td_error": 1.0}))
+    ours = make_buffer(32, 8, sampler=sampler)
     theirs, storage = PrioritizedSampler(32, 0.6, 0.4, 0.05), LazyTensorStorage(32)
     ours.extend(make_transitions(32))
     storage.set(torch.arange(32), make_transitions(32))

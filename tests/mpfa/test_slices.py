@@ -4,12 +4,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, RoundRobinWriter, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
 from tests.mpfa.transitions import (
     MISSING,
+    make_buffer,
     rejected,
     restore,
     same,
@@ -59,12 +60,9 @@ def choices(kind, **kwargs):
 
 
 def make_slices(*, ndim=2, storage=SignalTensorStorage, seed=0, batch_size=8, **kwargs):
-    return SignalReplayBuffer(
-        storage=storage(CAPACITY, ndim=ndim),
-        sampler=choices(SignalSliceSampler, **{"slice_len": LENGTH, **kwargs}),
-        batch_size=batch_size,
-        generator=seeded(seed),
-    )
+    sampler = choices(SignalSliceSampler, **{"slice_len": LENGTH, **kwargs})
+    parts = {"storage": storage(CAPACITY, ndim=ndim), "sampler": sampler}
+    return make_buffer(CAPACITY, batch_size, seed=seed, **parts)
 
 
 def make_steps(first, steps, *, seed=0):
@@ -363,26 +361,6 @@ def test_updates_of_an_iteration_learn_from_whole_slices(strict_length):
     check_leaves(buffer)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"slice_len": 0}, "slice_len must be an integer from 1"),
-        ({"slice_len": 2.0}, "slice_len must be an integer from 1"),
-        ({"slice_len": 61}, "slice_len must be at most max_capacity, 60, got 61"),
-        ({"slice_priority": "max"}, "unknown slice_priority 'max'"),
-        ({"batch_size": 6}, "batch_size must be a multiple of slice_len, 4, got 6"),
-    ],
-)
-def test_arguments_that_cannot_be_are_rejected_by_name(options, words):
-    with pytest.raises(ValueError, match=words):
-        make_slices(**options)
-
-
-def test_another_device_than_the_cpu_is_rejected():
-    with pytest.raises(ValueError, match="device must be that of a storage on the CPU, got meta"):
-        SignalSliceSampler(8, 0.6, 0.4, slice_len=2, device="meta")
-
-
 def test_a_batch_that_is_not_of_whole_slices_is_rejected():
     buffer = filled(batch_size=None)
     with rejected(buffer, ValueError, "batch_size must be a multiple of slice_len, 4, got 10"):
@@ -396,16 +374,6 @@ def test_steps_without_the_end_of_their_trajectory_are_rejected_before_they_are_
     ):
         buffer.extend(make_steps(0, 5).exclude(("next", "done")))
     assert len(buffer) == 0
-
-
-def test_a_storage_that_keeps_no_signals_is_rejected():
-    with pytest.raises(TypeError, match=r"storage must keep signals .* got LazyTensorStorage"):
-        SignalReplayBuffer(
-            storage=LazyTensorStorage(CAPACITY, ndim=2),
-            sampler=choices(SignalSliceSampler, slice_len=LENGTH),
-            writer=RoundRobinWriter(),
-            batch_size=8,
-        ).sample()
 
 
 def test_a_sampler_without_a_storage_cannot_know_where_trajectories_end():

@@ -9,8 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.transforms import Compose, MultiStepTransform, Transform
 
-from tests.mpfa.transitions import rejected, restore, same, seeded, snapshot
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from tests.mpfa.transitions import make_buffer, rejected, restore, same, seeded, snapshot
 from torchrl_mpfa.methods.her import HindsightGoals
 
 WAIT = 3
@@ -106,10 +105,7 @@ def steps(first, count, *, end=None):
 
 
 def make(kind, **kwargs):
-    parts = {"storage": SignalTensorStorage(60), "sampler": MPFASampler(60), "batch_size": 4}
-    return SignalReplayBuffer(
-        transform=TRANSFORMS[kind](), generator=seeded(), **{**parts, **kwargs}
-    )
+    return make_buffer(60, transform=TRANSFORMS[kind](), **kwargs)
 
 
 def held(buffer):

@@ -9,11 +9,16 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSliceSampler
 from torchrl.envs import SerialEnv
 from torchrl.testing.mocking_classes import CountingEnv
 
-from tests.mpfa.transitions import rejected, same, seeded, snapshot, train_rounds, write_signals
+from tests.mpfa.transitions import (
+    make_buffer,
+    rejected,
+    same,
+    snapshot,
+    train_rounds,
+    write_signals,
+)
 from torchrl_mpfa import (
-    MPFASampler,
     SignalMemmapStorage,
-    SignalReplayBuffer,
     SignalTensorStorage,
 )
 
@@ -31,12 +36,8 @@ def make_trajectories(first=0, steps=STEPS):
 
 
 def make_deep_buffer(kind=SignalTensorStorage, *, ndim=2, seed=0, **kwargs):
-    return SignalReplayBuffer(
-        storage=kind(CAPACITY, ndim=ndim, **kwargs),
-        sampler=MPFASampler(CAPACITY),
-        batch_size=8,
-        generator=seeded(seed),
-    )
+    storage = kind(CAPACITY, ndim=ndim, **kwargs)
+    return make_buffer(CAPACITY, 8, storage=storage, seed=seed)
 
 
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
@@ -170,9 +171,7 @@ def test_in_one_dimension_every_step_of_every_environment_is_a_row(shape):
 
 @pytest.mark.parametrize("ndim", [1, 2])
 def test_a_collector_of_several_environments_fills_the_buffer(ndim):
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(60, ndim=ndim), sampler=MPFASampler(60), batch_size=8
-    )
+    buffer = make_buffer(60, 8, storage=SignalTensorStorage(60, ndim=ndim))
     env = SerialEnv(ENVS, lambda: CountingEnv(max_steps=5))
     collector = Collector(
         env, env.rand_action, frames_per_batch=30, total_frames=120, replay_buffer=buffer
@@ -194,9 +193,7 @@ def test_torchrls_slices_are_sampled_from_our_storage(ndim):
     sampler = PrioritizedSliceSampler(
         CAPACITY, alpha=0.6, beta=0.4, slice_len=2, end_key=("next", "done"), strict_length=False
     )
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(CAPACITY, ndim=ndim), sampler=sampler, batch_size=8
-    )
+    buffer = make_buffer(8, 8, storage=SignalTensorStorage(CAPACITY, ndim=ndim), sampler=sampler)
     data = make_trajectories()
     data["next", "done"] = torch.zeros(ENVS, STEPS, 1, dtype=torch.bool)
     data["next", "done"][:, -1] = True

@@ -9,12 +9,12 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import PrioritizedSampler
 
+from tests.mpfa import transitions
 from tests.mpfa.second_device import DEVICE
 from tests.mpfa.transitions import same, seeded
 from torchrl_mpfa import (
     DDPGLearner,
     MPFASampler,
-    SignalReplayBuffer,
     SignalTensorStorage,
     make_actor,
     make_critic,
@@ -56,12 +56,8 @@ def make_learner(**options):
 
 
 def make_buffer(count=MANY, *, device="cpu", **options):
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(count, device=device),
-        sampler=MPFASampler(count, **options),
-        batch_size=BATCH,
-        generator=seeded(3),
-    )
+    storage = SignalTensorStorage(count, device=device)
+    buffer = transitions.make_buffer(count, BATCH, storage=storage, seed=3, **options)
     buffer.extend(make_rows(count))
     return buffer
 
@@ -140,12 +136,7 @@ def test_each_batch_has_places_and_a_mean_of_its_own(position):
 
 def test_of_a_transition_that_was_sampled_twice_the_last_update_counts():
     few = 12
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(few),
-        sampler=MPFASampler(few),
-        batch_size=8,
-        generator=seeded(0),
-    )
+    buffer = transitions.make_buffer(few, 8)
     buffer.extend(make_rows(few))
     learner = Counting()
     run_updates(buffer, learner, updates=UPDATES)
@@ -382,13 +373,10 @@ def test_a_batch_size_of_several_batches_is_not_warned_of(recwarn):
 
 def test_a_buffer_without_a_batch_size_or_with_too_few_rows_is_rejected():
     learner = make_learner()
-    storage = SignalTensorStorage(MANY)
-    buffer = SignalReplayBuffer(storage=storage, sampler=MPFASampler(MANY))
+    buffer = transitions.make_buffer(MANY, None)
     with pytest.raises(ValueError, match="buffer must have a batch_size, got None"):
         run_updates(buffer, learner)
-    buffer = SignalReplayBuffer(
-        storage=SignalTensorStorage(MANY), sampler=MPFASampler(MANY), batch_size=BATCH
-    )
+    buffer = transitions.make_buffer(MANY, BATCH)
     buffer.extend(make_rows(BATCH - 1))
     with pytest.raises(ValueError, match="at least one batch of 16, got 15 transitions"):
         run_updates(buffer, learner, updates=2)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_mpfa import MPFASampler, SignalReplayBuffer, SignalTensorStorage
+from torchrl_mpfa import MPFA_SIGNALS, MPFASampler, SignalReplayBuffer, SignalTensorStorage
 
 
 def seeded(seed=0):
@@ -30,13 +30,19 @@ def make_transitions(count, *, seed=0, first=0, rewards=None):
     )
 
 
-def make_buffer(capacity=16, batch_size=4, *, seed=0, storage=None, **kwargs):
-    """A buffer with the paper's sampler and a generator of its own."""
+_OF_BUFFER = {"transform", "transform_factory", "writer", "priority_key"}
+
+
+def make_buffer(capacity=16, batch_size=4, *, seed=0, storage=None, sampler=None, **kwargs):
+    """A buffer with a generator of its own; the paper's sampler, the default, takes the rest."""
+    parts = {name: kwargs.pop(name) for name in _OF_BUFFER & kwargs.keys()}
+    if sampler is None:
+        sampler = MPFASampler(capacity, **kwargs)
+    if storage is None:
+        signals = getattr(sampler, "signals", MPFA_SIGNALS)
+        storage = SignalTensorStorage(capacity, signals=signals)
     return SignalReplayBuffer(
-        storage=SignalTensorStorage(capacity) if storage is None else storage,
-        sampler=MPFASampler(capacity, **kwargs),
-        batch_size=batch_size,
-        generator=seeded(seed),
+        storage=storage, sampler=sampler, batch_size=batch_size, generator=seeded(seed), **parts
     )
 
 
