@@ -54,8 +54,8 @@ def boost_positive(
     Args:
         priority: Priorities of positive transitions, shape ``[B]``.
         boost: Factor :math:`\varphi`; the paper chose 3 out of 2, 3 and 4.
-        bound: What the 1 is: a ``"floor"`` (the letter of Eq. 22), a ``"cap"`` (``min`` in place
-            of ``max``), or ``"none"``.
+        bound: Role of the 1: a ``"floor"`` (the letter of Eq. 22), a ``"cap"`` (``min`` in place of
+            ``max``), or ``"none"``.
 
     Returns:
         Priorities, shape ``[B]``.
@@ -87,7 +87,7 @@ def adaptive_boost(positive_share: Tensor, *, target: float, highest: float) -> 
     Args:
         positive_share: Share :math:`q` of the transitions in the buffer that are positive, ``[]``.
         target: Share :math:`s` of the total priority that they are to have, in (0, 1).
-        highest: :math:`\varphi_{\max}`, at least 1; what it is where nothing is positive.
+        highest: :math:`\varphi_{\max}`, at least 1; the factor where nothing is positive.
 
     Returns:
         The factor, shape ``[]``.
@@ -169,7 +169,7 @@ class Adjustment(Protocol):
 class Counting(Protocol):
     """An adjustment that depends on the whole buffer, which is counted from time to time.
 
-    What it counts is handed to it as ``BatchFacts.counted``, and saved with the sampler.
+    The result is handed to it as ``BatchFacts.counted``, and saved with the sampler.
     """
 
     @property
@@ -238,13 +238,13 @@ class PositiveBoost:
         return self.target_share > 0
 
     def count(self, table: SignalTable, priority: Tensor) -> Tensor:
-        """Share of the transitions in the buffer that are positive, shape ``[]``."""
+        """Return the share of positive transitions in the buffer, shape ``[]``."""
         rewards = table.rewards
         mean = float(rewards.mean())
         return is_positive(rewards, self.positive_above, mean=mean).double().mean()
 
     def factor(self, counted: Tensor | None) -> float | Tensor:
-        """The factor, given what :meth:`count` gave; before it, the one that is given."""
+        """Return the factor by the result of :meth:`count`; before a count, ``boost``."""
         if not self.counts or counted is None:
             return self.boost
         return adaptive_boost(counted, target=self.target_share, highest=self.boost)
@@ -288,7 +288,7 @@ class PositiveDecay:
             raise ValueError(f"position must be 'batch', 'rank' or 'count', got {self.position!r}")
 
     def factors(self, priority: Tensor, batch: BatchFacts) -> Tensor:
-        """Factor of Eq. (23) for each transition, by the chosen reading of j, shape ``[B]``."""
+        """Return the factor of Eq. (23) for each transition, shape ``[B]``."""
         if self.position == "count":
             return decay_factor(batch.replay_count, sharpness=self.sharpness)
         by_place = _factors_by_place(
@@ -315,7 +315,7 @@ class PositiveDecay:
 def _factors_by_place(
     count: int, sharpness: float, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Factors of places 1 to ``count``: the same for every batch of that size."""
+    """Return factors of places 1 to ``count``: the same for every batch of that size."""
     places = torch.arange(1, count + 1, dtype=dtype, device=device)
     return decay_factor(places, sharpness=sharpness)
 

@@ -238,12 +238,12 @@ class SignalReplayBuffer(CheckedReplayBuffer):
                 self._sampler.anneal(fraction)
 
     def rewards(self) -> Tensor:
-        """Rewards of all transitions, shape ``[N]``."""
+        """Return the rewards of all transitions, shape ``[N]``."""
         found: Tensor = self.storage.signal_table.rewards
         return found
 
     def distributions(self) -> dict[str, Tensor]:
-        """Numbers of all transitions by name, each of shape ``[N]``.
+        """Return numbers of all transitions by name, each of shape ``[N]``.
 
         Each signal as it was last written (NaN where it never was), ``"priority"``, and
         ``"weight"``, the importance weight of Eq. (10) that the transition would have in a batch
@@ -259,7 +259,7 @@ class SignalReplayBuffer(CheckedReplayBuffer):
         return found
 
     def stats(self) -> dict[str, Any]:
-        """TorchRL's counters, and the sampler's statistics of signals and batch."""
+        """Return TorchRL's counters, and the sampler's statistics of signals and batch."""
         with self._replay_lock:
             found: dict[str, Any] = {**super().stats(), "stale_updates": self.stale_updates}
             if self.initialized and self._fuses:

@@ -66,7 +66,7 @@ def binary_entropy(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _split_entropy(reward: Tensor, level: float) -> Tensor:
-    """Entropy of being above a level; a reward equal to it is not."""
+    """Return the entropy of being above a level, which an equal reward is not."""
     if reward.numel() == 0:
         raise ValueError(f"reward must hold at least one transition, got shape {[*reward.shape]}")
     above = (reward > level).double().mean()
@@ -206,7 +206,7 @@ class Annealed(Protocol):
 def checked_weights(
     fusion: Fusion, names: Sequence[str], table: SignalTable, index: Tensor
 ) -> Tensor:
-    """Weights of a fusion, checked, in double precision, shape ``[K]``."""
+    """Return the checked weights of a fusion, in double precision, shape ``[K]``."""
     weights = fusion.weights(names, table, index)
     if weights.shape != (len(names),):
         raise ValueError(f"fusion must give {len(names)} weights, got shape {[*weights.shape]}")
@@ -273,7 +273,7 @@ class EntropyFusion:
         return self.population == "batch"
 
     def entropies(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
-        """Entropy of each signal in bits, Eqs. (16)-(17), shape ``[K]``."""
+        """Return the entropy of each signal in bits, Eqs. (16)-(17), shape ``[K]``."""
         rewards = table.rewards if self.population == "buffer" else table.rewards[index]
         of_reward = reward_entropy(rewards)
         of_positive = positive_entropy(rewards, positive_above=self.positive_above)
@@ -281,7 +281,7 @@ class EntropyFusion:
         return torch.stack([of_reward if name in by_reward else of_positive for name in names])
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
-        """Weights a, beta, nu of Eqs. (18)-(20), shape ``[K]``."""
+        """Return the weights a, beta, nu of Eqs. (18)-(20), shape ``[K]``."""
         weights = entropy_weights(self.entropies(names, table, index))
         if self.floor > 0:
             weights = weights.clamp_min(self.floor)
@@ -321,7 +321,7 @@ class FixedFusion:
         return tuple(self.values)
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
-        """The fixed weights in the order of ``names``, shape ``[K]``."""
+        """Return the fixed weights in the order of ``names``, shape ``[K]``."""
         return torch.tensor([self.values.get(name, 0.0) for name in names], dtype=torch.double)
 
 
@@ -361,7 +361,7 @@ class ScaledFusion:
             self.fusion.anneal(fraction)
 
     def weights(self, names: Sequence[str], table: SignalTable, index: Tensor) -> Tensor:
-        """Weights divided by the means of the signals, shape ``[K]``."""
+        """Return weights divided by the means of the signals, shape ``[K]``."""
         weights = self.fusion.weights(names, table, index)
         places = torch.tensor([table.column[name] for name in names])
         signals = table.rows[: table.size, places]

@@ -40,8 +40,8 @@ def run_updates(
 
     Args:
         buffer: Where batches of ``B`` are sampled, its own batch size.
-        learner: What is trained.
-        select: From the buffer to the batches of an update.
+        learner: The learner to train.
+        select: Function from the buffer to the batches of an update.
         updates: Number of updates ``U``.
         prepare: Applied to each batch before the learner gets it: to move it to the learner's
             device, or to add to its rewards. It keeps the rows of the batch and their order.
@@ -90,7 +90,7 @@ def run_updates(
 def _one_by_one(
     buffer: TensorDictReplayBuffer, learner: Learner, select: Selection, prepare: Prepare | None
 ) -> tuple[dict[str, Tensor], TensorDictBase]:
-    """One update, whose batches may depend on the priorities that the one before gave."""
+    """Make one update, whose batches may depend on the priorities of the update before."""
     log: dict[str, Tensor] = {}
     batch: TensorDictBase | None = None
     for sampled in select(buffer):
@@ -111,7 +111,7 @@ def _together(
     updates: int,
     batch_size: int,
 ) -> tuple[dict[str, Tensor], TensorDictBase]:
-    """All updates of an iteration, with one call to sample and one to write priorities."""
+    """Make all updates of an iteration by one call to sample and one to write priorities."""
     # TorchRL warns of a batch size that is not the buffer's, which is meant here.
     buffer._warned_batch_size_conflict = True
     sampled = buffer.sample(updates * batch_size)
@@ -129,7 +129,7 @@ def _together(
 def _learn(
     learner: Learner, sampled: SampledBatch, prepare: Prepare | None
 ) -> tuple[TensorDictBase, dict[str, Tensor]]:
-    """The batch with its signals, and values for the log."""
+    """Return the batch with its signals, and values for the log."""
     if prepare is not None:
         sampled = prepare(sampled)
     values = learner.update(sampled)
@@ -141,7 +141,7 @@ def _joined(
     batches: Sequence[TensorDictBase],
     device: torch.device | None,
 ) -> TensorDictBase:
-    """The entries of several batches that priorities are made from, shape ``[U * B]``."""
+    """Join the entries of several batches that priorities are made from, shape ``[U * B]``."""
     sampler = buffer.sampler
     keys = ["index", buffer.priority_key]
     if isinstance(sampler, SignalSampler):
@@ -156,7 +156,7 @@ def _joined(
 
 
 def _at(batch: TensorDictBase, device: torch.device | None) -> TensorDictBase:
-    """The batch on the device that its rows came from, of which None is the CPU."""
+    """Move a batch to the device of its rows, of which None is the CPU."""
     return batch if batch.device == device else batch.to(device or "cpu")
 
 

@@ -226,8 +226,8 @@ class SignalSampler(TreeSampler):
             storage: The storage with the signal table.
             written_at: The entry of that name in the sampled batch, shape ``[B]``: rows whose
                 slot was written since are left out.
-            batches: How many batches of one size these slots are, one after the other; each is
-                adjusted as a batch of its own.
+            batches: Number of batches of one size in these slots, one after the other; each is
+                adjusted by itself.
 
         Returns:
             Number of rows left out.
@@ -267,7 +267,7 @@ class SignalSampler(TreeSampler):
         return stale
 
     def _fused(self, table: SignalTable, rows: Tensor, slots: Tensor, weighing: Weighing) -> Tensor:
-        """Priorities of Eqs. (21)-(24), eps included, shape ``[B]``."""
+        """Return priorities by Eqs. (21)-(24), eps included, shape ``[B]``."""
         priority = self._combined(rows, weighing)
         facts = BatchFacts(
             reward=rows.select(1, table.reward_column),
@@ -286,11 +286,11 @@ class SignalSampler(TreeSampler):
         return priority.to(torch.double)
 
     def _combined(self, rows: Tensor, weighing: Weighing) -> Tensor:
-        """Priorities of Eq. (21), eps included, shape ``[B]``."""
+        """Return priorities by Eq. (21), eps included, shape ``[B]``."""
         return fuse(rows[:, self._columns], weighing.weights, eps=self._eps)
 
     def _weigh(self, table: SignalTable, index: Tensor, last: Weighing | None) -> Weighing:
-        """Weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
+        """Return the weights of Eqs. (15)-(20), computed again if enough of the buffer changed."""
         always = self.entropy_refresh == 0
         fresh = table.writes - (0 if last is None else last.writes)
         due = always or not 0 <= fresh <= self.entropy_refresh * table.size
@@ -324,7 +324,7 @@ class SignalSampler(TreeSampler):
         )
 
     def bind(self, storage: Storage) -> SignalTable:
-        """Take the signals of a storage, which must be those of the sampler, as those to fuse."""
+        """Fuse the signals of this storage, which must be those of the sampler."""
         table = signal_table_of(storage, self.signals, self._max_capacity)
         self._maybe_init_from_storage(storage)
         if table is not self._table:
@@ -341,7 +341,7 @@ class SignalSampler(TreeSampler):
         return table
 
     def stats(self, storage: Storage) -> dict[str, float]:
-        """Composition of buffer and last batch by name, see ``docs/metrics.md``."""
+        """Return the composition of buffer and last batch by name, see ``docs/metrics.md``."""
         table, weights = self.bind(storage), self.weights
         found: dict[str, float] = {f"weight/{name}": value for name, value in weights.items()}
         for place, adjust in enumerate(self.adjustments):
@@ -382,7 +382,7 @@ class SignalSampler(TreeSampler):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next batches depend on; tensors and plain values only."""
+        """Return everything that the next batches depend on; tensors and plain values only."""
         last = self._weighing or Weighing()
         state = {
             **super().state_dict(),

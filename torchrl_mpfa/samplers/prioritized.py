@@ -224,13 +224,9 @@ class TreeSampler(SavedTrees):
         return 1.0 if highest is None else max(highest - self._eps, 0.0)
 
     def priorities(self, index: Tensor | None = None) -> Tensor:
-        """Return priorities with eps, before alpha; NaN where nothing was written.
+        """Return priorities of slots, by default all, in double precision, shape ``[B]``.
 
-        Args:
-            index: Slots, shape ``[B]``; by default all of them.
-
-        Returns:
-            Priorities in double precision, shape ``[B]``.
+        They include eps and precede alpha, and are NaN where nothing was written.
         """
         return self._priorities.clone() if index is None else self._priorities[index]
 

@@ -19,7 +19,7 @@ from torchrl_mpfa.storages.schema import as_path
 from torchrl_mpfa.storages.table import SignalTable
 
 SlicePriority = Literal["mean", "start"]
-"""What the priority of a slice is: the mean over its steps, or that of its first one."""
+"""Priority of a slice: the mean over its steps, or that of its first step."""
 _TRAJ_IDS = ("collector", "traj_ids")
 _SETTINGS = ("slice_len", "slice_priority", "strict_length")
 """What a saved sampler must have been made with."""
@@ -220,7 +220,7 @@ class SignalSliceSampler(SignalSampler):
             self._refresh(self._starts_around(slots))
 
     def _join(self, slots: Tensor, storage: Any) -> None:
-        """Find out which slots, or those before them, the next step of a trajectory follows."""
+        """Find the slots, and those before them, that the next step of a trajectory follows."""
         table = super().bind(storage)
         if table.size == 0:
             return
@@ -239,7 +239,7 @@ class SignalSliceSampler(SignalSampler):
         self._joined[slots] = joined
 
     def _windows(self, starts: Tensor, joined: Tensor, stride: int) -> tuple[Tensor, Tensor]:
-        """Slots of slices and which of them belong to the same trajectory, both ``[S, L]``."""
+        """Return the slots of slices and the mask of one trajectory, both ``[S, L]``."""
         slots = starts.unsqueeze(1) + stride * torch.arange(self.slice_len)
         slots %= self._max_capacity
         inside = torch.ones(slots.shape, dtype=torch.bool)
@@ -247,7 +247,7 @@ class SignalSliceSampler(SignalSampler):
         return slots, inside
 
     def _starts_around(self, slots: Tensor) -> Tensor:
-        """Starts of all slices that these slots can be in, shape ``[S]``."""
+        """Return the starts of all slices that can hold these slots, shape ``[S]``."""
         if len(slots) * self.slice_len >= self._max_capacity:
             return torch.arange(self._max_capacity)
         starts = slots.unsqueeze(1) - self._stride * torch.arange(self.slice_len)
@@ -258,7 +258,7 @@ class SignalSliceSampler(SignalSampler):
         self._refresh(self._starts_around(slots) if self.slice_priority == "mean" else slots)
 
     def _refresh(self, starts: Tensor) -> None:
-        """Write the leaves of slices as they are now, by their starts, shape ``[S]``."""
+        """Write the present leaves of slices, by their starts, shape ``[S]``."""
         starts = starts[self._priorities[starts].isfinite()]
         for part in starts.split(_AT_ONCE):
             priority, whole = self._of_slices(part, self._priorities, self._joined, self._stride)
@@ -270,7 +270,7 @@ class SignalSliceSampler(SignalSampler):
     def _of_slices(
         self, starts: Tensor, priorities: Tensor, joined: Tensor, stride: int
     ) -> tuple[Tensor, Tensor]:
-        """Priorities of slices, and whether they are long enough, both of shape ``[S]``."""
+        """Return each slice's priority and a mask of full-length slices, both ``[S]``."""
         slots, inside = self._windows(starts, joined, stride)
         length = inside.sum(1)
         whole = (length == self.slice_len) | (not self.strict_length)
@@ -291,7 +291,7 @@ class SignalSliceSampler(SignalSampler):
 def _column(
     storage: Any, key: NestedKey, slots: Tensor, *, default: Tensor | None = None
 ) -> Tensor:
-    """An entry of stored steps on the CPU, ``[B, 1]``; of several numbers the highest."""
+    """Return an entry of stored steps on the CPU, ``[B, 1]``; of several numbers the highest."""
     entry = storage._storage.get(key, None)
     if entry is None:
         if default is None:

@@ -27,9 +27,9 @@ _CLOCK = "_signals_clock"
 class SignalStorageMixin:
     """Adds a :class:`~torchrl_mpfa.storages.SignalTable` to a TorchRL storage.
 
-    Every write of a slot resets its signals, whichever writer makes it, so that a transition
-    never has those of the one that was there before; nothing of them shows in sampled batches.
-    Transitions that do not fit are rejected before any of them is written.
+    Every write of a slot resets its signals, by any writer, so that a transition never has the
+    signals of the transition before it. Sampled batches hold no signals. Transitions that do not
+    fit are rejected before any of them is written.
     """
 
     signal_table: SignalTable
@@ -55,8 +55,8 @@ class SignalStorageMixin:
             data: Transitions, batch size ``[B]``, or ``[T, B]`` for a storage of two dimensions.
 
         Returns:
-            Their rows of the signal table, or None if they have no entries that could be read; and
-            pairs of a stored entry and its new values, or None if TorchRL has to find them.
+            Their rows of the signal table, or None if they have no entries; and pairs of a stored
+            entry and its new values, or None if TorchRL has to find them.
 
         Raises:
             KeyError: If an entry is missing or unknown, or a reward or signal that the sampler
@@ -118,7 +118,7 @@ class SignalStorageMixin:
             self.signal_table.to(device)
 
     def _rand_given_ndim(self, batch_size: int) -> Any:
-        """Slots sampled uniformly, as TorchRL does, which asks for a generator on the device."""
+        """Sample slots uniformly, as TorchRL, which asks for a generator on the device."""
         kept, device = self._rng, getattr(self, "device", None)
         if not isinstance(device, torch.device):
             return super()._rand_given_ndim(batch_size)  # type: ignore[misc]
@@ -157,7 +157,7 @@ class SignalStorageMixin:
             )
 
     def _known_schema(self) -> Schema | None:
-        """Schema of the stored tensordict; None if there is none yet."""
+        """Return the schema of the stored tensordict; None before the first write."""
         stored = getattr(self, "_storage", None)
         # What an empty storage was restored from is a tensordict without entries.
         if not self.initialized or type(stored) is not TensorDict:  # type: ignore[attr-defined]
@@ -167,7 +167,7 @@ class SignalStorageMixin:
         return self._schema
 
     def _write(self, cursor: Any, data: Any, pairs: Pairs | None) -> bool:
-        """Write checked entries one by one; False if TorchRL has to write them."""
+        """Write checked entries one by one; return False if TorchRL has to write them."""
         if not (
             self.strict
             and pairs
@@ -194,7 +194,7 @@ class SignalStorageMixin:
         return True
 
     def _slots(self, cursor: Any) -> Tensor:
-        """Numbers of the slots that a writer's cursor names, shape ``[B]``."""
+        """Return the slots that a writer's cursor names, shape ``[B]``."""
         if self.ndim == 1:
             return _as_index(cursor, self.max_size)
         if self._all_slots is None:
@@ -311,7 +311,7 @@ class SignalStorageMixin:
 
 
 def _as_index(cursor: Any, capacity: int) -> Tensor:
-    """The slots that a writer's cursor names, shape ``[B]``."""
+    """Return the slots that a writer's cursor names, shape ``[B]``."""
     if isinstance(cursor, slice):
         return torch.arange(*cursor.indices(capacity))
     if isinstance(cursor, Tensor) and cursor.dtype is torch.bool:
@@ -320,7 +320,7 @@ def _as_index(cursor: Any, capacity: int) -> Tensor:
 
 
 def _as_batch(data: Any) -> Any:
-    """A list of transitions as one batch; anything else as it is."""
+    """Stack a list of transitions to one batch; return anything else unchanged."""
     if isinstance(data, list) and data and is_tensor_collection(data[0]):
         return torch.stack(data)
     return data

@@ -113,13 +113,13 @@ class SignalTable:
         return self.rows[: self.size, self.reward_column]
 
     def blank(self, count: int, device: torch.device | str = "cpu") -> Tensor:
-        """Rows of transitions of which nothing is known, not yet written."""
+        """Return rows of transitions of which nothing is known yet."""
         return self._blank.to(device).expand(count, -1).clone()
 
     def read(self, data: Any, count: int) -> Tensor:
-        """Rows for new transitions, checked and not yet written; NaN for entries that they lack.
+        """Return checked rows for new transitions, with NaN for missing entries.
 
-        They are on the device of the data, whose checks then wait for no other one.
+        They are on the device of the data, so that checks wait for no other device.
         """
         reward = _column(data, self.reward_key, "reward", count)
         rows = self.blank(count, "cpu" if reward is None else reward.device)
@@ -140,7 +140,7 @@ class SignalTable:
         live: Tensor | None,
         sizes: Sequence[int],
     ) -> None:
-        """Put learned signals in copies of rows, of those that are live, batch by batch."""
+        """Write learned signals of live rows in copies of them, batch by batch."""
         count = len(rows) if live is None else len(live)
         for name, priority_of in learned.items():
             if name not in signals:
@@ -178,7 +178,7 @@ class SignalTable:
     def live_rows(
         self, slots: Tensor, written_at: Tensor | None, batches: int
     ) -> tuple[Tensor, Tensor, Tensor | None, list[int]]:
-        """Rows and slots that are not stale, which of the slots they are, and sizes of batches."""
+        """Return live rows and slots, the mask of live ones, and the sizes of batches."""
         # A batch from before the table was cleared is stale, as its times of writing show.
         filled = self.size if written_at is None else max(self.size, self.cleared)
         check_counts(batches=batches)
@@ -202,7 +202,7 @@ class SignalTable:
         return rows[live], slots[live], live, live.reshape(batches, -1).sum(1).tolist()
 
     def missing(self, rows: Tensor) -> str | None:
-        """Name of the first entry known at the write that some of the rows lack."""
+        """Return the name of the first entry known at the write that some rows lack, or None."""
         # Of two rewards the signal counts first: it is the one that an error should name.
         for name in [*(s.name for s in self.written), "reward"]:
             column = self.column.get(name, self.reward_column)
@@ -211,7 +211,7 @@ class SignalTable:
         return None
 
     def write(self, index: Tensor, rows: Tensor) -> None:
-        """Put new transitions in their slots, and reset everything else of these."""
+        """Write new transitions in their slots, and reset all else of these slots."""
         count = len(rows)
         if count > self.capacity:
             # Of a slot that is named twice the last row must win, which indexing leaves open.
@@ -240,11 +240,11 @@ class SignalTable:
             self.rows.select(1, self.count_column).index_add_(0, index, one)
 
     def written_at(self, index: Tensor) -> Tensor:
-        """Time of writing of each slot, as a count of writes, shape ``[B]``."""
+        """Return the time of writing of each slot, a count of writes, shape ``[B]``."""
         return self.rows.select(1, self.time_column).index_select(0, index)
 
     def replay_counts(self, index: Tensor) -> Tensor:
-        """Replays of each slot, shape ``[B]``."""
+        """Return the replays of each slot, shape ``[B]``."""
         return self.rows.select(1, self.count_column).index_select(0, index)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -296,14 +296,14 @@ class SignalTable:
 
 
 def by_batch(sizes: Sequence[int], *columns: Tensor) -> Iterable[tuple[Tensor, ...]]:
-    """The part of each column that belongs to a batch, for one batch after the other."""
+    """Split columns into the parts of each batch."""
     if len(sizes) == 1:
         return [columns]
     return zip(*(column.split(list(sizes)) for column in columns), strict=True)
 
 
 def signal_table_of(storage: object, signals: Sequence[Signal], capacity: int) -> SignalTable:
-    """The signals of a storage, which must fit the signals and the capacity of a sampler."""
+    """Return the signals of a storage, which must fit those and the capacity of a sampler."""
     table = getattr(storage, "signal_table", None)
     if not isinstance(table, SignalTable):
         raise TypeError(
@@ -321,7 +321,7 @@ def signal_table_of(storage: object, signals: Sequence[Signal], capacity: int) -
 
 
 def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.float64]:
-    """Numbers in a file that is locked for as long as they are in use."""
+    """Map numbers to a file, which is locked as long as they are in use."""
     file.parent.mkdir(parents=True, exist_ok=True)
     # Opened without emptying it: it may be another's.
     with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as opened:
@@ -341,7 +341,7 @@ def _map(file: Path, shape: tuple[int, int], *, existsok: bool) -> NDArray[np.fl
 
 
 def _column(data: Any, key: NestedKey, name: str, count: int) -> Tensor | None:
-    """One finite number per transition, in double precision, shape ``[count]``; None if absent."""
+    """Return one finite double per transition, shape ``[count]``, or None without the entry."""
     value = data.get(key, None)
     if value is None:
         return None

@@ -60,7 +60,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         super().__init__(max_size, **kwargs)
 
     def get(self, index: Any) -> Any:
-        """Read transitions; the usual case, a batch of slots, twice as fast as by indexing."""
+        """Read transitions; a batch of slots takes half of the time of indexing."""
         if (
             self.initialized
             and self.ndim == 1
@@ -88,7 +88,7 @@ class SignalTensorStorage(SignalStorageMixin, LazyTensorStorage):
         self._settle_device()
 
     def _device_of_tensors(self) -> torch.device | None:
-        """Device of all entries; None if one is no tensor, such as a text: TorchRL reads those."""
+        """Return the device of all entries; None if one is no tensor, which TorchRL reads."""
         if self._looked_at is not self._storage:
             self._looked_at, self._where = self._storage, _common_device(self._storage)
         return self._where
@@ -161,7 +161,7 @@ class SignalMemmapStorage(SignalStorageMixin, LazyMemmapStorage):
 
 
 def _common_device(data: Any) -> torch.device | None:
-    """Device of all tensors in a tensordict; None if there are several, or other entries."""
+    """Return the device of all tensors in a tensordict; None for several, or other entries."""
     if isinstance(data, Tensor):
         return data.device
     if type(data) is not TensorDict:
@@ -171,7 +171,7 @@ def _common_device(data: Any) -> torch.device | None:
 
 
 def _rows_of(data: TensorDict, index: Tensor) -> TensorDict:
-    """Rows of a tensordict that holds tensors only."""
+    """Return rows of a tensordict that holds tensors only."""
     rows = {
         key: _rows_of(entry, index) if type(entry) is TensorDict else entry.index_select(0, index)
         for key, entry in data.items()
