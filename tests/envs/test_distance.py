@@ -93,6 +93,17 @@ def test_a_path_leads_around_a_wall_but_not_a_closed_one() -> None:
     assert cut.lengths[i, j] == math.inf and math.isfinite(cut.at(-3.0, 3.0))
 
 
+def test_a_field_up_to_a_position_has_the_lengths_that_a_path_from_there_needs() -> None:
+    grid, goal = FreeGrid(MIXED, distance=0.2), (-0.5, 2.0)
+    whole = DistanceField(grid, goal)
+    for start in ((-3.4, -2.3), (3.2, 2.2), (0.0, 2.0)):
+        part = DistanceField(grid, goal, until=start)
+        known = np.isfinite(part.lengths)
+        assert part.length_from(start) == whole.length_from(start)
+        np.testing.assert_array_equal(part.lengths[known], whole.lengths[known])
+        assert whole.lengths[~known].min() >= whole.at(*start)
+
+
 def test_cells_without_a_path_take_the_nearest_length() -> None:
     grid = FreeGrid(MIXED, distance=0.2)
     field = DistanceField(grid, (-0.5, 2.0))

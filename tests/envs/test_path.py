@@ -48,7 +48,7 @@ def test_lengths_of_published_tasks_are_those_of_the_file(world: str, seed: int)
     # The field of another disc, of a world without fixed lengths, is near to them.
     renamed = WORLDS[world].renamed("other")
     measured = [shortest_length(renamed, 0.18, task.start[:2], task.goal) for task in tasks]
-    np.testing.assert_allclose(measured, lengths, rtol=0.025)
+    np.testing.assert_allclose(measured, lengths, rtol=0.045)
     assert measured != lengths
     assert shortest_length(WORLDS[world], 0.2, tasks[0].start[:2], tasks[0].goal) != lengths[0]
 
@@ -72,7 +72,7 @@ def test_the_path_around_a_box_is_near_the_optimum(turn: float | None, radius: f
         world = World(name="turned", polygons=(turned(BLOCK.boxes[0], turn),))
     ends = [(3 * s * math.cos(angle), 3 * s * math.sin(angle)) for s in (-1, 1)]
     length = shortest_length(world, radius, *ends)
-    assert length == pytest.approx(around_a_corner(radius), rel=0.02)
+    assert length == pytest.approx(around_a_corner(radius), rel=0.03)
 
 
 def test_the_path_around_a_cylinder_is_near_the_optimum() -> None:

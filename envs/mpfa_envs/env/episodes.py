@@ -6,7 +6,6 @@ import copy
 import math
 import os
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -16,7 +15,7 @@ from mpfa_envs.env.state import Beginning, generator_at
 from mpfa_envs.generators.generate import GENERATORS, generate_world, world_seed
 from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.lengths import shortest_length
+from mpfa_envs.paths.lengths import grid_for, shortest_length
 from mpfa_envs.paths.tasks import LONGEST_PATH, sample_task_on_grid
 from mpfa_envs.tasks.sampling import check_task, sample_task
 from mpfa_envs.walkers.starts import start_walkers
@@ -52,19 +51,10 @@ class Episode(NamedTuple):
     """Starts of the walkers."""
 
 
-def _grid_of(world: World, distance: float) -> FreeGrid:
-    """Make the grid of a world."""
-    return FreeGrid(world, distance=distance)
-
-
-_kept_grid_of = lru_cache(maxsize=4)(_grid_of)
-"""The same, cached for fixed worlds; a grid takes some megabytes."""
-
-
 def distance_field(world: World, distance: float, goal: tuple[float, float]) -> DistanceField:
     """Measure the paths to a goal that keep a distance [m]; on a map only around the goal."""
     longest = math.inf if world.occupancy is None else LONGEST_PATH
-    return DistanceField(_kept_grid_of(world, distance), goal, longest)
+    return DistanceField(grid_for(world, distance), goal, longest)
 
 
 class EpisodeSource:
@@ -262,8 +252,11 @@ class EpisodeSource:
     def _sample_on_grid(self, world: World, rng: np.random.Generator) -> Episode:
         """Sample an episode over the cells of a grid, in milliseconds even in crowded worlds."""
         config = self._config
+        distance = config.collision_distance
+        # A generator's worlds do not come again.
+        grid = FreeGrid(world, distance=distance) if self._generator else grid_for(world, distance)
         task, field = sample_task_on_grid(
-            (_grid_of if self._generator else _kept_grid_of)(world, config.collision_distance),
+            grid,
             rng,
             min_goal_distance=config.min_goal_distance,
             max_goal_distance=self._max_goal_distance,

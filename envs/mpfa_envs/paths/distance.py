@@ -21,7 +21,7 @@ from scipy.ndimage import label
 from scipy.sparse import csr_array
 
 from mpfa_envs.checks import check_number, check_positive
-from mpfa_envs.paths.field_loops import path_lengths
+from mpfa_envs.paths.field_loops import BEYOND, path_lengths
 from mpfa_envs.paths.grid_loops import (
     MOVES,
     STEP_SCALE,
@@ -38,6 +38,8 @@ MOST_CELLS: Final = 40_000_000
 """Most cells of a grid, for rooms of up to 1,000 m x 1,000 m."""
 MANY_CELLS: Final = 4_000_000
 """Where a grid would have more cells than this, longer cells are chosen if they are allowed."""
+_LARGE: Final = 100_000
+"""Cells of a grid on which a path between two positions is first looked for in a window."""
 _MARGIN: Final = 3
 """Cells by which a window is wider than the longest path."""
 
@@ -176,21 +178,28 @@ class FreeGrid:
         """Return True if there is a path between two positions (x, y) [m]."""
         if not self.free.any():
             return False
-        one, other = (self.parts[tuple(self.around(place)[0][0])] for place in (start, goal))
-        return bool(one == other)
+        return self._part(start) == self._part(goal)
+
+    def _part(self, place: tuple[float, float]) -> int:
+        """Number of the connected part in which a position lies, or of the nearest one."""
+        cell = self.index(*place)
+        if not self.free[cell]:
+            cell = tuple(self.around(place)[0][0].tolist())
+        return int(self.parts[cell])
 
     def length(self, start: tuple[float, float], goal: tuple[float, float]) -> float:
         """Length of the path between two positions (x, y) [m]; infinite if there is none."""
         if not self.joins(start, goal):
             return math.inf
         direct = math.dist(start, goal)
-        # Most paths lie in a window, which takes less time than the whole room.
-        for longest in (1.2 * direct + 1.0, 2.0 * direct + 4.0):
-            found = DistanceField(self, goal, longest).length_from(start)
+        # In a large room a window is searched first.
+        windows = (1.2 * direct + 1.0, 2.0 * direct + 4.0) if self.free.size > _LARGE else ()
+        for longest in windows:
+            found = DistanceField(self, goal, longest, until=start).length_from(start)
             # A cell with a longer path was not found, but might have been the best one.
             if found <= longest:
                 return found
-        return DistanceField(self, goal).length_from(start)
+        return DistanceField(self, goal, until=start).length_from(start)
 
     def graph_to(self, goal: tuple[float, float]) -> csr_array:
         """Write the moves, and those from a goal to the cells around it, as a sparse matrix.
@@ -231,6 +240,7 @@ class DistanceField:
         grid: The grid.
         goal: Position (x, y) [m]. If its cell is not free, the path ends at the nearest free one.
         longest: Longest path that is measured [m]; the field is a window that has room for it.
+        until: A position (x, y) [m]; cells that are much farther from the goal are not measured.
 
     Raises:
         ValueError: If the goal is not two finite numbers, or no cell is free.
@@ -247,7 +257,12 @@ class DistanceField:
     """
 
     def __init__(
-        self, grid: FreeGrid, goal: tuple[float, float], longest: float = math.inf
+        self,
+        grid: FreeGrid,
+        goal: tuple[float, float],
+        longest: float = math.inf,
+        *,
+        until: tuple[float, float] | None = None,
     ) -> None:
         self.grid = grid
         self.goal = (check_number("goal", goal[0]), check_number("goal", goal[1]))
@@ -265,8 +280,11 @@ class DistanceField:
         seeds, inside = self._in_window(cells, free.shape)
         step = grid.resolution * STEP_SCALE
         limit = float(longest)
-        self.lengths = path_lengths(free, seeds[inside], gaps[inside], MOVES, step, limit)
+        i, j = (-1, -1) if until is None else np.subtract(grid.index(*until), self.first).tolist()
+        self.lengths = path_lengths(free, seeds[inside], gaps[inside], MOVES, step, limit, (i, j))
         """Lengths of the shortest paths [m], infinite where there is none, ``[columns, rows]``."""
+        if 0 <= i < len(free) and 0 <= j < free.shape[1]:
+            self.lengths[self.lengths > self.lengths[i, j] + BEYOND * step] = math.inf
 
     @property
     def origin(self) -> tuple[float, float]:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from mpfa_envs.compiled import njit
 
+BEYOND: Final = 3.0
+"""Steps by which the last cell that is needed is exceeded: more than a move is long."""
 _BUCKETS: Final = 8
 """Number of buckets; a move leads three ahead at most."""
 
@@ -23,6 +25,7 @@ def path_lengths(
     moves: NDArray[np.int64],
     step: float,  # [m]
     limit: float,  # [m]
+    last: tuple[int, int] = (-1, -1),  # Lengths beyond this cell's may be too long.
 ) -> NDArray[np.float64]:
     """Lengths of the shortest paths to all cells within the limit [m], ``[nx, ny]``."""
     # They are those of Dijkstra's algorithm to the bit. Cells wait in buckets as wide as the
@@ -54,9 +57,11 @@ def path_lengths(
         heads[bucket % _BUCKETS] = nexts[at]
         waiting -= 1
         i, j = cells[at] // ny, cells[at] % ny
-        if settled[i, j]:
+        if settled[i, j] or lengths_to[i, j] > limit:
             continue
         settled[i, j] = True
+        if i == last[0] and j == last[1]:
+            limit = min(limit, lengths_to[i, j] + BEYOND * step)
         if entries + len(moves) > len(cells):
             cells = np.concatenate((cells, cells))
             nexts = np.concatenate((nexts, nexts))
@@ -67,9 +72,8 @@ def path_lengths(
             length = lengths_to[i, j] + lengths[k]
             if length > limit or length >= lengths_to[to_i, to_j]:
                 continue
-            if not free[i + moves[k, 2], j + moves[k, 3]]:
-                continue
-            if not free[i + moves[k, 4], j + moves[k, 5]]:
+            over, under = (i + moves[k, 2], j + moves[k, 3]), (i + moves[k, 4], j + moves[k, 5])
+            if not (free[over] and free[under]):
                 continue
             lengths_to[to_i, to_j] = length
             later = int(length / step) % _BUCKETS

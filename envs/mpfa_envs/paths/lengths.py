@@ -8,7 +8,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Final
 
-from mpfa_envs.paths.distance import MANY_CELLS, FreeGrid
+from mpfa_envs.paths.distance import MANY_CELLS, RESOLUTION, FreeGrid
 from mpfa_envs.worlds.builtin import WORLDS
 from mpfa_envs.worlds.shapes import Point
 from mpfa_envs.worlds.world import World
@@ -20,9 +20,6 @@ them."""
 _FIXED_RADIUS: Final = 0.18
 _TOUCH: Final = 1e-9
 """A line that grazes a grown obstacle by less than this does not cross it [m]."""
-_FINE: Final = 0.05
-"""Side of a cell in rooms of up to 250 m² [m]; twice as long in larger ones."""
-_LARGE: Final = 250.0
 _NARROW: Final = 0.2
 """Cells are this much shorter where no path is found, as a passage may be narrow."""
 
@@ -32,8 +29,8 @@ _NARROW: Final = 0.2
 def shortest_length(world: World, radius: float, start: Point, goal: Point) -> float:
     """Measure the shortest path of a disc [m]; infinite if there is none.
 
-    A free straight line is measured exactly, and a path around obstacles on a grid of 0.05 m, or
-    0.1 m in a room of more than 250 m². Cells are a fifth of that where it finds no path.
+    A free straight line is measured exactly, and a path around obstacles over cells of 0.1 m, or of
+    0.02 m where those have no path; in a room of more than 40,000 m² cells are longer.
     """
     fixed = _fixed_lengths(world.name) if radius == _FIXED_RADIUS else {}
     if fixed and world == WORLDS[world.name] and (start, goal) in fixed:
@@ -65,9 +62,8 @@ def _fits(world: World, radius: float, *points: Point) -> bool:
 
 @lru_cache(maxsize=16)
 def grid_for(world: World, distance: float, share: float = 1.0) -> FreeGrid:
-    """Share one grid of several megabytes, its cells a share of the usual size, among its users."""
-    area = math.prod(world.size)
-    side = max(share * (1 + (area > _LARGE)) * _FINE, math.sqrt(area / MANY_CELLS))
+    """Share a grid, whose cells have a share of the usual side, among the users of a world."""
+    side = max(share * RESOLUTION, math.sqrt(math.prod(world.size) / MANY_CELLS))
     return FreeGrid(world, distance=distance, resolution=min(side, distance))
 
 

@@ -96,7 +96,10 @@ def _sample_points(
         for _ in range(_GOALS_PER_START):
             clearance = max(GOAL_CLEARANCE, distance)
             goal = _sample_point(world, rng, world.goal_regions, clearance, "goal")
-            if math.dist(start, goal) < min_goal_distance or not grid.joins(start, goal):
+            far = math.dist(start, goal) >= min_goal_distance
+            if not (
+                far and (grid.joins(start, goal) or is_reachable(world, distance, start, goal))
+            ):
                 continue
             task = Task((*start, float(rng.uniform(-math.pi, math.pi))), goal)
             if not (detour and world.clearance_along(start, goal) >= distance):
