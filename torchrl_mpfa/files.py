@@ -1,4 +1,4 @@
-"""Saved states: files and folders that are whole or absent, and loads that fit or change nothing.
+"""Saved states: files and folders that are whole or absent, and checks of their entries.
 
 Files hold tensors and plain values only, so that reading one executes nothing, and a checksum, so
 that damage is noticed.
@@ -18,7 +18,6 @@ import shutil
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 from typing import IO, Any
 
@@ -150,26 +149,6 @@ def check_saved_numbers(part: str, state: Any) -> None:
             raise ValueError(f"the saved {part} must be finite, got {wrong} in {name!r}")
         elif isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"the saved {part} must be finite, got {value} in {name!r}")
-
-
-def load_together(*parts: tuple[Any, Any]) -> None:
-    """Load states into parts, or raise before any part is changed.
-
-    Each state is loaded into a copy of its part first.
-
-    Args:
-        *parts: Pairs of a part (module, optimizer, or the like) and its saved state.
-
-    Examples:
-        >>> weight = torch.nn.Linear(1, 1)
-        >>> load_together((weight, {"weight": torch.ones(1, 1), "bias": torch.ones(1)}))
-        >>> weight.bias.item()
-        1.0
-    """
-    for part, state in parts:
-        deepcopy(part).load_state_dict(state)
-    for part, state in parts:
-        part.load_state_dict(state)
 
 
 @contextmanager

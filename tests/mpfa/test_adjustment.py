@@ -32,7 +32,7 @@ def test_only_transitions_of_positive_reward_are_boosted():
     assert priority.tolist() == [2.0, 2.0, 2.0], "the input must not be changed"
 
 
-def test_what_counts_as_positive_can_be_raised():
+def test_level_of_positive_rewards_can_be_raised():
     found = PositiveBoost(positive_above=9.0)(torch.tensor([2.0, 2.0]), facts([10.0, 9.0]))
     assert found.tolist() == [6.0, 2.0]
 
@@ -67,7 +67,7 @@ def test_decay_equals_the_oracle(sharpness):
 
 
 @pytest.mark.parametrize("dtype", [torch.float, torch.double])
-def test_equal_priorities_do_not_decay_whatever_their_mean_is_rounded_to(dtype):
+def test_equal_priorities_do_not_decay_by_a_rounded_mean(dtype):
     values = torch.rand(40, generator=seeded(5), dtype=dtype) * 5
     below = 0
     for count in range(1, 31):
@@ -84,7 +84,7 @@ def test_a_priority_just_above_the_mean_decays():
     assert found.tolist() == pytest.approx([1.0001 / (1 + math.exp(-0.01)), 1.0, 1.0])
 
 
-def test_positions_by_rank_decay_the_highest_most_in_whatever_order_they_come():
+def test_positions_by_rank_decay_the_highest_most_in_any_order():
     priority = torch.tensor([4.0, 9.0, 1.0, 8.0])
     decay = PositiveDecay(sharpness=1.0, position="rank")
     factors = decay.factors(priority, facts([1, 1, 1, 1]))

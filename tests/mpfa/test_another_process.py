@@ -50,7 +50,7 @@ def test_importing_the_package_does_not_import_hydra(ended):
     assert ended.stdout.split()[-1] == "False"
 
 
-def test_a_folder_in_use_is_rejected_and_the_user_of_it_goes_on(ended, buffer, before):
+def test_folder_in_use_is_rejected_and_its_user_unaffected(ended, buffer, before):
     assert ended.returncode == 1
     assert "signals.memmap is in use by a living storage" in ended.stderr
     assert torch.equal(before.nan_to_num(-1), buffer.storage.signal_table.rows.nan_to_num(-1))

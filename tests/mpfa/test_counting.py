@@ -67,7 +67,7 @@ def test_every_update_counts_where_the_entropies_are_counted_at_every_update():
     assert census.asked == 5
 
 
-def test_it_is_shown_the_fused_priorities_of_what_is_known():
+def test_count_gets_fused_priorities_of_known_signals():
     buffer, census = make_counted(8, 8, entropy_refresh=0)
     errors = torch.arange(8.0)
     set_signals(buffer, td_error=errors)
@@ -77,7 +77,7 @@ def test_it_is_shown_the_fused_priorities_of_what_is_known():
 
 
 @pytest.mark.parametrize("way", ["state", "folder"])
-def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(way, tmp_path):
+def test_count_is_saved_and_later_batches_are_equal(way, tmp_path):
     def make(seed):
         replay = make_replay("mpfa_adaptive", capacity=200, batch_size=8, generator=seeded(seed))
         replay.buffer.extend(make_transitions(200, seed=seed))
@@ -102,7 +102,7 @@ def test_what_was_counted_is_saved_and_the_next_batches_are_the_same(way, tmp_pa
 
 
 @pytest.mark.parametrize("value", [None, [], [torch.tensor(torch.nan), None], [1.0, None]])
-def test_a_saved_count_that_does_not_fit_is_rejected(value):
+def test_wrong_saved_count_is_rejected(value):
     first, second = (
         make_replay("mpfa_adaptive", capacity=9, batch_size=2).buffer.sampler for _ in range(2)
     )
@@ -197,7 +197,7 @@ def test_adjustments_that_count_pass_the_checks():
     assert METHODS["mpfa_adaptive"].boost_target == 0.5
 
 
-def test_what_was_counted_of_later_writes_is_counted_again():
+def test_count_of_later_writes_is_made_again():
     buffer, census = make_counted()
     state = deepcopy(buffer.storage.state_dict())
     buffer.extend(make_transitions(6))

@@ -55,7 +55,7 @@ def test_the_transforms_of_a_factory_act_on_what_is_written_and_sampled():
     assert later.storage[:]["observation"].dtype is torch.float64
 
 
-def test_whatever_is_called_first_makes_the_parts(tmp_path):
+def test_any_first_call_makes_the_parts(tmp_path):
     filled = make_buffer()
     filled.extend(make_transitions(10))
     filled.dumps(tmp_path / "buffer")

@@ -230,7 +230,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("slots", "values", "error"), WRONG)
-def test_what_is_wrong_is_rejected_there_before_anything_changes(slots, values, error):
+def test_wrong_update_is_rejected_there_and_changes_nothing(slots, values, error):
     buffer = make_there()
     value = torch.tensor(values).to(DEVICE)
     with rejected(buffer.sampler, error):

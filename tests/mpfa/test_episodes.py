@@ -66,7 +66,7 @@ def whole_slices(rows):
 
 
 @pytest.mark.parametrize("kind", ["restart", "load", "load from a folder", "in turn", "one by one"])
-def test_no_slice_joins_what_two_collectors_wrote(kind, tmp_path):
+def test_slices_join_no_steps_of_two_collectors(kind, tmp_path):
     buffer, first, second = make_slices(), Robot(1), Robot(2)
     if kind == "one by one":
         for step in [*first.steps(5), *second.steps(5)]:
@@ -88,7 +88,7 @@ def test_no_slice_joins_what_two_collectors_wrote(kind, tmp_path):
     assert {(1, 1000), (2, 2000)} <= found
 
 
-def test_a_collector_that_goes_on_is_joined_across_its_writes_and_a_load():
+def test_steps_of_one_collector_are_joined_across_writes_and_a_load():
     buffer, again, robot = make_slices(), make_slices(), Robot(1, ends=100)
     buffer.extend(robot.steps(5))
     again.load_state_dict(snapshot(buffer))

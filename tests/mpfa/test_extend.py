@@ -143,7 +143,7 @@ def buffer(request, tmp_path):
 
 @pytest.mark.parametrize("name", BAD)
 @pytest.mark.parametrize("way", ["extend", "add", "lazy stack"])
-def test_what_does_not_fit_is_rejected_by_name_and_nothing_has_changed(buffer, name, way):
+def test_wrong_transitions_are_rejected_by_name_and_change_nothing(buffer, name, way):
     change, message = BAD[name]
     data = make_full_transitions(2, 9.0)
     change(data)
@@ -163,7 +163,7 @@ def test_what_does_not_fit_is_rejected_by_name_and_nothing_has_changed(buffer, n
     assert same(twin.sample(), buffer.sample())
 
 
-def test_what_is_written_is_what_torchrl_would_have_written(buffer):
+def test_written_data_equal_those_of_torchrl(buffer):
     index = buffer.extend(make_full_transitions(2, 9.0))
     found = buffer[index].exclude("index")
     assert same(found.to_dict(), make_full_transitions(2, 9.0).to_dict())
@@ -273,7 +273,7 @@ def test_first_priorities_of_any_real_type_are_taken(kind, shape):
 
 
 @pytest.mark.parametrize("shape", [(), (4,)])
-def test_steps_without_all_dimensions_of_a_batch_are_rejected_and_told_of_add(shape):
+def test_steps_without_all_dimensions_are_rejected_with_a_hint_to_add(shape):
     ndim = len(shape) + 1
     storage = SignalTensorStorage(CAPACITY, ndim=ndim)
     buffer = make_buffer(CAPACITY, storage=storage)
@@ -286,7 +286,7 @@ def test_steps_without_all_dimensions_of_a_batch_are_rejected_and_told_of_add(sh
 
 
 @pytest.mark.parametrize("part", ["construction", "first write", "update", "load"])
-def test_whatever_is_done_in_inference_mode_the_buffer_works_outside_of_it(part):
+def test_buffer_works_outside_of_inference_mode_after_use_inside(part):
     def make():
         buffer = make_buffer(CAPACITY)
         buffer.append_transform(MultiStepTransform(n_steps=2, gamma=1.0, done_keys=["done"]))

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read without executing anything; loads that fit or raise."""
+"""Files: written whole or not at all, read without executing anything."""
 
 import os
 import pickle
@@ -17,7 +17,6 @@ from tests.mpfa.transitions import (
 from torchrl_mpfa.files import (
     check_saved_numbers,
     load_safely,
-    load_together,
     save_atomically,
     write_text_atomically,
 )
@@ -158,17 +157,6 @@ def test_tensors_stay_in_the_file_until_they_are_read(tmp_path):
 def test_missing_file_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_safely(tmp_path / "none.pt")
-
-
-def test_load_together_changes_no_part_if_one_state_does_not_fit():
-    parts = [torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)]
-    before = [part.weight.clone() for part in parts]
-    states = [{"weight": torch.ones(1, size), "bias": torch.ones(1)} for size in (2, 4)]
-    with pytest.raises(RuntimeError, match="size mismatch for weight"):
-        load_together(*zip(parts, states, strict=True))
-    assert all(map(torch.equal, before, [part.weight for part in parts]))
-    load_together((parts[0], states[0]))
-    assert parts[0].weight.eq(1).all()
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.tensor([0.0, torch.inf])])

@@ -23,7 +23,7 @@ def update(buffer, index, values):
     buffer.update_tensordict_priority(batch)
 
 
-def test_fresh_rows_do_not_hand_on_what_they_were_given():
+def test_fresh_rows_do_not_hand_on_their_priority():
     buffer = make_plain(8)
     buffer.extend(make_transitions(4))
     update(buffer, [0, 1], [20.0, 0.4])
@@ -79,7 +79,7 @@ def test_methods_differ_in_it_as_their_authors_code_does(name):
 
 
 @pytest.mark.parametrize("within", [True, False])
-def test_it_is_saved_with_what_was_learned(within):
+def test_highest_priority_is_saved_with_learned_slots(within):
     first, second = (make_plain(8, max_priority_within_buffer=within) for _ in range(2))
     first.extend(make_transitions(4))
     update(first, [0, 1], [9.0, 3.0])
@@ -91,7 +91,7 @@ def test_it_is_saved_with_what_was_learned(within):
         assert buffer.sampler.priorities()[4:6].tolist() == [9.0, 9.0]
 
 
-def test_what_torchrls_buffer_hands_on_is_not_learned():
+def test_priority_from_torchrls_buffer_does_not_count_as_learned():
     """It reads the default priority, and writes it for batches without one."""
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(8),

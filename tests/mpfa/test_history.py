@@ -56,7 +56,7 @@ def test_the_weights_of_all_transitions_are_those_that_batches_have(kind, option
     assert kind is LA3PSampler or weights[~spent].unique().numel() > 10
 
 
-def test_histograms_count_what_the_buffer_holds():
+def test_histograms_count_all_rows_of_the_buffer():
     buffer = filled(MPFASampler(200, alpha=0.6, beta=0.4))
     history = ReplayHistory()
     history.add(0, buffer)
@@ -80,7 +80,7 @@ def test_histograms_count_what_the_buffer_holds():
     np.testing.assert_array_equal(found["weight"][2][1], np.histogram(weight, edges)[0])
 
 
-def test_what_lies_beyond_the_bins_counts_to_the_outermost():
+def test_numbers_beyond_the_bins_count_to_the_outermost():
     buffer = filled(MPFASampler(4), rows=4)
     table = buffer.storage.signal_table
     table.rows[:, table.column["td_error"]] = torch.tensor([0.0, 1e-9, 1e9, torch.nan])
@@ -98,7 +98,7 @@ def test_a_buffer_without_priorities_adds_nothing():
     assert history.histograms() == {}
 
 
-def test_a_history_goes_on_where_it_was_saved():
+def test_loaded_history_continues():
     buffer = filled(MPFASampler(200))
     history, other = ReplayHistory(), ReplayHistory()
     history.add(0, buffer)

@@ -252,11 +252,11 @@ def drive(examples, steps, **kwargs):
 
 # TorchRL recommends a memory map that was allocated before.
 @pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized TensorDict")
-def test_a_buffer_does_what_the_model_does_for_some_hundred_steps():
+def test_buffer_equals_the_model_for_some_hundred_steps():
     drive(12, 30, phases=[Phase.generate])
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized TensorDict")
-def test_a_buffer_does_what_the_model_does_for_ten_thousand_steps():
+def test_buffer_equals_the_model_for_ten_thousand_steps():
     drive(200, 50)

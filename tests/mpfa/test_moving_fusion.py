@@ -45,7 +45,7 @@ def test_a_signal_without_a_scale_is_not_scaled():
     assert weights.tolist() == [1.0, 1.0]
 
 
-def test_a_scaled_fusion_passes_on_what_the_other_needs_to_know():
+def test_scaled_fusion_passes_the_schedule_on():
     inner = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
     fusion = ScaledFusion(inner)
     assert fusion.every_batch
@@ -54,7 +54,7 @@ def test_a_scaled_fusion_passes_on_what_the_other_needs_to_know():
     ScaledFusion(FixedFusion()).anneal(0.5)  # Nothing to tell, and no error.
 
 
-def test_a_sampler_tells_its_fusion_how_much_of_the_training_is_done():
+def test_sampler_passes_the_schedule_to_its_fusion():
     fusion = ScheduledFusion({"td_error": 1.0}, {"reward": 1.0})
     buffer = make_filled(24, 6, fusion=fusion)
     for fraction, expected in ((0.0, 1.0), (1.0, 0.0)):

@@ -74,13 +74,13 @@ def test_the_cure_gives_every_signal_its_weight(level):
         lambda: make_replay("mpfa_per", capacity=8, positive_above="mean"),
     ],
 )
-def test_the_mean_as_level_is_told_to_make_all_weights_equal(make):
+def test_mean_as_level_causes_a_warning_of_equal_weights(make):
     with pytest.warns(UserWarning, match="equal weights, whatever the data") as told:
         make()
     assert len(told) == 1
 
 
-def test_own_weights_beside_the_mean_cause_no_warning():
+def test_own_weights_with_the_mean_cause_no_warning():
     fusion = FixedFusion({"reward": 1.0, "td_error": 2.0})
     MPFASampler(8, fusion=fusion, positive_above="mean")
 

@@ -56,7 +56,7 @@ def test_the_weight_of_a_batch_of_one_is_in_double_precision():
 
 
 @pytest.mark.slow
-def test_in_single_precision_they_have_not():
+def test_frequencies_in_single_precision_are_off():
     """A mass of 24 bits names each of a million slots by some seventeen values."""
     sampler = PrioritizedSampler(1_000_000, 1.0, 0.4, 0.0)
     storage, probability = filled(sampler, 1_000_000, spread=0.3)

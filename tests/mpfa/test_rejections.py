@@ -91,7 +91,7 @@ UPDATES = [
 
 
 @pytest.mark.parametrize(("change", "message"), UPDATES)
-def test_a_batch_that_does_not_fit_is_rejected_and_nothing_changes(buffer, change, message):
+def test_wrong_batch_is_rejected_and_changes_nothing(buffer, change, message):
     batch = change(write_signals(buffer.sample()))
     with rejected(buffer, (KeyError, ValueError, IndexError, TypeError), message):
         buffer.update_tensordict_priority(batch)

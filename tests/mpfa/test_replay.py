@@ -152,7 +152,7 @@ def test_adding_one_by_one_equals_extending_at_once():
     assert same(rows[0], rows[1])
 
 
-def test_a_batch_has_what_the_loss_and_the_update_need():
+def test_batch_has_the_entries_of_loss_and_update():
     buffer = make_filled(8)
     batch = buffer.sample()
     assert not batch.is_locked

@@ -13,7 +13,7 @@ from torchrl_mpfa import SignalMemmapStorage
 
 
 @pytest.mark.parametrize("capacity", [100, 16, 3])
-def test_a_folder_in_use_is_rejected_and_the_user_of_it_goes_on(tmp_path, capacity):
+def test_folder_in_use_is_rejected_and_its_user_unaffected(tmp_path, capacity):
     buffer = make_filled(16, storage=SignalMemmapStorage(16, scratch_dir=tmp_path))
     before = buffer.storage.signal_table.rows.clone()
     with pytest.raises(FileExistsError, match=r"signals.memmap is in use by a living storage"):
@@ -47,7 +47,7 @@ def test_a_storage_that_is_gone_leaves_its_folder_free(tmp_path):
 @pytest.mark.parametrize("folder", [True, False])
 @pytest.mark.parametrize("filled", [0, 9, 16])
 @pytest.mark.parametrize("way", [copy.deepcopy, lambda buffer: pickle.loads(pickle.dumps(buffer))])
-def test_a_copy_has_files_of_its_own_and_goes_on_like_the_first(tmp_path, folder, filled, way):
+def test_copy_has_its_own_files_and_samples_like_the_first(tmp_path, folder, filled, way):
     kwargs = {"scratch_dir": tmp_path} if folder else {}
     first = make_buffer(16, storage=SignalMemmapStorage(16, **kwargs))
     if filled:

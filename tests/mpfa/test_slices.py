@@ -192,7 +192,7 @@ def test_weights_are_those_of_the_starts_and_of_every_step_of_a_slice():
     assert known.tolist() == sorted(priority)
 
 
-def test_priorities_of_steps_are_those_that_they_have_without_slices():
+def test_priorities_of_steps_equal_those_without_slices():
     sliced = filled(batch_size=32)
     single = SignalReplayBuffer(
         storage=SignalTensorStorage(CAPACITY, ndim=2), sampler=choices(SignalSampler)
@@ -219,7 +219,7 @@ def test_steps_that_were_overwritten_are_left_out_of_an_update():
 
 @pytest.mark.parametrize("kind", [SignalTensorStorage, SignalMemmapStorage])
 @READINGS
-def test_training_goes_on_bit_for_bit_from_a_saved_buffer(
+def test_loaded_buffer_of_slices_trains_like_the_saved_one(
     slice_priority, strict_length, kind, tmp_path
 ):
     options = {"slice_priority": slice_priority, "strict_length": strict_length}
@@ -248,7 +248,7 @@ def test_training_goes_on_bit_for_bit_from_a_saved_buffer(
         ("_kind", "signals", "'_kind' .* must be 'slices', got 'signals'"),
     ],
 )
-def test_a_saved_state_that_does_not_fit_is_rejected_before_anything_changes(name, value, words):
+def test_wrong_state_of_slices_is_rejected_and_changes_nothing(name, value, words):
     buffer = filled()
     state = snapshot(buffer)
     spoil(state, ("_sampler", name), value)
@@ -282,7 +282,7 @@ def test_alpha_holds_for_the_priorities_of_slices():
     assert leaf.unique().tolist() == [0.0, 1.0]
 
 
-def test_an_emptied_buffer_has_no_slices_of_what_it_held():
+def test_emptied_buffer_has_no_old_slices():
     buffer = filled()
     buffer.empty()
     buffer.extend(make_steps(0, LENGTH - 1))
@@ -293,7 +293,7 @@ def test_an_emptied_buffer_has_no_slices_of_what_it_held():
     assert len(buffer.sample()) == 8
 
 
-def test_what_a_storage_holds_already_is_cut_into_trajectories():
+def test_steps_of_a_filled_storage_are_cut_into_trajectories():
     storage = SignalTensorStorage(CAPACITY, ndim=2)
     TensorDictReplayBuffer(storage=storage, batch_size=1, dim_extend=1).extend(make_steps(0, 9))
     buffer = SignalReplayBuffer(

@@ -93,7 +93,7 @@ def test_effective_sample_size_age_and_replays_of_the_last_batch(trained):
     assert counts.min() >= 1
 
 
-def test_statistics_grow_with_what_is_known():
+def test_statistics_grow_with_known_signals():
     buffer = make_buffer(8)
     assert not any("/" in name for name in buffer.stats())
     buffer.extend(make_transitions(8))

@@ -170,9 +170,6 @@ class ChangesFirst(SignalSampler):
 
 
 class LoadsAnything(SignalSampler):
-    def check_state(self, state_dict):
-        pass
-
     def load_state_dict(self, state_dict):
         if len(state_dict) == len(self.state_dict()):
             super().load_state_dict(state_dict)

@@ -143,7 +143,7 @@ BAD = {
 
 @pytest.mark.parametrize("kind", TRANSFORMS)
 @pytest.mark.parametrize("bad", BAD)
-def test_a_rejected_write_changes_nothing_and_mended_it_is_as_if_it_never_was(kind, bad):
+def test_rejected_write_changes_nothing_in_transforms(kind, bad):
     buffer, other = make(kind), make(kind)
     for place, each in enumerate(writes()):
         if place == 2:
@@ -155,7 +155,7 @@ def test_a_rejected_write_changes_nothing_and_mended_it_is_as_if_it_never_was(ki
     assert same(held(buffer), held(other))
 
 
-def test_a_relabeling_function_that_raises_leaves_goals_and_random_numbers_as_they_were():
+def test_relabeling_that_raises_changes_neither_goals_nor_random_numbers():
     buffer, other = make("hindsight"), make("hindsight")
     buffer.extend(steps(0, 4))
     other.extend(steps(0, 4))
@@ -175,7 +175,7 @@ def test_a_relabeling_function_that_raises_leaves_goals_and_random_numbers_as_th
 
 @pytest.mark.parametrize("kind", TRANSFORMS)
 @pytest.mark.parametrize("way", ["state", "folder", "pickle", "copy"])
-def test_what_waits_is_saved_and_goes_on(kind, way, tmp_path):
+def test_waiting_steps_are_saved_and_written_after_a_load(kind, way, tmp_path):
     buffer, again = make(kind), make(kind)
     again.extend(steps(40, 5))  # A load replaces what waits.
     for each in writes()[:2]:
@@ -192,7 +192,7 @@ def test_what_waits_is_saved_and_goes_on(kind, way, tmp_path):
 
 
 @pytest.mark.parametrize("kind", TRANSFORMS)
-def test_an_emptied_buffer_keeps_nothing_and_settings_stay(kind):
+def test_emptied_buffer_keeps_settings_and_no_waiting_steps(kind):
     buffer, fresh = make(kind), make(kind)
     buffer.extend(steps(20, 4))
     if kind == "n-step":
@@ -205,7 +205,7 @@ def test_an_emptied_buffer_keeps_nothing_and_settings_stay(kind):
 
 
 @pytest.mark.parametrize("kind", TRANSFORMS)
-def test_what_waits_is_no_reference_to_tensors_of_the_caller(kind):
+def test_waiting_steps_share_no_tensors_with_the_caller(kind):
     buffer, other = make(kind), make(kind)
     mine = steps(0, 2)
     for first in range(0, 10, 2):
@@ -220,7 +220,7 @@ def test_what_waits_is_no_reference_to_tensors_of_the_caller(kind):
     [3, {"7.": {"rows": 1}}, {"0.": {"no_such": 1}}, {"0.": 3}],
     ids=["number", "part", "name", "3"],
 )
-def test_a_state_of_other_transforms_is_rejected_before_anything_changes(kept):
+def test_state_of_other_transforms_is_rejected_and_changes_nothing(kept):
     buffer = make("n-step")
     buffer.extend(steps(0, 8))
     state = {**snapshot(buffer), "_kept": kept}
@@ -228,7 +228,7 @@ def test_a_state_of_other_transforms_is_rejected_before_anything_changes(kept):
         buffer.load_state_dict(state)
 
 
-def test_steps_of_several_with_ends_as_numbers_stop_at_them():
+def test_steps_of_several_stop_at_ends_given_as_numbers():
     for kind in (torch.uint8, torch.int64, torch.float32):
         buffer, rows = make("n-step"), steps(0, 8, end=4)
         rows["next", "done"] = rows["next", "done"].to(kind)

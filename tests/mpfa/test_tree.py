@@ -198,7 +198,7 @@ def test_a_new_buffer_over_a_filled_storage_can_be_sampled():
     assert set(buffer.sample().tolist()) <= set(range(6))
 
 
-def test_a_saved_sampler_goes_on_as_if_nothing_had_happened(tmp_path):
+def test_loaded_sampler_samples_like_the_saved_one(tmp_path):
     first = TreeSampler(10, 0.6, 0.4, 0.05)
     storage = filled(first, 7, 10)
     first.update_priority(torch.arange(5), torch.rand(5, generator=seeded(4)) * 4)

@@ -134,7 +134,7 @@ def test_a_batch_from_before_the_buffer_was_emptied_is_stale_in_two_dimensions(s
     assert buffer.stale_updates == 8
 
 
-def test_training_goes_on_bit_for_bit_in_two_dimensions(tmp_path):
+def test_loaded_buffer_of_two_dimensions_trains_like_the_saved_one(tmp_path):
     first, second, third = make_deep_buffer(), make_deep_buffer(seed=3), make_deep_buffer(seed=4)
     first.extend(make_trajectories(steps=6))
     train_rounds(first, 4)

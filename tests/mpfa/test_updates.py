@@ -342,7 +342,7 @@ def test_batches_on_another_device_than_the_signals_update_them():
 
 
 @pytest.mark.parametrize("sampler", [RandomSampler(), PrioritizedSampler(300, 0.6, 0.4)])
-def test_buffers_of_torchrl_are_served_as_they_are(sampler):
+def test_buffers_of_torchrl_are_updated_too(sampler):
     def make():
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(300),

@@ -215,7 +215,7 @@ class SignalTable:
         count = len(rows)
         if count > self.capacity:
             # Of a slot that is named twice the last row must win, which indexing leaves open.
-            self._count_writes(count - self.capacity)
+            self.writes += count - self.capacity
             index, rows = index[-self.capacity :], rows[-self.capacity :]
             count = self.capacity
         index, rows = index.to(self.device), rows.to(self.device)
@@ -225,9 +225,6 @@ class SignalTable:
             times = torch.arange(self.writes, self.writes + count, device=self.device)
             rows[:, self.time_column] = times
         self.rows[index] = rows
-        self._count_writes(count)
-
-    def _count_writes(self, count: int) -> None:
         self.writes += count
         self.clock[0] = self.writes
 
