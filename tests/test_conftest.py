@@ -27,6 +27,7 @@ def test_nothing(): ...
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["0", "1"])
 def test_the_summary_is_the_last_line(tmp_path: Path, workers: str) -> None:
     pytest.importorskip("triton", reason="PyTorch brings it on Linux alone")

@@ -35,7 +35,8 @@ def write_report(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer], folder: Pa
 
 
 def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
-    """The tables, in Markdown."""
+    """Return the tables in Markdown."""
+    planned = rows[rows["method"].isin((*PLANNED, AGAINST))]
     seeds = rows.groupby(["buffer", "method"])["seed"].nunique()
     count = " to ".join(str(number) for number in sorted({seeds.min(), seeds.max()}))
     parts = [
@@ -44,7 +45,7 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         f"Differences to `{AGAINST}`, of the same buffers and seeds, with 95 % intervals over "
         "buffers; RMSE in per cent of that of PER. [What it is](../../values.md).",
         "## Planned comparisons",
-        planned_table(rows),
+        planned_table(planned),
         "## All arms",
         "Means over all marks, the last two columns at the end; `sparse` and `dense` are the RMSE "
         "to long training in six buffers each. Exploratory but for what was planned, and not "
@@ -58,9 +59,9 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
         pair_table(rows),
         "## Fading",
         "RMSE to long training after so many updates.",
-        fading_table(rows),
+        fading_table(planned),
         "## By buffer",
-        buffer_table(rows),
+        buffer_table(planned),
         "## The two references",
         "Long training with uniform replay against what the policy got in episodes of its own.",
         reference_table(buffers),
@@ -74,7 +75,7 @@ def page(rows: pd.DataFrame, buffers: Sequence[FrozenBuffer]) -> str:
 
 
 def planned_table(rows: pd.DataFrame) -> str:
-    """The planned comparisons, corrected for each other."""
+    """Return the planned comparisons, corrected for each other."""
     found = differences(rows, against=AGAINST)
     there = found.loc[[name for name in PLANNED if name in found.index]]
     corrected = holm(there["rmse_p"].to_numpy())
@@ -95,7 +96,7 @@ def planned_table(rows: pd.DataFrame) -> str:
 
 
 def arm_table(rows: pd.DataFrame) -> str:
-    """All arms by both references, the best first."""
+    """Return all arms by both references, the best first."""
     found = differences(rows, against=AGAINST)
     parts = [
         differences(rows[rows["buffer"].str.startswith(reward)], against=AGAINST)
@@ -126,7 +127,7 @@ def arm_table(rows: pd.DataFrame) -> str:
 
 
 def pair_table(rows: pd.DataFrame) -> str:
-    """Differences of :data:`PAIRS`."""
+    """Return the differences of :data:`PAIRS`."""
     head = ("", "effective samples", "RMSE, long training", "p", *REWARDS, "RMSE, returns")
     cells = []
     for first, second in PAIRS:
@@ -150,7 +151,7 @@ def pair_table(rows: pd.DataFrame) -> str:
 
 
 def fading_table(rows: pd.DataFrame) -> str:
-    """Differences of the planned arms after each number of updates."""
+    """Return the differences of the planned arms after each number of updates."""
     marks = sorted(rows["updates"].unique())
     by_mark = [differences(rows, against=AGAINST, at=mark) for mark in marks]
     cells = [
@@ -162,7 +163,7 @@ def fading_table(rows: pd.DataFrame) -> str:
 
 
 def buffer_table(rows: pd.DataFrame) -> str:
-    """RMSE of PER, and differences of the planned arms, in each buffer."""
+    """Return the RMSE of PER, and the differences of the planned arms, in each buffer."""
     gaps = paired(rows, "rmse", against=AGAINST)
     of_per = rows[rows["method"] == AGAINST].groupby("buffer")["rmse"].mean()
     there = [name for name in PLANNED if name in gaps]
@@ -174,7 +175,7 @@ def buffer_table(rows: pd.DataFrame) -> str:
 
 
 def reference_table(buffers: Sequence[FrozenBuffer]) -> str:
-    """How far long training and Monte Carlo returns agree."""
+    """Return how far long training and Monte Carlo returns agree."""
     cells = []
     for each in buffers:
         rmse, bias, rank = compared(each.returns["long"], each.returns["value"])
@@ -189,7 +190,7 @@ def reference_table(buffers: Sequence[FrozenBuffer]) -> str:
 
 
 def plot_curves(rows: pd.DataFrame, path: Path) -> None:
-    """RMSE beside PER over updates, by reward and reference: means over buffers, 95 % intervals."""
+    """Plot the RMSE relative to PER over updates, means over buffers with 95 % intervals."""
     figure, axes = new_figure(2, 2, panel=(3.8, 2.4), sharex=True, sharey="col")
     marks = sorted(rows["updates"].unique())
     references = {"rmse": "long training", "returns_rmse": "returns"}
@@ -212,7 +213,7 @@ def plot_curves(rows: pd.DataFrame, path: Path) -> None:
 
 
 def plot_arms(rows: pd.DataFrame, path: Path) -> None:
-    """RMSE and rank correlation beside PER of all arms, with 95 % intervals over buffers."""
+    """Plot RMSE and rank correlation of all arms relative to PER, with 95 % intervals."""
     found = differences(rows, against=AGAINST)[::-1]
     figure, axes = new_figure(1, 2, panel=(3.8, 0.19 * len(found) + 0.8), sharey=True)
     heights = np.arange(len(found))
@@ -232,7 +233,7 @@ def plot_arms(rows: pd.DataFrame, path: Path) -> None:
 
 
 def missing(rows: pd.DataFrame, buffers: Sequence[str], seeds: int) -> int:
-    """Trainings of table G that have no rows."""
+    """Count the trainings of table G that have no rows."""
     made = rows[["buffer", "method", "seed"]].drop_duplicates()
     return len(ARMS) * len(buffers) * seeds - len(made)
 

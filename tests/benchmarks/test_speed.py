@@ -50,6 +50,7 @@ def test_replay_is_compared_with_that_of_torchrl(measure) -> None:
     assert stock["ratio"] is None
 
 
+@pytest.mark.slow
 def test_leaves_are_compared_with_trees_where_the_machine_has_them() -> None:
     entries = leaves.measure(quick=True)
     check_schema(entries)
@@ -154,6 +155,7 @@ def test_both_training_steps_learn() -> None:
     assert agent.buffer.sampler.weights
 
 
+@pytest.mark.slow
 def test_a_step_of_each_method_is_compared_with_uniform_ddpg() -> None:
     found = method_steps.measure(quick=True)
     check_schema(found)

@@ -96,6 +96,7 @@ def test_the_target_of_a_last_step_is_its_reward() -> None:
     assert bool((error[~last] > 10).all())
 
 
+@pytest.mark.slow
 def test_the_critics_learn_what_a_slice_pays() -> None:
     learner = page.RecurrentTD3(SIZE, forgetful=False)
     batch = make_slices([1] * 40, [True] * 40)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from training.run.checkpoints import read_checkpoint
@@ -68,6 +69,15 @@ def blocky(block: int, method: str = "rud") -> TrainSettings:
     settings = tiny(method, [Stage("A", actions=120)], robots=3, updates=2)
     settings.method.batch_size, settings.method.update_block = 16, block
     return settings
+
+
+def mostly_slow(cases: Iterable[Any], kept: Collection[Any]) -> list[Any]:
+    """Mark all cases of a test slow but those that are kept."""
+    return [c if c in kept else pytest.param(*_as_tuple(c), marks=pytest.mark.slow) for c in cases]
+
+
+def _as_tuple(case: Any) -> tuple[Any, ...]:
+    return case if isinstance(case, tuple) else (case,)
 
 
 def weights_of(policy: torch.nn.Module) -> torch.Tensor:

@@ -12,9 +12,10 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks.values import ARMS, FrozenBuffer, critic_values, frozen_buffers, learn
-from benchmarks.values.arms import both_images
+from benchmarks.values.arms import PLANNED, both_images
 from benchmarks.values.frozen import FOLDER, read_frozen
 from benchmarks.values.learning import Draws, compared, make_frozen_learner, mirror
+from tests.integration.tiny_runs import mostly_slow
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.selection import SampledBatch
 
@@ -27,6 +28,7 @@ def test_critics_come_to_the_values_of_the_policy(walk: FrozenBuffer) -> None:
     assert abs(last.bias) < last.rmse
 
 
+@pytest.mark.slow
 def test_a_critic_that_gets_other_rewards_does_not(walk: FrozenBuffer) -> None:
     shuffled = walk.rows.clone()
     order = torch.randperm(len(walk), generator=torch.Generator().manual_seed(1))
@@ -51,7 +53,7 @@ def test_the_policy_stays_as_it_was_frozen(walk: FrozenBuffer) -> None:
     assert other.policy(walk.rows[:16].clone())["action"].equal(action)
 
 
-@pytest.mark.parametrize("arm", sorted(ARMS))
+@pytest.mark.parametrize("arm", mostly_slow(sorted(ARMS), (*PLANNED, "la3p", "per/both_images")))
 @pytest.mark.filterwarnings("ignore:positive_above='mean'")
 def test_every_arm_of_the_table_learns_from_a_frozen_buffer(arm: str, walk: FrozenBuffer) -> None:
     made = ARMS[arm]

@@ -106,7 +106,8 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def command(folder: Path, ranges: Path, *more: str, trials: int = 20) -> list[str]:
     return [
-        *("learner=td3", "method=per", "curriculum.stages=[{world: mixed, actions: 4000}]"),
+        *("learner=td3", "method=per", "curriculum.stages=[{world: A, actions: 4000}]"),
+        *("environment.physics=kinematic", "evaluation.world=validation"),
         *("evaluation.every=1000", "--folder", str(folder), "--ranges", str(ranges)),
         *("--trials", str(trials), "--jobs", "1", *more),
     ]
@@ -122,6 +123,7 @@ def written(folder: Path, column: str) -> list[float]:
         return [float(row[column]) for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_a_search_finds_what_does_best_and_prunes_what_does_badly(
     tmp_path: Path,
     ranges: Path,

@@ -93,6 +93,7 @@ def test_runs_of_one_worker_are_those_of_the_scripts_alone_also_after_one_that_f
         assert_same_run(job, alone)
 
 
+@pytest.mark.slow
 def test_a_script_finds_its_process_as_it_was_before_the_others(
     tmp_path: Path, worker: LocalWorker
 ) -> None:

@@ -8,7 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.integration.tiny_runs import assert_same_run, go_on, stop_after, tiny, train
+from tests.integration.tiny_runs import (
+    assert_same_run,
+    go_on,
+    mostly_slow,
+    stop_after,
+    tiny,
+    train,
+)
 from training.run.loop import TrainingRun
 from training.settings.checks import check_settings
 from training.settings.train import Stage, TrainSettings
@@ -28,7 +35,7 @@ def buffer_of(run: TrainingRun) -> torch.Tensor:
     return run.buffer.storage[:]["observation"]
 
 
-@pytest.mark.parametrize("method", ["her", "mpfa_per", "ref_er", "la3p"])
+@pytest.mark.parametrize("method", mostly_slow(["her", "mpfa_per", "ref_er", "la3p"], ["her"]))
 def test_a_resumed_run_with_goals_in_hindsight_is_an_uninterrupted_one(
     method: str, tmp_path: Path
 ) -> None:

@@ -12,7 +12,14 @@ from typing import Any
 
 import pytest
 
-from tests.integration.tiny_runs import OVERRIDES, assert_same_run, go_on, tiny, train
+from tests.integration.tiny_runs import (
+    OVERRIDES,
+    assert_same_run,
+    go_on,
+    mostly_slow,
+    tiny,
+    train,
+)
 from training import files
 from training.records import EvaluationRecord, read_table
 from training.run import loop
@@ -96,7 +103,10 @@ def test_a_hook_that_looks_changes_nothing(tmp_path: Path) -> None:
     assert_same_run(looked, train(tmp_path / "plain", of_all_events()))
 
 
-@pytest.mark.parametrize("event", ["on_update", "on_episode", "on_evaluation", "on_iteration"])
+@pytest.mark.parametrize(
+    "event",
+    mostly_slow(["on_update", "on_episode", "on_evaluation", "on_iteration"], ["on_iteration"]),
+)
 def test_a_run_that_a_hook_s_error_ended_goes_on_as_if_it_had_not(
     tmp_path: Path, event: str
 ) -> None:

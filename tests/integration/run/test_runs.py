@@ -17,7 +17,7 @@ import wandb
 from hydra import compose, initialize_config_module
 
 import train
-from tests.integration.tiny_runs import OVERRIDES
+from tests.integration.tiny_runs import OVERRIDES, mostly_slow
 from tests.integration.tiny_runs import train as train_tiny
 from training import files
 from training.comparison.jobs import Job
@@ -59,7 +59,7 @@ def test_a_run_leaves_its_settings_and_how_far_it_is(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("lost", ["save_atomically", "write_table"])
+@pytest.mark.parametrize("lost", mostly_slow(["save_atomically", "write_table"], ["write_table"]))
 def test_a_run_is_not_finished_before_all_of_it_is_saved(
     lost: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -283,6 +283,7 @@ def appears(file: Path, seconds: float = 120) -> bool:
     return file.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 def test_a_killed_run_goes_on_and_signals_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -333,7 +334,9 @@ def test_a_run_stopped_at_once_says_what_there_is_to_go_on_with(
     assert ("nothing of it was saved" in out) == (not saved)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", mostly_slow([signal.SIGINT, signal.SIGTERM, signal.SIGHUP], [signal.SIGTERM])
+)
 def test_a_signal_stops_after_the_iteration_and_twice_at_once(number: int, tmp_path: Path) -> None:
     (settings,) = composed([*OVERRIDES, STAGES.format(50)])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tests.integration.tiny_runs import (
     assert_same_run,
     blocky,
     go_on,
+    mostly_slow,
     rows,
     stop_after,
     tiny,
@@ -68,10 +70,13 @@ RESUMED = {
 }
 
 
-@pytest.mark.parametrize("settings", RESUMED.values(), ids=RESUMED)
-def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
-    tmp_path: Path, settings: TrainSettings
-) -> None:
+KEPT = ("mpfa_per-ddpg", "mpfa_per-sac", "mpfa_per-dqn", "la3p-td3", "robots-kinematic")
+"""Cases that are not slow: a learner of each kind, and several robots."""
+
+
+@pytest.mark.parametrize("case", mostly_slow(RESUMED, (*KEPT, "ref_er-blocks")))
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path, case: str) -> None:
+    settings = RESUMED[case]
     whole = train(tmp_path / "whole", settings)
     actions = 31 if settings.robots == 1 else 45
     part = stop_after(actions, tmp_path, settings)
@@ -88,8 +93,15 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Pat
     assert rows(first) != rows(train(tmp_path / "c", other))
 
 
-@pytest.mark.parametrize("learner", ["ddpg", "sac", "td3"])
-@pytest.mark.parametrize("method", sorted(GROUPS["method"]))
+ACTORS = ("ddpg", "sac", "td3")
+PAIRS = list(product(sorted(GROUPS["method"]), ACTORS))
+
+
+# Each method is trained by one of the learners, all of them by turns; the other pairs are slow.
+@pytest.mark.parametrize(
+    ("method", "learner"),
+    mostly_slow(PAIRS, [pair for n, pair in enumerate(PAIRS) if n % 3 == n // 3 % 3]),
+)
 def test_every_method_trains_every_learner_by_its_own_signals(
     tmp_path: Path, method: str, learner: str
 ) -> None:

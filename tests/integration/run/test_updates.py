@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from tests.integration.tiny_runs import go_on, stop_after, tiny, train
+from tests.integration.tiny_runs import go_on, mostly_slow, stop_after, tiny, train
 from torchrl_mpfa.selection import SampledBatch
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
@@ -22,7 +22,7 @@ def of_run(folder: Path) -> pd.DataFrame:
     return read_table(folder / "updates.csv")
 
 
-@pytest.mark.parametrize("method", ["mpfa_per", "uniform", "klper"])
+@pytest.mark.parametrize("method", mostly_slow(["mpfa_per", "uniform", "klper"], ["mpfa_per"]))
 def test_the_rows_say_what_was_sampled_and_how_old_its_errors_were(
     tmp_path: Path, method: str
 ) -> None:
