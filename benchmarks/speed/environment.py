@@ -14,12 +14,14 @@ import argparse
 import math
 import statistics
 import time
-from collections.abc import Callable
+from functools import partial
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from benchmarks.speed.bullet_world import BulletWorld
+from benchmarks.speed.timing import Call, Entry, entry, seconds_per_call, take_turns
 from mpfa_envs import PAPER_TASK, WORLDS, Lidar, NavigationEnv, World
 from mpfa_envs.paths.lengths import grid_for, is_reachable, shortest_length
 from mpfa_envs.planners import astar_path
@@ -28,162 +30,94 @@ from mpfa_envs.tasks.sampling import evaluation_pairs
 
 ROUNDS = 5
 PAIRS = 200
+_ROLLOUT = 20
+"""Steps of a rollout."""
+_BASELINES = {
+    "env": ("env_wheels", "steps/s"),
+    "torchrl_env": ("env_kinematic", "steps/s"),
+    "lidar": ("lidar_pybullet", "scans/s"),
+}
+"""Baseline and unit of each kind of figure."""
 GRID = np.arange(-4.95, 5.0, 0.1)
 _CORNER_REACHED = 0.2
 """Distance from a corner of its path at which a robot turns to the next [m]."""
 
 
-def _entry(
-    name: str, value: float, unit: str, *, ratio: float | None = None, baseline: str | None = None
-) -> dict[str, Any]:
-    return {"name": name, "value": value, "unit": unit, "ratio": ratio, "baseline": baseline}
-
-
-def _rate(run: Callable[[int], None], seconds: float) -> float:
-    """Calls per CPU second of ``run(count)``, the median over the rounds."""
-    run(10)
-    count, spent = 10, 0.0
-    while spent < seconds / ROUNDS / 4:
-        count *= 2
-        start = time.process_time()
-        run(count)
-        spent = time.process_time() - start
-    count = max(1, round(count * seconds / ROUNDS / spent))
-    rates = []
-    for _ in range(ROUNDS):
-        start = time.process_time()
-        run(count)
-        rates.append(count / max(time.process_time() - start, 1e-9))
-    return statistics.median(rates)
-
-
-class _Clock:
-    """Wraps a method and adds up the CPU time that it takes [s]."""
-
-    def __init__(self, method: Callable[..., Any]) -> None:
-        self.method = method
-        self.spent = 0.0
-
-    def __call__(self, *args: Any) -> Any:
-        start = time.process_time()
-        result = self.method(*args)
-        self.spent += time.process_time() - start
-        return result
-
-
-def _stepper(env: NavigationEnv) -> Callable[[int], None]:
-    """Random driving with resets, as training does it."""
+def _stepper(env: NavigationEnv) -> Call:
+    """Return a function that makes one step of random driving, resets included."""
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (4096, 2)).astype(np.float32)
-    actions[:, 0] = actions[:, 0] * 0.3 + 0.6
-    actions[:, 1] = actions[:, 1] * 0.3 + 0.6
+    numbers = cycle(0.3 * actions + 0.6)
 
-    def run(count: int) -> None:
-        for i in range(count):
-            _, _, terminated, truncated, _ = env.step(actions[i % 4096])
-            if terminated or truncated:
-                env.reset()
+    def step() -> None:
+        _, _, terminated, truncated, _ = env.step(next(numbers))
+        if terminated or truncated:
+            env.reset()
 
-    return run
+    return step
 
 
 def _physics_share(env: NavigationEnv, steps: int) -> float:
-    """Part of the CPU time of driving that moving the robot takes, resets included in the whole."""
-    run = _stepper(env)
-    drives = env.robots._batch.drives
-    clock = _Clock(drives.move)
-    drives.move = clock  # type: ignore[method-assign, assignment]
-    start = time.process_time()
-    run(steps)
-    return clock.spent / (time.process_time() - start)
+    """Return the part of the CPU time of driving, resets included, that moving the robot takes."""
+    step, drives, spent = _stepper(env), env.robots._batch.drives, 0.0
+    move = drives.move
+
+    def timed(*arguments: Any) -> Any:
+        nonlocal spent
+        start = time.process_time()
+        found = move(*arguments)
+        spent += time.process_time() - start
+        return found
+
+    drives.move = timed  # type: ignore[method-assign, assignment]
+    whole = steps * seconds_per_call(step, steps)
+    return spent / whole
 
 
-def measure(*, seconds: float = 2.0) -> list[dict[str, Any]]:
-    """Measure the environment in world D.
+def measure(*, seconds: float = 2.0) -> list[Entry]:
+    """Measure the environment and the lidar in world D.
 
     Args:
         seconds: CPU time for each figure [s].
 
     Returns:
-        Entries with the keys ``name``, ``value``, ``unit``, ``ratio`` and ``baseline``; a ratio is
-        the value over that of the entry that ``baseline`` names.
+        Steps or scans per second, whose ratios are of rates, and shares of moving the robot.
     """
-    # Imported here: the rest of the file needs no torch.
-    import torch
-
+    # Imported here: the rest of the file needs no TorchRL.
     from mpfa_envs import make_navigation_env
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        entries, rates = [], {}
-        for physics in ("wheels", "kinematic"):
-            env = NavigationEnv(world="D", physics=physics, action_repeat=1)
-            rates[physics] = _rate(_stepper(env), seconds)
-            share = _physics_share(env, max(20, round(rates[physics] * seconds / ROUNDS)))
-            env.close()
-            entries += [
-                _entry(
-                    f"env_{physics}",
-                    rates[physics],
-                    "steps/s",
-                    ratio=rates[physics] / rates["wheels"],
-                    baseline="env_wheels",
-                ),
-                _entry(f"env_{physics}_physics_share", share, "fraction"),
-            ]
-        for name, num_envs, keys in (
-            ("torchrl_env", None, None),
-            ("torchrl_env_without_info", None, ()),
-            ("torchrl_env_batch_of_8", 8, None),
-        ):
-            batch = make_navigation_env(
-                "D",
-                physics="kinematic",
-                action_repeat=1,
-                num_envs=num_envs,
-                info_keys=keys,
-                seed=0,
-            )
-
-            def run(count: int, env: Any = batch) -> None:
-                env.rollout(count, break_when_any_done=False)
-
-            rate = _rate(run, seconds) * (num_envs or 1)
-            batch.close()
-            entries.append(
-                _entry(
-                    name,
-                    rate,
-                    "steps/s",
-                    ratio=rate / rates["kinematic"],
-                    baseline="env_kinematic",
-                )
-            )
-        return entries + _measure_lidar(seconds)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _measure_lidar(seconds: float) -> list[dict[str, Any]]:
-    """Compare the lidar with PyBullet's ray test."""
-    lidar = Lidar(WORLDS["D"])
-    bullet = BulletWorld(WORLDS["D"])
-
-    def ours(count: int) -> None:
-        for _ in range(count):
-            lidar.cast(0.1, 0.2, 0.3)
-
-    def engine(count: int) -> None:
-        for _ in range(count):
-            bullet.cast_rays(0.1, 0.2, lidar.angles + 0.3, reach=10.0)
-
-    rates = _rate(engine, seconds), _rate(ours, seconds)
+    task: dict[str, Any] = {"action_repeat": 1}
+    envs = {p: NavigationEnv(world="D", physics=p, **task) for p in ("wheels", "kinematic")}
+    calls: dict[str, Call] = {f"env_{name}": _stepper(env) for name, env in envs.items()}
+    steps: dict[str, int] = {}
+    for name, num_envs, keys in (
+        ("torchrl_env", None, None),
+        ("torchrl_env_without_info", None, ()),
+        ("torchrl_env_batch_of_8", 8, None),
+    ):
+        how = {"num_envs": num_envs, "info_keys": keys, "seed": 0, **task}
+        batch = make_navigation_env("D", physics="kinematic", **how)
+        calls[name] = partial(batch.rollout, _ROLLOUT, break_when_any_done=False)
+        steps[name] = _ROLLOUT * (num_envs or 1)
+    lidar, bullet = Lidar(WORLDS["D"]), BulletWorld(WORLDS["D"])
+    calls["lidar_pybullet"] = lambda: bullet.cast_rays(0.1, 0.2, lidar.angles + 0.3, reach=10.0)
+    calls["lidar"] = lambda: lidar.cast(0.1, 0.2, 0.3)
+    timings = take_turns(calls, rounds=ROUNDS, seconds=seconds / ROUNDS)
+    rates = {name: steps.get(name, 1) / timing.median for name, timing in timings.items()}
+    entries = []
+    for name, rate in rates.items():
+        kind = next(kind for kind in _BASELINES if name.startswith(kind))
+        baseline, unit = _BASELINES[kind]
+        ratio = None if name == "lidar_pybullet" else rate / rates[baseline]
+        of = None if ratio is None else baseline
+        entries.append(entry(name, rate, unit, ratio=ratio, baseline=of))
+    for name, env in envs.items():
+        count = max(20, round(rates[f"env_{name}"] * seconds / ROUNDS))
+        share = _physics_share(env, count)
+        entries.append(entry(f"env_{name}_physics_share", share, "fraction"))
+        env.close()
     bullet.close()
-    return [
-        _entry("lidar_pybullet", rates[0], "scans/s"),
-        _entry("lidar", rates[1], "scans/s", ratio=rates[1] / rates[0], baseline="lidar_pybullet"),
-    ]
+    return entries
 
 
 def drive_straight(env: NavigationEnv, options: dict[str, Any]) -> tuple[str, list[Any]]:
@@ -295,7 +229,7 @@ def render_worlds(*, size: int = 224) -> np.ndarray[Any, Any]:
 
 def main() -> None:
     """Print what the arguments ask for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=2.0, help="CPU time per figure [s]")
     parser.add_argument("--worlds", action="store_true", help="describe the worlds instead")
     parser.add_argument("--picture", help="render the worlds into this file instead")
@@ -315,9 +249,9 @@ def main() -> None:
             )
             print(f"| {name} | " + " | ".join(cells) + " |")
     else:
-        for entry in measure(seconds=arguments.seconds):
-            ratio = f"{entry['ratio']:8.2f} x {entry['baseline']}" if entry["baseline"] else ""
-            print(f"{entry['name']:30} {entry['value']:12.4g} {entry['unit']:9} {ratio}")
+        for found in measure(seconds=arguments.seconds):
+            ratio = f"{found['ratio']:8.2f} x {found['baseline']}" if found["baseline"] else ""
+            print(f"{found['name']:30} {found['value']:12.4g} {found['unit']:9} {ratio}")
 
 
 if __name__ == "__main__":

@@ -5,9 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -17,7 +15,6 @@ from training import files
 from training.records import read_table
 from training.run.checkpoints import read_checkpoint
 from training.run.loop import TrainingRun
-from training.settings.checks import check_settings
 from training.settings.train import RaySettings, Stage, TrainSettings
 
 TRAIN = Path(__file__).parents[3] / "examples" / "train.py"
@@ -29,25 +26,6 @@ def on_ray(actions: int) -> TrainSettings:
     settings.method.capacity, settings.method.batch_size = 100, 16
     settings.environment.max_steps = 25
     return settings
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"robots": 9}, "robots must be a multiple of ray.workers=2, got 9"),
-        ({"ray": RaySettings(workers=-1)}, "ray.workers must be at least 0, got -1"),
-        ({"ray": RaySettings(workers=2, steps=0)}, "ray.steps must be at least 1, got 0"),
-        # These methods need the buffer at hand.
-        *(
-            ({"method": tiny(name).method}, f"ray.workers must be 0 with method={name}, got 2")
-            for name in ("la3p", "ref_er", "reaper")
-        ),
-    ],
-)
-def test_what_workers_cannot_do_is_rejected(change: dict[str, Any], message: str) -> None:
-    pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
-    with pytest.raises(ValueError, match=message):
-        check_settings(replace(on_ray(100), **change))
 
 
 def test_a_checkpoint_without_the_places_of_the_robots_begins_new_episodes(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from tests.integration.tiny_runs import (
     train,
 )
 from training.run.loop import TrainingRun
-from training.settings.checks import check_settings
 from training.settings.train import Stage, TrainSettings
 
 
@@ -59,17 +58,3 @@ def test_hindsight_adds_goals_and_neither_actions_nor_updates(tmp_path: Path) ->
     for run in runs.values():
         run.log.add(run.actions, episode=0, buffer=run.buffer)
         assert abs(run.log.rows[-1]["average_reward"]) <= 10
-
-
-def test_a_reward_for_progress_is_rejected_before_a_run_begins() -> None:
-    settings = sparse()
-    settings.environment.progress = "shortest_path"
-    with pytest.raises(ValueError, match=r"environment\.progress must be 'none' with goals"):
-        check_settings(settings)
-
-
-def test_robots_on_other_machines_are_rejected() -> None:
-    settings = sparse()
-    settings.ray.workers = 3
-    with pytest.raises(ValueError, match=r"ray\.workers must be 0 with method=her"):
-        check_settings(settings)

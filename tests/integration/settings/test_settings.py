@@ -247,18 +247,59 @@ def usual() -> TrainSettings:
         ),
         ("environment.detour_chance=1.5", r"environment.detour_chance must be in \[0, 1\]"),
         ("exploration.random_steps=-1", "exploration.random_steps must be at least 0"),
+        # Learners without continuous actions, or without an actor.
+        *(
+            (f"learner={learner} method={method}", f"method={method} is not for learner={learner}")
+            for learner in ("dqn", "q_learning")
+            for method in ("hvper", "la3p", "ref_er", "averaged_ddpg", "ddpg_radam")
+        ),
+        *(
+            (f"learner=q_learning method={method}", "method.loss_function must be l2 with .*ning")
+            for method in ("lap", "pal")
+        ),
+        ("learner=dqn method=pal", "loss_function must be l2 or smooth_l1 with learner=dqn, got p"),
+        (
+            "learner=q_learning learner.reward_scale=0.1",
+            "learner.reward_scale must be 1 with q_learning, .* got 0.1",
+        ),
+        (
+            "learner=dqn method=per method.signals=action_gradient",
+            "method.signals must hold reward or td_error with learner=dqn",
+        ),
+        ("learner=dqn learner.compile=true", "learner.compile must be false with dqn, got True"),
+        # Robots and buffer in other processes than the learner.
+        ("ray.workers=-1", "ray.workers must be at least 0, got -1"),
+        ("ray.workers=2 ray.steps=0", "ray.steps must be at least 1, got 0"),
+        ("robots=9 ray.workers=2", "robots must be a multiple of ray.workers=2, got 9"),
+        *(
+            (f"method={method} ray.workers=2", f"ray.workers must be 0 with method={method}, got 2")
+            for method in ("la3p", "ref_er", "reaper")
+        ),
+        (
+            "method=her environment.progress=none ray.workers=2",
+            "ray.workers must be 0 with method=her, got 2",
+        ),
+        ("method=her", "environment.progress must be 'none' with goals"),
     ],
 )
-def test_a_value_that_cannot_be_is_one_sentence_with_its_name(
+def test_setting_with_a_bad_value_is_rejected_by_name_in_one_sentence(
     usual: TrainSettings, arguments: str, message: str
 ) -> None:
+    if "ray" in arguments:
+        pytest.importorskip("ray", reason="an extra: pip install 'torchrl-mpfa[ray]'")
     # Set by hand, as Hydra takes most of the time.
     settings = deepcopy(usual)
     for name, text in (each.split("=") for each in arguments.split(" ")):
         *groups, last = name.split(".")
         group = reduce(getattr, groups, settings)
         kind = type(getattr(group, last))
-        setattr(group, last, text == "true" if kind is bool else kind(text))
+        if name in ("learner", "method"):
+            chosen = GROUPS[name][text]
+            setattr(settings, name, chosen() if name == "learner" else deepcopy(chosen))
+        elif text == "true" or kind is list:
+            setattr(group, last, True if text == "true" else [text])
+        else:
+            setattr(group, last, kind(text))
     with pytest.raises(ValueError, match=message) as caught:
         check_settings(settings)
     assert "\n" not in str(caught.value)
