@@ -133,10 +133,6 @@ EDGES = np.geomspace(1e-2, 1e2, 5)
         ),
         (partial(tiled, []), "pictures must not be empty"),
         (partial(write_animation, [], "b.gif"), "frames must not be empty"),
-        (
-            partial(write_animation, [BLACK], "b.gif", palette_size=300),
-            "palette_size must be at most 256, got 300",
-        ),
         (partial(FIELD, values=lambda _: np.zeros(3)), "values must give a finite number for each"),
         (
             partial(FIELD, values=lambda seen: np.full(len(seen), np.nan)),
@@ -275,7 +271,7 @@ def test_a_small_goal_keeps_its_color_in_an_animation(tmp_path: Path) -> None:
         frame = rng.integers(0, 256, (120, 120, 1), dtype=np.uint8).repeat(3, axis=2)
         frame[10:14, 10 + step : 14 + step] = GOAL[:3]
         frames.append(frame)
-    write_animation(frames, tmp_path / "a.gif", frame_time=0.2, speed=2.0, palette_size=16)
+    write_animation(frames, tmp_path / "a.gif", frame_time=0.2, speed=2.0)
     with Image.open(tmp_path / "a.gif") as animation:
         assert animation.n_frames == 3
         assert animation.info["duration"] == 100

@@ -110,7 +110,7 @@ def test_a_world_without_a_task_is_replaced_and_counted(monkeypatch: pytest.Monk
 def test_a_task_needs_its_world_where_worlds_come_and_go() -> None:
     env = make(2, "bars")
     task = Task((0.0, 0.0, 0.0), (3.0, 0.0))
-    with pytest.raises(ValueError, match="robot 0: a task must come with a world"):
+    with pytest.raises(ValueError, match="robot 0: world must be given"):
         env.reset(options={"tasks": [task, None]})
     env.reset(seed=0, options={"worlds": ["A", None], "tasks": [task, None]})
     assert env.worlds[0].name == "A" and env.worlds[1].name.startswith("bars-")

@@ -194,13 +194,21 @@ class EpisodeSource:
                 f"corner, as the observations are bounded, got {world.diagonal:.4g} m"
             )
 
+    def room(self, robot: int, choice: WorldChoice | None) -> World:
+        """Look up the world that a robot is to drive in; None is the one that it always has."""
+        world = self.fixed(robot) if choice is None else resolve_world(choice)
+        if world is None:
+            raise ValueError("world must be given where the worlds are a generator's, got None")
+        self.check_world(world)
+        return world
+
     def check_task(self, world: World, start: Sequence[float], goal: Sequence[float]) -> Task:
         """Read a task in a world, and reject one that cannot be driven."""
-        self.check_world(world)
         config = self._config
         return check_task(
             world,
-            {"start": start, "goal": goal},
+            start,
+            goal,
             collision_distance=config.collision_distance,
             goal_radius=config.goal_radius,
             radius=config.robot.radius,

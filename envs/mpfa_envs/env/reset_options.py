@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpfa_envs.checks import check_seed
-from mpfa_envs.generators.resolve import resolve_world
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,12 +65,7 @@ def read_tasks(
             found.append(None)
             continue
         try:
-            world = source.fixed(robot) if choice is None else resolve_world(choice)
-            if world is None:
-                raise ValueError(
-                    f"a task must come with a world where these are a generator's, got {task}"
-                )
-            source.check_world(world)
+            world = source.room(robot, choice)
             found.append((world, None if task is None else source.check_task(world, *task)))
         except ValueError as error:
             raise ValueError(f"robot {robot}: {error}") from error

@@ -26,7 +26,6 @@ from mpfa_envs.env.reset_options import (
 from mpfa_envs.env.robots import RobotBatch
 from mpfa_envs.env.state import read_state, robot_to_plain
 from mpfa_envs.env.step_loops import outcomes
-from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.sensing.observation import FLAGS, INFO_TYPES, NUMBERS
 from mpfa_envs.worlds.task import Task
 from mpfa_envs.worlds.world import World
@@ -204,9 +203,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
         Raises:
             ValueError: If it cannot be driven.
         """
-        room = self._source.fixed(index) if world is None else resolve_world(world)
-        if room is None:
-            raise ValueError("world must be given where the worlds are a generator's, got None")
+        room = self._source.room(index, world)
         return room, self._source.check_task(room, start, goal)
 
     def trail(self, index: int) -> list[tuple[float, float]]:

@@ -16,8 +16,8 @@ from mpfa_envs.scene import colors
 
 _LEAST_DELAY: Final = 20
 """Players of GIFs ignore shorter delays [ms]."""
-_KIT: Final = 64
-"""Greatest number of colors of :mod:`mpfa_envs.scene.colors` in a palette."""
+_COLORS: Final = 64
+"""Number of colors of an animation, at most half of which are of :mod:`mpfa_envs.scene.colors`."""
 
 
 def write_animation(
@@ -27,7 +27,6 @@ def write_animation(
     frame_time: float = 0.1,
     speed: float = 2.0,
     most: int = 120,
-    palette_size: int = 64,
 ) -> None:
     """Write an animation, faster than real and with no more frames than needed.
 
@@ -40,7 +39,6 @@ def write_animation(
         frame_time: Time between two frames [s].
         speed: How many times as fast as real.
         most: How many frames to keep at most, evenly spaced and with the last one.
-        palette_size: How many colors the frames have at most, 16 to 256.
 
     Raises:
         ValueError: If there is no frame, or an argument is out of its range.
@@ -54,13 +52,10 @@ def write_animation(
     """
     if not len(frames):
         raise ValueError("frames must not be empty")
-    check_count("palette_size", palette_size, least=16)
-    if palette_size > 256:
-        raise ValueError(f"palette_size must be at most 256, got {palette_size}")
     step = -(-len(frames) // check_count("most", most))
     delay = 1000 * step * check_positive("frame_time", frame_time) / check_positive("speed", speed)
     chosen = [*frames[:-1:step], frames[-1]]
-    palette = _palette(chosen, palette_size)
+    palette = _palette(chosen)
     pictures = [
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in chosen
@@ -75,17 +70,17 @@ def write_animation(
     )
 
 
-def _palette(pictures: Sequence[NDArray[np.uint8]], size: int) -> Image.Image:
+def _palette(pictures: Sequence[NDArray[np.uint8]]) -> Image.Image:
     """One palette for all pictures: colors of the kit that occur, and the most frequent others."""
     # Trails and maps are longest at the end, scans differ in the middle.
     samples = np.concatenate([pictures[n] for n in (0, len(pictures) // 2, -1)])
     found, counts = np.unique(samples.reshape(-1, 3), axis=0, return_counts=True)
     # A few pixels of one color are a mark; a few of many colors are blurred edges.
     there = {tuple(color) for color in found[counts > 3].tolist()}
-    kept = sorted({color for color in _kit() if color in there})[: min(_KIT, size // 2)]
-    most = Image.fromarray(samples).quantize(size - len(kept)).getpalette() or []
+    kept = sorted({color for color in _kit() if color in there})[: _COLORS // 2]
+    most = Image.fromarray(samples).quantize(_COLORS - len(kept)).getpalette() or []
     palette = Image.new("P", (1, 1))
-    values = [channel for color in kept for channel in color] + most[: 3 * (size - len(kept))]
+    values = [channel for color in kept for channel in color] + most[: 3 * (_COLORS - len(kept))]
     # What is left of the 256 entries repeats the first, so that no color comes out of nothing.
     palette.putpalette((values + values[:3] * 256)[:768])
     return palette

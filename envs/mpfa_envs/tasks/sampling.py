@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Literal
 
@@ -115,26 +114,17 @@ def _sample_points(
 
 def check_task(
     world: World,
-    options: Mapping[str, Any],  # start (x, y, heading) [m, m, rad] and goal (x, y) [m]
+    start: Any,  # x, y, heading [m, m, rad]
+    goal: Any,  # x, y [m]
     *,
     collision_distance: float,  # [m]
     goal_radius: float,  # [m]
     radius: float,  # [m]
 ) -> Task:
-    """Read a task from the options of a reset."""
-    if set(options) != {"start", "goal"}:
-        raise ValueError(f"options must have the keys 'start' and 'goal', got {sorted(options)}")
-    numbers: dict[str, list[float]] = {}
-    for name, size in (("start", 3), ("goal", 2)):
-        try:
-            values = np.asarray(options[name], dtype=np.float64)
-        except (TypeError, ValueError):
-            values = np.empty(0)
-        if values.shape != (size,) or not np.isfinite(values).all():
-            raise ValueError(f"{name} must be {size} finite numbers, got {options[name]!r}")
-        numbers[name] = values.tolist()
-    x, y, heading = numbers["start"]
-    goal = (numbers["goal"][0], numbers["goal"][1])
+    """Read a task, and reject one that cannot be driven."""
+    x, y, heading = _numbers("start", start, 3)
+    goal_x, goal_y = _numbers("goal", goal, 2)
+    goal = (goal_x, goal_y)
     clearance = world.clearance(x, y)
     if clearance <= collision_distance:
         raise ValueError(
@@ -155,6 +145,17 @@ def check_task(
             f"collision_distance = {collision_distance} m from obstacles and walls, got {goal}"
         )
     return Task((x, y, heading), goal)
+
+
+def _numbers(name: str, given: Any, count: int) -> list[float]:
+    """Read some finite numbers."""
+    try:
+        values = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ValueError(f"{name} must be {count} finite numbers, got {given!r}")
+    return values.tolist()
 
 
 def _can_be_won(
