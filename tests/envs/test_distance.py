@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pytest
@@ -182,42 +180,6 @@ def test_the_same_generator_gives_the_same_task() -> None:
         for _ in range(2)
     ]
     assert tasks[0] == tasks[1]
-
-
-CLOSET = World(name="closet", size=(0.3, 0.3))
-GRID = partial(FreeGrid, WORLDS["A"])
-SAMPLE = partial(sample_task_on_grid, rng=np.random.default_rng(0))
-IN_A = partial(SAMPLE, WORLDS["A"], distance=0.3)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (partial(GRID, distance=0.0), "distance must be positive"),
-        (partial(GRID, distance=0.25, resolution=-0.1), "resolution must be positive"),
-        (partial(GRID, distance=0.05, resolution=0.1), "at most the distance, 0.05 m, got 0.1"),
-        (partial(GRID, distance=0.25, resolution=0.0001), "at most 40000000 cells"),
-        (
-            lambda: DistanceField(FreeGrid(CLOSET, distance=0.2), (0.0, 0.0)),
-            "grid must have a free cell, and 'closet' has none",
-        ),
-        (partial(SAMPLE, WORLDS["A"]), "distance must be given for a world, got None"),
-        (
-            lambda: SAMPLE(FreeGrid(WORLDS["A"], distance=0.3), distance=0.2),
-            "distance must be None for a",
-        ),
-        (partial(IN_A, min_goal_distance=0), "min_goal_distance must be pos"),
-        (partial(IN_A, max_goal_distance=1.0), "max_goal_distance must be a"),
-        (partial(IN_A, detour_chance=2), r"detour_chance must be in \[0, 1\]"),
-        (partial(IN_A, min_goal_distance=30), "'A' has no start and goal"),
-        (partial(SAMPLE, CLOSET, distance=0.3), "'closet' has no start and"),
-    ],
-)
-def test_an_impossible_grid_field_or_task_is_rejected(
-    call: Callable[[], object], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
 
 
 def test_has_task_knows_worlds_without_a_task() -> None:

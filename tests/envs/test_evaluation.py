@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -229,50 +227,6 @@ def test_walkers_and_noise_of_a_task_ignore_the_other_tasks() -> None:
     assert after[2:] == alone
     some = run_tasks(steer, crowd[3:], **given)
     assert [found.path_length for found in some] == [found.path_length for found in alone[3:]]
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        *(
-            (partial(world_tasks, name), f"world must be .*got '{name}'")
-            for name in ("bars", "bars:train", "bras:test")
-        ),
-        (partial(evaluated, episodes=0), "episodes must be a positive integer, got 0"),
-        (
-            partial(evaluated, envs_at_once=1.5),
-            "envs_at_once must be a positive integer, got 1.5",
-        ),
-        (partial(evaluated, world="tets"), "world must be .*did you mean 'test'"),
-        (partial(evaluated, world=["A", "tets"]), "world must be .*did you mean 'test'"),
-        (partial(evaluated, physics="magic"), "physics must be one of .*got 'magic'"),
-        # A policy of one observation is asked for two.
-        (
-            partial(evaluated, lambda _: np.zeros(2), episodes=2, envs_at_once=2),
-            r"shape \(2, 2\) for observations of shape \(2, 24\)",
-        ),
-        *(
-            (
-                partial(evaluated, lambda _, action=action: action, episodes=1),
-                r"policy must give an action of shape \(2,\) .*got array",
-            )
-            for action in (np.ones(1), np.ones((1, 2)), np.float64(1.0))
-        ),
-        *(
-            (
-                partial(run_tasks, steer, world_tasks("A", episodes=1), **{name: value}),
-                f"{name} must be left to the tasks",
-            )
-            for name, value in (("world", "B"), ("num_envs", 3), ("autoreset_mode", "next_step"))
-        ),
-        (partial(summarize, []), "results must hold at least one episode"),
-    ],
-)
-def test_a_bad_argument_or_action_is_named_with_its_value(
-    call: Callable[[], object], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
 
 
 def test_an_undrivable_task_is_named_before_any_is_driven() -> None:

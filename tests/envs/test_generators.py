@@ -4,8 +4,6 @@ import hashlib
 import math
 import random
 from collections import Counter
-from collections.abc import Callable
-from functools import partial
 from itertools import combinations, product
 
 import numpy as np
@@ -29,7 +27,6 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.lengths import is_reachable
 from mpfa_envs.paths.tasks import sample_task_on_grid
-from mpfa_envs.worlds.barn import barn_world
 from mpfa_envs.worlds.plain import walker_to_plain
 
 NAMES = list(GENERATORS)
@@ -134,55 +131,6 @@ def pillars(source: random.Random, difficulty: float) -> World:
     """A room with one pillar, the wider the more difficult."""
     pillar = Cylinder(source.uniform(-4, 4), source.uniform(-4, 4), 0.1 + difficulty)
     return World(name="pillars", cylinders=(pillar,))
-
-
-OF_NO_WORLD = ("bars", "bars-", "bars--1", "bars-1.5", "bars-a", "bars-train-1", "bars-1@2")
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        *(
-            (partial(resolve_world, name), r"world must be .*'NAME-SEED'.* got '")
-            for name in (*OF_NO_WORLD, "barz-1", "-1")
-        ),
-        (
-            partial(generate_world, "bers", 1),
-            r"generator must be one of \['rooms',.*got 'bers' \(did you mean 'bars'\?\)",
-        ),
-        (partial(generate_world, "bars", -1), "seed must be an integer of at least 0, got -1"),
-        (partial(generate_world, "bars", True), "seed must be an integer of at least 0, got True"),
-        (partial(generate_world, "bars", 3 * 10**9), "seed must be at most 2999999999, got 300"),
-        *(
-            (partial(generate_world, "bars", 1, difficulty=each), "difficulty must be")
-            for each in (-0.1, 1.1, "hard", math.nan)
-        ),
-        (partial(world_seed, "tests", 1), "split must be one of"),
-        (partial(world_seed, "test", 10**9), "index must be at most 999999999, got 1000000000"),
-        (partial(split_worlds, "bars", "test", 0), "count must be a positive integer, got 0"),
-        (
-            partial(generator_tasks, "bars", "test", worlds=1, tasks=0),
-            "tasks must be a positive integer, got 0",
-        ),
-        *(
-            (partial(register_generator, name, pillars), f"not be that of a built-in .*'{name}'")
-            for name in ("rooms", "crowd", "validation", "barn")
-        ),
-        *(
-            (partial(register_generator, name, pillars), f"lower-case letters a to z, got {name!r}")
-            for name in ("", "Pillars", "two words", "pillars-7", "pillars2")
-        ),
-        *((partial(barn_world, index), "index must be") for index in (-1, 20, True, 1.5)),
-        *(
-            (partial(resolve_world, f"barn-{index}"), "'barn-0' to 'barn-19'")
-            for index in (-1, 20, True, 1.5)
-        ),
-        (partial(register_generator, "pillars", None), "generator must be callable, got None"),
-    ],
-)
-def test_a_bad_name_or_number_is_rejected(call: Callable[[], object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
 
 
 # A harder crowd has more walkers.

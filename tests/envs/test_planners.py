@@ -6,8 +6,6 @@ import itertools
 import math
 import subprocess
 import sys
-from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -30,7 +28,6 @@ from mpfa_envs.generators.resolve import resolve_world
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.planners import (
     AntColony,
-    DynamicWindow,
     MapPlanner,
     PurePursuit,
     Search,
@@ -365,29 +362,3 @@ def test_a_policy_is_a_driver_that_sees_the_observation_alone() -> None:
     actions = driver.drive(None, np.arange(3), observations)  # type: ignore[arg-type]
     assert actions.shape == (3, 2) and seen[0] is observations
     assert as_driver(driver) is driver
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            partial(make_planner, "djikstra"),
-            "name must be one of .*got 'djikstra' .did you mean 'dijkstra'",
-        ),
-        (partial(make_planner, "astar", memory="map"), "memory must be 'none' for astar.*'map'"),
-        (partial(make_planner, "dwa", robot="burgr"), "robot must be .*did you mean 'burger'"),
-        (partial(AntColony, ants=0), "ants must be a positive integer, got 0"),
-        (partial(AntColony, evaporation=1.5), r"evaporation must be in \[0, 1\], got 1\.5"),
-        (partial(AntColony, seed=-1), "seed must be an integer of at least 0, got -1"),
-        (partial(AntColony, time_limit=0.0), r"time_limit must be positive, got 0\.0"),
-        (partial(DynamicWindow, memory="x"), "memory must be one of .*got 'x'"),
-        (partial(DynamicWindow, samples=1), "samples must be an integer of at least 2, got 1"),
-        (partial(DynamicWindow, length=0.0), r"length must be positive, got 0\.0"),
-        (partial(DynamicWindow, acceleration=-1.0), r"acceleration must be positive, got -1\.0"),
-        (partial(DynamicWindow(), np.zeros(27)), r"shape \[..., 24\], got \(27,\)"),
-        (partial(DynamicWindow(), np.full(24, np.nan)), "observation must be finite"),
-    ],
-)
-def test_a_bad_argument_is_named_with_its_value(call: Callable[[], object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()

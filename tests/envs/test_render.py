@@ -1,11 +1,8 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World
@@ -17,14 +14,8 @@ from mpfa_envs.render import (
     RIVAL,
     TRAIL,
     WALL,
-    Panel,
-    plot_histograms,
-    plot_seeds,
     render_methods,
-    render_samples,
-    render_traces,
     render_trajectories,
-    render_values,
     shown_episodes,
     tiled,
     viridis,
@@ -103,74 +94,6 @@ def test_a_narrow_world_has_its_whole_legend_below_it() -> None:
     left, right = dark[0], picture.shape[1] - 1 - dark[-1]
     assert abs(left - right) <= 1
     assert left > 100
-
-
-BLACK = np.zeros((40, 40, 3), np.uint8)
-FIELD = partial(render_values, "A", goal=(3.0, 3.0), spacing=2.0)
-PLACES = np.zeros((2, 2))
-EDGES = np.geomspace(1e-2, 1e2, 5)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            partial(render_trajectories, "A", [], [(0, 0)], []),
-            "must have one entry per episode, got 0, 1 and 0",
-        ),
-        (
-            partial(render_trajectories, "A", [[(0, 0)]], [(0, 0)], ["lost"]),
-            "outcomes must be among .*got 'lost'",
-        ),
-        (
-            partial(render_trajectories, "A", [], [], [], size=3),
-            "size must be an integer of at least 32, got 3",
-        ),
-        (partial(render_trajectories, "A", [], [], [], most=0), "most must be .*got 0"),
-        (
-            partial(render_methods, "A", {"one": [[]]}, [(1, 1)], {"two": ["success"]}),
-            r"same methods, got .'one'. and .'two'.",
-        ),
-        (partial(tiled, []), "pictures must not be empty"),
-        (partial(write_animation, [], "b.gif"), "frames must not be empty"),
-        (partial(FIELD, values=lambda _: np.zeros(3)), "values must give a finite number for each"),
-        (
-            partial(FIELD, values=lambda seen: np.full(len(seen), np.nan)),
-            "values must give a finite number",
-        ),
-        (partial(FIELD, actions=lambda _: np.zeros((2, 2))), "actions must have shape"),
-        (partial(FIELD, values=len, spacing=0.0), "spacing must be"),
-        (partial(FIELD, values=len, heading="north"), "heading must be"),
-        (partial(render_samples, "A", np.zeros((0, 2)), [], []), "positions must have shape"),
-        (partial(render_samples, "A", PLACES, [1.0], [1, 1]), "priorities must have shape"),
-        (partial(render_samples, "A", PLACES, [1.0, np.nan], [1, 1]), "priorities must be finite"),
-        (partial(render_samples, "A", PLACES, [1.0, 1.0], [2]), "sampled must be numbers below 2"),
-        (partial(render_samples, "A", PLACES, [1.0, 1.0], [0.5]), "sampled must be 2 counts or"),
-        (
-            partial(render_traces, [Panel("Q", {"": []})], 0, step_time=0.2),
-            "equally long and not empty",
-        ),
-        (partial(plot_seeds, {}, "b.png"), "runs must hold a curve"),
-        (partial(plot_seeds, {"one": [([0, 1], [0.0])]}, "b.png"), "must be equally many"),
-        (partial(plot_seeds, {"one": [([0, 0], [0.0, 1.0])]}, "b.png"), "steps of a run must rise"),
-        (
-            partial(plot_seeds, {"one": [([0], [0.0])]}, "b.png", band="range"),
-            "band must be 'interval' or 'runs', got 'range'",
-        ),
-        (
-            partial(plot_histograms, {"priority": ([0, 1], EDGES, np.zeros((20, 4)))}, "b.png"),
-            r"counts of 'priority' must have shape \(2, 4\)",
-        ),
-        (partial(plot_histograms, {}, "b.png"), "histories must not be empty"),
-    ],
-)
-def test_bad_arguments_of_a_picture_are_rejected(
-    call: Callable[[], object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=message):
-        call()
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_shows_boxes_cylinders_and_polygons() -> None:

@@ -14,61 +14,6 @@ from tests.envs.process import run
 from tests.envs.shapes import distance
 
 
-def around(count: int, turn: float = 1.0) -> tuple[tuple[float, float], ...]:
-    """Corners on a circle, each turned from the one before [rad]."""
-    return tuple((math.cos(i * turn), math.sin(i * turn)) for i in range(count))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Box(1, 0, 1, 2), "box must have x_min < x_max"),
-        (lambda: Box(0, 0, math.nan, 2), "box must have finite edges"),
-        (lambda: Cylinder(0, 0, 0), "cylinder must have a positive radius"),
-        (lambda: World(name="x", size=(0, 1)), r"size must be two positive lengths, got \(0, 1\)"),
-        (lambda: World(name="x", boxes=(Box(4, 0, 6, 1),)), "boxes must lie in the room"),
-        (lambda: World(name="x", cylinders=(Cylinder(5, 0, 1),)), "cylinders must lie in the room"),
-        (lambda: World(name="x", goal_regions=(Box(4, 0, 6, 1),)), "goal_regions must lie in"),
-        (lambda: Box("1", 0, 2, 2), "box must have finite edges, got .*'1'"),
-        (lambda: Box(0, 0, True, 2), "box must have finite edges, got .*True"),
-        (lambda: Cylinder(None, 0, 1), "cylinder must have finite numbers, got .*None"),
-        (lambda: Polygon(3), "polygon must have a list of vertices, got 3"),
-        (lambda: Polygon(("ab", "cd", "ef")), "polygon must have two finite numbers .*'ab'"),
-        (lambda: Polygon(((0, 0), (1, 1))), "3 to 100 vertices, got 2"),
-        (lambda: Polygon(around(101)), "3 to 100 vertices, got 101"),
-        (lambda: Polygon(((0, 0), (1, 1), (1, math.inf))), "two finite numbers a vertex"),
-        (lambda: Polygon(((0, 0), (1, 1), (1,))), "two finite numbers a vertex"),
-        (lambda: Polygon(((0, 0), (1, 1), (2, 2))), "must have an area"),
-        (lambda: Polygon(((0, 0), (1, 1), (1, 0), (0, 1))), "does not cross"),
-        (
-            lambda: Polygon(((0, 0), (2, 0), (2, 2), (1, 2), (1, -1), (0, 1))),
-            "does not cross or touch itself",
-        ),
-        (lambda: Polygon(((0, 0), (2, 0), (2, 2), (1, 0), (0, 2))), "does not cross or touch"),
-        (lambda: Polygon(((0, 0), (2, 0), (2, 0), (0, 2))), "does not cross or touch itself"),
-        (lambda: Polygon(((0, 0), (2, 0), (1, 0), (1, 2))), "does not cross or touch itself"),
-        # A pentagram turns left at each of its points, twice around.
-        (lambda: Polygon(around(5, 2.513)), "does not cross"),
-        (
-            lambda: World(name="x", polygons=(Polygon(((4, 0), (5.1, 0), (4, 1))),)),
-            "polygons must lie in the room",
-        ),
-        (lambda: World(name=None), "name must be text, got None"),
-        (lambda: World(name="x", size=8), "size must be two positive lengths, got 8"),
-        (lambda: World(name="x", size=("1", "2")), "size must be two positive .*'1'"),
-        (lambda: World(name="x", size=()), r"size must be two positive lengths, got \(\)"),
-        (lambda: World(name="x", boxes=Box(0, 0, 1, 1)), "boxes must be a tuple of Box, got Box"),
-        (lambda: World(name="x", boxes=((1, 1, 2, 2),)), "boxes must be a tuple of Box, got"),
-        (lambda: World(name="x", cylinders=(Box(0, 0, 1, 1),)), "cylinders must be a tuple of Cyl"),
-        (lambda: World(name="x", walkers=Walker()), "walkers must be a tuple of Walker, got"),
-        (lambda: World(name="x", occupancy=3), "occupancy must be an OccupancyGrid, got 3"),
-    ],
-)
-def test_a_bad_shape_or_world_is_rejected(make: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_the_training_maps_are_those_of_the_public_course() -> None:
     assert [len(WORLDS[name].boxes) for name in "ABCD"] == [0, 4, 4, 6]
     assert WORLDS["C"].boxes[0] == Box(-1.5, 1.5, 1.5, 2.0)
