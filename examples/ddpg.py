@@ -81,7 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     loss = mpfa.make_ddpg_loss(
         actor, critic, reward_scale=0.1, saturation_penalty=1.0, saturation_limit=1.5
     )
-    learner = mpfa.DDPGLearner(loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005)
+    learner = mpfa.ActorCriticLearner(
+        loss, actor_lr=LEARNING_RATE, critic_lr=LEARNING_RATE, tau=0.005
+    )
 
     falling = max(int(0.4 * options.actions), 1)
     noise = AdditiveGaussianModule(

@@ -56,7 +56,7 @@ def run_updates(
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from torchrl_mpfa import DDPGLearner, make_actor, make_critic, make_ddpg_loss
+        >>> from torchrl_mpfa import ActorCriticLearner, make_actor, make_critic, make_ddpg_loss
         >>> from torchrl_mpfa.methods import make_replay
         >>> replay = make_replay("mpfa_per", capacity=100, batch_size=8)
         >>> end = torch.zeros(32, 1, dtype=torch.bool)
@@ -67,7 +67,7 @@ def run_updates(
         ...     "next": {**after, "done": end, "terminated": end},
         ... }
         >>> index = replay.buffer.extend(TensorDict(rows, [32]))
-        >>> learner = DDPGLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
+        >>> learner = ActorCriticLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
         >>> log, batch = run_updates(replay.buffer, learner, replay.select, updates=4)
         >>> learner.updates, batch["signals", "td_error"].shape
         (4, torch.Size([8]))

@@ -33,7 +33,7 @@ from benchmarks.speed.timing import (
     take_turns,
 )
 from torchrl_mpfa import (
-    DDPGLearner,
+    ActorCriticLearner,
     Learner,
     MPFASampler,
     SignalReplayBuffer,
@@ -72,7 +72,7 @@ class Agent:
         options: dict[str, Any] = {"width": width, **(_PLAIN if plain else {})}
         critic = make_critic(*sizes, **options, late_action=not plain)
         loss = make_ddpg_loss(make_actor(*sizes, **options), critic)
-        self.learner = DDPGLearner(loss, compile=compile)
+        self.learner = ActorCriticLearner(loss, compile=compile)
         spec = Bounded(low=-1.0, high=1.0, shape=(ACTION_SIZE,))
         self.noise = AdditiveGaussianModule(spec, sigma_init=0.2, sigma_end=0.2)
         self.buffer = SignalReplayBuffer(

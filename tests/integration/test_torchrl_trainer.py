@@ -20,7 +20,7 @@ from torchrl.trainers.algorithms import DDPGTrainer
 
 from mpfa_envs import make_navigation_env
 from torchrl_mpfa import (
-    DDPGLearner,
+    ActorCriticLearner,
     MPFASampler,
     SignalReplayBuffer,
     SignalTensorStorage,
@@ -194,7 +194,7 @@ def test_the_code_of_the_page_runs() -> None:
 def test_a_collector_of_many_robots_acts_by_the_weights_that_were_learned() -> None:
     env = make_navigation_env("A", num_envs=2, physics="kinematic", seed=0)
     actor = make_actor(24, 2, width=8)
-    learner = DDPGLearner(make_ddpg_loss(actor, make_critic(24, 2, width=8)), actor_lr=0.1)
+    learner = ActorCriticLearner(make_ddpg_loss(actor, make_critic(24, 2, width=8)), actor_lr=0.1)
     buffer = SignalReplayBuffer(
         storage=SignalTensorStorage(100), sampler=MPFASampler(100), batch_size=4
     )

@@ -11,9 +11,10 @@ from torch import nn
 
 from tests.mpfa.losses import KINDS, differentiate_at_once, make_batch, make_of
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import DDPGLearner, make_actor, make_critic, make_ddpg_loss
-from torchrl_mpfa.losses import base, noise
-from torchrl_mpfa.losses.noise import QUANTILES, quantile_loss
+from torchrl_mpfa import ActorCriticLearner, make_actor, make_critic, make_ddpg_loss
+from torchrl_mpfa.losses import base
+from torchrl_mpfa.losses.functional import LEAST_NOISE, quantile_loss
+from torchrl_mpfa.losses.stacked import QUANTILES
 from torchrl_mpfa.methods import loss_options, make_replay
 from torchrl_mpfa.priorities import information_gain_priority
 
@@ -92,7 +93,7 @@ def test_the_loss_writes_the_gain_of_its_critics_in_any_units_of_its_reward(kind
         if kind != "ddpg":
             target = log["target_value"][row] / scale
             errors = (target - log["pred_value"][:, row] / scale).tolist()
-        expected = by_hand(errors, (quantiles[row] / scale).tolist(), noise.LEAST_NOISE)
+        expected = by_hand(errors, (quantiles[row] / scale).tolist(), LEAST_NOISE)
         assert batch[SIGNAL][row].item() == pytest.approx(expected, rel=1e-4)
 
 
@@ -166,7 +167,7 @@ def noisy_share(method, *, rows=1_000, updates=300):
         )
     )
     networks = make_actor(2, 1, width=32), make_critic(2, 1, width=32)
-    learner = DDPGLearner(make_ddpg_loss(*networks, **loss_options(method)), critic_lr=1e-3)
+    learner = ActorCriticLearner(make_ddpg_loss(*networks, **loss_options(method)), critic_lr=1e-3)
     found = []
     for _ in range(updates):
         for draw in replay.select(replay.buffer):

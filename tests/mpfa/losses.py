@@ -9,17 +9,18 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from tests.mpfa.transitions import seeded
 from torchrl_mpfa import (
-    DDPGLearner,
-    SACLearner,
-    TD3Learner,
+    ActorCriticLearner,
+    DQNLearner,
+    SignalDQNLoss,
     make_actor,
     make_critic,
     make_ddpg_loss,
     make_sac_loss,
     make_stochastic_actor,
     make_td3_loss,
+    make_value_network,
 )
-from torchrl_mpfa.learners.program import CompiledGradients
+from torchrl_mpfa.learners.compiled import CompiledGradients
 from torchrl_mpfa.networks import StochasticActor
 
 GAMMA = 0.9
@@ -27,7 +28,6 @@ BOUNDS = (-1.0, 1.0)
 KINDS = ["ddpg", "td3", "sac"]
 CRITICS_LOSS = {"ddpg": "loss_value", "td3": "loss_qvalue", "sac": "loss_qvalue"}
 """TorchRL's name of the critics' loss."""
-LEARNERS = {"ddpg": DDPGLearner, "td3": TD3Learner, "sac": SACLearner}
 UNTRACED = {"compile": {"disable": True}}
 """The function that torch.compile would make one program of, which takes seconds."""
 TRACED = {"compile": {"backend": "eager"}}
@@ -78,7 +78,12 @@ def make_learner(kind="ddpg", seed=0, *, of_loss=None, **options):
     """A learner of any kind whose targets differ from its networks."""
     networks = make_networks(seed, stochastic=kind == "sac")
     loss = make_of(kind, **{"networks": networks, **(of_loss or {})})
-    return LEARNERS[kind](loss, **{"actor_lr": 1e-3, "critic_lr": 1e-3, **options})
+    return ActorCriticLearner(loss, **{"actor_lr": 1e-3, "critic_lr": 1e-3, **options})
+
+
+def make_discrete(size=5, **options):
+    """A learner of four actions."""
+    return DQNLearner(SignalDQNLoss(make_value_network(size, 4, width=8)), **options)
 
 
 def critics_of(loss, params):

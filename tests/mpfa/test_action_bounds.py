@@ -13,9 +13,8 @@ from torchrl.objectives import SACLoss, TD3Loss, ValueEstimators
 
 from tests.mpfa.losses import GAMMA, make_batch, parameter_gradients
 from torchrl_mpfa import (
-    SACLearner,
+    ActorCriticLearner,
     SignalTD3Loss,
-    TD3Learner,
     make_actor,
     make_critic,
     make_sac_loss,
@@ -171,12 +170,12 @@ def test_sac_equals_torchrls_within_these_bounds():
 
 def test_learners_train_within_bounds_and_move_no_bound():
     for learner in (
-        TD3Learner(
+        ActorCriticLearner(
             # The function that would be compiled, which it is not: that takes seconds.
             make_td3_loss(*networks(make_actor), action_spec=SPEC),
             compile={"disable": True},
         ),
-        SACLearner(make_sac_loss(*networks(make_stochastic_actor))),
+        ActorCriticLearner(make_sac_loss(*networks(make_stochastic_actor))),
     ):
         for _ in range(4):
             learner.update(batch_of())

@@ -7,6 +7,7 @@ import torch
 
 from tests.mpfa import losses
 from tests.mpfa.losses import GAMMA, make_batch
+from torchrl_mpfa.losses.functional import smoothing_noise
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
@@ -75,7 +76,8 @@ def next_values(name, learner, batch):
     with torch.no_grad():
         action = networks.target_actor.outputs(after)["action"]
         if name == "td3":
-            action = (action + loss.target_noise(action)).clamp(-1, 1)
+            noise = smoothing_noise(action, deviation=loss.policy_noise, limit=loss.noise_clip)
+            action = (action + noise).clamp(-1, 1)
         given = {"observation": after["observation"], "action": action}
         each = [critic.outputs(given) for critic in networks.target_critics]
         return torch.stack([found["state_action_value"].squeeze(-1) for found in each])

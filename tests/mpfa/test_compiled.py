@@ -11,7 +11,7 @@ from torchrl.objectives import ValueEstimators
 from tests.mpfa.compiled import UNTRACED, assert_alike, fail_with, make_pair, update_both
 from tests.mpfa.losses import (
     BOUNDS,
-    LEARNERS,
+    KINDS,
     differentiate_at_once,
     make_batch,
     make_learner,
@@ -20,7 +20,7 @@ from tests.mpfa.losses import (
     parameter_gradients,
     without_shortcut,
 )
-from torchrl_mpfa import DDPGLearner, SignalDDPGLoss, make_ddpg_loss
+from torchrl_mpfa import ActorCriticLearner, SignalDDPGLoss, make_ddpg_loss
 from torchrl_mpfa.files import load_safely, save_atomically
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -50,7 +50,7 @@ def assert_same_gradients(name, options, batch, *, trains="both", **kwargs):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        *((name, {}) for name in LEARNERS),
+        *((name, {}) for name in KINDS),
         ("td3", {"num_qvalue_nets": 1}),
         ("td3", {"num_qvalue_nets": 3, "target_average": 3}),
         ("ddpg", {"target_average": 3, **NOISE}),
@@ -254,7 +254,7 @@ def test_a_loss_that_depends_on_the_numbers_in_a_batch_cannot_be_a_program():
             loss, log = super().loss_actor(tensordict)
             return (loss if bool(tensordict["observation"].sum() > 0) else -loss), log
 
-    learner = DDPGLearner(Choosing(*make_networks()), compile=UNTRACED)
+    learner = ActorCriticLearner(Choosing(*make_networks()), compile=UNTRACED)
     with pytest.raises(ValueError, match=r"compile needs a loss .* got a Choosing"):
         learner.update(make_batch())
     assert learner.updates == 0
@@ -272,7 +272,7 @@ def test_running_statistics_count_each_batch_once():
     for compile in (False, UNTRACED):
         actor, critic = make_networks()
         critic.module.first.insert(1, torch.nn.BatchNorm1d(16))
-        learner = DDPGLearner(make_ddpg_loss(actor, critic), compile=compile)
+        learner = ActorCriticLearner(make_ddpg_loss(actor, critic), compile=compile)
         for seed in range(3):
             learner.update(make_batch(seed=seed))
         found = learner.loss.state_dict()
@@ -288,7 +288,7 @@ def test_a_batch_without_entries_is_rejected_as_in_eager():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", KINDS)
 def test_a_compiled_learner_takes_the_same_steps(name):
     learners = make_pair(name, True)
     for seed in range(4):

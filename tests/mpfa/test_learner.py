@@ -1,4 +1,4 @@
-"""DDPGLearner: target networks, gradients, saving, arguments."""
+"""ActorCriticLearner: target networks, gradients, saving, arguments."""
 
 import pytest
 import torch

@@ -1,16 +1,12 @@
-"""Actor and critic: shapes, options, the start near the middle of the tanh, and rejections."""
-
-import math
+"""Actor and critic: shapes, options, and the start near the middle of the tanh."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from tests.mpfa.transitions import seeded
-from torchrl_mpfa import make_actor, make_critic, make_stochastic_actor, make_value_network
-from torchrl_mpfa.networks import make_value_table
+from torchrl_mpfa import make_actor, make_critic
 
 
 def count(module, kind):
@@ -83,54 +79,3 @@ def test_the_value_depends_on_observation_and_action(late_action):
     value = critic(observation, action)
     assert not critic(observation, action + 1).equal(value)
     assert not critic(observation + 1, action).equal(value)
-
-
-_SPEC = Bounded(low=-1.0, high=1.0, shape=(2,))
-SPECS = [
-    (Unbounded((2,)), "action_spec must be Bounded, got Unbounded"),
-    (Categorical(3), "action_spec must be Bounded, got Categorical"),
-    (Bounded(low=0, high=3, shape=(2,), dtype=torch.int64), "real numbers, got torch.int64"),
-    (Bounded(low=-1.0, high=1.0, shape=(3,)), "must have action_size = 2 entries"),
-    (Bounded(low=-1.0, high=math.inf, shape=(2,)), "finite bounds, low < high"),
-    (Bounded(low=1.0, high=1.0, shape=(2,)), "finite bounds, low < high"),
-    (Composite(a=_SPEC, b=_SPEC), "action_spec must have one entry, got 2"),
-    (
-        Bounded(
-            low=torch.tensor([[-2.0, 0.0], [0.0, 0.0]]),
-            high=torch.tensor([[2.0, 10.0], [2.0, 10.0]]),
-        ),
-        "the same bounds for all environments",
-    ),
-]
-SIZES = {
-    make_actor: {"observation_size": 3, "action_size": 2, "width": 8, "layers": 2},
-    make_critic: {"observation_size": 3, "action_size": 2, "width": 8, "layers": 2},
-    make_stochastic_actor: {"observation_size": 3, "action_size": 2, "width": 8, "layers": 2},
-    make_value_network: {"observation_size": 3, "actions": 2, "width": 8, "layers": 2},
-    make_value_table: {"cell_of": len, "cells": 3, "actions": 2},
-}
-REJECTIONS = [
-    *[
-        (make, {name: 0}, f"{name} must be an integer from 1 to 2147483647, got 0")
-        for make, sizes in SIZES.items()
-        for name in sizes
-        if name != "cell_of"
-    ],
-    *[
-        (make, {"final_init": -1.0}, "final_init must be finite and not negative, got -1.0")
-        for make in list(SIZES)[:4]
-    ],
-    *[
-        (make, {"action_spec": spec}, words)
-        for make in (make_actor, make_stochastic_actor)
-        for spec, words in SPECS
-    ],
-    (make_critic, {"layers": 1}, "layers must be at least 2 with late_action, got 1"),
-]
-
-
-@pytest.mark.parametrize(("make", "options", "words"), REJECTIONS)
-def test_an_argument_that_no_network_can_have_is_rejected_by_name(make, options, words):
-    make(**SIZES[make])
-    with pytest.raises(ValueError, match=words):
-        make(**{**SIZES[make], **options})

@@ -10,7 +10,7 @@ from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 
 from tests.mpfa.compiled import assert_alike, counting, fail_with, make_pair, update_both
 from tests.mpfa.losses import BOUNDS, make_batch, make_learner, make_networks
-from torchrl_mpfa.learners import program
+from torchrl_mpfa.learners import compiled as program
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 

@@ -1,4 +1,4 @@
-"""SACLearner: what moves and what does not, saving, and a problem that it solves."""
+"""ActorCriticLearner: what moves and what does not, saving, and a problem that it solves."""
 
 import math
 from copy import deepcopy
@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tests.mpfa import losses
 from tests.mpfa.losses import critics_of, make_batch, make_networks
 from tests.mpfa.transitions import make_buffer, seeded
-from torchrl_mpfa import Learner, SACLearner, make_sac_loss
+from torchrl_mpfa import ActorCriticLearner, Learner, make_sac_loss
 from torchrl_mpfa.selection import SampledBatch
 
 
@@ -98,7 +98,7 @@ def solve_bandit(updates=300, **rates):
     loss = make_sac_loss(
         *make_networks(stochastic=True, size=2, width=32), alpha_init=0.1, target_entropy=-1.0
     )
-    learner = SACLearner(loss, **rates)
+    learner = ActorCriticLearner(loss, **rates)
     generator, end = seeded(), torch.ones(64, 1, dtype=torch.bool)
     for _ in range(updates):
         state, action = (torch.rand(64, 2, generator=generator) * 2 - 1 for _ in range(2))

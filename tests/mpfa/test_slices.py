@@ -21,7 +21,7 @@ from tests.mpfa.transitions import (
     write_signals,
 )
 from torchrl_mpfa import (
-    DDPGLearner,
+    ActorCriticLearner,
     EntropyFusion,
     PositiveBoost,
     PositiveDecay,
@@ -352,7 +352,8 @@ def test_updates_of_an_iteration_learn_from_whole_slices(strict_length):
     data["next", "observation"] = data["observation"] + 1
     data["next", "terminated"] = data["next", "done"].clone()
     buffer.extend(data)
-    learner = DDPGLearner(make_ddpg_loss(make_actor(1, 2, width=8), make_critic(1, 2, width=8)))
+    networks = make_actor(1, 2, width=8), make_critic(1, 2, width=8)
+    learner = ActorCriticLearner(make_ddpg_loss(*networks))
     _, batch = run_updates(buffer, learner, updates=3)
     last = batch["next", "truncated"].squeeze(1)
     assert last[-1]

@@ -11,6 +11,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from tests.mpfa.losses import BOUNDS, critics_of, make_batch, make_networks, make_of
 from torchrl_mpfa import SignalDDPGLoss, SignalSACLoss, SignalTD3Loss
+from torchrl_mpfa.losses.functional import smoothing_noise
 
 # TorchRL warns at every loss whose target networks nothing moves; these tests do not train.
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -86,7 +87,9 @@ def test_a_target_of_several_steps_is_its_formula_row_by_row(name):
     compute = loss.value_loss if name == "td3" else loss.loss_value
     found = compute(batch)[1]["target_value"]
     torch.manual_seed(3)
-    noise = loss.target_noise(batch["action"]) if name == "td3" else torch.zeros(len(batch), 2)
+    noise = torch.zeros(len(batch), 2)
+    if name == "td3":
+        noise = smoothing_noise(noise, deviation=loss.policy_noise, limit=loss.noise_clip)
     for row in range(len(batch)):
         after = batch["next"][row]
         action = networks.target_actor.module(after["observation"])[1] + noise[row]

@@ -13,7 +13,7 @@ from tests.mpfa import transitions
 from tests.mpfa.second_device import DEVICE
 from tests.mpfa.transitions import same, seeded
 from torchrl_mpfa import (
-    DDPGLearner,
+    ActorCriticLearner,
     MPFASampler,
     SignalTensorStorage,
     make_actor,
@@ -52,7 +52,8 @@ def make_learner(**options):
     torch.manual_seed(0)
     actor = make_actor(OBSERVATION, ACTION, width=8)
     critic = make_critic(OBSERVATION, ACTION, width=8)
-    return DDPGLearner(make_ddpg_loss(actor, critic, **options), actor_lr=1e-2, critic_lr=1e-2)
+    loss = make_ddpg_loss(actor, critic, **options)
+    return ActorCriticLearner(loss, actor_lr=1e-2, critic_lr=1e-2)
 
 
 def make_buffer(count=MANY, *, device="cpu", **options):

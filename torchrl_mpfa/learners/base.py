@@ -1,4 +1,4 @@
-"""What all learners share: a loss, one optimizer, target networks.
+"""A loss, one optimizer and target networks behind one ``update``, for actors with critics.
 
 A learner knows nothing of replay or environment: a batch goes in, signals come back in it. Another
 learner has the same methods and takes its place.
@@ -7,17 +7,20 @@ learner has the same methods and takes its place.
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar, Literal, NoReturn, Protocol, runtime_checkable
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, NoReturn, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check, check_counts
-from torchrl_mpfa.learners.program import CompiledGradients
-from torchrl_mpfa.learners.states import check_state, naming, refuse_unfinished
-from torchrl_mpfa.learners.targets import MultiTensorSoftUpdate
+from torchrl_mpfa.files import check_saved_numbers
+from torchrl_mpfa.learners.compiled import CompiledGradients
 from torchrl_mpfa.losses import SignalLoss
 from torchrl_mpfa.selection import SampledBatch, Trains
 
@@ -26,24 +29,24 @@ OptimizerName = Literal["adam", "radam"]
 
 @runtime_checkable
 class Learner(Protocol):
-    """What a training loop needs of a learner."""
+    """Methods of a learner that a training loop calls."""
 
     policy: TensorDictModule
 
-    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
-        """Train on a draw, write the signals in its batch, and give values for the log.
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+        """Train on a batch, write its signals, and return values for the log.
 
         Args:
-            draw: What an update is made from; a batch of size ``[B]`` stands for
-                ``SampledBatch(batch)``.
+            sampled: The batch and the networks that learn from it; a batch of size ``[B]`` stands
+                for ``SampledBatch(batch)``.
 
         Returns:
-            Detached values for the log, of those losses that were computed.
+            Detached values for the log, of the losses that were computed.
         """
         ...
 
     def end_episode(self) -> None:
-        """Take note that an episode has ended."""
+        """Signal the end of an episode."""
         ...
 
     def anneal(self, factor: float) -> None:
@@ -51,12 +54,42 @@ class Learner(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next update depends on."""
+        """Return everything that the next update depends on."""
         ...
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Restore a state from :meth:`state_dict`."""
         ...
+
+
+class MultiTensorSoftUpdate(SoftUpdate):
+    r"""Target networks, :math:`\theta' \leftarrow \tau\theta + (1 - \tau)\theta'` (Eqs. 6-7).
+
+    :class:`~torchrl.objectives.SoftUpdate` with all tensors in one call: one by one they take
+    a fifth of a training step.
+
+    Args:
+        loss: A loss with target parameters; they are set to the current ones.
+        tau: :math:`\tau`.
+
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
+        >>> loss = make_ddpg_loss(make_actor(24, 2), make_critic(24, 2))
+        >>> MultiTensorSoftUpdate(loss, tau=0.01).step()
+    """
+
+    def __init__(self, loss: LossModule, *, tau: float) -> None:
+        super().__init__(loss, tau=tau)
+        params = dict(loss.named_parameters())
+        buffers = {**params, **dict(loss.named_buffers())}
+        pairs = [(p, buffers.get(f"target_{name}")) for name, p in params.items()]
+        pairs = [(online, target) for online, target in pairs if target is not None]
+        self._online, self._target = (list(each) for each in zip(*pairs, strict=True))
+        self._move = get_ema_multi_avg_fn(1.0 - tau)
+
+    def step(self) -> None:
+        """Move every target parameter by tau."""
+        self._move(self._target, self._online, 0)
 
 
 class OptimizedLearner:
@@ -65,6 +98,7 @@ class OptimizedLearner:
     def __init__(
         self, loss: Any, groups: list[dict[str, Any]], optimizer: OptimizerName, tau: float
     ) -> None:
+        check(ABOVE_ZERO, tau=tau)
         self.loss: Any = loss
         self.optimizer = make_optimizer(optimizer, groups)
         self._rates = [group["lr"] for group in groups]
@@ -72,11 +106,36 @@ class OptimizedLearner:
         self.updates = 0
         """Training steps taken."""
 
+    def _step(
+        self, batch: TensorDictBase, trains: Trains = "both", loss_function: str | None = None
+    ) -> dict[str, Tensor]:
+        """Step the optimizer, and the target networks with the actor; return the log."""
+        self.optimizer.zero_grad(set_to_none=True)
+        try:
+            log = self._differentiate(batch, trains, loss_function)
+        except RuntimeError as error:
+            if type(error) is not RuntimeError:  # Memory or compiler failed, whatever the batch.
+                raise
+            found = [(k, v) for k, v in batch.items(True, True) if isinstance(v, Tensor)]
+            forms = ", ".join(f"{key!r} {[*value.shape]} {value.dtype}" for key, value in found)
+            raise RuntimeError(f"batch does not fit the loss, got {forms}: {error}") from error
+        check_losses(log, batch)
+        self.optimizer.step()
+        if trains != "critic":
+            self.targets.step()
+        return log
+
+    def _differentiate(
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
+    ) -> dict[str, Tensor]:
+        """Set the gradients and return the log; a parameter without a gradient stays as it is."""
+        raise NotImplementedError
+
     def end_episode(self) -> None:
-        """Nothing changes."""
+        """Change nothing."""
 
     def anneal(self, factor: float) -> None:
-        """Set the learning rates to a fraction of what the constructor was given.
+        """Set the learning rates to a fraction of the constructor's.
 
         Args:
             factor: The fraction, in [0, 1].
@@ -97,7 +156,7 @@ class OptimizedLearner:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, target networks, optimizer and count; tensors and plain values only."""
+        """Return networks, targets, optimizer and count, as tensors and plain values."""
         return {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -105,139 +164,131 @@ class OptimizedLearner:
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
+        """Restore a state from :meth:`state_dict`.
 
         Args:
             state_dict: The state of a learner of the same kind, with networks of the same sizes.
 
         Raises:
-            ValueError: If it is not; nothing is changed then.
+            ValueError: If it is of another kind or size, or not finite; nothing is changed then.
         """
-        check_state(state_dict, self.state_dict(), self.optimizer)
+        # A twin takes a step, so that it has all moments: PyTorch checks neither their sizes nor
+        # those of TorchRL's target networks, and its fused optimizers write past the end.
+        twin = copy.deepcopy(self.optimizer)
+        for group in twin.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.zeros_like(parameter)
+        twin.step()
+        check_alike("learner", state_dict, {**self.state_dict(), "optimizer": twin.state_dict()})
         self.loss.load_state_dict(state_dict["loss"])
-        # PyTorch would share the tensors with whoever gave the state.
+        # PyTorch would share the tensors with the owner of the state.
         self.optimizer.load_state_dict(copy.deepcopy(state_dict["optimizer"]))
         self.updates = state_dict["updates"]
 
 
 class ActorCriticLearner(OptimizedLearner):
-    r"""One optimizer for actor and critics, target networks, and rates that can be lowered.
+    r"""DDPG, TD3 or SAC by the loss: one optimizer for actor and critics, and target networks.
 
     All gradients of an update are taken at the same networks, by one backward pass; then all
-    networks take their step. A kind of learner says which loss it takes.
+    networks take their step, and the target networks follow (Eqs. 4-7).
 
     Args:
-        loss: The loss with its networks in it.
+        loss: A :class:`~torchrl_mpfa.losses.SignalLoss` with its networks in it.
         actor_lr: Learning rate of the actor, Table 1.
         critic_lr: Learning rate of the critics, Table 1.
+        alpha_lr: Learning rate of the logarithm of SAC's temperature. The temperature takes some
+            ``1 / alpha_lr`` updates to change by a factor of e.
         critic_weight_decay: L2 decay of the critics' weights. A decay of 1e-2, as in the original
             DDPG paper, was seen to hold Q below the returns.
         tau: :math:`\tau` of Eqs. (6)-(7), Table 1.
         optimizer: ``"adam"`` (the paper), or ``"radam"``, which warms up by itself (Liu et al.
             2020, https://arxiv.org/abs/1908.03265).
-        policy_delay: Updates of the critics for one of the actor and of the target networks.
-        compile: Whether ``torch.compile`` makes one program of the losses and their gradients, or
-            the arguments for it. It needs a C++ compiler and half a minute once (the program is
+        policy_delay: Updates of the critics for one of the actor and of the target networks; by
+            default 2 with a TD3 loss, and 1 with others, as in Eqs. (4)-(7). A delay steadies a
+            single critic, too.
+        compile: True to make one program of the losses and their gradients by ``torch.compile``,
+            or the arguments for it. It needs a C++ compiler and half a minute once (the program is
             kept on disk), and takes half of the time for networks of 64 units. The networks must
             stay on their device.
 
     Raises:
-        TypeError: If the loss is another learner's.
+        TypeError: If the loss writes no signals.
         ValueError: If a rate is not positive, the decay negative, ``tau`` not in (0, 1], the delay
             no count, or the optimizer unknown.
-    """
 
-    loss_type: ClassVar[type] = SignalLoss
-    """The loss that this kind of learner takes."""
+    Examples:
+        >>> from torchrl_mpfa import make_actor, make_critic, make_ddpg_loss
+        >>> learner = ActorCriticLearner(make_ddpg_loss(make_actor(24, 2), make_critic(24, 2)))
+        >>> learner.policy.out_keys
+        ['preactivation', 'action']
+    """
 
     def __init__(
         self,
-        loss: Any,
+        loss: SignalLoss,
         *,
         actor_lr: float = 1e-4,
         critic_lr: float = 1e-4,
+        alpha_lr: float = 3e-4,
         critic_weight_decay: float = 1e-4,
         tau: float = 0.01,
         optimizer: OptimizerName = "adam",
-        policy_delay: int = 1,
+        policy_delay: int | None = None,
         compile: bool | dict[str, Any] = False,
     ) -> None:
-        check_counts(policy_delay=policy_delay)
-        if not isinstance(loss, SignalLoss) or not isinstance(loss, self.loss_type):
-            raise TypeError(
-                f"loss of a {type(self).__name__} must be a {self.loss_type.__name__}, got "
-                f"{type(loss).__name__}"
-            )
-        if loss.reduction == "none":  # type: ignore[attr-defined]
+        if not isinstance(loss, SignalLoss):
+            raise TypeError(f"loss must be a SignalLoss, got {type(loss).__name__}")
+        if loss.reduction == "none":
             raise ValueError("reduction of the loss must be 'mean' or 'sum', got 'none'")
-        check(POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr)
+        self.policy_delay = loss.policy_delay if policy_delay is None else policy_delay
+        check_counts(policy_delay=self.policy_delay)
+        check(POSITIVE, actor_lr=actor_lr, critic_lr=critic_lr, alpha_lr=alpha_lr)
         check(NOT_NEGATIVE, critic_weight_decay=critic_weight_decay)
-        check(ABOVE_ZERO, tau=tau)
+        decay = {"weight_decay": critic_weight_decay}
         groups = [
             {"params": loss.actor_parameters(), "lr": actor_lr},
-            {
-                "params": loss.critic_parameters(),
-                "lr": critic_lr,
-                "weight_decay": critic_weight_decay,
-            },
+            {"params": loss.critic_parameters(), "lr": critic_lr, **decay},
         ]
+        if of_temperature := loss.temperature_parameters():
+            groups.append({"params": of_temperature, "lr": alpha_lr})
         super().__init__(loss, groups, optimizer, tau)
-        self.policy: TensorDictModule = getattr(loss, "actor_network")  # noqa: B009
-        self.policy_delay = policy_delay
+        self.policy: TensorDictModule = loss.actor_network
         arguments = compile if isinstance(compile, dict) else {}
         self._program = CompiledGradients(loss, arguments) if compile else None
 
-    def _add_parameters(self, parameters: list[torch.nn.Parameter], *, lr: float) -> None:
-        """Have the optimizer move further parameters of the loss, at a rate of their own."""
-        self.optimizer.add_param_group({"params": parameters, "lr": lr})
-        self._rates.append(lr)
-
-    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
-        """One step of the networks and of the target networks, as far as they are due.
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+        """Step the networks and the target networks, as far as they are due.
 
         Args:
-            draw: What an update is made from; a batch of size ``[B]`` stands for
-                ``SampledBatch(batch)``. The critics' loss writes the signals in the batch; the
-                target networks move with the actor. If ``draw.new_step`` is false, it is a further
-                batch of the same training step, which a delay of the actor does not count.
+            sampled: The batch and the networks that learn from it; a batch of size ``[B]`` stands
+                for ``SampledBatch(batch)``. The critics' loss writes the signals in the batch; the
+                target networks move with the actor. A false ``new_step`` marks a further batch of
+                the same training step, which a delay of the actor does not count.
 
         Returns:
-            Detached values for the log; none where the actor alone is to learn, and is not due.
+            Detached values for the log; none for a batch of the actor alone that is not due.
 
         Raises:
             KeyError: If the batch lacks an entry.
             RuntimeError: If the batch does not fit the networks.
             ValueError: If a loss is not finite. Nothing of the learner is changed then.
         """
-        if not isinstance(draw, SampledBatch):
-            draw = SampledBatch(draw)
-        updates = self.updates + draw.new_step
-        trains, log = draw.trains, {}
-        due = updates % self.policy_delay == 0
+        if not isinstance(sampled, SampledBatch):
+            sampled = SampledBatch(sampled)
+        updates = self.updates + sampled.new_step
+        trains, due = sampled.trains, updates % self.policy_delay == 0
         if trains == "both" and not due:
             trains = "critic"
+        log = {}
         if trains == "critic" or due:
-            with naming(draw.batch):
-                log = self._step(draw.batch, trains, draw.loss_function)
+            log = self._step(sampled.batch, trains, sampled.loss_function)
         self.updates = updates
         return {key: value.detach() for key, value in log.items()}
-
-    def _step(
-        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
-    ) -> dict[str, Tensor]:
-        """One step of the optimizer, and of the target networks with the actor; give the log."""
-        log = self._differentiate(batch, trains, loss_function)
-        refuse_unfinished(log, batch)
-        self.optimizer.step()
-        if trains != "critic":
-            self.targets.step()
-        return log
 
     def _differentiate(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
-        """Set the gradients and give the log; a parameter without one stays, decay and all."""
-        self.optimizer.zero_grad(set_to_none=True)
+        """Set the gradients and return the log; a parameter without a gradient stays as it is."""
         if self._program is not None:
             return self._program(batch, trains, loss_function)
         losses, log = self.loss.losses(batch, trains=trains, loss_function=loss_function)
@@ -247,14 +298,80 @@ class ActorCriticLearner(OptimizedLearner):
         return {**losses, **log}
 
     def end_episode(self) -> None:
-        """Keep the target critics as they are now, if the loss averages several of them."""
+        """Keep the target critics' present state, if the loss averages several of them."""
         self.loss.keep_target_critics()
 
 
 def make_optimizer(name: OptimizerName, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-    """The optimizer of this name, all tensors in one call."""
+    """Make the optimizer of this name, which steps all tensors in one call."""
     if name == "adam":
         return torch.optim.Adam(groups, fused=True)
     if name == "radam":
         return torch.optim.RAdam(groups, foreach=True)
     raise ValueError(f"optimizer must be 'adam' or 'radam', got {name!r}")
+
+
+def check_losses(losses: Mapping[str, Tensor], batch: TensorDictBase) -> None:
+    """Raise if a value whose name begins with ``"loss"`` is not finite, with entry and row."""
+    # One NaN in an observation would make all weights NaN. Losses are looked at and not the batch,
+    # as that is one number for each.
+    for name, value in losses.items():
+        if not name.startswith("loss"):
+            continue
+        if math.isfinite(value.item()) if value.ndim == 0 else bool(value.isfinite().all()):
+            continue
+        cause = _first_not_finite(batch)
+        if cause is not None:
+            raise ValueError(f"batch must be finite, got {cause}")
+        raise ValueError(
+            f"{name} must be finite, got {value.sum().item()} of a finite batch: lower the "
+            "learning rate, or scale the rewards"
+        )
+
+
+def _first_not_finite(batch: TensorDictBase) -> str | None:
+    """Describe the first number of a batch that is not finite, but for the signals."""
+    for key, value in batch.items(True, True):
+        written = key[0] if isinstance(key, tuple) else key
+        if written in {"signals", "td_error"} or not torch.is_floating_point(value):
+            continue
+        rows = (~value.isfinite()).reshape(len(value), -1)
+        if bool(rows.any()):
+            row = int(rows.any(1).nonzero()[0])
+            number = value[row].reshape(-1)[rows[row]][0].item()
+            return f"{number} in {key!r}, row {row}"
+    return None
+
+
+def check_alike(part: str, state: Any, own: Any) -> None:
+    """Raise unless a saved state has the entries, types and sizes of a part's own, all finite."""
+    _check_form(f"the saved {part}", state, own)
+    check_saved_numbers(part, state)
+
+
+def _check_form(place: str, state: Any, own: Any) -> None:
+    if isinstance(own, Tensor) and isinstance(state, Tensor):
+        # PyTorch keeps a count in the default type of the process that began.
+        if state.shape != own.shape or (state.dtype is not own.dtype and own.ndim):
+            raise ValueError(f"{place} must be {_form(own)}, got {_form(state)}")
+    elif isinstance(own, Mapping) and isinstance(state, Mapping):
+        # The moments of an optimizer come with the first gradient of a parameter.
+        missing = [] if place.endswith("'state'") else [key for key in own if key not in state]
+        if unfit := [*missing, *(key for key in state if key not in own)]:
+            word = "lacks" if missing else "must not have"
+            raise ValueError(f"{place} {word} {unfit[0]!r}")
+        for key, value in state.items():
+            _check_form(f"{place}, {key!r}", value, own[key])
+    elif isinstance(own, list) and isinstance(state, list) and len(own) == len(state):
+        for number, pair in enumerate(zip(state, own, strict=True)):
+            _check_form(f"{place}, {number}", *pair)
+    elif type(state) is not type(own) or isinstance(own, list):
+        raise ValueError(f"{place} must be {_form(own)}, got {_form(state)}")
+
+
+def _form(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"{value.dtype} of shape {[*value.shape]}"
+    if isinstance(value, Mapping):
+        return "a mapping"
+    return f"a list of {len(value)}" if isinstance(value, list) else repr(value)

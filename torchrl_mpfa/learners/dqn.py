@@ -10,31 +10,31 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_mpfa.checks import ABOVE_ZERO, NOT_NEGATIVE, POSITIVE, SHARE, check
-from torchrl_mpfa.learners.base import OptimizedLearner, OptimizerName
-from torchrl_mpfa.learners.states import naming, refuse_unfinished
+from torchrl_mpfa.learners.base import (
+    OptimizedLearner,
+    OptimizerName,
+    check_alike,
+    check_losses,
+)
 from torchrl_mpfa.losses.dqn import SignalDQNLoss
 from torchrl_mpfa.losses.functional import bootstrap_target, read_choices
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.networks.values import ValueTable
-from torchrl_mpfa.saved import Entry, check_entries, count
-from torchrl_mpfa.selection import SampledBatch
+from torchrl_mpfa.selection import SampledBatch, Trains
 from torchrl_mpfa.signals import TD_ERROR
 
-_ONE_NETWORK = (
-    "a draw for the {trains} alone, or with the loss function {loss_function!r}, needs actor and "
-    "critic: {name} has one network for both"
-)
 
-
-def _whole_batch(draw: SampledBatch | TensorDictBase, name: str) -> TensorDictBase:
-    """The sampled batch, which must be for actor and critic alike."""
-    if not isinstance(draw, SampledBatch):
-        return draw
-    if draw.trains != "both" or draw.loss_function is not None:
+def _whole_batch(sampled: SampledBatch | TensorDictBase, learner: object) -> TensorDictBase:
+    """Return the sampled batch, which must be for actor and critic alike."""
+    if not isinstance(sampled, SampledBatch):
+        return sampled
+    if sampled.trains != "both" or sampled.loss_function is not None:
         raise ValueError(
-            _ONE_NETWORK.format(trains=draw.trains, loss_function=draw.loss_function, name=name)
+            f"a batch for the {sampled.trains} alone, or with the loss function "
+            f"{sampled.loss_function!r}, needs actor and critic: {type(learner).__name__} has one "
+            "network for both"
         )
-    return draw.batch
+    return sampled.batch
 
 
 class DQNLearner(OptimizedLearner):
@@ -68,12 +68,9 @@ class DQNLearner(OptimizedLearner):
         optimizer: OptimizerName = "adam",
     ) -> None:
         if not isinstance(loss, SignalDQNLoss):
-            raise TypeError(
-                f"loss of a DQNLearner must be a SignalDQNLoss, got {type(loss).__name__}"
-            )
+            raise TypeError(f"loss must be a SignalDQNLoss, got {type(loss).__name__}")
         check(POSITIVE, lr=lr)
         check(NOT_NEGATIVE, weight_decay=weight_decay)
-        check(ABOVE_ZERO, tau=tau)
         network = loss.value_network
         if not isinstance(network, DirectModule):
             raise TypeError(f"network must be a DirectModule, got {type(network).__name__}")
@@ -84,32 +81,32 @@ class DQNLearner(OptimizedLearner):
         self.policy: DirectModule = copy.deepcopy(network)
         loss.value_network_params.to_module(self.policy)
 
-    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
-        """One step of the network and of the target network.
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+        """Step the network and the target network.
 
         Args:
-            draw: What is learned from; a batch of size ``[B]`` stands for
-                ``SampledBatch(batch)``. Gets the signal of Eq. (13).
+            sampled: The batch; one of size ``[B]`` stands for ``SampledBatch(batch)``. It gets the
+                signal of Eq. (13).
 
         Returns:
             Detached values for the log.
 
         Raises:
             KeyError: If the batch lacks an entry.
-            ValueError: If the loss is not finite, or the draw is for an actor or critic alone;
+            ValueError: If the loss is not finite, or the batch is for an actor or critic alone;
                 nothing is changed then.
         """
-        batch = _whole_batch(draw, type(self).__name__)
-        self.optimizer.zero_grad(set_to_none=True)
-        with naming(batch):
-            loss, log = self.loss.losses(batch)
-        log["loss_value"] = loss
-        refuse_unfinished(log, batch)
-        loss.backward()
-        self.optimizer.step()
-        self.targets.step()
+        log = self._step(_whole_batch(sampled, self))
         self.updates += 1
         return {key: value.detach() for key, value in log.items()}
+
+    def _differentiate(
+        self, batch: TensorDictBase, trains: Trains, loss_function: str | None
+    ) -> dict[str, Tensor]:
+        """Set the gradients and return the log."""
+        loss, log = self.loss.losses(batch)
+        loss.backward()
+        return {**log, "loss_value": loss}
 
 
 class TabularQLearner:
@@ -125,7 +122,7 @@ class TabularQLearner:
         policy: The table with its cells, out of :func:`~torchrl_mpfa.networks.make_value_table`.
         lr: Learning rate.
         gamma: Discount, in [0, 1].
-        importance: Whether importance weights, where a batch has them, scale the TD errors.
+        importance: True to scale TD errors by the importance weights of a batch, if it has them.
 
     Raises:
         TypeError: If the policy is no table.
@@ -160,30 +157,30 @@ class TabularQLearner:
         self.policy, self.gamma, self.importance = policy, gamma, importance
         self._rate = self._first_rate = lr
         self.updates = 0
-        """Updates made."""
+        """Training steps taken."""
 
     @property
     def table(self) -> Tensor:
-        """Values, shape ``[cells, K]``."""
+        """Values of all cells, shape ``[cells, K]``."""
         found: Tensor = self.policy.module.table
         return found
 
     @torch.no_grad()
-    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """Move the entries that the transitions of a batch belong to.
 
         Args:
-            draw: As in :meth:`DQNLearner.update`; actions are one-hot, ``[B, K]``, or numbers.
+            sampled: As in :meth:`DQNLearner.update`; actions are one-hot, ``[B, K]``, or numbers.
 
         Returns:
             Values for the log.
 
         Raises:
             KeyError: If the batch lacks an entry.
-            ValueError: If a number is not finite, the actions have neither form, or the draw is
+            ValueError: If a number is not finite, the actions have neither form, or the batch is
                 for an actor or critic alone; nothing is changed then.
         """
-        batch = _whole_batch(draw, type(self).__name__)
+        batch = _whole_batch(sampled, self)
         cell_of, table = self.policy.module.cell_of, self.table
         action = read_choices(batch["action"], table.shape[1], batch)
         entry = cell_of(batch["observation"]) * table.shape[1] + action
@@ -202,7 +199,7 @@ class TabularQLearner:
         step = td_error
         if self.importance and "priority_weight" in batch.keys():  # noqa: SIM118
             step = td_error * batch["priority_weight"].reshape(-1)
-        refuse_unfinished({**log, "loss_step": step}, batch)
+        check_losses({**log, "loss_step": step}, batch)
         batch.set(TD_ERROR.key, td_error.abs())
         total = torch.zeros(table.numel()).index_add_(0, entry, step)
         count = torch.bincount(entry, minlength=table.numel()).clamp_min(1)
@@ -211,10 +208,10 @@ class TabularQLearner:
         return log
 
     def end_episode(self) -> None:
-        """Nothing changes."""
+        """Change nothing."""
 
     def anneal(self, factor: float) -> None:
-        """Set the learning rate to a fraction of what the constructor was given.
+        """Set the learning rate to a fraction of the constructor's.
 
         Args:
             factor: The fraction, in [0, 1].
@@ -226,20 +223,18 @@ class TabularQLearner:
         self._rate = self._first_rate * factor
 
     def state_dict(self) -> dict[str, Any]:
-        """The table and the count."""
+        """Return the table and the count."""
         return {"loss": {"table": self.table.clone()}, "updates": self.updates}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` gave.
+        """Restore a state from :meth:`state_dict`.
 
         Args:
             state_dict: The state of a learner with a table of the same size.
 
         Raises:
-            ValueError: If it is not; nothing is changed then.
+            ValueError: If its table is of another size, or not finite; nothing is changed then.
         """
-        check_entries("learner", state_dict, [Entry("loss"), count("updates")], missing=ValueError)
-        table = Entry("table", torch.isfinite, "finite", self.table.dtype, tuple(self.table.shape))
-        check_entries("loss", state_dict["loss"], [table], missing=ValueError)
+        check_alike("learner", state_dict, self.state_dict())
         self.table.copy_(state_dict["loss"]["table"])
         self.updates = state_dict["updates"]

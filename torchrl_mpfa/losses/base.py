@@ -4,37 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.value import TD0Estimator, TD1Estimator, TDLambdaEstimator
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
-from torchrl_mpfa.losses.averaging import PastCritics, average
-from torchrl_mpfa.losses.calling import (
-    Networks,
-    StackedNetworks,
-    Tensors,
-    bind,
-    bind_frozen,
-    call,
-    check_networks,
-)
 from torchrl_mpfa.losses.functional import (
     DISTANCES,
+    LEAST_NOISE,
     action_gradient,
-    bootstrap_target,
     critic_loss,
+    quantile_loss,
     read_trust,
     saturation,
-    scale_rewards,
     trusted_loss,
 )
-from torchrl_mpfa.losses.keys import DEFAULT_SIGNALS, KNOWN_SIGNALS, VALUE, check_importance
-from torchrl_mpfa.losses.noise import LEAST_NOISE, last_layer, quantile_loss, with_quantiles
+from torchrl_mpfa.losses.stacked import (
+    Networks,
+    PastCritics,
+    Tensors,
+    as_function,
+    average,
+    bind_frozen,
+    bind_networks,
+    check_networks,
+    last_layer,
+    with_quantiles,
+)
 from torchrl_mpfa.networks import DirectModule
 from torchrl_mpfa.priorities import (
     action_gradient_priority,
@@ -42,9 +44,32 @@ from torchrl_mpfa.priorities import (
     td_error_priority,
 )
 from torchrl_mpfa.selection import Trains
-from torchrl_mpfa.signals import ACTION_GRADIENT, INFORMATION_GAIN, TD_ERROR
+from torchrl_mpfa.signals import ACTION_GRADIENT, INFORMATION_GAIN, SIGNALS_KEY, TD_ERROR
 
+VALUE = "value"
+"""Name of the signal that is Q itself, which may be negative."""
+DEFAULT_SIGNALS = (TD_ERROR.name, ACTION_GRADIENT.name)
+KNOWN_SIGNALS = (*DEFAULT_SIGNALS, VALUE, INFORMATION_GAIN.name)
+"""Signals that a loss can write."""
 _ESTIMATORS = (TD0Estimator, TD1Estimator, TDLambdaEstimator)
+
+
+@dataclass
+class SignalKeys:
+    """Keys that a loss of this package reads or writes in addition to those of TorchRL's loss."""
+
+    action: NestedKey = "action"
+    preactivation: NestedKey = "preactivation"
+    td_error_signal: NestedKey = TD_ERROR.key
+    action_gradient_signal: NestedKey = ACTION_GRADIENT.key
+    value_signal: NestedKey = (SIGNALS_KEY, VALUE)
+    information_gain_signal: NestedKey = INFORMATION_GAIN.key
+
+
+def check_importance(importance: str) -> None:
+    """Reject an unknown use of importance weights."""
+    if importance not in ("critic", "torchrl", "none"):
+        raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")
 
 
 class SignalLoss:
@@ -87,13 +112,17 @@ class SignalLoss:
         (True, ('td_error',))
     """
 
+    actor_network: Any
     loss_function: str
+    reduction: str
     tensor_keys: Any
     value_estimator: Any
     value_type: Any
     _value_estimator: Any
     _critic_name: ClassVar[str] = "qvalue_network"
     """TorchRL's name of the critic."""
+    policy_delay: ClassVar[int] = 1
+    """Updates of the critics for one of the actor, unless a learner is given another number."""
 
     def __init__(
         self,
@@ -171,11 +200,11 @@ class SignalLoss:
         loss_function: str | None = None,
         defer_gradient: bool = True,
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The losses of an update, with the signal of Eq. (14) deferred.
+        """Compute the losses of an update, with the signal of Eq. (14) deferred.
 
         Args:
             batch: Transitions, batch size ``[B]``; the critics' loss writes their signals.
-            trains: Whose losses are wanted: the ``"critic"``'s, the ``"actor"``'s, or ``"both"``.
+            trains: Losses to compute: the ``"critic"``'s, the ``"actor"``'s, or ``"both"``.
             loss_function: Distance of the critics' loss; None: the loss's own.
             defer_gradient: False writes the signal of Eq. (14) at once.
 
@@ -187,31 +216,31 @@ class SignalLoss:
         log: dict[str, Tensor] = {}
         self._deferred = None  # Of an update that failed halfway.
         if trains != "actor":
-            options = {"defer_gradient": defer_gradient, "loss_function": loss_function}
-            losses["loss_value"], log = self._critics_part(batch, **options)
+            losses["loss_value"], log = self._critics_part(
+                batch, defer_gradient=defer_gradient, loss_function=loss_function
+            )
         if trains != "critic":
             of_actor, more = self._actors_part(batch)
             losses, log = {**losses, **of_actor}, {**log, **more}
         return losses, log
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
-        """Loss of the critics under TorchRL's name for it, and values for the log."""
+        """Compute the critics' loss by TorchRL's method for it; return values for the log too."""
         raise NotImplementedError
 
     def _actors_part(self, batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Loss of the actor, and others by the same batch, by name; and values for the log."""
+        """Compute the actor's loss, and others of the same batch; return values for the log too."""
         raise NotImplementedError
 
     def write_action_gradient(self, tensordict: TensorDictBase) -> None:
-        r"""Write the signal of Eq. (14) that the critics' loss was asked to defer.
+        r"""Write the signal of Eq. (14) that the critics' loss deferred.
 
         A transition's action enters the loss through its own Q alone, so
         :math:`\nabla_a Q = \nabla_a L / (\partial L / \partial Q)`: the backward pass of the loss
-        has found it on its way, and needs no other one before it.
+        gives both factors, and no pass of its own is needed.
 
         Args:
-            tensordict: The batch that the loss was computed of; nothing happens if it deferred
-                nothing.
+            tensordict: The batch of the loss; nothing is written if nothing was deferred.
 
         Raises:
             RuntimeError: If the loss was not differentiated.
@@ -227,104 +256,68 @@ class SignalLoss:
         gradient = action.grad / slope
         flat = slope == 0
         if bool(flat.any()):  # Where there is no error there is nothing to divide.
-            action = action.detach().requires_grad_(True)
+            stored, keys = self._stored(tensordict), self.tensor_keys
+            action = stored[keys.action].requires_grad_(True)
             with torch.enable_grad():
-                critic = self._networks().frozen_critics[0]
-                value = self._q(critic, tensordict, {self.tensor_keys.action: action})
-                gradient = torch.where(flat, action_gradient(value, action), gradient)
-        self._write_gradient(tensordict, gradient)
+                found = self._networks().frozen_critics[0].outputs(stored)
+                own = action_gradient(found[keys.state_action_value].squeeze(-1), action)
+            gradient = torch.where(flat, own, gradient)
+        self._write_slope(tensordict, gradient)
 
     def keep_target_critics(self) -> None:
-        """Keep the target critics as they are now for the average that later targets have."""
+        """Keep the target critics' present state for the mean of later targets."""
         if self.past_critics:
             for critic, past in zip(self._held_critics("target_"), self.past_critics, strict=True):
                 past.push(critic.module)  # type: ignore[operator]
 
     def current_critics(self) -> list[TensorDictModule]:
-        """The critics as modules of their own, for looking at Q: they get no gradient."""
+        """Return modules that hold the critics' parameters, without gradients."""
         return self._held_critics("")
 
     def actor_parameters(self) -> list[nn.Parameter]:
-        """Parameters that the actor's loss moves."""
+        """Return the parameters that the actor's loss moves."""
         return self._parameters_of("actor_network")
 
     def critic_parameters(self) -> list[nn.Parameter]:
-        """Parameters that the critics' loss moves."""
+        """Return the parameters that the critics' loss moves."""
         more = [] if self.noise_network is None else self.noise_network.parameters()
         return [*self._parameters_of(self._critic_name), *more]
+
+    def temperature_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that only SAC has: its temperature, unless that is fixed."""
+        return []
 
     def _parameters_of(self, name: str) -> list[nn.Parameter]:
         flat = getattr(self, f"{name}_params").flatten_keys().values()
         return [value for value in flat if value.requires_grad]
 
-    # The critics' loss, in the order of its steps.
+    # The steps of a loss, in their order.
 
-    def _q(self, critic: TensorDictModule, source: TensorDictBase, chosen: Tensors) -> Tensor:
-        """Q of a critic, shape ``[B]``, at the states of ``source`` and the actions chosen."""
-        found: Tensor = call(critic, source, chosen)[self.tensor_keys.state_action_value]
-        return found.squeeze(-1)
+    def _stored(self, batch: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Read a critic's inputs of stored transitions, without gradients."""
+        return {key: batch[key].detach() for key in self._networks().stored}
 
-    def _values(self, source: TensorDictBase, action: Tensor) -> Tensor:
-        """Q of the current critics, ``[C, B]``; the action leads to the first one alone."""
-        critic, keys = self._networks().critic, self.tensor_keys
-        if not isinstance(critic, StackedNetworks):
-            return self._q(critic, source, {keys.action: action}).unsqueeze(0)
-        others = [action.detach()] * (len(self._networks().target_critics) - 1)
-        found = critic.call(source, [{keys.action: each} for each in (action, *others)])
-        return torch.stack([out[keys.state_action_value].squeeze(-1) for out in found])
+    def _states(self, source: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Read the states in which the actor is to act, without gradients."""
+        return {key: source[key].detach() for key in self._networks().states}
 
-    def _stored_values(self, tensordict: TensorDictBase, *, defer_gradient: bool) -> Tensor:
-        """Q of the stored actions, ``[C, B]``; writes its slope (Eq. 14), or defers that."""
-        self._deferred = None
+    def _values(self, stored: dict[NestedKey, Tensor]) -> Tensor:
+        """Compute Q of the stored actions, ``[C, B]``; the first critic's slope can follow."""
+        keys, each = self.tensor_keys, []
         with_slope = ACTION_GRADIENT.name in self.signals
-        differentiable = torch.is_grad_enabled()
-        action = tensordict[self.tensor_keys.action].detach()
-        # The slope is wanted under no_grad as well, when a loss is only looked at.
-        with torch.set_grad_enabled(with_slope or differentiable):
-            if with_slope:
-                action.requires_grad_(True)  # A detached alias: the batch itself is not touched.
-            value = self._values(tensordict, action)
-            if with_slope and defer_gradient and differentiable:
-                value.retain_grad()
-                self._deferred = action, value
-            elif with_slope:
-                self._write_gradient(tensordict, action_gradient(value[0], action))
-        return value if differentiable else value.detach()
-
-    def _target(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
-        """Targets by the loss's value estimator, Eq. (5) unless told otherwise, shape ``[B]``."""
-        after, keys, estimator = tensordict["next"], self.tensor_keys, self.value_estimator
-        if not self.bootstraps_once:
-            scaled = scale_rewards(tensordict, keys, self.reward_scale)
-            longer: Tensor = estimator.value_estimate(scaled, next_value=next_value.unsqueeze(-1))
-            return longer.squeeze(-1)
-        steps = tensordict.get(estimator.tensor_keys.steps_to_next_obs, None)
-        reward = after[keys.reward] * self.reward_scale
-        return bootstrap_target(
-            reward.reshape(next_value.shape),
-            next_value,
-            after[keys.terminated].reshape(next_value.shape),
-            gamma=estimator.gamma,
-            steps=None if steps is None else steps.reshape(next_value.shape),
-        )
-
-    def _write_signals(self, tensordict: TensorDictBase, td_error: Tensor, value: Tensor) -> None:
-        """Write ``|TD error|`` (Eq. 13), the largest of the critics, and Q of the first."""
-        if TD_ERROR.name in self.signals:
-            size = td_error_priority(td_error).amax(0)
-            tensordict.set(self.tensor_keys.td_error_signal, size / self.reward_scale)
-        if VALUE in self.signals:
-            tensordict.set(self.tensor_keys.value_signal, value[0].detach() / self.reward_scale)
-
-    def _write_gradient(self, tensordict: TensorDictBase, gradient: Tensor) -> None:
-        """Write the norm of the gradient of the first critic (Eq. 14)."""
-        size = action_gradient_priority(gradient, order=self.gradient_order)
-        tensordict.set(self.tensor_keys.action_gradient_signal, size / self.reward_scale)
+        action = stored[keys.action].requires_grad_(with_slope)
+        # The slope is written under no_grad as well, when a loss is only looked at.
+        with torch.set_grad_enabled(with_slope or torch.is_grad_enabled()):
+            for critic in self._networks().critics:
+                found = critic.outputs({**stored, keys.action: action})
+                each.append(found[keys.state_action_value].squeeze(-1))
+                action = action.detach()
+            return torch.stack(each) if len(each) > 1 else each[0].unsqueeze(0)
 
     def _critic_mean(
-        self, tensordict: TensorDictBase, value: Tensor, target: Tensor, loss_function: str | None
+        self, batch: TensorDictBase, value: Tensor, target: Tensor, loss_function: str | None
     ) -> Tensor:
-        """Loss of the critics (Eq. 4), with the importance weights of Eq. (11) or TorchRL's."""
+        """Compute the critics' loss (Eq. 4), with the weights of Eq. (11) or TorchRL's."""
         loss = critic_loss(
             value,
             target,
@@ -333,36 +326,53 @@ class SignalLoss:
             pal_alpha=self.pal_alpha,
         )
         if self.noise_network is not None:
-            loss = loss + self._noise_loss(tensordict, (target - value).detach(), target)
+            loss = loss + self._noise_loss(batch, (target - value).detach(), target)
         if self.importance == "critic":
-            weight = tensordict.get(self.tensor_keys.priority_weight, None)
+            weight = batch.get(self.tensor_keys.priority_weight, None)
             if weight is not None:
                 loss = loss * weight.reshape(loss.shape).to(loss.device)
-        return self._mean(tensordict, loss)
+        return self._mean(batch, loss)
 
-    def _noise_loss(self, tensordict: TensorDictBase, td_error: Tensor, target: Tensor) -> Tensor:
-        """Loss of the quantiles of the targets, ``[B]``; writes the information gain."""
-        quantiles = call(self.noise_network, tensordict)[self.tensor_keys.state_action_value]
+    def _noise_loss(self, batch: TensorDictBase, td_error: Tensor, target: Tensor) -> Tensor:
+        """Compute the loss of the targets' quantiles, ``[B]``; write the information gain."""
+        found = as_function(self.noise_network).outputs(self._stored(batch))
+        quantiles = found[self.tensor_keys.state_action_value]
         least = LEAST_NOISE * self.reward_scale
         gain = information_gain_priority(td_error, quantiles.detach(), least_noise=least)
-        tensordict.set(self.tensor_keys.information_gain_signal, gain)
+        batch.set(self.tensor_keys.information_gain_signal, gain)
         return quantile_loss(quantiles, target)
 
-    def _mean(self, tensordict: TensorDictBase, loss: Tensor) -> Tensor:
-        """Mean over the batch; with ``importance="torchrl"`` by TorchRL's weights."""
-        weights = self._maybe_get_priority_weight(tensordict)  # type: ignore[attr-defined]
-        reduced: Tensor = self._reduce_loss(loss, tensordict=tensordict, weights=weights)  # type: ignore[attr-defined]
-        return reduced
+    def _write_signals(
+        self, batch: TensorDictBase, value: Tensor, td_error: Tensor, action: Tensor, defer: bool
+    ) -> None:
+        """Write ``|TD error|`` (Eq. 13), the largest of the critics, the slope (Eq. 14), and Q."""
+        keys = self.tensor_keys
+        if TD_ERROR.name in self.signals:
+            size = td_error_priority(td_error).amax(0)
+            batch.set(keys.td_error_signal, size / self.reward_scale)
+        if VALUE in self.signals:
+            batch.set(keys.value_signal, value[0].detach() / self.reward_scale)
+        if ACTION_GRADIENT.name not in self.signals:
+            return
+        if defer and torch.is_grad_enabled():
+            value.retain_grad()
+            self._deferred = action, value
+        else:
+            with torch.enable_grad():
+                self._write_slope(batch, action_gradient(value[0], action))
 
-    # The actor's loss.
+    def _write_slope(self, batch: TensorDictBase, gradient: Tensor) -> None:
+        """Write the norm of the gradient of the first critic (Eq. 14)."""
+        size = action_gradient_priority(gradient, order=self.gradient_order)
+        batch.set(self.tensor_keys.action_gradient_signal, size / self.reward_scale)
 
     def _actor_mean(
-        self, tensordict: TensorDictBase, loss: Tensor, chosen: Tensors
+        self, batch: TensorDictBase, loss: Tensor, chosen: Tensors
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean of the losses ``[B]`` of an actor, with the penalty on saturation; and its log."""
+        """Average an actor's losses ``[B]``, add the penalty on saturation; return its log too."""
         keys = self.tensor_keys
-        loss = trusted_loss(loss, chosen[keys.action], read_trust(tensordict))
-        mean = self._mean(tensordict, loss)
+        loss = trusted_loss(loss, chosen[keys.action], read_trust(batch))
+        mean = self._mean(batch, loss)
         preactivation = chosen.get(keys.preactivation)
         if preactivation is None:
             if self.saturation_penalty > 0:
@@ -376,13 +386,13 @@ class SignalLoss:
             mean = mean + self.saturation_penalty * penalty
         return mean, {"preactivation": preactivation.detach().abs()}
 
-    # The estimator of the targets.
+    def _mean(self, batch: TensorDictBase, loss: Tensor) -> Tensor:
+        """Average over the batch; with ``importance="torchrl"`` by TorchRL's weights."""
+        weights = self._maybe_get_priority_weight(batch)  # type: ignore[attr-defined]
+        reduced: Tensor = self._reduce_loss(loss, tensordict=batch, weights=weights)  # type: ignore[attr-defined]
+        return reduced
 
-    @property
-    def bootstraps_once(self) -> bool:
-        """Whether a target needs its own transition alone, as in Eq. (5)."""
-        estimator = self.value_estimator
-        return type(estimator) is TD0Estimator and not estimator.average_rewards
+    # The estimator of the targets.
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
         """As in TorchRL: set how targets are made, by TD(0), TD(1) or TD(lambda).
@@ -411,28 +421,23 @@ class SignalLoss:
     # The networks, made once: they hold the parameters of the loss.
 
     def _networks(self) -> Networks:
+        """Return the networks, bound to the parameters if they are not yet."""
         if self._bound is None:
-            actor, params = self.actor_network, self.actor_network_params  # type: ignore[attr-defined]
-            target = self.target_actor_network_params  # type: ignore[attr-defined]
-            critic, of_critic = (
-                getattr(self, f"{self._critic_name}{end}") for end in ("", "_params")
-            )
-            self._bound = Networks(
-                actor=bind(actor, params),
-                critic=(StackedNetworks if of_critic.batch_size else bind)(critic, of_critic),
-                frozen_critics=self._held_critics(""),
-                target_actor=bind(actor, target).requires_grad_(False),
-                target_critics=average(self._held_critics("target_"), self.past_critics),
+            name = self._critic_name
+            self._bound = bind_networks(
+                (self.actor_network, self.actor_network_params, self.target_actor_network_params),  # type: ignore[attr-defined]
+                (getattr(self, name), getattr(self, f"{name}_params")),
+                average(self._held_critics("target_"), self.past_critics),
             )
         return self._bound
 
     def _held_critics(self, prefix: str) -> list[TensorDictModule]:
-        """Critics that hold the parameters whose name has this prefix, and get no gradient."""
+        """Return critics that hold the parameters with this prefix, without gradients."""
         name = self._critic_name
         return bind_frozen(getattr(self, name), getattr(self, f"{prefix}{name}_params"))
 
     def forget_networks(self) -> None:
-        """Have the networks that hold the parameters made again: those lie elsewhere now."""
+        """Have the networks bound to the parameters again at their next use."""
         self._bound = None
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:

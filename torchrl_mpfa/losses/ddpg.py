@@ -12,10 +12,8 @@ from torch import Tensor
 from torchrl.objectives import DDPGLoss, ValueEstimators
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, check
-from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.calling import call
-from torchrl_mpfa.losses.functional import smoothed_action, smoothing_noise
-from torchrl_mpfa.losses.keys import SignalKeys
+from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.functional import estimated_target, smoothed_action, smoothing_noise
 from torchrl_mpfa.networks.bounds import given_bounds
 
 
@@ -120,15 +118,28 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        value = self._stored_values(tensordict, defer_gradient=defer_gradient)  # And Eq. (14).
+        networks, keys, estimator = self._networks(), self.tensor_keys, self.value_estimator
+        stored, after = self._stored(tensordict), self._states(tensordict["next"])
+        value = self._values(stored)
         with torch.no_grad():
-            target = self._target(tensordict, self._next_value(tensordict["next"]))  # Eq. (5)
-        td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, value)  # Eq. (13)
+            chosen = networks.target_actor.outputs(after)
+            if self.policy_noise > 0:
+                action = chosen[keys.action]
+                noise = smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
+                low, high = self.min_action, self.max_action
+                chosen[keys.action] = smoothed_action(action, noise, low=low, high=high)
+            found = networks.target_critics[0].outputs({**after, **chosen})
+            next_value = found[keys.state_action_value].squeeze(-1)
+            target = estimated_target(  # Eq. (5)
+                tensordict, next_value, estimator, keys, reward_scale=self.reward_scale
+            )
         loss = self._critic_mean(tensordict, value, target, loss_function)  # Eqs. (4), (11)
+        td_error = (target - value).detach()
+        action = stored[keys.action]
+        self._write_signals(tensordict, value, td_error, action, defer_gradient)  # Eqs. (13), (14)
 
         squared, value = td_error[0].square(), value[0].detach()
-        tensordict.set(self.tensor_keys.priority, squared, inplace=True)
+        tensordict.set(keys.priority, squared, inplace=True)
         metadata = {
             "td_error": squared,
             "pred_value": value,
@@ -137,19 +148,6 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
             "pred_value_max": value.max(),
         }
         return loss, metadata
-
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        """Q of the target networks at the next states in Eq. (5), shape ``[B]``."""
-        networks, key = self._networks(), self.tensor_keys.action
-        chosen = call(networks.target_actor, after)
-        if self.policy_noise > 0:
-            noise, (low, high) = self.target_noise(chosen[key]), (self.min_action, self.max_action)
-            chosen[key] = smoothed_action(chosen[key], noise, low=low, high=high)
-        return self._q(networks.target_critics[0], after, chosen)
-
-    def target_noise(self, action: Tensor) -> Tensor:
-        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
-        return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor's loss, with the penalty on saturation if there is one.
@@ -160,9 +158,10 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         Returns:
             The loss, and detached values for the log.
         """
-        networks = self._networks()
-        chosen = call(networks.actor, tensordict)
-        value = self._q(networks.frozen_critics[0], tensordict, chosen)
+        networks, states = self._networks(), self._states(tensordict)
+        chosen = networks.actor.outputs(states)
+        found = networks.frozen_critics[0].outputs({**states, **chosen})
+        value = found[self.tensor_keys.state_action_value].squeeze(-1)
         return self._actor_mean(tensordict, -value, chosen)
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:

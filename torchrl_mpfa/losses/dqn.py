@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
+from torchrl_mpfa.losses.base import check_importance
 from torchrl_mpfa.losses.functional import distance, read_choices, scale_rewards
-from torchrl_mpfa.losses.keys import check_importance
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives.utils import distance_loss
+from torchrl.objectives.value import TD0Estimator
 
 from torchrl_mpfa.checks import as_mask
 
@@ -19,6 +20,9 @@ PAL = "pal"
 DISTANCES = ("l1", "l2", "smooth_l1", PAL)
 """Names of the loss functions, of which all but the last are TorchRL's too."""
 
+LEAST_NOISE = 0.05
+"""Standard deviation below which a target counts as certain, in units of the reward: without noise
+the errors of a network would otherwise be infinitely informative."""
 POLICY_WEIGHT = "policy_weight"
 BEHAVIOR_WEIGHT = "behavior_weight"
 BEHAVIOR_MEAN = "behavior_mean"
@@ -61,6 +65,26 @@ def bootstrap_target(
     discount = gamma if steps is None else gamma**steps
     # Of integers ~ would turn over the bits.
     return reward + discount * next_value * ~as_mask("'terminated' of the next step", terminated)
+
+
+def estimated_target(
+    batch: TensorDictBase, next_value: Tensor, estimator: Any, keys: Any, *, reward_scale: float
+) -> Tensor:
+    """Target by a value estimator of TorchRL, Eq. (5) by TD(0), shape ``[B]``."""
+    if type(estimator) is not TD0Estimator or estimator.average_rewards:
+        # A target of other transitions, too.
+        scaled = scale_rewards(batch, keys, reward_scale)
+        longer: Tensor = estimator.value_estimate(scaled, next_value=next_value.unsqueeze(-1))
+        return longer.squeeze(-1)
+    after, steps = batch["next"], batch.get(estimator.tensor_keys.steps_to_next_obs, None)
+    reward = after[keys.reward] * reward_scale
+    return bootstrap_target(
+        reward.reshape(next_value.shape),
+        next_value,
+        after[keys.terminated].reshape(next_value.shape),
+        gamma=estimator.gamma,
+        steps=None if steps is None else steps.reshape(next_value.shape),
+    )
 
 
 def smoothing_noise(action: Tensor, *, deviation: float, limit: float) -> Tensor:
@@ -140,6 +164,18 @@ def pal_distance(error: Tensor, *, alpha: float = 0.4) -> Tensor:
     loss = torch.where(size <= 1.0, 0.5 * size.square(), far)
     largest = size.detach() if error.ndim == 1 else size.detach().amax(0)
     return loss / largest.clamp_min(1.0).pow(alpha).mean()
+
+
+def quantile_loss(quantiles: Tensor, target: Tensor) -> Tensor:
+    r"""Loss of quantile regression, :math:`\frac1N \sum_k u_k (\tau_k - 1[u_k < 0])`.
+
+    With :math:`u_k = y - \theta_k` and :math:`\tau_k = (k - \frac12) / N`, Dabney et al. (2018),
+    https://arxiv.org/abs/1710.10044; from ``[B, N]`` and ``[B]`` to ``[B]``.
+    """
+    count = quantiles.shape[-1]
+    middle = (torch.arange(count, device=quantiles.device) + 0.5) / count
+    error = target.unsqueeze(-1) - quantiles
+    return torch.maximum(middle * error, (middle - 1.0) * error).mean(-1)
 
 
 def saturation(preactivation: Tensor, *, limit: float) -> Tensor:

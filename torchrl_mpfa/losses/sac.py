@@ -8,15 +8,15 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
 from torchrl.objectives import SACLoss, ValueEstimators
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
-from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.calling import Tensors, read_inputs
-from torchrl_mpfa.losses.functional import least_value, soft_value
-from torchrl_mpfa.losses.keys import SignalKeys
+from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.functional import estimated_target, least_value, soft_value
+from torchrl_mpfa.losses.stacked import Tensors
 from torchrl_mpfa.networks import StochasticActor
 
 
@@ -94,13 +94,21 @@ class SignalSACLoss(SignalLoss, SACLoss):
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
-        value = self._stored_values(tensordict, defer_gradient=defer_gradient)  # And Eq. (14).
+        networks, keys, estimator = self._networks(), self.tensor_keys, self.value_estimator
+        stored, after = self._stored(tensordict), self._states(tensordict["next"])
+        value = self._values(stored)
         with torch.no_grad():
-            next_value = self._next_value(tensordict["next"])
-            target = self._target(tensordict, next_value)  # Eq. (5)
-        td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, value)  # Eq. (13)
+            chosen, log_prob = self._sample(after)
+            found = [q.outputs({**after, **chosen}) for q in networks.target_critics]
+            values = torch.stack([each[keys.state_action_value].squeeze(-1) for each in found])
+            next_value = soft_value(values, log_prob, alpha=self._alpha)
+            target = estimated_target(  # Eq. (5)
+                tensordict, next_value, estimator, keys, reward_scale=self.reward_scale
+            )
         loss = self._critic_mean(tensordict, value, target, loss_function)  # Eqs. (4), (11)
+        td_error = (target - value).detach()
+        action = stored[keys.action]
+        self._write_signals(tensordict, value, td_error, action, defer_gradient)  # Eqs. (13), (14)
         metadata = {
             "td_error": td_error.square(),
             "next_state_value": next_value,
@@ -108,12 +116,6 @@ class SignalSACLoss(SignalLoss, SACLoss):
             "target_value": target,
         }
         return loss, metadata
-
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        """Soft value of the next states at actions of the current policy, shape ``[B]``."""
-        chosen, log_prob = self._sample(after)
-        values = [self._q(critic, after, chosen) for critic in self._networks().target_critics]
-        return soft_value(torch.stack(values), log_prob, alpha=self._alpha)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of :meth:`value_loss`, and the larger error, as TorchRL's ``forward`` asks for."""
@@ -125,9 +127,10 @@ class SignalSACLoss(SignalLoss, SACLoss):
 
         Among the values for the log is ``"log_prob"``, ``[B]``, for :meth:`temperature_loss`.
         """
-        chosen, log_prob = self._sample(tensordict)
-        critics = self._networks().frozen_critics
-        values = torch.stack([self._q(critic, tensordict, chosen) for critic in critics])
+        states, key = self._states(tensordict), self.tensor_keys.state_action_value
+        chosen, log_prob = self._sample(states)
+        found = [q.outputs({**states, **chosen}) for q in self._networks().frozen_critics]
+        values = torch.stack([each[key].squeeze(-1) for each in found])
         each = -soft_value(values, log_prob, alpha=self._alpha)
         loss, log = self._actor_mean(tensordict, each, chosen)
         least = least_value(values.detach())
@@ -148,18 +151,21 @@ class SignalSACLoss(SignalLoss, SACLoss):
         alpha = self.log_alpha.detach().exp()
         return losses, {"alpha": alpha, "entropy": -log_prob.mean(), **log}
 
-    def _sample(self, source: TensorDictBase) -> tuple[Tensors, Tensor]:
-        """Actions of the policy and means by key, ``[B, A]``, and log-densities, ``[B]``."""
-        actor, keys = self._networks().actor, self.tensor_keys
-        inputs = read_inputs(actor, source)
+    def _sample(self, states: Tensors) -> tuple[dict[NestedKey, Tensor], Tensor]:
+        """Sample actions of the policy; return them and means by key, and log-densities ``[B]``."""
+        actor, keys = self._networks().actor.network, self.tensor_keys  # type: ignore[attr-defined]
         if isinstance(actor, StochasticActor):
-            action, log_prob, mean = actor.sample(inputs)
+            action, log_prob, mean = actor.sample(states)
         else:
-            found = actor.get_dist_params(TensorDict(inputs))
+            found = actor.get_dist_params(TensorDict({key: states[key] for key in actor.in_keys}))
             action, log_prob = compute_rsample_log_prob(actor.build_dist_from_params(found))
             mean = found.get(keys.preactivation, None)
         chosen = {keys.action: action}
         return chosen if mean is None else {**chosen, keys.preactivation: mean}, log_prob
+
+    def temperature_parameters(self) -> list[nn.Parameter]:
+        """Return the temperature's logarithm, unless it is fixed."""
+        return [] if self.fixed_alpha else [self.log_alpha]
 
 
 def make_sac_loss(

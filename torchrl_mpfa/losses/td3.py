@@ -12,10 +12,13 @@ from torch import Tensor
 from torchrl.objectives import TD3Loss, ValueEstimators
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, SHARE, check
-from torchrl_mpfa.losses.base import SignalLoss
-from torchrl_mpfa.losses.calling import call
-from torchrl_mpfa.losses.functional import least_value, smoothed_action, smoothing_noise
-from torchrl_mpfa.losses.keys import SignalKeys
+from torchrl_mpfa.losses.base import SignalKeys, SignalLoss
+from torchrl_mpfa.losses.functional import (
+    estimated_target,
+    least_value,
+    smoothed_action,
+    smoothing_noise,
+)
 from torchrl_mpfa.networks.bounds import given_bounds
 
 
@@ -59,6 +62,7 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    policy_delay = 2
     min_action: Tensor
     max_action: Tensor
 
@@ -84,13 +88,23 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
-        value = self._stored_values(tensordict, defer_gradient=defer_gradient)  # And Eq. (14).
+        networks, keys, estimator = self._networks(), self.tensor_keys, self.value_estimator
+        stored, after = self._stored(tensordict), self._states(tensordict["next"])
+        value = self._values(stored)
         with torch.no_grad():
-            next_value = self._next_value(tensordict["next"])
-            target = self._target(tensordict, next_value)  # Eq. (5)
-        td_error = (target - value).detach()
-        self._write_signals(tensordict, td_error, value)  # Eq. (13)
+            action = networks.target_actor.outputs(after)[keys.action]
+            noise = smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
+            action = smoothed_action(action, noise, low=self.min_action, high=self.max_action)
+            found = [q.outputs({**after, keys.action: action}) for q in networks.target_critics]
+            values = [each[keys.state_action_value].squeeze(-1) for each in found]
+            next_value = least_value(torch.stack(values))
+            target = estimated_target(  # Eq. (5)
+                tensordict, next_value, estimator, keys, reward_scale=self.reward_scale
+            )
         loss = self._critic_mean(tensordict, value, target, loss_function)  # Eqs. (4), (11)
+        td_error = (target - value).detach()
+        action = stored[keys.action]
+        self._write_signals(tensordict, value, td_error, action, defer_gradient)  # Eqs. (13), (14)
         metadata = {
             "td_error": td_error.square(),
             "next_state_value": next_value,
@@ -99,24 +113,12 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
         }
         return loss, metadata
 
-    def _next_value(self, after: TensorDictBase) -> Tensor:
-        """Least Q of the target critics at the smoothed action in the next states, ``[B]``."""
-        networks, key = self._networks(), self.tensor_keys.action
-        action = call(networks.target_actor, after)[key]
-        noise, (low, high) = self.target_noise(action), (self.min_action, self.max_action)
-        chosen = {key: smoothed_action(action, noise, low=low, high=high)}
-        values = [self._q(critic, after, chosen) for critic in networks.target_critics]
-        return least_value(torch.stack(values))
-
-    def target_noise(self, action: Tensor) -> Tensor:
-        """Noise that smooths the target, as many numbers as actions, ``[B, A]``."""
-        return smoothing_noise(action, deviation=self.policy_noise, limit=self.noise_clip)
-
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor's loss by the first critic, as :meth:`SignalDDPGLoss.loss_actor`."""
-        networks = self._networks()
-        chosen = call(networks.actor, tensordict)
-        value = self._q(networks.frozen_critics[0], tensordict, chosen)
+        networks, states = self._networks(), self._states(tensordict)
+        chosen = networks.actor.outputs(states)
+        found = networks.frozen_critics[0].outputs({**states, **chosen})
+        value = found[self.tensor_keys.state_action_value].squeeze(-1)
         loss, log = self._actor_mean(tensordict, -value, chosen)
         return loss, {"state_action_value_actor": value.detach(), **log}
 

@@ -17,7 +17,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check, check_counts
-from torchrl_mpfa.learners.states import refuse_unfinished
+from torchrl_mpfa.learners.base import check_losses
 
 
 def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
@@ -138,7 +138,7 @@ class Curiosity(nn.Module):
         after, reward = following["observation"], following[self.reward_key]
         bonus = self.bonus(observation, action, after).reshape(reward.shape).to(reward.dtype)
         losses = self._losses(observation, action, after)
-        refuse_unfinished({"loss_reward": reward + bonus, **losses}, batch)
+        check_losses({"loss_reward": reward + bonus, **losses}, batch)
         self._learn(losses)
         following.set("extrinsic_reward", reward)
         following.set("intrinsic_reward", bonus)

@@ -1,8 +1,13 @@
 """Actors and critics, with what keeps them from collapsing as arguments."""
 
 from torchrl_mpfa.networks.bounds import ActionScale, action_bounds
-from torchrl_mpfa.networks.deterministic import Actor, Critic, make_actor, make_critic
-from torchrl_mpfa.networks.direct import DirectModule
+from torchrl_mpfa.networks.deterministic import (
+    Actor,
+    Critic,
+    DirectModule,
+    make_actor,
+    make_critic,
+)
 from torchrl_mpfa.networks.stochastic import (
     StochasticActor,
     StochasticNetwork,

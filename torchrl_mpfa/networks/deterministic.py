@@ -8,14 +8,94 @@ start near zero) and add LayerNorm. ``docs/design.md`` has the reason of each.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
-from torchrl_mpfa.checks import check_counts
+from torchrl_mpfa.checks import NOT_NEGATIVE, check, check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.direct import DirectModule
-from torchrl_mpfa.networks.perceptron import Perceptron
+
+
+class DirectModule(TensorDictModule):
+    """A :class:`~tensordict.nn.TensorDictModule` that is a plain function of its inputs as well.
+
+    A loss that calls a network through tensordicts spends half as much time on them as on the
+    network, if that is small. The losses of this package call these modules directly; any other
+    module works there, too, but slower.
+
+    Args:
+        module: Function of one tensor per key of ``in_keys``, in their order.
+        in_keys: What it reads.
+        out_keys: What it gives.
+
+    Examples:
+        >>> import torch
+        >>> double = DirectModule(lambda x: 2 * x, in_keys=["x"], out_keys=["y"])
+        >>> double.outputs({"x": torch.ones(2)})["y"]
+        tensor([2., 2.])
+    """
+
+    def __init__(
+        self, module: nn.Module, in_keys: list[NestedKey], out_keys: list[NestedKey]
+    ) -> None:
+        super().__init__(module, in_keys=in_keys, out_keys=out_keys)
+
+    def outputs(
+        self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
+    ) -> dict[NestedKey, Tensor]:
+        """Compute the outputs and leave the inputs as they are.
+
+        Args:
+            inputs: Tensors by key, in a mapping or a tensordict.
+
+        Returns:
+            Outputs by key.
+        """
+        return self.by_key(self.module(*[inputs.get(key) for key in self.in_keys]))
+
+    def by_key(self, found: Tensor | tuple[Tensor, ...]) -> dict[NestedKey, Tensor]:
+        """Name what the module gave."""
+        return dict(
+            zip(self.out_keys, found if isinstance(found, tuple) else (found,), strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Perceptron:
+    """Options of an actor, a critic, or a value network, see :func:`~torchrl_mpfa.make_actor`."""
+
+    width: int
+    layers: int
+    layer_norm: bool
+    final_init: float | None
+
+    def __post_init__(self) -> None:
+        check_counts(width=self.width, layers=self.layers)
+        if self.final_init is not None:
+            check(NOT_NEGATIVE, final_init=self.final_init)
+
+    def hidden(self, inputs: int, count: int) -> list[nn.Module]:
+        """So many hidden layers, each followed by LayerNorm (if asked) and ReLU."""
+        layers: list[nn.Module] = []
+        for _ in range(count):
+            norm = [nn.LayerNorm(self.width)] if self.layer_norm else []
+            layers += [nn.Linear(inputs, self.width), *norm, nn.ReLU()]
+            inputs = self.width
+        return layers
+
+    def last(self, outputs: int) -> nn.Linear:
+        """The linear layer after the hidden ones."""
+        layer = nn.Linear(self.width, outputs)
+        if self.final_init is not None:
+            nn.init.uniform_(layer.weight, -self.final_init, self.final_init)
+            nn.init.uniform_(layer.bias, -self.final_init, self.final_init)
+        return layer
 
 
 class Actor(nn.Module):

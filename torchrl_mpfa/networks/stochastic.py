@@ -17,8 +17,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_mpfa.checks import check_counts
 from torchrl_mpfa.networks.bounds import ActionScale, action_scale
-from torchrl_mpfa.networks.direct import DirectModule
-from torchrl_mpfa.networks.perceptron import Perceptron
+from torchrl_mpfa.networks.deterministic import DirectModule, Perceptron
 
 _SCALE_BIAS = math.log(math.e - 1.0)
 """The softplus of this is one."""

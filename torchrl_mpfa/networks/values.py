@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_mpfa.checks import check_counts
-from torchrl_mpfa.networks.direct import DirectModule
-from torchrl_mpfa.networks.perceptron import Perceptron
+from torchrl_mpfa.networks.deterministic import DirectModule, Perceptron
 
 _OUT_KEYS = ["action_value", "action", "chosen_action_value"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -15,13 +14,11 @@ from mpfa_envs.policies.layers import Choice, Layer, Table, from_torch
 from mpfa_envs.robots.discrete import WHEEL_PAIRS
 from mpfa_envs.sensing.binning import Binning
 from torchrl_mpfa import (
-    DDPGLearner,
+    ActorCriticLearner,
     DQNLearner,
     Learner,
-    SACLearner,
     SignalDQNLoss,
     TabularQLearner,
-    TD3Learner,
     make_actor,
     make_critic,
     make_ddpg_loss,
@@ -80,54 +77,19 @@ def make_learner(
         "optimizer": method.optimizer,
         "compile": compile,
     }
-    make_one = ALGORITHMS[settings.algorithm]
-    return make_one(settings, actor.to(device), critic.to(device), of_loss, of_learner)
-
-
-def _ddpg(
-    settings: LearnerSettings,
-    actor: TensorDictModule,
-    critic: TensorDictModule,
-    of_loss: Options,
-    of_learner: Options,
-) -> Learner:
-    loss = make_ddpg_loss(actor, critic, **_smoothing(settings), **of_loss)
-    return DDPGLearner(loss, policy_delay=settings.policy_delay, **of_learner)
-
-
-def _td3(
-    settings: LearnerSettings,
-    actor: TensorDictModule,
-    critic: TensorDictModule,
-    of_loss: Options,
-    of_learner: Options,
-) -> Learner:
-    loss = make_td3_loss(actor, critic, **_smoothing(settings), **of_loss)
-    return TD3Learner(loss, policy_delay=settings.policy_delay, **of_learner)
-
-
-def _smoothing(settings: LearnerSettings) -> Options:
-    return {
+    actor, critic = actor.to(device), critic.to(device)
+    if settings.algorithm == "sac":
+        loss = make_sac_loss(actor, critic, alpha_init=settings.alpha_init, **of_loss)
+        return ActorCriticLearner(loss, alpha_lr=settings.alpha_lr, **of_learner)
+    smoothing: Options = {
         # Wheel speeds are scaled to it by the environment.
         "bounds": (-1.0, 1.0),
         "policy_noise": settings.policy_noise,
         "noise_clip": settings.noise_clip,
     }
-
-
-def _sac(
-    settings: LearnerSettings,
-    actor: TensorDictModule,
-    critic: TensorDictModule,
-    of_loss: Options,
-    of_learner: Options,
-) -> Learner:
-    loss = make_sac_loss(actor, critic, alpha_init=settings.alpha_init, **of_loss)
-    return SACLearner(loss, alpha_lr=settings.alpha_lr, **of_learner)
-
-
-ALGORITHMS: dict[str, Callable[..., Learner]] = {"ddpg": _ddpg, "td3": _td3, "sac": _sac}
-"""Learners by the name of their algorithm."""
+    make_loss = make_td3_loss if settings.algorithm == "td3" else make_ddpg_loss
+    loss = make_loss(actor, critic, **smoothing, **of_loss)
+    return ActorCriticLearner(loss, policy_delay=settings.policy_delay, **of_learner)
 
 
 def _dqn(settings: LearnerSettings, method: Method, network: DirectModule) -> Learner:
