@@ -26,6 +26,7 @@ from torchrl_mpfa.losses.functional import (
     trusted_loss,
 )
 from torchrl_mpfa.losses.stacked import (
+    HoldsNetworks,
     Networks,
     PastCritics,
     Tensors,
@@ -72,7 +73,7 @@ def check_importance(importance: str) -> None:
         raise ValueError(f"importance must be 'critic', 'torchrl' or 'none', got {importance!r}")
 
 
-class SignalLoss:
+class SignalLoss(HoldsNetworks):
     r"""Options of the losses that write signals; mixed into one of TorchRL's.
 
     A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|` (Eq. 13) and
@@ -119,6 +120,7 @@ class SignalLoss:
     value_estimator: Any
     value_type: Any
     _value_estimator: Any
+    _bound: Networks | None
     _critic_name: ClassVar[str] = "qvalue_network"
     """TorchRL's name of the critic."""
     policy_delay: ClassVar[int] = 1
@@ -180,7 +182,6 @@ class SignalLoss:
         self.pal_alpha = pal_alpha
         # Last, so that the critics start as they would without it.
         self.noise_network = with_quantiles(one) if with_noise else None
-        self._bound: Networks | None = None
         self._deferred: tuple[Tensor, Tensor] | None = None
         """Actions and values, whose gradients the backward pass of the loss will find."""
         # A list of modules, so that the past is saved, loaded and moved with the loss.
@@ -435,19 +436,3 @@ class SignalLoss:
         """Return critics that hold the parameters with this prefix, without gradients."""
         name = self._critic_name
         return bind_frozen(getattr(self, name), getattr(self, f"{prefix}{name}_params"))
-
-    def forget_networks(self) -> None:
-        """Have the networks bound to the parameters again at their next use."""
-        self._bound = None
-
-    def _apply(self, *args: Any, **kwargs: Any) -> Any:
-        self._bound = None
-        return super()._apply(*args, **kwargs)  # type: ignore[misc]
-
-    def train(self, mode: bool = True) -> Any:
-        """Set training mode, of the networks that the loss holds too."""
-        self._bound = None
-        return super().train(mode)  # type: ignore[misc]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_bound": None, "_deferred": None}

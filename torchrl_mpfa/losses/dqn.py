@@ -8,19 +8,21 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from torchrl_mpfa.checks import POSITIVE, SHARE, check
 from torchrl_mpfa.losses.base import check_importance
-from torchrl_mpfa.losses.functional import distance, read_choices, scale_rewards
+from torchrl_mpfa.losses.functional import distance, estimated_target, read_choices
+from torchrl_mpfa.losses.stacked import Function, HoldsNetworks, as_function, bind
 from torchrl_mpfa.priorities import td_error_priority
 from torchrl_mpfa.signals import ACTION_GRADIENT, TD_ERROR
 
 _DISTANCES = ("l1", "l2", "smooth_l1")
 
 
-class SignalDQNLoss(DQNLoss):
+class SignalDQNLoss(HoldsNetworks, DQNLoss):
     r""":class:`~torchrl.objectives.DQNLoss` that also writes the signal of Eq. (13).
 
     A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|`, shape ``[B]``. There is no signal
@@ -36,7 +38,7 @@ class SignalDQNLoss(DQNLoss):
         reward_scale: Factor of the rewards in the loss; the signal is divided by it again.
         loss_function: ``"l2"``, ``"l1"`` or ``"smooth_l1"``, which bends at an error of one in
             units of the environment's reward.
-        double: Whether the next action is that of the network, and not of the target network
+        double: True to take the next action from the network, and not from the target network
             (van Hasselt et al. 2016, https://arxiv.org/abs/1509.06461).
         gamma: Discount, in [0, 1].
 
@@ -50,6 +52,7 @@ class SignalDQNLoss(DQNLoss):
     """
 
     SIGNALS: ClassVar[tuple[str, ...]] = (TD_ERROR.name,)
+    _bound: tuple[Function, Function] | None
 
     def __init__(
         self,
@@ -70,21 +73,17 @@ class SignalDQNLoss(DQNLoss):
         check(SHARE, gamma=gamma)
         super().__init__(
             value_network,
-            # Of which the bent distance is made, in the units of the reward.
-            loss_function="l1" if loss_function == "smooth_l1" else loss_function,
+            loss_function=loss_function,
             delay_value=True,
             double_dqn=double,
             action_space="one-hot",
-            reduction="none",
             use_prioritized_weights=False,
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.signals, self.importance, self.reward_scale = tuple(signals), importance, reward_scale
-        self._bends = loss_function == "smooth_l1"
-        self._count: int | None = None
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss; writes the signal in ``batch``.
+        """Compute the loss, and write the signal in ``batch``.
 
         Args:
             batch: Transitions, batch size ``[B]``, with actions one-hot, ``[B, K]``, or as numbers,
@@ -96,40 +95,43 @@ class SignalDQNLoss(DQNLoss):
         Raises:
             ValueError: If the actions have neither form.
         """
-        scaled = scale_rewards(batch.select(*self.in_keys), self.tensor_keys, self.reward_scale)
-        if self._count is None:
-            self._count = self._count_actions(batch)
-        number = read_choices(batch[self.tensor_keys.action], self._count, batch)
-        scaled[self.tensor_keys.action] = nn.functional.one_hot(number, self._count)
-        # Transitions of several steps say of how many: the bootstrap is discounted by all of them.
-        steps = self.value_estimator.tensor_keys.steps_to_next_obs
-        if (count := batch.get(steps, None)) is not None:
-            scaled[steps] = count
-        each: Tensor = super().forward(scaled)["loss"]
-        if self._bends:
-            each = distance(each, torch.zeros_like(each), "smooth_l1", unit=self.reward_scale)
-        squared = scaled[self.tensor_keys.priority].squeeze(-1)
+        (online, target), keys = self._networks(), self.tensor_keys
+        states, after = self._states(batch), self._states(batch["next"])
+        values = online.outputs(states)[keys.action_value]
+        number = read_choices(batch[keys.action], values.shape[-1], batch)
+        value = values.gather(-1, number.unsqueeze(-1)).squeeze(-1)
+        with torch.no_grad():
+            chooser = online if self.double_dqn else target
+            choice = chooser.outputs(after)[keys.action]
+            next_value = (target.outputs(after)[keys.action_value] * choice).sum(-1)
+            aim = estimated_target(  # Eq. (5)
+                batch, next_value, self.value_estimator, keys, reward_scale=self.reward_scale
+            )
+        each = distance(value, aim, self.loss_function, unit=self.reward_scale)  # Eq. (4)
+        if self.importance != "none" and (weight := batch.get("priority_weight", None)) is not None:
+            weight = weight.reshape(-1)
+            each = each * weight / (weight.mean() if self.importance == "torchrl" else 1.0)
+        td_error = (aim - value).detach()
         if TD_ERROR.name in self.signals:
-            size = td_error_priority(squared.sqrt())
-            batch.set(TD_ERROR.key, size / self.reward_scale)
-        if self.importance != "none" and "priority_weight" in batch.keys():  # noqa: SIM118
-            weight = batch["priority_weight"].reshape(-1)
-            mean = weight.mean() if self.importance == "torchrl" else 1.0
-            each = each * weight / mean
-        return each.mean(), {"td_error": squared}
+            batch.set(TD_ERROR.key, td_error_priority(td_error) / self.reward_scale)  # Eq. (13)
+        return each.mean(), {"td_error": td_error.square()}  # Eq. (11)
 
-    @torch.no_grad()
-    def _count_actions(self, batch: TensorDictBase) -> int:
-        """Number of actions that the network values."""
-        training = self.value_network.training
-        self.value_network.eval()
-        with self.value_network_params.to_module(self.value_network):
-            values = self.value_network(batch.select(*self.value_network.in_keys))
-        self.value_network.train(training)
-        return int(values[self.tensor_keys.action_value].shape[-1])
+    def _states(self, source: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Read the inputs of the network, without gradients."""
+        return {key: source[key].detach() for key in self.value_network.in_keys}
+
+    def _networks(self) -> tuple[Function, Function]:
+        """Return network and target network, bound to the parameters if they are not yet."""
+        if self._bound is None:
+            network, target = self.value_network, self.target_value_network_params
+            self._bound = (
+                as_function(bind(network, self.value_network_params)),
+                as_function(bind(network, target).requires_grad_(False)),
+            )
+        return self._bound
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss under the key ``"loss"``, as TorchRL has it.
+        """Compute the loss under the key ``"loss"``, as TorchRL has it.
 
         Args:
             tensordict: As in :meth:`losses`.

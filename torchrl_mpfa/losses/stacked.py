@@ -108,6 +108,28 @@ class Networks:
     """Entries that actor and critics read where the actor chooses the action."""
 
 
+class HoldsNetworks:
+    """Mixin of losses that bind their networks once, and again when parameters may have moved."""
+
+    _bound: Any = None
+
+    def forget_networks(self) -> None:
+        """Have the networks bound to the parameters again at their next use."""
+        self._bound = None
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        self._bound = None
+        return super()._apply(*args, **kwargs)  # type: ignore[misc]
+
+    def train(self, mode: bool = True) -> Any:
+        """Set training mode, of the bound networks too."""
+        self._bound = None
+        return super().train(mode)  # type: ignore[misc]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_bound": None, "_deferred": None}
+
+
 def as_function(network: TensorDictModule) -> DirectModule | TensorDictFunction:
     """Return a network as a function, wrapped unless it is one."""
     return network if isinstance(network, DirectModule) else TensorDictFunction(network)
