@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms.configs import EnvConfig
 
-from torchrl_mpfa.configs import register_configs
+from torchrl_mpfa.integrations.hydra import register_configs
 from torchrl_trainer import close_progress_bar, report, silence
 from training.settings.from_file import quoted
 

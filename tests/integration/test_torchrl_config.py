@@ -37,7 +37,7 @@ from torchrl_mpfa import (
     make_ddpg_loss,
     make_stochastic_actor,
 )
-from torchrl_mpfa.configs import (
+from torchrl_mpfa.integrations.hydra import (
     CONFIGS,
     ActorConfig,
     CriticConfig,

@@ -120,6 +120,7 @@ def test_the_exponent_of_pal_is_that_of_the_method():
         ({"method": "per", "boost": True}, "unknown setting of per 'boost'"),
         ({"decay_position": "row"}, "decay_position must be one of batch, rank, count, got 'row'"),
         ({"importance": "all"}, "importance must be one of critic, torchrl, none, got 'all'"),
+        ({"method": "la3p", "loss_function": "l2"}, "loss_function must be one of smooth_l1, got"),
         ({"capacity": 0}, "capacity must be an integer from 1 to 2147483647, got 0"),
         ({"batch_size": 2.5}, "batch_size must be an integer from 1 to 2147483647, got 2.5"),
         ({"alpha": -1.0}, "alpha must be finite and not negative, got -1.0"),

@@ -7,7 +7,7 @@ from tests.methods.replays import make_buffer, make_transitions, set_signals
 from tests.mpfa.test_updates import make_learner, make_rows
 from torchrl_mpfa import run_updates
 from torchrl_mpfa.methods import loss_options, make_replay
-from torchrl_mpfa.methods.halves import uniform_halves
+from torchrl_mpfa.methods.la3p import uniform_halves
 
 
 def steps_of(name, **settings):

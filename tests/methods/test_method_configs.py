@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from torchrl_mpfa import SignalReplayBuffer, make_actor
-from torchrl_mpfa.configs import CONFIGS, register_configs
+from torchrl_mpfa.integrations.hydra import CONFIGS, register_configs
 from torchrl_mpfa.methods import METHODS, Replay
 
 SMALL = ["capacity=32", "batch_size=4"]

@@ -1,1 +1,1 @@
-"""Parts for frameworks: TorchRL's trainers and Hydra."""
+"""Parts for TorchRL's trainers, for Hydra and for Ray, each imported by its own module alone."""

@@ -16,16 +16,12 @@ if TYPE_CHECKING:
     from torchrl_mpfa.methods.mpfa import MPFA as MPFA
     from torchrl_mpfa.methods.mpfa import Adjusted as Adjusted
     from torchrl_mpfa.methods.mpfa import Scaled as Scaled
-    from torchrl_mpfa.methods.remote import MethodReplayBuffer as MethodReplayBuffer
-    from torchrl_mpfa.methods.remote import RaySignalReplayBuffer as RaySignalReplayBuffer
-    from torchrl_mpfa.methods.remote import make_ray_replay as make_ray_replay
 
 _NAMES = {
     "assembly": "Replay loss_options make_replay",
     "base": "Method Prioritized",
     "catalogue": "ALIASES METHODS method_named",
     "mpfa": "Adjusted MPFA Scaled",
-    "remote": "MethodReplayBuffer RaySignalReplayBuffer make_ray_replay",
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(_MODULE_OF, key=lambda name: (not name.isupper(), name))

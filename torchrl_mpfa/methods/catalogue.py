@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torchrl_mpfa.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, unknown
-from torchrl_mpfa.methods.base import Method, Prioritized, within
+from torchrl_mpfa.methods.base import Method, Prioritized, one_of, within
 from torchrl_mpfa.methods.mpfa import MPFA, Adjusted, Scaled
 
 if TYPE_CHECKING:
@@ -145,6 +145,8 @@ class LA3P(LAP):
     batches: ClassVar[str] = "torchrl_mpfa.methods.la3p.la3p_batches"
 
     name: str = "la3p"
+    # Its parts have losses of their own: PAL on the uniform one, Huber on the prioritized one.
+    loss_function: str = one_of("smooth_l1")
     plain: ClassVar[bool] = False
     needs_actor: ClassVar[bool] = True
 
@@ -197,7 +199,7 @@ class Geometric(Method):
 class UniformHalves(Method):
     """Two updates on uniform halves of a batch, the control of LA3P."""
 
-    batches: ClassVar[str] = "torchrl_mpfa.methods.halves.uniform_halves"
+    batches: ClassVar[str] = "torchrl_mpfa.methods.la3p.uniform_halves"
 
     name: str = "uniform_halves"
     plain: ClassVar[bool] = False

@@ -20,9 +20,9 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import ExplorationType, set_exploration_type
 
 from torchrl_mpfa.checks import NOT_NEGATIVE, POSITIVE, check, check_counts
-from torchrl_mpfa.methods.acting import actions_of
 from torchrl_mpfa.selection import SampledBatch, one_batch
 
 _LEAST_VARIANCE = 1e-3
@@ -67,6 +67,25 @@ def gaussian_divergence(deviation: Tensor, *, variance: float) -> Tensor:
     covariance = centered.mT @ centered / deviation.shape[-2]
     wider = (torch.linalg.eigvalsh(covariance) / variance).clamp_min(1.0)
     return 0.5 * ((wider - 1.0 - wider.log()).sum(-1) + mean.square().sum(-1) / variance)
+
+
+def actions_of(
+    policy: TensorDictModule, batch: TensorDictBase, *, action_key: NestedKey = "action"
+) -> Tensor:
+    """Compute actions ``[B, A]`` of a policy without exploration, on the device of the batch."""
+    read = batch.select(*policy.in_keys)
+    parameter = next(policy.parameters(), None)
+    if parameter is not None:
+        read = read.to(parameter.device)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        action: Tensor = policy(read)[action_key]
+    stored: Tensor = batch[action_key]
+    if stored.shape != action.shape:
+        raise ValueError(
+            f"{action_key!r} must have the shape of the policy's actions, {[*action.shape]}, got "
+            f"{[*stored.shape]}"
+        )
+    return action.to(stored.device)
 
 
 class KLPERSelection:

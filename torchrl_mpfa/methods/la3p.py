@@ -147,3 +147,35 @@ def la3p_batches(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
     with sampler.part("inverse"):
         batch = buffer.sample()
     yield SampledBatch(batch, trains="actor", new_step=False)
+
+
+def uniform_halves(buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
+    """Sample two halves of a uniform batch, the control of LA3P, for an update each.
+
+    An LA3P step makes two updates of critic and actor on half batches, where others make one on a
+    whole batch. The control shows the gain of that alone, without priorities.
+
+    Args:
+        buffer: The buffer, with a uniform sampler and a batch size.
+
+    Yields:
+        Two batches of one training step, for critic and actor.
+
+    Raises:
+        ValueError: If a half would be empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), batch_size=8)
+        >>> index = buffer.extend(TensorDict({"reward": torch.rand(10)}, [10]))
+        >>> [len(each.batch) for each in uniform_halves(buffer)]
+        [4, 4]
+    """
+    batch = buffer.sample()
+    if len(batch) < 2:
+        raise ValueError(f"batch_size must be at least 2 for two halves, got {len(batch)}")
+    half = len(batch) // 2
+    yield SampledBatch(batch[:half])
+    yield SampledBatch(batch[half:], new_step=False)

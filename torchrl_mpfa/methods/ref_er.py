@@ -30,7 +30,7 @@ from torchrl_mpfa.losses.functional import (
     BEHAVIOR_WEIGHT,
     POLICY_WEIGHT,
 )
-from torchrl_mpfa.methods.acting import actions_of
+from torchrl_mpfa.methods.klper import actions_of
 from torchrl_mpfa.samplers.states import SavedSampler
 from torchrl_mpfa.selection import SampledBatch
 

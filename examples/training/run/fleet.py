@@ -24,7 +24,8 @@ from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.weight_update import _ray
 from tqdm import tqdm
 
-from torchrl_mpfa.methods import Method, RaySignalReplayBuffer, Replay, make_ray_replay
+from torchrl_mpfa.integrations.ray import RaySignalReplayBuffer, make_ray_replay
+from torchrl_mpfa.methods import Method, Replay
 from training.environments import FilteredRobots, make_training_env
 from training.records import EpisodeRecord
 from training.run.driving import TRANSITION, Robots

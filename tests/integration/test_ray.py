@@ -14,9 +14,13 @@ from tensordict import TensorDict
 from tests.methods.replays import make_transitions
 from tests.mpfa.transitions import same
 from torchrl_mpfa import ReplayHistory
-from torchrl_mpfa.methods import METHODS, MethodReplayBuffer, make_ray_replay
+from torchrl_mpfa.integrations.ray import (
+    MethodReplayBuffer,
+    RaySignalReplayBuffer,
+    make_ray_replay,
+)
+from torchrl_mpfa.methods import METHODS
 from torchrl_mpfa.methods import make_replay as make_local_replay
-from torchrl_mpfa.methods.remote import RaySignalReplayBuffer
 
 CAPACITY = 64
 

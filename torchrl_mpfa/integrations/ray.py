@@ -11,16 +11,17 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import RayReplayBuffer
 
 from torchrl_mpfa.buffer import SignalReplayBuffer
+from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.methods.assembly import Replay, buffer_parts, learned_signals
 from torchrl_mpfa.methods.base import Method
 
 
 class MethodReplayBuffer(SignalReplayBuffer):
-    """The buffer of a method, made of its settings, where it shall be.
+    """A buffer made from the settings of a method.
 
     Args:
         method: The settings.
-        seed: Of its randomness.
+        seed: Seed of its randomness.
         **kwargs: Passed to :class:`~torchrl_mpfa.SignalReplayBuffer`.
 
     Examples:
@@ -37,7 +38,7 @@ class MethodReplayBuffer(SignalReplayBuffer):
 
 
 class _AloneInProcess(MethodReplayBuffer):
-    """The buffer where nothing else is random: its seed is that of the transforms too."""
+    """A buffer in a process of its own, whose seed is that of the transforms too."""
 
     def __init__(self, method: Method, *, seed: int = 0, **kwargs: Any) -> None:
         torch.manual_seed(seed)
@@ -52,8 +53,8 @@ class RaySignalReplayBuffer(RayReplayBuffer):
 
     Args:
         method: The settings.
-        seed: Of all randomness of the buffer.
-        remote_config: What the process of the buffer asks of the cluster, as in ``ray.remote``.
+        seed: Seed of all randomness of the buffer.
+        remote_config: Resources of the process of the buffer, as in ``ray.remote``.
     """
 
     takes_signals = True
@@ -110,17 +111,17 @@ def make_ray_replay(
     sigma: float | Callable[[], float] | None = None,
     remote_config: dict[str, Any] | None = None,
 ) -> Replay:
-    """As :func:`make_replay`, with the buffer in a process of a Ray cluster.
+    """Make a replay with its buffer in a process of a Ray cluster.
 
     Args:
         method: The settings.
-        seed: Of all randomness of the buffer.
-        policy: See :func:`make_replay`.
-        sigma: See :func:`make_replay`.
-        remote_config: What that process asks of the cluster, as in ``ray.remote``.
+        seed: Seed of all randomness of the buffer.
+        policy: See :func:`~torchrl_mpfa.methods.make_replay`.
+        sigma: See :func:`~torchrl_mpfa.methods.make_replay`.
+        remote_config: Resources of that process, as in ``ray.remote``.
 
     Returns:
-        The replay, whose ``buffer.clients(W)`` are for those that write in it.
+        The replay, whose ``buffer.clients(W)`` are for the processes that write in it.
 
     Raises:
         ValueError: If the method chooses by what lies in the buffer, as LA3P and ReF-ER do, or
