@@ -52,7 +52,7 @@ def test_an_odd_batch_is_split_and_a_single_transition_is_rejected():
     buffer = make_buffer(make_replay("ddpg").buffer.sampler, 9, 5)
     assert [len(draw.batch) for draw in uniform_halves(buffer)] == [2, 3]
     alone = make_buffer(make_replay("ddpg").buffer.sampler, 9, 1)
-    with pytest.raises(ValueError, match="batch_size must leave no half empty, got 1"):
+    with pytest.raises(ValueError, match="batch_size must be at least 2 for two halves, got 1"):
         next(uniform_halves(alone))
 
 
