@@ -1,4 +1,4 @@
-"""Options, networks, signals (Eqs. 13-14) and means over the batch, which all losses share."""
+"""Options, networks, signals (Eqs. 13-14) and means over the batch of all losses."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def check_importance(importance: str) -> None:
 
 
 class SignalLoss(HoldsNetworks):
-    r"""Options of the losses that write signals; mixed into one of TorchRL's.
+    r"""Options of the losses that write signals, mixed into one of TorchRL's losses.
 
     A batch gets ``("signals", "td_error")`` :math:`= |\delta_i|` (Eq. 13) and
     ``("signals", "action_gradient")`` :math:`= \lVert \nabla_a Q(s_i, a_i) \rVert` (Eq. 14), each
@@ -84,10 +84,9 @@ class SignalLoss(HoldsNetworks):
     Args:
         actor_network: Policy; reads observations, writes ``"action"``.
         critic_network: Critic; reads observations and action, writes ``"state_action_value"``.
-        signals: Which of ``"td_error"``, ``"action_gradient"``, ``"value"`` (Q itself) and
-            ``"information_gain"`` to write. The last is UPER's, of all critics and of a further
-            network, like the critic, which learns the quantiles of the targets: its loss is part
-            of the critics', and its weights are among theirs.
+        signals: Signals to write, of ``"td_error"``, ``"action_gradient"``, ``"value"`` (Q itself)
+            and ``"information_gain"``. The last is UPER's. It needs a further network, like the
+            critic, that learns the quantiles of the targets: its loss is added to the critics'.
         gradient_order: Order of the norm in Eq. (14).
         importance: Use of ``"priority_weight"``: on the ``"critic"`` alone, divided by the batch
             size (Eq. 11); ``"torchrl"``: on all losses, divided by the sum of the weights;
@@ -97,10 +96,11 @@ class SignalLoss(HoldsNetworks):
         saturation_penalty: Factor of the mean of :math:`\max(0, |u| - l)^2`, added to the actor's
             loss, where :math:`u` is the action before its tanh (``"preactivation"``).
         saturation_limit: The limit :math:`l`.
-        target_average: Number of critics of which the target's Q is the mean: the target critic
-            and what it was at the last calls of :meth:`keep_target_critics`; 1 is Eq. (5).
-        pal_alpha: Priority exponent :math:`\alpha` that the loss function ``"pal"`` stands for.
-        **kwargs: Passed to TorchRL's loss.
+        target_average: Number of critics in the mean of the target: the target critic and its
+            states at the last calls of :meth:`keep_target_critics`; 1 is Eq. (5).
+        pal_alpha: Priority exponent :math:`\alpha` of the loss function ``"pal"``.
+        **kwargs: Arguments of TorchRL's loss. ``loss_function``, the distance of value and target,
+            may be ``"pal"``, too.
 
     Raises:
         TypeError: If a network is no module of tensordicts.
@@ -183,7 +183,7 @@ class SignalLoss(HoldsNetworks):
         # Last, so that the critics start as they would without it.
         self.noise_network = with_quantiles(one) if with_noise else None
         self._deferred: tuple[Tensor, Tensor] | None = None
-        """Actions and values, whose gradients the backward pass of the loss will find."""
+        """Actions and values, for their gradients in the backward pass of the loss."""
         # A list of modules, so that the past is saved, loaded and moved with the loss.
         self.past_critics = nn.ModuleList()
         if target_average > 1:
@@ -191,7 +191,7 @@ class SignalLoss(HoldsNetworks):
             for network in self._held_critics(""):
                 self.past_critics.append(PastCritics(network.module, target_average - 1))
 
-    # Asked for by a learner.
+    # Methods for a learner.
 
     def losses(
         self,
@@ -396,14 +396,14 @@ class SignalLoss(HoldsNetworks):
     # The estimator of the targets.
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
-        """As in TorchRL: set how targets are made, by TD(0), TD(1) or TD(lambda).
+        """Choose the estimator of the targets, TD(0), TD(1) or TD(lambda), as in TorchRL.
 
         Args:
             value_type: A member of :class:`~torchrl.objectives.ValueEstimators`, or an estimator.
-            **hyperparams: Of the estimator; ``gamma`` among them.
+            **hyperparams: Arguments of the estimator, such as ``gamma``.
 
         Raises:
-            ValueError: If it is another estimator.
+            ValueError: If the estimator is of another kind.
         """
         kept = self._value_estimator, self.value_type
         try:

@@ -1,4 +1,4 @@
-"""DDPG loss that writes the signals of each transition, in one forward pass of the critic."""
+"""DDPG loss that writes the signals of each transition, by one forward pass of the critic."""
 
 from __future__ import annotations
 
@@ -27,26 +27,20 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
 
     Cheng et al. (2023), https://doi.org/10.3389/fnbot.2023.1281166
 
-    Options: see :class:`~torchrl_mpfa.losses.SignalLoss`.
+    Further arguments and errors: see :class:`~torchrl_mpfa.losses.SignalLoss`.
 
     Args:
-        actor_network: Policy; reads observations, writes ``"action"``.
-        value_network: Critic; reads observations and action, writes ``"state_action_value"``.
-        delay_actor: Whether the target has a target actor, as Eq. (5) has; TorchRL's default is
-            not to.
-        policy_noise: Standard deviation of noise on the target action, in units of the action, as
-            TD3 has it; 0 is Eq. (5).
+        actor_network: Policy.
+        value_network: Critic.
+        delay_actor: True to use a target actor in the target, as in Eq. (5). TorchRL's default is
+            False.
+        policy_noise: Standard deviation of TD3's noise on the target action, in units of the
+            action; 0 is Eq. (5).
         noise_clip: Limit of that noise.
-        action_spec: Bounded spec of the actions, such as ``env.action_spec``; noise needs it, or
-            ``bounds``.
-        bounds: Least and greatest action, numbers or tensors of shape ``[A]``, in its place.
-        **kwargs: Options of :class:`~torchrl_mpfa.losses.SignalLoss`: ``signals``,
-            ``gradient_order``, ``importance``, ``reward_scale``, ``saturation_penalty``,
-            ``saturation_limit``, ``target_average``, ``pal_alpha``; and of TorchRL's loss.
-
-    Raises:
-        TypeError: If a network is no module of tensordicts.
-        ValueError: If an argument is out of its range, or the networks are in the wrong order.
+        action_spec: Bounded spec of the actions, such as ``env.action_spec``. Noise needs the spec
+            or ``bounds``.
+        bounds: Least and greatest action, numbers or tensors of shape ``[A]``.
+        **kwargs: Further arguments.
 
     Examples:
         >>> import torch
@@ -72,7 +66,7 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, DDPGLoss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.keys.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -106,12 +100,12 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         defer_gradient: bool = False,
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critic's loss (Eq. 11); writes the signals (Eqs. 13-14) in ``tensordict``.
+        """Compute the critic's loss (Eq. 11); write the signals (Eqs. 13-14) in ``tensordict``.
 
         Args:
             tensordict: A batch of transitions, batch size ``[B]``.
-            defer_gradient: Leave the signal of Eq. (14) to :meth:`write_action_gradient`, which
-                has it from the backward pass at no cost.
+            defer_gradient: True to leave the signal of Eq. (14) to :meth:`write_action_gradient`,
+                after the backward pass of the loss.
             loss_function: Distance of value and target for this call, one of ``"l1"``, ``"l2"``,
                 ``"smooth_l1"`` and ``"pal"``; by default the loss's own.
 
@@ -150,7 +144,7 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
         return loss, metadata
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor's loss, with the penalty on saturation if there is one.
+        """Compute the actor's loss, with the penalty on saturation if there is one.
 
         Args:
             tensordict: A batch of transitions, batch size ``[B]``.
@@ -175,19 +169,13 @@ class SignalDDPGLoss(SignalLoss, DDPGLoss):
 def make_ddpg_loss(
     actor: TensorDictModule, critic: TensorDictModule, *, gamma: float = 0.99, **kwargs: Any
 ) -> SignalDDPGLoss:
-    """A :class:`SignalDDPGLoss` with the target of Eq. (5).
+    """Make a :class:`SignalDDPGLoss` with the target of Eq. (5).
 
     Args:
         actor: Policy.
         critic: Critic.
         gamma: Discount, in [0, 1].
-        **kwargs: Passed to :class:`SignalDDPGLoss`.
-
-    Returns:
-        The loss.
-
-    Raises:
-        ValueError: If an argument is out of its range.
+        **kwargs: Arguments of :class:`SignalDDPGLoss`.
 
     Examples:
         >>> from torchrl_mpfa.networks import make_actor, make_critic

@@ -46,8 +46,7 @@ def bootstrap_target(
     Args:
         reward: :math:`r_i`, discounted and summed over the steps, shape ``[B]``.
         next_value: Q of the target networks at the next state, shape ``[B]``.
-        terminated: Whether the episode ended there, as booleans, or 0 and 1; a time limit is no
-            end, shape ``[B]``.
+        terminated: True, or 1, at the end of an episode; a time limit is no end, shape ``[B]``.
         gamma: Discount.
         steps: Steps :math:`n_i` to the next state, shape ``[B]``; None: one.
 
@@ -70,7 +69,7 @@ def bootstrap_target(
 def estimated_target(
     batch: TensorDictBase, next_value: Tensor, estimator: Any, keys: Any, *, reward_scale: float
 ) -> Tensor:
-    """Target by a value estimator of TorchRL, Eq. (5) by TD(0), shape ``[B]``."""
+    """Compute targets by a value estimator of TorchRL, Eq. (5) by TD(0), shape ``[B]``."""
     if type(estimator) is not TD0Estimator or estimator.average_rewards:
         # A target of other transitions, too.
         scaled = scale_rewards(batch, keys, reward_scale)
@@ -88,12 +87,12 @@ def estimated_target(
 
 
 def smoothing_noise(action: Tensor, *, deviation: float, limit: float) -> Tensor:
-    r"""Noise of TD3's target for actions ``[B, A]``, :math:`\mathrm{clip}(N(0, \sigma), -c, c)`."""
+    r"""Sample TD3's noise for actions ``[B, A]``, :math:`\mathrm{clip}(N(0, \sigma), -c, c)`."""
     return torch.randn_like(action).mul_(deviation).clamp_(-limit, limit)
 
 
 def smoothed_action(action: Tensor, noise: Tensor, *, low: Tensor, high: Tensor) -> Tensor:
-    """Action of TD3's target, with noise and within the bounds, shape ``[B, A]``."""
+    """Add noise to TD3's target action, within the bounds, shape ``[B, A]``."""
     return torch.clamp(action + noise, low, high)
 
 
@@ -115,7 +114,7 @@ def critic_loss(
     unit: float,
     pal_alpha: float,
 ) -> Tensor:
-    """Loss of each transition (Eq. 4), summed over the critics, from ``[C, B]`` to ``[B]``."""
+    """Compute each transition's loss (Eq. 4), summed over critics, from ``[C, B]`` to ``[B]``."""
     target = target.expand_as(value)
     return distance(value, target, loss_function, unit=unit, pal_alpha=pal_alpha).sum(0)
 
@@ -196,7 +195,7 @@ def action_gradient(value: Tensor, action: Tensor) -> Tensor:
 
 
 def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> TensorDictBase:
-    """A shallow copy of a batch with scaled rewards, and ends as booleans as TorchRL needs them."""
+    """Return a shallow copy of a batch with scaled rewards, and ends as booleans for TorchRL."""
     found = batch.copy()
     after = found["next"]
     after.set(keys.reward, after[keys.reward] * reward_scale)
@@ -207,7 +206,7 @@ def scale_rewards(batch: TensorDictBase, keys: Any, reward_scale: float) -> Tens
 
 
 def read_choices(action: Tensor, count: int, batch: TensorDictBase) -> Tensor:
-    """Numbers of actions among ``K``, shape ``[B]``, given one-hot or as numbers.
+    """Read the numbers of actions among ``K``, shape ``[B]``, given one-hot or as numbers.
 
     Args:
         action: One-hot, ``[B, K]``, or numbers, ``[B]`` or ``[B, 1]``.

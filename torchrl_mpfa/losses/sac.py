@@ -29,31 +29,27 @@ class SignalSACLoss(SignalLoss, SACLoss):
     :math:`\alpha` is tuned until the policy has the entropy ``target_entropy``, minus the number of
     action dimensions unless told otherwise.
 
-    Of the critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; gradient
-    and value are those of the first critic. Neither the actor's nor the temperature's loss has
-    importance weights unless ``importance`` is ``"torchrl"``. Q contains the entropy of what
-    follows, hence so do the signals. The temperature belongs to scaled rewards: in units of the
-    environment's reward it is :math:`\alpha` divided by ``reward_scale``, so that a smaller factor
-    needs a smaller ``alpha_init`` for the same policy.
+    The signal of Eq. (13) is the larger TD error of the critics, as in TorchRL's own
+    ``"td_error"``; gradient and value are those of the first critic. The losses of actor and
+    temperature have importance weights only if ``importance`` is ``"torchrl"``. Q contains the
+    entropy of later actions, hence so do the signals. The temperature belongs to scaled rewards: in
+    units of the environment's reward it is :math:`\alpha` divided by ``reward_scale``, so that a
+    smaller factor needs a smaller ``alpha_init`` for the same policy.
 
     Haarnoja et al. (2018), https://arxiv.org/abs/1812.05905
 
-    Options: see :class:`~torchrl_mpfa.losses.SignalLoss`.
+    Further arguments and errors: see :class:`~torchrl_mpfa.losses.SignalLoss`. The penalty on
+    saturation is that of the means before the tanh.
 
     Args:
-        actor_network: Stochastic policy, such as :func:`~torchrl_mpfa.make_stochastic_actor` makes;
-            reads observations, writes ``"action"``.
-        qvalue_network: Critic, of which two are made; reads observations and action, writes
-            ``"state_action_value"``.
-        **kwargs: Options of :class:`~torchrl_mpfa.losses.SignalLoss`: ``signals``,
-            ``gradient_order``, ``importance``, ``reward_scale``, ``saturation_penalty`` (of means,
-            where the actor writes them as ``"preactivation"``), ``saturation_limit``,
-            ``target_average``, ``pal_alpha``; and of TorchRL's loss: ``alpha_init``,
-            ``target_entropy`` and ``fixed_alpha`` among them.
+        actor_network: Stochastic policy, such as from :func:`~torchrl_mpfa.make_stochastic_actor`.
+        qvalue_network: Critic, of which two are made.
+        **kwargs: Further arguments, such as TorchRL's ``alpha_init``, ``target_entropy`` and
+            ``fixed_alpha``.
 
     Raises:
         TypeError: If the actor is not stochastic.
-        ValueError: If an argument is out of its range, or one of SAC's first version.
+        ValueError: If an argument is one of SAC's first version.
 
     Examples:
         >>> from torchrl_mpfa import make_critic, make_stochastic_actor
@@ -64,7 +60,7 @@ class SignalSACLoss(SignalLoss, SACLoss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, SACLoss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.keys.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -93,7 +89,7 @@ class SignalSACLoss(SignalLoss, SACLoss):
         defer_gradient: bool = False,
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
+        """Add up the critics' losses; write the signals as :meth:`SignalDDPGLoss.loss_value`."""
         networks, keys, estimator = self._networks(), self.tensor_keys, self.value_estimator
         stored, after = self._stored(tensordict), self._states(tensordict["next"])
         value = self._values(stored)
@@ -118,12 +114,12 @@ class SignalSACLoss(SignalLoss, SACLoss):
         return loss, metadata
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of :meth:`value_loss`, and the larger error, as TorchRL's ``forward`` asks for."""
+        """Compute :meth:`value_loss` and the larger error for TorchRL's ``forward``."""
         loss, metadata = self.value_loss(tensordict)
         return loss, {"td_error": metadata["td_error"].amax(0).sqrt()}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor's loss by the least of the critics, as :meth:`SignalDDPGLoss.loss_actor`.
+        """Compute the actor's loss by the critics' least Q, as :meth:`SignalDDPGLoss.loss_actor`.
 
         Among the values for the log is ``"log_prob"``, ``[B]``, for :meth:`temperature_loss`.
         """
@@ -137,7 +133,7 @@ class SignalSACLoss(SignalLoss, SACLoss):
         return loss, {"log_prob": log_prob.detach(), "state_action_value_actor": least, **log}
 
     def temperature_loss(self, tensordict: TensorDictBase, log_prob: Tensor) -> Tensor:
-        r"""Loss of the temperature, the mean of :math:`-\ln\alpha (\ln\pi(a | s_i) + \bar H)`."""
+        r"""Average the temperature's loss, :math:`-\ln\alpha (\ln\pi(a | s_i) + \bar H)`."""
         return self._mean(tensordict, self.alpha_loss(log_prob))
 
     def _critics_part(self, batch: TensorDictBase, **options: Any) -> tuple[Tensor, Any]:
@@ -176,21 +172,14 @@ def make_sac_loss(
     loss_function: str = "l2",
     **kwargs: Any,
 ) -> SignalSACLoss:
-    """A :class:`SignalSACLoss` with one-step targets and the squared error of Eq. (11).
+    """Make a :class:`SignalSACLoss` with one-step targets and the squared error of Eq. (11).
 
     Args:
         actor: Stochastic policy.
         critic: Critic, of which two are made, with new weights.
         gamma: Discount, in [0, 1].
-        loss_function: Distance between value and target; TorchRL's own default is smoothed.
-        **kwargs: Passed to :class:`SignalSACLoss`.
-
-    Returns:
-        The loss.
-
-    Raises:
-        TypeError: If the actor is not stochastic.
-        ValueError: If an argument is out of its range.
+        loss_function: Distance of value and target. TorchRL's own default is smoothed.
+        **kwargs: Arguments of :class:`SignalSACLoss`.
 
     Examples:
         >>> from torchrl_mpfa import make_critic, make_stochastic_actor

@@ -25,29 +25,21 @@ from torchrl_mpfa.networks.bounds import given_bounds
 class SignalTD3Loss(SignalLoss, TD3Loss):
     r""":class:`~torchrl.objectives.TD3Loss` that also writes the signals of Eqs. (13)-(14).
 
-    Of its two critics' TD errors the larger one counts, as in TorchRL's own ``"td_error"``; the
-    gradient is that of the first critic, the one that the actor climbs.
+    The signal of Eq. (13) is the larger TD error of the two critics, as in TorchRL's own
+    ``"td_error"``; the gradient is that of the first critic, by which the actor learns.
 
     Fujimoto et al. (2018), https://arxiv.org/abs/1802.09477
 
-    Options: see :class:`~torchrl_mpfa.losses.SignalLoss`.
+    Further arguments and errors: see :class:`~torchrl_mpfa.losses.SignalLoss`.
 
     Args:
-        actor_network: Policy; reads observations, writes ``"action"``.
-        qvalue_network: Critic, of which two are made; reads observations and action, writes
-            ``"state_action_value"``.
+        actor_network: Policy.
+        qvalue_network: Critic, of which two are made.
         action_spec: Bounded spec of the actions, such as ``env.action_spec``.
-        bounds: Least and greatest action, numbers or tensors of shape ``[A]``, in place of the
-            spec. One of the two must be given.
-        **kwargs: Options of :class:`~torchrl_mpfa.losses.SignalLoss`: ``signals``,
-            ``gradient_order``, ``importance``, ``reward_scale``, ``saturation_penalty``,
-            ``saturation_limit``, ``target_average``, ``pal_alpha``; and of TorchRL's loss:
-            ``policy_noise`` and ``noise_clip``, in units of the action, among them.
-
-    Raises:
-        TypeError: If a network is no module of tensordicts.
-        ValueError: If an argument is out of its range, both or none of ``action_spec`` and
-            ``bounds`` are given, or the networks are in the wrong order.
+        bounds: Least and greatest action, numbers or tensors of shape ``[A]``. Either the spec or
+            the bounds must be given.
+        **kwargs: Further arguments, such as TorchRL's ``policy_noise`` and ``noise_clip``, in units
+            of the action.
 
     Examples:
         >>> from torchrl_mpfa import make_actor, make_critic
@@ -58,7 +50,7 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
 
     @dataclass
     class _AcceptedKeys(SignalKeys, TD3Loss._AcceptedKeys):
-        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.keys.SignalKeys`."""
+        """Keys of TorchRL's loss and of :class:`~torchrl_mpfa.losses.base.SignalKeys`."""
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -87,7 +79,7 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
         defer_gradient: bool = False,
         loss_function: str | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum of the critics' losses; writes the signals, as :meth:`SignalDDPGLoss.loss_value`."""
+        """Add up the critics' losses; write the signals as :meth:`SignalDDPGLoss.loss_value`."""
         networks, keys, estimator = self._networks(), self.tensor_keys, self.value_estimator
         stored, after = self._stored(tensordict), self._states(tensordict["next"])
         value = self._values(stored)
@@ -114,7 +106,7 @@ class SignalTD3Loss(SignalLoss, TD3Loss):
         return loss, metadata
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor's loss by the first critic, as :meth:`SignalDDPGLoss.loss_actor`."""
+        """Compute the actor's loss by the first critic, as :meth:`SignalDDPGLoss.loss_actor`."""
         networks, states = self._networks(), self._states(tensordict)
         chosen = networks.actor.outputs(states)
         found = networks.frozen_critics[0].outputs({**states, **chosen})
@@ -138,20 +130,14 @@ def make_td3_loss(
     loss_function: str = "l2",
     **kwargs: Any,
 ) -> SignalTD3Loss:
-    """A :class:`SignalTD3Loss` with one-step targets and the squared error of Eq. (11).
+    """Make a :class:`SignalTD3Loss` with one-step targets and the squared error of Eq. (11).
 
     Args:
         actor: Policy.
         critic: Critic, of which two are made, the second with new weights.
         gamma: Discount, in [0, 1].
-        loss_function: Distance between value and target; TorchRL's own default is smoothed.
-        **kwargs: Passed to :class:`SignalTD3Loss`; ``action_spec`` or ``bounds`` must be there.
-
-    Returns:
-        The loss.
-
-    Raises:
-        ValueError: If an argument is out of its range, or the bounds of actions are missing.
+        loss_function: Distance of value and target. TorchRL's own default is smoothed.
+        **kwargs: Arguments of :class:`SignalTD3Loss`, with ``action_spec`` or ``bounds``.
 
     Examples:
         >>> from torchrl.data import Bounded
