@@ -237,7 +237,7 @@ def test_networks_of_another_kind_or_order_are_rejected_and_left_as_they_are(kin
     cases = [
         ((critic, actor), *swapped),
         ((actor, nn.Linear(5, 1)), TypeError, f"{name} must be a TensorDictModule, got Linear"),
-        ((actor, blind), ValueError, f"{name} must read what actor_network writes"),
+        ((actor, blind), ValueError, f"{name} must read an output of actor_network"),
     ]
     if kind == "sac":
         cases.append(((make_networks()[0], critic), TypeError, kind_of_actor))

@@ -186,9 +186,8 @@ def _type_of(annotation: Any) -> Any:
     return Optional[plain] if text.endswith("None") else plain  # noqa: UP045
 
 
-# The capacity is that of the storage beside the sampler, wherever the two groups are placed. A type
-# is no value of a configuration. Signals are names or configurations of Signal; fusion and
-# adjustments are configurations.
+# The capacity is that of the storage in the same group. A type is no value of a configuration.
+# Signals are names or configurations of Signal; fusion and adjustments are configurations.
 _sampler_config = partial(
     config_of, base=SamplerConfig, leave_out=["dtype"], max_capacity="${..storage.max_size}"
 )

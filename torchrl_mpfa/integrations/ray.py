@@ -1,4 +1,4 @@
-"""The replay of a method in a process of its own on a Ray cluster, for many that write in it."""
+"""The replay of a method in a process of its own on a Ray cluster, for many writers."""
 
 from __future__ import annotations
 
@@ -124,8 +124,8 @@ def make_ray_replay(
         The replay, whose ``buffer.clients(W)`` are for the processes that write in it.
 
     Raises:
-        ValueError: If the method chooses by what lies in the buffer, as LA3P and ReF-ER do, or
-            needs more of a transition than the usual.
+        ValueError: If the method selects by the state of the buffer, as LA3P and ReF-ER do, or
+            needs extra entries.
     """
     if not method.remote:
         raise ValueError(f"method {method.name!r} needs its buffer in the process that learns")

@@ -2,7 +2,7 @@
 
 With networks of a hundred units an update is mostly the cost of calling some five hundred small
 operations, of which ``torch.compile`` makes one. They are recorded while the losses run once, so
-that nothing is said a second time, and what a loss or network of a user does is in the program.
+that nothing is said a second time, and a loss or network of a user is in the program, too.
 Learners whose losses record the same operations share one compiled program, as all tensors of a
 loss are inputs of it: a learner of the same settings as one before it is only recorded.
 """
@@ -29,7 +29,7 @@ Entries = dict[NestedKey, Tensor]
 Call = Callable[..., list[Tensor]]
 
 _COMPILED: dict[Any, Call] = {}
-"""What the learners of this process have compiled, by all that it depends on."""
+"""Programs of the learners of this process, by all that they depend on."""
 
 
 class Program(NamedTuple):
@@ -59,7 +59,7 @@ class CompiledGradients:
     def __call__(
         self, batch: TensorDictBase, trains: Trains, loss_function: str | None
     ) -> dict[str, Tensor]:
-        """Set gradients and write signals as losses and a backward pass do; values for the log."""
+        """Set gradients and write signals like losses and a backward pass; return the log."""
         entries = self._entries(batch)
         form = trains, loss_function, self._options(), *map(_form, entries.items())
         program = self._programs.get(form)
@@ -75,7 +75,7 @@ class CompiledGradients:
         return dict(zip(program.log, found, strict=True))
 
     def _entries(self, batch: TensorDictBase) -> Entries:
-        """What a program may read: all tensors but those that the loss itself writes."""
+        """Return the tensors that a program may read: all but those that the loss writes."""
         keys = self._loss.tensor_keys
         written = {keys.priority, keys.td_error_signal, keys.action_gradient_signal}
         written |= {keys.value_signal, keys.information_gain_signal}
@@ -84,7 +84,7 @@ class CompiledGradients:
         return {k: v.contiguous() for k, v in found if isinstance(v, Tensor) and k not in written}
 
     def _options(self) -> tuple[Any, ...]:
-        """What a trace takes for given: options, keys, how targets are made, and precision."""
+        """Return the constants of a trace: options, keys, estimator of the targets, precision."""
         estimator = self._loss.value_estimator
         keys = self._loss.tensor_keys, estimator.tensor_keys
         held = [v for each in (self._loss, estimator, *keys) for v in vars(each).values()]
@@ -149,7 +149,7 @@ class CompiledGradients:
         return Program(call, taken, moved, list(written), list(log))
 
     def _compiled(self, graph: fx.Graph, inputs: list[Any]) -> Call:
-        """A graph as a program, the same one for equal graphs of equal inputs."""
+        """Compile a graph, or return the program of an equal graph with equal inputs."""
         # Operations are compared as objects; numbers and names of nodes as they are written.
         nodes = tuple((n.name, n.op, n.target, repr((n.args, n.kwargs))) for n in graph.nodes)
         forms = tuple((v.shape, v.stride(), v.dtype, v.device, v.requires_grad) for v in inputs)
@@ -163,7 +163,7 @@ class CompiledGradients:
 
 
 def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any]) -> Call:
-    """The program of a record, by Inductor itself unless ``torch.compile`` has another backend."""
+    """Compile a record by Inductor itself, unless ``torch.compile`` has another backend."""
     if arguments.keys() - {"options"}:
         return torch.compile(module, **{"fullgraph": True, "dynamic": False, **arguments})
     # ``torch.compile`` would record it once more, three seconds at the start, and would compare the
@@ -181,7 +181,7 @@ def _compile(module: fx.GraphModule, inputs: list[Any], arguments: dict[str, Any
 
 
 def _keep_programs() -> None:
-    """Have PyTorch keep programs in a folder of the user, unless it was told where."""
+    """Have PyTorch keep programs in a folder of the user, unless the environment names one."""
     # Its own default is a temporary folder, where others may put something: a program is code.
     # PyTorch writes that default into the environment itself.
     if os.environ.get("TORCHINDUCTOR_CACHE_DIR") not in (None, default_cache_dir()):
@@ -210,7 +210,7 @@ def _form(entry: tuple[NestedKey, Tensor]) -> tuple[Any, ...]:
 
 
 def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[Tensor]:
-    """Have a trace take all tensors that it holds as its last inputs, and give them."""
+    """Make the tensors that a trace holds its last inputs, and return them."""
     graph, inputs = trace.graph, dict[int, tuple[fx.Node, Tensor]]()
     of_storage = {_place(value): value for value in state.values()}
     last = graph.find_nodes(op="placeholder")[-1]
@@ -232,5 +232,5 @@ def _take_state(trace: fx.GraphModule, state: dict[str, Tensor]) -> list[Tensor]
 
 
 def _place(value: Tensor) -> int:
-    """Where the numbers of a tensor are; a tensor without any is a place of its own."""
+    """Return the address of a tensor's numbers; a tensor without numbers has its own."""
     return value.untyped_storage().data_ptr() or -id(value)

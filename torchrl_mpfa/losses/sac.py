@@ -27,7 +27,7 @@ class SignalSACLoss(SignalLoss, SACLoss):
     \ln\pi(a' | s_{i+1}))` with an action :math:`a'` of the current policy; the actor's loss
     is the mean of :math:`\alpha \ln\pi(a | s_i) - \min_k Q_k(s_i, a)`. The temperature
     :math:`\alpha` is tuned until the policy has the entropy ``target_entropy``, minus the number of
-    action dimensions unless told otherwise.
+    action dimensions by default.
 
     The signal of Eq. (13) is the larger TD error of the critics, as in TorchRL's own
     ``"td_error"``; gradient and value are those of the first critic. The losses of actor and

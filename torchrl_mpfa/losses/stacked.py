@@ -185,7 +185,7 @@ def check_networks(actor: Any, critic: Any, *, critic_name: str) -> None:
         )
     if not set(actor.out_keys) & set(first.in_keys):
         raise ValueError(
-            f"{critic_name} must read what actor_network writes, {list(actor.out_keys)}, but "
+            f"{critic_name} must read an output of actor_network, {list(actor.out_keys)}, but "
             f"reads {list(first.in_keys)}"
         )
 

@@ -29,7 +29,7 @@ class Replay:
         select: Samples the batches of one training step from the buffer.
         signals: The signals that the loss has to write, by name.
         method: The settings that it was made from.
-        entries: Names of the entries that transitions must have beside the usual: ``"episode"``, a
+        entries: Names of extra entries that transitions must contain: ``"episode"``, a
             number, shape ``[B, 1]``; ``"behavior_mean"``, the action without its noise, ``[B, A]``,
             and ``"behavior_sigma"``, the standard deviation of that, ``[B, 1]``.
     """
@@ -73,19 +73,19 @@ def make_replay(
     sigma: float | Callable[[], float] | None = None,
     **settings: Any,
 ) -> Replay:
-    """The replay of a method: buffer, selection, and the signals that the loss has to write.
+    """Make the replay of a method: buffer, selection, and the signals that the loss has to write.
 
     Args:
         method: A name out of :data:`~torchrl_mpfa.methods.METHODS`, or a method of your own.
         capacity: Slots of the buffer; by default those of the storage, or of the method.
         batch_size: Transitions of a batch; by default the method's.
         generator: Source of all randomness; by default a new one that ``torch.manual_seed`` rules.
-        storage: Where the transitions lie; by default a new
+        storage: Storage of the transitions; by default a new
             :class:`~torchrl_mpfa.SignalTensorStorage`. It must keep the signals of the method.
         device: Device of a new storage; ``"auto"``: that of the first transition.
-        policy: The policy in training, with whose actions KLPER and ReF-ER compare.
+        policy: The policy in training, whose actions KLPER and ReF-ER compare.
         sigma: Standard deviation of the exploration noise in units of the action, for KLPER; or a
-            function that gives that of the present episode.
+            function that returns that of the current episode.
         **settings: Other values for the settings of the method.
 
     Returns:

@@ -1,7 +1,7 @@
-"""What a method is: settings, and the parts of a replay that it makes of them.
+"""A method: settings, and the parts of a replay that it makes of them.
 
-A method of your own is a subclass: its fields are its settings, and it overrides what it makes
-otherwise. Parts are imported where they are made, as TorchRL's buffers take half a second.
+A method of your own is a subclass: its fields are its settings, and it overrides the methods whose
+parts differ. Parts are imported where they are made, as TorchRL's buffers take half a second.
 """
 
 from __future__ import annotations
@@ -98,12 +98,12 @@ class Method:
 
     @property
     def curiosity(self) -> float:
-        """Factor of the bonus for what the robot could not foresee (ICM); 0: none."""
+        """Factor of the bonus for outcomes that the robot could not predict (ICM); 0: none."""
         return 0.0
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Entries that transitions must have beside the usual ones."""
+        """Extra entries that transitions must contain."""
         return ("episode",) if self.hindsight else ()
 
     @property
@@ -168,9 +168,9 @@ class Prioritized(Method):
     eps: float = within(NOT_NEGATIVE, 0.05)
     """Added to every priority, Eq. 21."""
     max_priority_within_buffer: bool = within(SWITCH, True)
-    """Whether a fresh transition gets the highest priority in the buffer, or the highest ever."""
+    """True: a fresh transition gets the highest priority in the buffer; false: the highest ever."""
     stratified: bool = within(SWITCH, False)
-    """Whether a batch takes one transition from each of equal parts of the total priority."""
+    """True: a batch has one transition from each of equal parts of the total priority."""
 
     def beta_at(self, fraction: float) -> float:
         """Return the importance exponent after a part of the training (Eq. 10)."""

@@ -252,7 +252,7 @@ class ReFER(Method):
         return (*super().entries, "behavior_mean", "behavior_sigma")
 
     def selection(self, policy: Any, sigma: Any) -> Selection:
-        """Make the selection that leaves out what is far."""
+        """Make the selection that leaves out far transitions."""
         from torchrl_mpfa.methods.ref_er import ReFERSelection
 
         return ReFERSelection(policy, far_share=self.far_share, cutoff=self.far_cutoff)
@@ -270,7 +270,7 @@ class AveragedDDPG(Method):
 
 @dataclass
 class Curious(Prioritized):
-    """PER with RAdam, and a bonus for what the robot could not foresee (ICM)."""
+    """PER with RAdam, and a bonus for outcomes that the robot could not predict (ICM)."""
 
     name: str = "ddpg_radam"
     optimizer: str = "radam"

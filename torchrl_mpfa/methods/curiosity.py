@@ -1,8 +1,8 @@
-r"""Curiosity: a bonus for transitions whose outcome the robot cannot foresee yet.
+r"""Curiosity: a bonus for transitions whose outcome the robot cannot predict yet.
 
 Intrinsic curiosity module of Pathak et al. (2017), https://arxiv.org/abs/1705.05363, which Li et
 al. (2021), https://doi.org/10.1155/2021/5169460, add to DDPG with RAdam and PER. Features
-:math:`\phi` of observations are learned such that they tell the action from the observations before
+:math:`\phi` of observations are learned from which the action can be inferred, given those before
 and after it; the bonus is the error of predicting the latter from the former and the action.
 """
 
@@ -21,11 +21,11 @@ from torchrl_mpfa.learners.base import check_losses
 
 
 def intrinsic_reward(foreseen: Tensor, found: Tensor, *, scale: float) -> Tensor:
-    r"""Bonus of a transition, :math:`\tfrac{\eta}{2} \lVert \hat\phi' - \phi' \rVert^2`.
+    r"""Compute the bonus :math:`\tfrac{\eta}{2} \lVert \hat\phi' - \phi' \rVert^2`.
 
     Args:
-        foreseen: Features that the forward model expects, shape ``[B, F]``.
-        found: Features of what came, shape ``[B, F]``.
+        foreseen: Features that the forward model predicts, shape ``[B, F]``.
+        found: Features of the next observation, shape ``[B, F]``.
         scale: :math:`\eta`.
 
     Returns:
@@ -49,8 +49,8 @@ class Curiosity(nn.Module):
     r"""Adds the bonus to the rewards of a sampled batch, and trains its models on it.
 
     The bonus is computed whenever a transition is sampled, so that it fades as the models
-    learn; what the buffer keeps is the reward of the environment. To be called on a batch before
-    the learner is: ``("next", "reward")`` gets the bonus on top, the reward alone stays at
+    learn; the buffer keeps the reward of the environment. Call it on a batch before the learner:
+    ``("next", "reward")`` gets the bonus on top, the reward alone stays at
     ``("next", "extrinsic_reward")``, and the bonus is at ``("next", "intrinsic_reward")``. The
     losses of the models are :math:`(1 - b) L_{inverse} + b L_{forward}`.
 
@@ -63,7 +63,7 @@ class Curiosity(nn.Module):
         forward_share: :math:`b`.
         lr: Learning rate of the models, by default ten times the actor's in Table 1, as in the
             public code of the module.
-        reward_key: Where the reward of a transition is, within ``"next"``.
+        reward_key: Key of the reward within ``"next"``.
 
     Raises:
         ValueError: If an argument is out of its range.
@@ -109,7 +109,7 @@ class Curiosity(nn.Module):
         self.optimizer = torch.optim.RAdam(self.parameters(), lr=lr)
 
     def bonus(self, observation: Tensor, action: Tensor, after: Tensor) -> Tensor:
-        """Bonus of transitions by the present models, shape ``[B]``.
+        """Compute the bonus of transitions by the present models, shape ``[B]``.
 
         Args:
             observation: Shape ``[B, O]``.
@@ -147,26 +147,26 @@ class Curiosity(nn.Module):
         return {**log, "intrinsic_reward": bonus}
 
     def _losses(self, observation: Tensor, action: Tensor, after: Tensor) -> dict[str, Tensor]:
-        """The losses of both models; the features learn from the inverse one and follow."""
+        """Compute the losses of both models, from both of which the features learn."""
         before, then = self.encoder(observation), self.encoder(after)
-        told = self.inverse_model(torch.cat((before, then), -1))
-        inverse_loss = (told - action).square().sum(-1).mean()
+        inferred = self.inverse_model(torch.cat((before, then), -1))
+        inverse_loss = (inferred - action).square().sum(-1).mean()
         foreseen = self.forward_model(torch.cat((before, action), -1))
         forward_loss = intrinsic_reward(foreseen, then, scale=1.0).mean()
         return {"loss_inverse": inverse_loss, "loss_forward": forward_loss}
 
     def _learn(self, losses: dict[str, Tensor]) -> None:
-        """One step of both models."""
+        """Take one step of both models."""
         self.optimizer.zero_grad(set_to_none=True)
         share = self.forward_share
         ((1.0 - share) * losses["loss_inverse"] + share * losses["loss_forward"]).backward()
         self.optimizer.step()
 
     def checkpoint(self) -> dict[str, Any]:
-        """Models and optimizer; tensors and plain values only."""
+        """Return models and optimizer as tensors and plain values."""
         return {"models": self.state_dict(), "optimizer": self.optimizer.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`checkpoint` gave."""
+        """Restore a state from :meth:`checkpoint`."""
         self.load_state_dict(state["models"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -2,7 +2,7 @@ r"""Replay by age: the older a transition, the less often, by a truncated geomet
 
 After Korniak et al. (2026), "When does non-uniform replay matter in reinforcement learning?",
 https://arxiv.org/abs/2605.10236. **A reconstruction**: that replay by a truncated geometric law
-prefers what is recent is said by its abstract; the form of the law and its rate are our reading:
+prefers recent transitions is said by its abstract; the form and the rate are our reading:
 
 .. math::
 
@@ -10,8 +10,8 @@ prefers what is recent is said by its abstract; the form of the law and its rate
     \rho = 1 - e^{-c / N}
 
 where the age :math:`k` of a transition counts those that were written after it. The rate
-:math:`\rho` follows the number :math:`N` of transitions in the buffer: whatever it is, the newest
-is sampled :math:`e^c` times as often as the oldest.
+:math:`\rho` follows the number :math:`N` of transitions in the buffer, so that the newest is
+always sampled :math:`e^c` times as often as the oldest.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from torchrl_mpfa.samplers.uniform import NewestSampler
 
 
 def geometric_age(share: Tensor, *, rate: float, count: int) -> Tensor:
-    r"""The age below which a share of a truncated geometric law lies.
+    r"""Compute the age below which a share of a truncated geometric law lies.
 
     The inverse of its distribution function,
     :math:`k = \lfloor \ln(1 - u (1 - (1 - \rho)^N)) / \ln(1 - \rho) \rfloor`: of shares that are
@@ -51,7 +51,7 @@ def geometric_age(share: Tensor, *, rate: float, count: int) -> Tensor:
         age = share * count
     else:
         step = math.log1p(-rate)
-        # log1p and expm1 keep what a small rate would lose beside 1.
+        # log1p and expm1 keep digits that a small rate would lose next to 1.
         age = torch.log1p(share * math.expm1(count * step)) / step
     # Rounding can carry the last share one age too far.
     return age.long().clamp_(0, count - 1)
@@ -89,7 +89,7 @@ class GeometricSampler(NewestSampler):
 
     @property
     def divisible(self) -> bool:
-        """Whether ``U * B`` slots, sampled at once, are as good as ``U`` batches of ``B``."""
+        """True if ``U * B`` slots, sampled at once, can be split into ``U`` batches of ``B``."""
         return True
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Any, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Hindsight experience replay: episodes are learned from once more, with goals that they reached.
+"""Hindsight experience replay: episodes are learned from again, with goals that they reached.
 
 After Andrychowicz et al. (2017), "Hindsight experience replay", https://arxiv.org/abs/1707.01495.
 """
@@ -22,7 +22,7 @@ class Relabel(Protocol):
 
     @property
     def entries(self) -> tuple[NestedKey, ...]:
-        """What it reads beside the usual; it is not stored."""
+        """Extra entries to read, which are not stored."""
         ...
 
     def __call__(self, episode: TensorDictBase, steps: Tensor) -> TensorDictBase:
@@ -39,7 +39,7 @@ class Relabel(Protocol):
 
 
 def future_goals(length: int, goals: int, generator: torch.Generator | None = None) -> Tensor:
-    """Steps of an episode at random, each at most once.
+    """Choose steps of an episode at random, each at most once.
 
     Args:
         length: Steps of the episode ``T``.
@@ -57,20 +57,21 @@ def future_goals(length: int, goals: int, generator: torch.Generator | None = No
 
 
 class HindsightGoals(Transform):
-    """Writes each episode that has ended once more to a replay buffer, for other goals.
+    """Writes each episode that has ended to a replay buffer again, for other goals.
 
-    Append it to a buffer: what is written is stored as it is, and once an episode has ended, its
+    Append it to a buffer: transitions are stored unchanged, and once an episode has ended, its
     relabelled transitions follow in the same call. They are transitions like all others, with
     signals and priorities of their own. Nothing changes when batches are sampled.
 
-    Transitions must have the number of their episode and what ``relabel`` reads; neither is stored.
-    Episodes that are under way are part of the state of the buffer.
+    Transitions must have the number of their episode and the entries of ``relabel``; neither is
+    stored.
+    Unfinished episodes are part of the state of the buffer.
 
     Args:
         relabel: Gives an episode other goals, say ``mpfa_envs.GoalRelabeling``.
-        goals: Goals of an episode ``K``: what was reached after steps at random, each a goal of all
-            that came before it.
-        episode_key: Where the number of the episode is, ``[..., 1]``.
+        goals: Goals of an episode ``K``: places reached after steps at random, each the goal of all
+            steps before it.
+        episode_key: Key of the episode's number, ``[..., 1]``.
         generator: Source of the choice of goals; None: PyTorch's own. Its state is not part of the
             buffer's.
 
@@ -126,20 +127,20 @@ class HindsightGoals(Transform):
         return tensordict
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        beside = (self._episode_key, *self._relabel.entries)
-        for key in beside:
+        extra = (self._episode_key, *self._relabel.entries)
+        for key in extra:
             if tensordict.get(key, None) is None:
                 raise KeyError(f"transitions for goals in hindsight must have {key!r}")
         rows = tensordict.reshape(-1)
         done = as_mask("('next', 'done')", rows["next", "done"]).reshape(-1)
         self._pending = (*self._pending, rows.clone())
-        written = [rows.exclude(*beside)]
+        written = [rows.exclude(*extra)]
         if done.any():
             written += [self._in_hindsight(episode) for episode in self._take()]
         return torch.cat(written)
 
     def _take(self) -> list[TensorDictBase]:
-        """Take the episodes that have ended out of those under way."""
+        """Remove the episodes that have ended from the pending rows, and return them."""
         rows = cast(TensorDictBase, torch.cat(self._pending))
         number, done = (
             rows[key].reshape(-1).cpu() for key in (self._episode_key, ("next", "done"))

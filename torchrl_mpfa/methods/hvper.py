@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def relative_value(value: Tensor) -> Tensor:
-    """Q relative to its batch, ``V``: the sigmoid of its standard score.
+    """Compute Q relative to its batch, ``V``: the sigmoid of its standard score.
 
     Args:
         value: Q, shape ``[B]``.
@@ -48,7 +48,7 @@ def relative_value(value: Tensor) -> Tensor:
 
 
 def relative_error(td_error: Tensor) -> Tensor:
-    r"""TD error relative to its batch, ``T``: its share of the largest.
+    r"""Compute the TD error relative to its batch, ``T``: its share of the largest.
 
     Args:
         td_error: :math:`|\delta|`, shape ``[B]``.
@@ -117,7 +117,7 @@ class ScheduledFusion:
 
 
 def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
-    r"""Weights that go from the TD error alone to an equal part of Q, which is wrong at first.
+    r"""Make weights that go from the TD error alone to an equal part of Q, which is wrong at first.
 
     Args:
         final_share: :math:`\lambda` at the end of the training.
@@ -139,13 +139,13 @@ def value_schedule(*, final_share: float = 0.5) -> ScheduledFusion:
 
 @dataclass(frozen=True)
 class HVPERPenalty:
-    r"""Less for what was replayed often, :math:`\max(p_i - \kappa U_i, \epsilon)`.
+    r"""Lower priorities of often replayed transitions, :math:`\max(p_i - \kappa U_i, \epsilon)`.
 
     ``U`` is the number of replays as a share of the largest one in the batch.
 
     Args:
         penalty: :math:`\kappa`.
-        floor: :math:`\epsilon`, so that nothing is lost for good.
+        floor: :math:`\epsilon`, so that no transition is lost.
 
     Raises:
         ValueError: If an argument is out of its range.

@@ -97,11 +97,10 @@ class KLPERSelection:
         batch = select(buffer.sample(3 * 256))
 
     Args:
-        policy: The current policy, on any device; reads what its ``in_keys`` name, writes the
-            action.
+        policy: The current policy, on any device; writes the action.
         batches: Number of batches ``K`` to choose from.
         sigma: Standard deviation of the exploration noise in units of the action, or a function
-            that tells that of the episode that acts.
+            that returns that of the current episode.
         action_key: Key of the action.
 
     Raises:
@@ -142,13 +141,13 @@ class KLPERSelection:
         """Choose a batch.
 
         Args:
-            tensordict: What the buffer gave, batch size ``[K * B]``.
+            tensordict: The sampled rows, batch size ``[K * B]``.
 
         Returns:
             The batch, batch size ``[B]``.
 
         Raises:
-            ValueError: If what it gave is no multiple of the number of batches.
+            ValueError: If the rows are no multiple of the number of batches.
         """
         count = len(tensordict)
         if count % self.batches:

@@ -17,7 +17,7 @@ from torchrl_mpfa.checks import POSITIVE, check
 
 @dataclass(frozen=True)
 class LAPFloor:
-    r"""No priority below a floor, :math:`\max(|\delta_i|, 1)`.
+    r"""Raise priorities to a floor, :math:`\max(|\delta_i|, 1)`.
 
     Args:
         floor: The floor in the units of the environment's reward. LAP's 1 is where its Huber loss
@@ -39,5 +39,5 @@ class LAPFloor:
         check(POSITIVE, floor=self.floor)
 
     def __call__(self, priority: Tensor, batch: BatchFacts) -> Tensor:
-        """Raise what is below the floor, shape ``[B]``."""
+        """Raise priorities to the floor, shape ``[B]``."""
         return priority.clamp_min(self.floor)

@@ -30,7 +30,7 @@ class MWSampler(SignalSampler):
 
     Args:
         *args: As :class:`~torchrl_mpfa.SignalSampler`.
-        replay_cap: How often a transition may be replayed.
+        replay_cap: Largest number of replays of a transition.
         **kwargs: As :class:`~torchrl_mpfa.SignalSampler`.
 
     Raises:
@@ -51,7 +51,7 @@ class MWSampler(SignalSampler):
 
     @property
     def divisible(self) -> bool:
-        """Never: how a batch is sampled depends on whether enough transitions are left for it."""
+        """False: sampling depends on the number of transitions that are left for a batch."""
         return False
 
     def _init(self) -> None:
@@ -73,7 +73,7 @@ class MWSampler(SignalSampler):
         spent = slots[self._spent[slots]]
         if len(spent):
             set_leaves(spent, leaf.new_zeros(len(spent)), self._sum_tree)
-            # The lowest share of those that can be sampled is what weights are relative to.
+            # Weights are relative to the lowest share of those that can be sampled.
             set_leaves(spent, leaf.new_full((len(spent),), _NO_LEAF), self._min_tree)
 
     def _sample_slots(self, size: int, batch_size: int) -> tuple[Tensor, Tensor]:

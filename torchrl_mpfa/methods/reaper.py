@@ -1,8 +1,8 @@
-r"""ReaPER: errors count for more where the rest of their episode is well foreseen.
+r"""ReaPER: errors count for more where the rest of their episode is well predicted.
 
 Pleiss et al. (2025), "Reliability-adjusted prioritized experience replay",
 https://arxiv.org/abs/2506.18482, by the rules of the authors' public code. The target of a
-transition is made of what comes after it: where the later TD errors of its episode are large, its
+transition is made of later ones: where the later TD errors of its episode are large, its
 own error says little.
 
 .. math::
@@ -10,8 +10,8 @@ own error says little.
     R_t = 1 - \frac{\sum_{i > t} |\delta_i|}{F}, \qquad F = \sum_i |\delta_i|, \qquad
     P(t) \propto R_t^{\,\omega}\, p_t^{\,\alpha}
 
-Of an episode that is still under way, :math:`F` is the largest sum of one that has ended, and what
-is not known of it counts as the difference: :math:`R_t = \sum_{i \le t} |\delta_i| / F`.
+Of an unfinished episode, :math:`F` is the largest sum of one that has ended, and its unknown rest
+counts as the difference: :math:`R_t = \sum_{i \le t} |\delta_i| / F`.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from torchrl_mpfa.storages.table import SignalTable
 EPISODE = Signal("episode", key="episode", known_at="write")
 """The number of the episode that a transition is of, which the storage has to keep.
 
-It may begin again with a process or a collector: a transition continues an episode of its number
-if it begins with what that ended with (:func:`~torchrl_mpfa.episodes.episodes_of`)."""
+Numbers may begin again with a process or a collector: a transition continues an episode of its
+number if it begins where that ended (:func:`~torchrl_mpfa.episodes.episodes_of`)."""
 ENDED = Signal("ended", key=("next", "done"), known_at="write")
-"""Whether the transition is the last one of its episode, likewise."""
+"""True for the last transition of an episode, likewise."""
 _LEAST = 1e-3
 """With a reliability of zero a transition would be lost for good."""
 _UNDER_WAY = 1024
@@ -147,7 +147,7 @@ class ReaPERSampler(SignalSampler):
         written_at: Tensor | None = None,
         batches: int = 1,
     ) -> int:
-        """Store new signals of a batch, and set what its episodes are sampled in proportion to.
+        """Store new signals of a batch, and set the leaves of its episodes.
 
         As :meth:`SignalSampler.update_signals`.
         """

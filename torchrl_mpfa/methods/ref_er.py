@@ -1,4 +1,4 @@
-r"""ReF-ER: remember and forget. What the policy would no longer do teaches nothing.
+r"""ReF-ER: remember and forget. Actions that the policy would no longer take teach nothing.
 
 Novati and Koumoutsakos (2019), "Remember and forget for experience replay",
 https://arxiv.org/abs/1807.05827. Of transitions whose importance ratio
@@ -42,11 +42,11 @@ _FIRST_WEIGHT = 1e-4
 
 
 def importance_ratio(action: Tensor, now: Tensor, then: Tensor, sigma: Tensor) -> Tensor:
-    r"""Density of an action by the policy of today over that by the behavior, :math:`\rho`.
+    r"""Compute the ratio of an action's densities, current policy over behavior, :math:`\rho`.
 
     Args:
-        action: What was done, shape ``[B, A]``.
-        now: What the policy would do, shape ``[B, A]``.
+        action: Stored actions, shape ``[B, A]``.
+        now: Actions of the current policy, shape ``[B, A]``.
         then: Mean of the behavior, shape ``[B, A]``.
         sigma: Standard deviation of both, shape ``[B, 1]``.
 
@@ -73,7 +73,7 @@ def next_weight(weight: float, *, far: float, allowed: float, rate: float) -> fl
 
 
 class ReFERSampler(SavedSampler, RandomSampler):
-    r"""Uniform sampling by a sampler that keeps and saves what ReF-ER adapts.
+    r"""Uniform sampling, with the weight that ReF-ER adapts as a saved state.
 
     Examples:
         >>> ReFERSampler().policy_weight
@@ -103,7 +103,7 @@ class ReFERSelection:
     r"""Selection of ReF-ER: a uniform batch whose far transitions have no weight.
 
     Args:
-        policy: The current policy; reads what its ``in_keys`` name, writes ``"action"``.
+        policy: The current policy; writes ``"action"``.
         far_share: Share :math:`D` of far transitions up to which the policy is set free.
         cutoff: :math:`C` of :math:`c = 1 + C / (1 + 5 \cdot 10^{-7} t)`, after ``t`` batches.
 
@@ -126,12 +126,12 @@ class ReFERSelection:
         self.cutoff = cutoff
 
     def limit(self, batches: int) -> float:
-        """The ratio :math:`c` from which on a transition is far, after so many batches."""
+        """Compute the ratio :math:`c` above which a transition is far after these batches."""
         return 1.0 + self.cutoff / (1.0 + _CUTOFF_DECAY * batches)
 
     @torch.no_grad()
     def __call__(self, buffer: TensorDictReplayBuffer) -> Iterator[SampledBatch]:
-        """Sample a batch, and say what of it counts.
+        """Sample a batch, and set the weights of its transitions.
 
         Args:
             buffer: The buffer, with a :class:`ReFERSampler`.

@@ -1,4 +1,4 @@
-"""Actors and critics, with what keeps them from collapsing as arguments."""
+"""Actors and critics."""
 
 from torchrl_mpfa.networks.bounds import ActionScale, action_bounds
 from torchrl_mpfa.networks.deterministic import (

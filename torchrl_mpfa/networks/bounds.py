@@ -10,7 +10,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 
 def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tuple[Tensor, Tensor]:
-    """Least and greatest action of a spec.
+    """Return the least and greatest action of a spec.
 
     Args:
         action_spec: A :class:`~torchrl.data.Bounded` spec, or a :class:`~torchrl.data.Composite`
@@ -58,7 +58,7 @@ def action_bounds(action_spec: TensorSpec, action_size: int | None = None) -> tu
 
 
 def given_bounds(action_spec: TensorSpec | None, bounds: Any) -> tuple[Tensor, Tensor]:
-    """Least and greatest action, of a spec or as they are given; of both or none it raises."""
+    """Return the least and greatest action of a spec, or of bounds, one of which must be given."""
     if (action_spec is None) == (bounds is None):
         raise ValueError(
             "one of action_spec and bounds must be given, got "
@@ -94,12 +94,12 @@ class ActionScale(nn.Module):
         self.register_buffer("half_width", (high - low) / 2)
 
     def forward(self, action: Tensor) -> Tensor:
-        """From [-1, 1] to the bounds, each of shape ``[..., A]``."""
+        """Map [-1, 1] to the bounds, each of shape ``[..., A]``."""
         return torch.addcmul(self.center, self.half_width, action)
 
 
 def action_scale(action_spec: TensorSpec | None, action_size: int) -> ActionScale | None:
-    """The last layer that a policy needs after its tanh; None if actions are in [-1, 1]."""
+    """Make the layer after a policy's tanh; None if actions are in [-1, 1]."""
     if action_spec is None:
         return None
     low, high = action_bounds(action_spec, action_size)

@@ -1,4 +1,4 @@
-"""Actor and critic for DDPG and TD3, with what keeps them from collapsing as arguments.
+"""Actor and critic for DDPG and TD3, with the options that keep them from collapsing.
 
 Plain multi-layer perceptrons were seen to saturate the actor's tanh within some fifty episodes:
 the robot then circles. The defaults follow the original DDPG paper (Lillicrap et al. 2016,
@@ -31,8 +31,8 @@ class DirectModule(TensorDictModule):
 
     Args:
         module: Function of one tensor per key of ``in_keys``, in their order.
-        in_keys: What it reads.
-        out_keys: What it gives.
+        in_keys: Keys of the inputs.
+        out_keys: Keys of the outputs.
 
     Examples:
         >>> import torch
@@ -60,7 +60,7 @@ class DirectModule(TensorDictModule):
         return self.by_key(self.module(*[inputs.get(key) for key in self.in_keys]))
 
     def by_key(self, found: Tensor | tuple[Tensor, ...]) -> dict[NestedKey, Tensor]:
-        """Name what the module gave."""
+        """Return the module's results by key."""
         return dict(
             zip(self.out_keys, found if isinstance(found, tuple) else (found,), strict=True)
         )
@@ -68,7 +68,7 @@ class DirectModule(TensorDictModule):
 
 @dataclass(frozen=True)
 class Perceptron:
-    """Options of an actor, a critic, or a value network, see :func:`~torchrl_mpfa.make_actor`."""
+    """Options of a network, documented at :func:`~torchrl_mpfa.make_actor`."""
 
     width: int
     layers: int
@@ -81,7 +81,7 @@ class Perceptron:
             check(NOT_NEGATIVE, final_init=self.final_init)
 
     def hidden(self, inputs: int, count: int) -> list[nn.Module]:
-        """So many hidden layers, each followed by LayerNorm (if asked) and ReLU."""
+        """Make hidden layers, each followed by ReLU and, by option, LayerNorm before it."""
         layers: list[nn.Module] = []
         for _ in range(count):
             norm = [nn.LayerNorm(self.width)] if self.layer_norm else []
@@ -90,7 +90,7 @@ class Perceptron:
         return layers
 
     def last(self, outputs: int) -> nn.Linear:
-        """The linear layer after the hidden ones."""
+        """Make the linear layer after the hidden ones."""
         layer = nn.Linear(self.width, outputs)
         if self.final_init is not None:
             nn.init.uniform_(layer.weight, -self.final_init, self.final_init)
@@ -99,7 +99,7 @@ class Perceptron:
 
 
 class Actor(nn.Module):
-    """Deterministic policy; gives the action before its tanh as well."""
+    """Deterministic policy, which returns the action before its tanh as well."""
 
     def __init__(
         self,
@@ -116,13 +116,13 @@ class Actor(nn.Module):
         self.scale = scale
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """From ``[..., O]`` to the preactivation and the action, each ``[..., A]``."""
+        """Map ``[..., O]`` to the preactivation and the action, each ``[..., A]``."""
         before = self.head(self.body(observation))
         action = torch.tanh(before)
         return before, action if self.scale is None else self.scale(action)
 
     def layers(self) -> list[nn.Module]:
-        """All layers in their order, from observation to action."""
+        """Return all layers in their order, from observation to action."""
         scale = [] if self.scale is None else [self.scale]
         return [*self.body, self.head, nn.Tanh(), *scale]
 
@@ -145,7 +145,7 @@ class Critic(nn.Module):
         self.rest = nn.Sequential(*rest, perceptron.last(1))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        """From ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``."""
+        """Map ``[..., O]`` and ``[..., A]`` to Q, ``[..., 1]``."""
         if self.late_action:
             joined = torch.cat((self.first(observation), action), -1)
         else:
@@ -164,7 +164,7 @@ def make_actor(
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
 ) -> DirectModule:
-    """Policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
+    """Make a policy from ``"observation"`` to ``"preactivation"`` and ``"action"``.
 
     Args:
         observation_size: ``O``.
@@ -173,9 +173,9 @@ def make_actor(
             its bounds. None: actions are in [-1, 1].
         width: Units of each hidden layer.
         layers: Number of hidden layers.
-        layer_norm: Normalize each hidden layer, so that no feature grows without bound.
-        final_init: The last layer starts uniformly within this, hence near the middle of the
-            tanh; None leaves PyTorch's start.
+        layer_norm: True to normalize each hidden layer, so that no feature grows without bound.
+        final_init: Bound of the last layer's uniform start, hence near the middle of the tanh;
+            None keeps PyTorch's start.
 
     Returns:
         A module for TorchRL's losses and collectors.
@@ -207,7 +207,7 @@ def make_critic(
     final_init: float | None = 3e-3,
     late_action: bool = True,
 ) -> DirectModule:
-    """Critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
+    """Make a critic from ``"observation"`` and ``"action"`` to ``"state_action_value"``.
 
     Args:
         observation_size: ``O``.
@@ -216,7 +216,7 @@ def make_critic(
         layers: Number of hidden layers; with ``late_action`` at least two.
         layer_norm: As in :func:`make_actor`.
         final_init: As in :func:`make_actor`.
-        late_action: Whether the action joins at the second layer in place of the first.
+        late_action: True to feed the action to the second layer, and not to the first.
 
     Returns:
         A module for TorchRL's losses.

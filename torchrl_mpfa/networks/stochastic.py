@@ -70,7 +70,7 @@ class StochasticNetwork(nn.Module):
         self.scale_head = perceptron.last(action_size)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """From ``[..., O]`` to mean and scale, each ``[..., A]``."""
+        """Map ``[..., O]`` to mean and scale, each ``[..., A]``."""
         features = self.body(observation)
         # Flat nowhere, as a clamped exponential is: a scale that got there would stay.
         scale = softplus(self.scale_head(features) + _SCALE_BIAS) + _LEAST_SCALE
@@ -109,7 +109,7 @@ class StochasticActor(ProbabilisticActor):
         self.action_scale = scale
 
     def layers(self) -> list[nn.Module]:
-        """All layers in their order, from observation to the action that is not random."""
+        """Return all layers in their order, from observation to the mean action."""
         network = self.module[0].module
         scale = [] if self.action_scale is None else [self.action_scale]
         return [*network.body, network.head, nn.Tanh(), *scale]
@@ -141,7 +141,7 @@ class StochasticActor(ProbabilisticActor):
     def sample(
         self, inputs: Mapping[NestedKey, Tensor] | TensorDictBase
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Sample actions, whatever the exploration type is.
+        """Sample actions under any exploration type.
 
         Args:
             inputs: Tensors by key, in a mapping or a tensordict.
@@ -165,7 +165,7 @@ def make_stochastic_actor(
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
 ) -> StochasticActor:
-    """Policy from ``"observation"`` to ``"preactivation"``, ``"scale"`` and ``"action"``.
+    """Make a policy from ``"observation"`` to ``"preactivation"``, ``"scale"`` and ``"action"``.
 
     The action is the tanh of a Gaussian with this mean (the preactivation) and scale. It is random
     under ``set_exploration_type(ExplorationType.RANDOM)``, as in TorchRL's collectors; otherwise it
@@ -178,8 +178,8 @@ def make_stochastic_actor(
         width: Units of each hidden layer.
         layers: Number of hidden layers.
         layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
-        final_init: The last layers start uniformly within this, hence means near zero and scales
-            near one; None leaves PyTorch's start.
+        final_init: Bound of the last layers' uniform start, hence means near zero and scales near
+            one; None keeps PyTorch's start.
 
     Returns:
         A module for :class:`~torchrl_mpfa.SignalSACLoss` and TorchRL's collectors.

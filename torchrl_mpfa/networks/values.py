@@ -22,11 +22,11 @@ class ValueNetwork(nn.Module):
         self.head = perceptron.last(actions)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        """Map ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
         return _chosen(self.head(self.body(observation)))
 
     def layers(self) -> list[nn.Module]:
-        """All layers in their order, from observation to values."""
+        """Return all layers in their order, from observation to values."""
         return [*self.body, self.head]
 
 
@@ -41,12 +41,12 @@ class ValueTable(nn.Module):
         self.register_buffer("table", torch.zeros(cells, actions))
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
+        """Map ``[..., O]`` to values and choice, ``[..., K]``, and its value, ``[..., 1]``."""
         return _chosen(self.table[self.cell_of(observation)])
 
 
 def _chosen(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Values, the greatest of them as a one-hot choice, and its value."""
+    """Return values, the greatest as a one-hot choice, and the greatest value."""
     choice = nn.functional.one_hot(values.argmax(-1), values.shape[-1])
     return values, choice, values.amax(-1, keepdim=True)
 
@@ -60,7 +60,7 @@ def make_value_network(
     layer_norm: bool = True,
     final_init: float | None = 3e-3,
 ) -> DirectModule:
-    """Network from ``"observation"`` to a value for each action, and the best one, one-hot.
+    """Make a network from ``"observation"`` to a value for each action, and the best one, one-hot.
 
     Args:
         observation_size: ``O``.
@@ -68,7 +68,7 @@ def make_value_network(
         width: Units of each hidden layer.
         layers: Number of hidden layers.
         layer_norm: As in :func:`~torchrl_mpfa.make_actor`.
-        final_init: As there.
+        final_init: As in :func:`~torchrl_mpfa.make_actor`.
 
     Returns:
         A module for ``DQNLoss``.
@@ -87,7 +87,7 @@ def make_value_network(
 
 
 def make_value_table(cell_of: Callable[[Tensor], Tensor], cells: int, actions: int) -> DirectModule:
-    """Table from ``"observation"`` to a value for each action, zero at first, and the best one.
+    """Make a table from ``"observation"`` to values of actions, zero at first, and the best one.
 
     Args:
         cell_of: From observations, shape ``[..., O]``, to integers in [0, cells), shape ``[...]``.
