@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import RayReplayBuffer
 
 from torchrl_mpfa.buffer import SignalReplayBuffer
-from torchrl_mpfa.buffer import SignalReplayBuffer
 from torchrl_mpfa.methods.assembly import Replay, buffer_parts, learned_signals
 from torchrl_mpfa.methods.base import Method
 
