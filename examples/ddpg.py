@@ -27,7 +27,7 @@ ROBOTS = 16
 STEPS = 8
 """Actions of each robot between two rounds of updates."""
 ACTIONS_PER_UPDATE = 4
-"""Of all robots together."""
+"""Actions of all robots together."""
 CAPACITY = 100_000
 BATCH_SIZE = 256
 LEARNING_RATE = 3e-4

@@ -71,14 +71,14 @@ _DOCUMENTED = (
 )
 _COLUMNS = {"success": "{:.1%}", "collision": "{:.1%}", "timeout": "{:.1%}", "spl": "{:.3f}"}
 _BARN = {"barn_score": "{:.3f}"}
-"""What there is on the task of that benchmark."""
+"""Columns of the task of that benchmark."""
 _LENGTHS = {"time_s": "{:.1f}", "path_length": "{:.2f}", "min_clearance": "{:.3f}"}
 _ENCOUNTERS = {
     "walker_distance": "{:.3f}",
     "intrusion_time": "{:.1f}",
     "time_to_collision": "{:.2f}",
 }
-"""What there is where people walk."""
+"""Columns of worlds where people walk."""
 _MILLISECONDS = {"plan_s": "{:.2f}", "decision_s": "{:.2f}"}
 
 
@@ -160,7 +160,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def read_noise(words: str) -> RobotNoise:
-    """What ``--noise slip=0.1,latency=1`` says."""
+    """Parse ``--noise slip=0.1,latency=1``."""
     try:
         values = {
             name: float(value) for name, _, value in (w.partition("=") for w in words.split(","))
@@ -181,7 +181,7 @@ def load_driver(options: argparse.Namespace) -> Drivable:
 
 
 def name_of(options: argparse.Namespace) -> str:
-    """What is evaluated: the path of a policy, or a planner, what it remembers and drives."""
+    """Return the name of what is evaluated: the path of a policy, or a planner's name."""
     if options.policy is None:
         return str(options.path)
     parts = [options.policy, options.memory if options.memory != "none" else "", options.robot]
@@ -189,7 +189,7 @@ def name_of(options: argparse.Namespace) -> str:
 
 
 def output_folder(options: argparse.Namespace) -> Path:
-    """Where results go unless the command line says."""
+    """Return the default folder of the results."""
     name = evaluation_folder(
         options.worlds,
         options.physics,
@@ -221,7 +221,7 @@ def printed(summary: pd.DataFrame) -> str:
 
 
 def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The rows as one document: the total, and each generator and each world under its name."""
+    """Return the rows as one document: the total, and each generator and world by name."""
 
     def entries(row: Mapping[str, Any]) -> dict[str, Any]:
         # JSON has no NaN, which the time is where no episode succeeds.
@@ -247,7 +247,7 @@ def as_document(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def critic(options: argparse.Namespace) -> Values | None:
-    """What the critic of a run thinks, if there is a run."""
+    """Return the values of the critic of a run, if there is a run."""
     if options.path is None or not (options.path / files.CHECKPOINT).exists():
         return None
     try:
@@ -261,7 +261,7 @@ def critic(options: argparse.Namespace) -> Values | None:
 def show_live(
     driver: Drivable, options: argparse.Namespace, how: Mapping[str, Any]
 ) -> pd.DataFrame:
-    """Show the episodes in a window, one after another, and tell how each ended."""
+    """Show the episodes in a window, one after another; return how each ended."""
     rows = []
     tasks = tasks_of(driver, options.names, episodes=options.episodes, seed=options.seed)
     for end in watch(driver, tasks, **how):
@@ -272,7 +272,7 @@ def show_live(
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Hold the folder of the results; one that another process holds is refused."""
+    """Hold the folder of the results; exit if another process holds it."""
     try:
         with files.lock(folder):
             yield

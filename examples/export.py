@@ -29,7 +29,7 @@ TOLERANCE = 1e-6
 """By how much actions of the file may differ, unless it is quantized."""
 _OBSERVATIONS = 1000
 _LIKELY = (-1.0, 1.0)
-"""Where the numbers of an observation mostly lie."""
+"""Range in which most numbers of an observation lie."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -92,7 +92,7 @@ def largest_difference(one: Policy, other: Policy) -> float:
 
 
 def driven(policy: Policy, options: argparse.Namespace) -> dict[str, Any]:
-    """How a policy drives the tasks, on exact arcs."""
+    """Drive a policy through the tasks, on exact arcs."""
     results = evaluate(policy, options.world, episodes=options.episodes, physics="kinematic")
     rates = {
         name: sum(getattr(each, name) for each in results) / len(results)

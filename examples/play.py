@@ -79,7 +79,7 @@ class Racer:
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """Where it is (x, y, heading) [m, m, rad]."""
+        """Pose of the robot (x, y, heading) [m, m, rad]."""
         return self.info["x"], self.info["y"], self.info["heading"]
 
     @property

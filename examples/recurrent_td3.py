@@ -29,7 +29,7 @@ ROBOTS = 16
 STEPS = 8
 """Actions of each robot between two rounds of updates."""
 ACTIONS_PER_UPDATE = 16
-"""Of all robots together."""
+"""Actions of all robots together."""
 CAPACITY = 96_000
 SLICES = 32
 """Slices in a batch."""

@@ -32,11 +32,11 @@ CAPACITY = 100_000
 RANDOM_ACTIONS = 2_048
 LEARNING_RATE = 3e-4
 ACTIONS_PER_UPDATE = 4
-"""Of all robots together."""
+"""Actions of all robots together."""
 STEPS = 4
 """Actions of each robot between two rounds of updates."""
 SENSES = {name: ROOMS_TASK[name] for name in ("physics", "memory", "closeness_distance")}
-"""What a policy must find again wherever it drives."""
+"""Arguments of the environment that a policy needs wherever it drives."""
 
 
 def make_networks(env: EnvBase) -> tuple[MLP, ProbabilisticActor, ValueOperator]:

@@ -39,7 +39,7 @@ from torchrl_mpfa.integrations.trainer import PriorityStepper
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """How much is collected, kept and learned."""
+    """Sizes of what is collected, kept and learned."""
 
     frames: int = 2_000
     frames_per_batch: int = 200

@@ -42,7 +42,7 @@ from training.settings.train import register
 
 RANGES = Path(__file__).with_suffix(".yaml")
 FIRST_SEED = 3000
-"""Of the runs of a search; no study and no default of another script has it."""
+"""First seed of the runs of a search; no study and no default of another script uses it."""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

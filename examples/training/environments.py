@@ -1,4 +1,4 @@
-"""The environments of a run: where it learns, and what a policy must sense where it is judged."""
+"""The environments of a run: of its training, and the arguments of its evaluation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ INFO = ("success", "collision", "timeout", "path_length", "shortest_path")
 
 
 def check_physics(physics: str) -> None:
-    """Refuse simulated wheels where there is no PyBullet."""
+    """Raise for simulated wheels if there is no PyBullet."""
     if physics == "wheels":
         try:
             import_module("mpfa_envs.robots.simulation")
@@ -39,7 +39,7 @@ def check_physics(physics: str) -> None:
 
 
 def env_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
-    """What a policy must find again wherever it drives: robot, time, and lidar."""
+    """Return the arguments that a policy needs wherever it drives: robot, time and lidar."""
     robot = resolve_robot(settings.robot)
     # Only where it is not the default: policies are asked for no argument that they do not need.
     view = settings.field_of_view
@@ -64,7 +64,7 @@ def collision_distance(settings: EnvironmentSettings) -> float:
 
 
 def task_arguments(settings: EnvironmentSettings) -> dict[str, Any]:
-    """The task to learn: what a policy must find again, and what pays and ends an episode."""
+    """Return the task to learn: what a policy needs, rewards, and ends of an episode."""
     return {
         "collision_distance": collision_distance(settings),
         "progress": settings.progress,
@@ -134,7 +134,7 @@ class FilteredRobots:
 
 
 def vector_of(env: EnvBase) -> VectorNavigationEnv:
-    """The robots in an environment of :func:`make_training_env`."""
+    """Return the robots in an environment of :func:`make_training_env`."""
     base = env.base_env if isinstance(env, TransformedEnv) else env
     assert isinstance(base, NavigationTorchEnv)
     return base.env

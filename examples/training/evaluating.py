@@ -1,4 +1,4 @@
-"""How well a policy drives in the worlds of a command line, and where that is kept."""
+"""Evaluations of a policy in the worlds of a command line, and the names of their folders."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from mpfa_envs.robots.drives import SERVERS
 from training.worlds import worlds_label
 
 Drivable = Policy | MapPlanner | DynamicWindow | Filtered
-"""What drives, and knows by ``env_arguments`` what it must sense."""
+"""Drivers of a robot, with the ``env_arguments`` that they need."""
 
 
 @dataclass(frozen=True)
 class Drives:
-    """What a policy did in one world, or in the worlds of a generator."""
+    """Episodes of a policy in one world, or in the worlds of a generator."""
 
     tasks: list[WorldTask]
     results: list[EpisodeResult]
@@ -37,7 +37,7 @@ class Drives:
     """Positions of the robot in each episode [m]."""
 
     def of_world(self, name: str) -> list[int]:
-        """Numbers of the episodes in one world."""
+        """Return the numbers of the episodes in one world."""
         return [n for n, each in enumerate(self.tasks) if each.world.name == name]
 
 
@@ -67,14 +67,14 @@ def evaluation_folder(
 
 
 def filtered(policy: Policy | MapPlanner | DynamicWindow, **env_arguments: Any) -> Filtered:
-    """The same, with the filter that keeps the robot off what its lidar sees."""
+    """Put a policy behind the filter that keeps the robot off obstacles that its lidar sees."""
     return Filtered(policy, TaskConfig(**policy.env_arguments | env_arguments).make_filter())
 
 
 def tasks_of(
     policy: Drivable, worlds: Sequence[str], *, episodes: int | None, seed: int
 ) -> list[WorldTask]:
-    """The fixed tasks of some worlds, for the robot of a policy."""
+    """Return the fixed tasks of some worlds, for the robot of a policy."""
     robot = policy.env_arguments.get("robot", "turtlebot2")
     return [
         task

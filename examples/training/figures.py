@@ -15,7 +15,7 @@ from mpfa_envs.render.charts import finish, look, new_figure, plot_seeds
 Runs = Mapping[str, Mapping[str, pd.DataFrame]]
 """Tables by the name of their arm, then of their run."""
 _SPREAD = 6
-"""Of fewer runs the interval of the mean fills the panel."""
+"""Fewest runs with an interval of the mean; of fewer runs it would fill the panel."""
 
 
 def plot_learning_curve(episodes: pd.DataFrame, path: Path, *, window: int = 20) -> None:

@@ -23,7 +23,7 @@ STATUS = "status.json"
 CSV = "csv"
 TENSORBOARD = "tensorboard"
 PREVIOUS = "previous"
-"""Where the files of a run go that is started anew."""
+"""Folder of the files of an earlier run in the same folder."""
 _LOCK = ".lock"
 _TABLES = (EPISODES, EVALUATIONS, UPDATES)
 # The checkpoint first: once it is gone, nothing can go on with the old run.
@@ -35,12 +35,12 @@ class FolderInUse(RuntimeError):
 
 
 def digest(file: Path) -> str:
-    """SHA-256 of a file, by which another one in its place is told from it."""
+    """Return a file's SHA-256, to detect that it was replaced."""
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written in, before anything is computed for it."""
+    """Raise if a folder cannot be made or written in."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not there.is_dir():
         raise ValueError(f"{folder} cannot be a folder, as {there} is a file: name another one")

@@ -1,4 +1,4 @@
-"""Whether a run has come to its end, read without PyTorch, which takes seconds to import."""
+"""The end of a run, read without PyTorch, which takes seconds to import."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from training import files
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether a run came to its end, and left behind what a run has there."""
+    """Return True if a run is finished and its policy and episodes are there."""
     there = all((folder / name).exists() for name in (files.POLICY, files.EPISODES))
     return there and bool(read_json(folder / files.STATUS).get("finished"))
 
 
 def after_the_end(folder: Path) -> str:
-    """One sentence for who resumes a finished run: what can be done with it."""
+    """Return one sentence on what can be done with a finished run."""
     status = read_json(folder / files.STATUS)
     stages = read_json(folder / files.SETTINGS).get("curriculum", {}).get("stages", [])
     words = []
@@ -34,8 +34,8 @@ def after_the_end(folder: Path) -> str:
 
 
 def read_json(path: Path) -> Mapping[str, Any]:
-    """A JSON file of a run; empty where there is none."""
+    """Read a JSON file of a run; empty if there is none."""
     try:
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     except ValueError as error:
-        raise ValueError(f"{path} is damaged: remove it, and the run is made anew") from error
+        raise ValueError(f"{path} is damaged: remove it, and the run is made again") from error

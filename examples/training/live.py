@@ -15,7 +15,7 @@ _PAUSE = 1.0
 
 
 class Watched(NamedTuple):
-    """How an episode ended that was seen to its end."""
+    """The end of an episode that was watched to its end."""
 
     world: str
     outcome: str
@@ -27,7 +27,7 @@ def watch(
 ) -> Iterator[Watched]:
     """Drive tasks one after another in a window, until it is closed.
 
-    The key N goes on with the next task, Escape ends.
+    The key N starts the next task, Escape ends.
     """
     window: Window | None = None
     for number, task in enumerate(tasks):

@@ -24,7 +24,7 @@ from mpfa_envs.render import (
 from training.evaluating import Drivable, Drives
 
 Values = Callable[[NDArray[np.float32]], NDArray[np.float64]]
-"""What a critic thinks: from observations, ``[N, O]``, to numbers, ``[N]``."""
+"""Values by a critic: from observations, ``[N, O]``, to numbers, ``[N]``."""
 
 TRAJECTORIES = "trajectories.png"
 VALUES = "values.png"
@@ -62,7 +62,7 @@ def trajectories_of(driven: Sequence[Drives], *, size: int = 360) -> NDArray[np.
 
 
 def worlds_in(drives: Drives) -> list[tuple[World, Drives]]:
-    """Each world of some drives, with the drives."""
+    """Return each world of some drives, with the drives."""
     return [(world, drives) for world in {e.world.name: e.world for e in drives.tasks}.values()]
 
 

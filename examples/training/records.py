@@ -1,4 +1,4 @@
-"""What a run leaves behind in rows: of training episodes and evaluations."""
+"""Records of a run: a row for each training episode and each evaluation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class EpisodeRecord:
 
     episode: int
     world: str
-    """Of the stage; of a generator its name."""
+    """World of the stage; for a generator, its name."""
     steps: int
     """Actions of this episode."""
     total_steps: int
@@ -50,7 +50,7 @@ class EvaluationRecord:
     episode: int
     """Training episodes finished."""
     world: str
-    """Where it was evaluated."""
+    """World of the evaluation."""
     success: float
     collision: float
     timeout: float
@@ -61,7 +61,7 @@ class EvaluationRecord:
     """Wall-clock time of the run before it, less that of evaluations [s]."""
 
     def is_best(self, others: Sequence[EvaluationRecord]) -> bool:
-        """Whether none of the others had a higher success, or the same and a higher SPL."""
+        """Return True if no other has a higher success, or the same success and a higher SPL."""
         mine = (self.success, self.spl)
         return all(mine >= (other.success, other.spl) for other in others)
 

@@ -1,4 +1,4 @@
-"""How a run ends early: Ctrl-C, a scheduler, a closed terminal, a parent gone, or a hook."""
+"""Early ends of a run: Ctrl-C, a scheduler, a closed terminal, a parent gone, or a hook."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stop:
-    """Whether a program was asked to stop, and by which signal.
+    """Flag that a program was asked to stop, with the number of the signal.
 
     The first signal lets it end in good order; at the second it stops at once.
 
@@ -53,7 +53,7 @@ class Stop:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Have the signals ask to stop."""
+        """Let signals ask to stop."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return

@@ -14,12 +14,12 @@ _LONGEST = 60
 _MOST_WORLDS = 10_000
 """Worlds of a span at most."""
 _ARCHIVE = "barn:"
-"""What the path of the benchmark's archive follows."""
+"""Prefix of the path of the benchmark's archive."""
 _OF_MANY = re.compile(r"(barn300|[a-z]+)(?:-(validation|test))?-\d+(?:@.*)?")
 
 
 def parse_worlds(words: Sequence[str]) -> list[str]:
-    """What some words stand for.
+    """Return the worlds that a command line names.
 
     Args:
         words: Names of worlds, paths of world files, spans of a generator's worlds,
@@ -62,7 +62,7 @@ def parse_worlds(words: Sequence[str]) -> list[str]:
 
 
 def family(name: str) -> str:
-    """What a world is one of: the worlds of a generator, those of BARN, or itself.
+    """Return the family of a world: its generator and split, BARN, or the world itself.
 
     Examples:
         >>> [family(name) for name in ("bars-test-7", "rooms-7", "barn-3", "test", "my-room")]
@@ -79,7 +79,7 @@ def family(name: str) -> str:
 
 
 def is_of_a_test(word: str) -> bool:
-    """Whether a policy is tested there, so that nothing may be chosen by it.
+    """Return True if a world is for tests, so that nothing may be chosen by it.
 
     Examples:
         >>> [is_of_a_test(word) for word in ("test", "bars:test", "bars-test-3", "barn", "bars-3")]
@@ -89,7 +89,7 @@ def is_of_a_test(word: str) -> bool:
 
 
 def world_name(world: str) -> str:
-    """A world as part of a file's name: that of a world file without folder and ending."""
+    """Return a world as part of a file's name: a world file without folder and ending."""
     if world.startswith(_ARCHIVE):
         return "barn300"
     name = Path(world).stem if Path(world).suffix else world
@@ -97,7 +97,7 @@ def world_name(world: str) -> str:
 
 
 def worlds_label(words: Sequence[str]) -> str:
-    """A name for the results in some worlds.
+    """Return a name for the results in some worlds.
 
     Examples:
         >>> worlds_label(["test", "rooms:100-109"])

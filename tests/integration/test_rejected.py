@@ -145,7 +145,7 @@ def status_of(main: Callable[..., object], arguments: list[str]) -> object:
         (
             compare.main,
             "--folder study --methods per --seeds 0",
-            "settings.json is damaged: remove it, and the run is made anew",
+            "settings.json is damaged: remove it, and the run is made again",
         ),
         (compare.main, "-- settings=typo.yaml", "typo.yaml: unknown setting 'learner.tua'"),
         (train.main, "settings=nowhere", "^train.py: there is no file nowhere$"),

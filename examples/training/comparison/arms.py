@@ -1,4 +1,4 @@
-"""The arms of a comparison: what is other in some of its runs, by a name."""
+"""The arms of a comparison: named settings of some of its runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from training.settings.command_line import parse_overrides
 from training.settings.rules import NAME, named
 
 DEFAULTS = ("tracking=off", "evaluation.every=5000")
-"""What a comparison has unless its command line says otherwise."""
+"""Settings of a comparison unless its command line has others."""
 _OF_THE_COMPARISON = ("learner", "method", "seed", "run_dir", "overwrite", "resume")
 """Settings that a comparison gives each of its runs."""
 
@@ -36,7 +36,7 @@ PLAIN = Arm()
 
 
 def parse_arms(texts: Sequence[str]) -> list[Arm]:
-    """The arms on a command line; :data:`PLAIN` if there are none."""
+    """Parse the arms on a command line; :data:`PLAIN` if there are none."""
     arms: list[Arm] = []
     for text in texts:
         with named(f"--arm {text}: "):
@@ -48,7 +48,7 @@ def parse_arms(texts: Sequence[str]) -> list[Arm]:
 
 
 def parse_arm(text: str) -> Arm:
-    """An arm as on the command line.
+    """Parse an arm of the command line.
 
     Args:
         text: ``NAME:SETTING=VALUE,SETTING=VALUE``; commas in brackets or quotes are of the value.
@@ -75,7 +75,7 @@ def parse_arm(text: str) -> Arm:
 
 
 def check_free(settings: Sequence[str]) -> None:
-    """Refuse settings that the comparison itself gives its runs, and unknown ones."""
+    """Raise for settings that the comparison gives its runs itself, and for unknown ones."""
     for setting in settings:
         if setting.startswith("-") or "=" not in setting:
             raise ValueError(f"{setting!r} is not NAME=VALUE")

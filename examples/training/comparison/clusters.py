@@ -46,7 +46,7 @@ class RemoteWorker:
         self._log = Path()
 
     def ready(self) -> bool:
-        """Whether a machine has a core for it; that is asked for from the first call on."""
+        """Return True if a machine has a core for it, which the first call asks for."""
         if self._actor is None:
             # Two calls at a time: a script, and what asks it to stop.
             options = {"num_cpus": 1, "max_concurrency": 2, "scheduling_strategy": "SPREAD"}
@@ -65,12 +65,12 @@ class RemoteWorker:
         return True
 
     def start(self, command: Sequence[str], log: Path) -> None:
-        """Begin a script; its output is appended to a file."""
+        """Start a script, whose output is appended to a file."""
         self._log = log
         self._task = self._actor.run.remote(list(command), log, Path.cwd())
 
     def ended(self) -> int | None:
-        """Exit status of the script, None while it runs; raise :class:`Lost` if it was lost."""
+        """Return the exit status of the script, None while it runs; raise :class:`Lost` if lost."""
         done, _ = ray.wait([self._task], timeout=0)
         if not done:
             return None
@@ -100,7 +100,7 @@ class RemoteWorker:
 
 
 class _Host:
-    """What a machine runs for a worker: the process of one, which scripts have to themselves."""
+    """The part of a worker on its machine: a process that scripts have to themselves."""
 
     def __init__(self) -> None:
         self._worker = LocalWorker()

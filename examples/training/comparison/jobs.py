@@ -25,9 +25,9 @@ from training.settings.train import TrainSettings, as_settings
 
 SCRIPTS = Path(__file__).resolve().parents[2]
 _OF_THE_RESULT = ("evaluation.every", "ray.workers", "ray.steps", "ray.sync")
-"""Settings that a run may change on its way, although it becomes another one by them."""
+"""Settings that a resumed run may change, but that change its result."""
 _FREE = {*LAWFUL, *OF_THE_CALL, "device", "threads"} - {*_OF_THE_RESULT}
-"""Settings that may be others than those that a comparison asks for."""
+"""Settings that may differ from those that a comparison asks for."""
 
 
 def run_name(learner: str, method: str, arm: str, seed: int) -> str:
@@ -37,7 +37,7 @@ def run_name(learner: str, method: str, arm: str, seed: int) -> str:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What every policy of a comparison is asked to do."""
+    """The evaluation of every policy of a comparison."""
 
     words: tuple[str, ...]
     """Worlds, as on the command line."""
@@ -46,11 +46,11 @@ class Evaluation:
     physics: str | None = None
     """``wheels`` or ``kinematic``; None: as trained."""
     filtered: bool = False
-    """Whether actions pass the filter."""
+    """True if actions pass the filter."""
 
 
 TESTED = Evaluation(("test",), 200)
-"""What ``compare.py`` asks for unless its command line says otherwise."""
+"""Evaluation by ``compare.py`` unless its command line names another."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Job:
     method: str
     seed: int
     folder: Path
-    """Of the comparison."""
+    """Folder of the comparison."""
     arm: Arm = PLAIN
 
     @property
@@ -75,7 +75,7 @@ class Job:
         return self.folder / self.name
 
     def overrides(self, overrides: Sequence[str]) -> list[str]:
-        """Its settings on the command line of ``train.py``."""
+        """Return its settings as on the command line of ``train.py``."""
         own = [f"learner={self.learner}", f"method={self.method}", f"seed={self.seed}"]
         # The runs that differ by their seeds alone are one group in wandb.
         group = f"{self.folder.name}/{self.name.removesuffix(f'-{self.seed}')}"
@@ -83,7 +83,7 @@ class Job:
         return [*own, *with_defaults(self.arm.over(overrides))]
 
     def asked(self, overrides: Sequence[str]) -> TrainSettings:
-        """Its settings."""
+        """Return its settings."""
         with named(f"--arm {self.arm.name}: " if self.arm.name else ""):
             first, *others = composed(self.overrides(overrides))
         if others:
@@ -91,14 +91,14 @@ class Job:
         return first
 
     def trains(self, overrides: Sequence[str], *, anew: bool = False) -> list[str]:
-        """The command that trains it, or goes on where a checkpoint lies."""
+        """Return the command that trains the run, or resumes it from its checkpoint."""
         script = [str(SCRIPTS / "train.py")]
         if (self.path / files.CHECKPOINT).exists() and not anew:
             return [*script, f"resume={self.path}"]
         return [*script, *self.overrides(overrides), "overwrite=true"]
 
     def evaluates(self, wanted: Evaluation) -> list[str]:
-        """The command that evaluates its policy."""
+        """Return the command that evaluates its policy."""
         return [
             *(str(SCRIPTS / "evaluate.py"), str(self.path)),
             *("--worlds", *wanted.words, "--episodes", str(wanted.episodes), "--no-pictures"),
@@ -107,28 +107,28 @@ class Job:
         ]
 
     def physics(self, wanted: Evaluation) -> str:
-        """What it is evaluated with: ``wheels`` or ``kinematic``."""
+        """Return the physics of its evaluation: ``wheels`` or ``kinematic``."""
         if wanted.physics is not None:
             return wanted.physics
         trained = read_json(self.path / files.SETTINGS).get("environment", {})
         return str(trained.get("physics", EnvironmentSettings.physics))
 
     def results(self, wanted: Evaluation) -> Path:
-        """Folder of its evaluation."""
+        """Return the folder of its evaluation."""
         return self.path / evaluation_folder(
             wanted.words, self.physics(wanted), filtered=wanted.filtered
         )
 
     def status(self) -> Mapping[str, Any]:
-        """How far it says that it is; nothing before its first episode."""
+        """Return its progress; empty before its first episode."""
         return read_json(self.path / files.STATUS)
 
     def is_trained(self) -> bool:
-        """Whether it came to its end, and left behind what a run has there."""
+        """Return True if the run is finished and its policy and episodes are there."""
         return is_finished(self.path)
 
     def is_evaluated(self, wanted: Evaluation) -> bool:
-        """Whether the policy that it has now was evaluated as it is asked for."""
+        """Return True if its present policy was evaluated as wanted."""
         found = read_json(self.results(wanted) / files.SETTINGS)
         policy = self.path / files.POLICY
         return (
@@ -145,7 +145,7 @@ class Job:
         )
 
     def differences(self, asked: TrainSettings) -> list[str]:
-        """Where the settings that it was trained with are others than those asked for."""
+        """Return the settings that differ from those asked for."""
         found = read_json(self.path / files.SETTINGS)
         if not found:
             return []
@@ -189,7 +189,7 @@ class Comparison:
 
     @property
     def command(self) -> str:
-        """What makes the runs, and leaves alone those that are made.
+        """Command that makes the runs, and leaves alone those that are made.
 
         Examples:
             >>> settings, arms = ("robots=4",), (Arm("a"),)
@@ -213,7 +213,7 @@ robots=4'
         ]
 
     def runs(self) -> dict[str, list[Job]]:
-        """Its runs by arm, or by method if it has no arms."""
+        """Return its runs by arm, or by method if it has no arms."""
         found: dict[str, list[Job]] = {}
         for job in self.jobs:
             found.setdefault(job.arm.name or job.method, []).append(job)
@@ -221,7 +221,7 @@ robots=4'
 
 
 def other_than_asked(jobs: Sequence[Job], overrides: Sequence[str]) -> dict[Job, list[str]]:
-    """Runs that were trained with other settings than those asked for."""
+    """Return the runs whose settings differ from those asked for."""
     asked: dict[tuple[str, str, Arm], TrainSettings] = {}
     others = {}
     for job in jobs:

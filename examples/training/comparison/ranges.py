@@ -24,7 +24,7 @@ from training.worlds import is_of_a_test
 OF_THE_SEARCH = ("seed", "run_dir", "overwrite", "resume", "checkpoint_every")
 """Settings that a search gives each of its runs."""
 _ALIKE = ("evaluation", "curriculum", "regime", "tracking", "ray", "device", "threads")
-"""What the trials of a search have in common: how they are compared, and where they run."""
+"""Groups that are the same in all trials: how trials are compared, and where they run."""
 
 
 Ranges = Mapping[str, BaseDistribution]

@@ -48,7 +48,7 @@ class Plan:
     """Plan of a search, the same whenever the search resumes."""
 
     settings: tuple[str, ...]
-    """Of all trials, as on the command line of ``train.py``."""
+    """Settings of all trials, as on the command line of ``train.py``."""
     ranges: Ranges
     seeds: tuple[int, ...]
     """A trial is a run with each of them."""

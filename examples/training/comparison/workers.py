@@ -29,18 +29,18 @@ class Lost(Exception):
 
 
 class Worker(Protocol):
-    """What makes runs, one at a time, on this machine or on another."""
+    """Maker of runs, one at a time, on this machine or on another."""
 
     def ready(self) -> bool:
-        """Whether a script would begin at once."""
+        """Return True if a script would begin at once."""
         ...
 
     def start(self, command: Sequence[str], log: Path) -> None:
-        """Begin a script; its output is appended to a file."""
+        """Start a script, whose output is appended to a file."""
         ...
 
     def ended(self) -> int | None:
-        """Exit status of the script, None while it runs; raise :class:`Lost` if it was lost."""
+        """Return the exit status of the script, None while it runs; raise :class:`Lost` if lost."""
         ...
 
     def stop(self) -> None:
@@ -65,11 +65,11 @@ class LocalWorker:
         self._statuses: Connection
 
     def ready(self) -> bool:
-        """Whether a script would begin at once."""
+        """Return True if a script would begin at once."""
         return True
 
     def start(self, command: Sequence[str], log: Path) -> None:
-        """Begin a script; its output is appended to a file."""
+        """Start a script, whose output is appended to a file."""
         if self._process is None:
             context = multiprocessing.get_context("spawn")
             theirs, self._commands = context.Pipe(duplex=False)
@@ -82,7 +82,7 @@ class LocalWorker:
             self._commands.send((list(command), str(log)))
 
     def ended(self) -> int | None:
-        """Exit status of the script, None while it runs; raise :class:`Lost` if it was lost."""
+        """Return the exit status of the script, None while it runs; raise :class:`Lost` if lost."""
         try:
             return int(self._statuses.recv()) if self._statuses.poll() else None
         except (EOFError, ConnectionResetError):

@@ -1,4 +1,4 @@
-"""Whether a run makes one program of its update, and with what."""
+"""Compilation of the update of a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EPISODE = 100
 
 
 def is_compiled(settings: TrainSettings) -> bool:
-    """Whether the update is compiled: as asked for, or by the length of the run and nothing else.
+    """Return True if the update is compiled: as asked for, or by the length of the run alone.
 
     So a seed gives the same bits whatever was compiled before.
     """
@@ -39,13 +39,13 @@ def is_compiled(settings: TrainSettings) -> bool:
 
 
 def has_compiler() -> bool:
-    """Whether there is a C++ compiler and the headers of Python, without which none compiles."""
+    """Return True if there are a C++ compiler and the headers of Python."""
     headers = Path(sysconfig.get_path("include"), "Python.h")
     return headers.exists() and shutil.which(os.environ.get("CXX", "g++")) is not None
 
 
 def prepare_compiler() -> None:
-    """Have PyTorch compile as fits a few small programs for a CPU."""
+    """Set PyTorch's compiler for a few small programs on a CPU."""
     # Threads wait for the C++ compiler. Processes beside them, to compile programs of a GPU, would
     # be started for nothing.
     os.environ.setdefault("TORCH_WARM_POOL", "0")

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from training.run.loop import TrainingRun
 
 SEED = 1
-"""Of the pairs of start and goal: others than those of ``evaluate.py``."""
+"""Seed of the pairs of start and goal: other pairs than those of ``evaluate.py``."""
 
 
 def exported_policy(
     policy: TensorDictModule, settings: TrainSettings, *, episodes: int = 0, steps: int = 0
 ) -> Policy:
-    """The policy without noise, with what is needed to use it and how it was trained."""
+    """Return the policy without noise, with its card and the arguments of its environment."""
     return Policy(
         policy_layers(policy),
         card={

@@ -1,6 +1,6 @@
-"""TorchRL's loggers that write to the folder of a run; one that goes on begins no second log.
+"""TorchRL's loggers that write to the folder of a run; a resumed run begins no second log.
 
-What was logged after the checkpoint that a run goes on from is logged again. Of a CSV file those
+A resumed run logs again what was logged after its checkpoint. Of a CSV file those
 rows are removed, and TensorBoard is told to forget them.
 """
 
@@ -24,13 +24,13 @@ Entry = float | torch.Tensor | NDArray[np.uint8] | Path
 
 
 class Log(Protocol):
-    """Where entries are logged."""
+    """A log of entries."""
 
     def log(self, entries: Mapping[str, Any], actions: int) -> None:
         """Log entries by their names; what this kind of log cannot hold is left out."""
 
     def flush(self) -> None:
-        """See that what was logged survives the end of this process, however it ends."""
+        """Write what was logged, so that it survives the end of this process."""
 
     def close(self) -> None:
         """Finish the log."""
@@ -41,7 +41,7 @@ class CSVLog:
 
     Args:
         folder: Of the run.
-        actions: After which the run goes on; 0: it begins.
+        actions: Actions after which the run resumes; 0: it begins.
     """
 
     def __init__(self, folder: Path, *, actions: int) -> None:
@@ -49,7 +49,7 @@ class CSVLog:
 
     @cached_property
     def _logger(self) -> Any:
-        # Only now: the log of a run that is begun anew has been moved out of the way.
+        # Only now: an earlier log in the folder has been moved to ``previous/``.
         from torchrl.record import CSVLogger
 
         for path in (self._folder / files.CSV).rglob("*.csv"):
@@ -85,7 +85,7 @@ class TensorboardLog:
 
     Args:
         folder: Of the run.
-        actions: After which the run goes on; 0: it begins.
+        actions: Actions after which the run resumes; 0: it begins.
     """
 
     def __init__(self, folder: Path, *, actions: int) -> None:
@@ -93,7 +93,7 @@ class TensorboardLog:
 
     @cached_property
     def _logger(self) -> Any:
-        # Only now: the log of a run that is begun anew has been moved out of the way.
+        # Only now: an earlier log in the folder has been moved to ``previous/``.
         from torch.utils.tensorboard import SummaryWriter
         from torchrl.record import TensorboardLogger
 

@@ -53,8 +53,8 @@ class TrainingRun:
     Args:
         settings: The settings.
         folder: Where checkpoints and records go.
-        state: A checkpoint to go on with.
-        hooks: What is called on the way, after the run's own hooks.
+        state: A checkpoint to resume from.
+        hooks: Hooks to call after the run's own hooks.
 
     Raises:
         TypeError: If one of the hooks is no :class:`Hook`, or a class instead of an object.
@@ -93,7 +93,7 @@ class TrainingRun:
         self.waiting = 0
         """Actions whose updates are still to be made."""
         self._events: list[tuple[Any, ...]] = []
-        """What hooks are still to be told of the iteration."""
+        """Events of the iteration that hooks still have to get."""
         self.records: list[EpisodeRecord] = []
         self.evaluations: list[EvaluationRecord] = []
         self._bonus: dict[str, Tensor] = {}
@@ -153,7 +153,7 @@ class TrainingRun:
         return self.schedule.actions
 
     def crossed(self, every: int) -> bool:
-        """Whether the last iteration has reached a multiple of so many actions; 0: never."""
+        """Return True if the last iteration has reached a multiple of ``every`` actions."""
         return every > 0 and self._before // every != self.actions // every
 
     def train(self) -> bool:
@@ -178,7 +178,7 @@ class TrainingRun:
         return self.schedule.finished
 
     def _call(self, *events: tuple[Any, ...]) -> None:
-        """Call a hook's methods, by name and with what they are told, then the next hook's."""
+        """Call all events of a hook, by name and with their arguments, then those of the next."""
         for hook in self.hooks:
             for name, *told in events:
                 getattr(hook, name)(self, *told)
@@ -217,7 +217,7 @@ class TrainingRun:
         self._anneal()
 
     def _advance(self) -> bool:
-        """Begin the next stage if it is due, and tell whether it was."""
+        """Begin the next stage if it is due; return True if it was."""
         if not self.schedule.advance():
             return False
         if not self.settings.curriculum.carry:
@@ -290,7 +290,7 @@ class TrainingRun:
         self.learner.anneal(lowest + (1.0 - lowest) * (1.0 - done) ** power)
 
     def _resume(self, robots: dict[str, Any], random: Any) -> None:
-        """Let the robots go on from their state, or begin the next stage if that is due."""
+        """Restore the robots, or begin the next stage if it is due."""
         self.robots.recall(robots)
         if self._advance():
             pass

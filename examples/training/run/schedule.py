@@ -1,4 +1,4 @@
-"""How far a run is in its curriculum, in episodes or in actions."""
+"""The progress of a run in its curriculum, in episodes or in actions."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Schedule:
 
     @property
     def fraction(self) -> float:
-        """How much of the run is done, from 0 to 1."""
+        """Share of the run that is done, from 0 to 1."""
         return self.done / self.total
 
     @property
     def finished(self) -> bool:
-        """Whether all stages are over."""
+        """True if all stages are over."""
         return self.done == self.total
 
     def count(self, *, actions: int, episodes: int) -> None:
@@ -71,7 +71,7 @@ class Schedule:
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """How far the run is."""
+        """Return the progress of the run."""
         return {
             "stage": self.stage,
             "in_stage": self._in_stage,
@@ -80,6 +80,6 @@ class Schedule:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was called, perhaps with more stages than there were."""
+        """Restore the progress of a run, which may have more stages now."""
         self.stage, self._in_stage = state["stage"], state["in_stage"]
         self.actions, self.episodes = state["actions"], state["episodes"]

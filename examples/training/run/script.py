@@ -1,4 +1,4 @@
-"""What ``train.py`` does with its command line: one run, a sweep, or a run that resumes."""
+"""The work of ``train.py``: one run, a sweep, or a run that resumes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run's policy does in worlds that it has not met, as its tracker shows it."""
+"""Pictures of a run's policy in unseen worlds, for its tracker."""
 
 from __future__ import annotations
 

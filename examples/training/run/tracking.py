@@ -1,4 +1,4 @@
-"""What a run logs: to wandb, in ``wandb_log.py``, and by TorchRL's loggers, in ``loggers.py``."""
+"""The logs of a run: wandb, in ``wandb_log.py``, and TorchRL's loggers, in ``loggers.py``."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Tracker(Hook):
     Args:
         settings: The settings, logged as the run's configuration.
         folder: Of the run, where logs are kept.
-        run_id: wandb's of the run that is gone on with; it stays one run.
-        actions: After which the run goes on; 0: it begins.
+        run_id: wandb's id of a run that resumes; it stays one run.
+        actions: Actions after which the run resumes; 0: it begins.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Tracker(Hook):
         wanted = settings.tracking
         self._logs: list[Log] = []
         self.upload = upload_command(wanted, folder, self.run_id)
-        """What uploads the run to wandb, if it is kept offline."""
+        """Command that uploads the run to wandb, if it is kept offline."""
         self._wandb: WandbLog | None = None
         if wanted.mode != "off":
             # Imports wandb, which takes a second.
@@ -92,7 +92,7 @@ class Tracker(Hook):
 
     @property
     def shows(self) -> bool:
-        """Whether there is a log for pictures."""
+        """True if there is a log for pictures."""
         return any(not isinstance(log, CSVLog) for log in self._logs)
 
     def log_policy(
@@ -108,7 +108,7 @@ class Tracker(Hook):
             log.log(entries, actions)
 
     def flush(self) -> None:
-        """See that what was logged is kept, however this process ends."""
+        """Write what was logged, so that it survives the end of this process."""
         for log in self._logs:
             log.flush()
 

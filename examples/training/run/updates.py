@@ -1,4 +1,4 @@
-"""What a run learned from, in rows: one for every so many actions, with or without wandb."""
+"""Rows on what a run learned from, one for every so many actions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class UpdateLog:
 
     Args:
         capacity: Slots of the buffer.
-        reward_scale: Factor of rewards in the loss; TD errors are told in units of the reward.
+        reward_scale: Factor of rewards in the loss; TD errors are in units of the reward.
     """
 
     def __init__(self, capacity: int, *, reward_scale: float) -> None:
@@ -59,7 +59,7 @@ class UpdateLog:
         self._squares: Tensor | None = None
 
     def wrote(self, index: Tensor, rewards: Tensor) -> None:
-        """Take note of new transitions.
+        """Record new transitions.
 
         Args:
             index: Their slots, and those of what was written in hindsight, shape ``[B]``.
@@ -70,7 +70,7 @@ class UpdateLog:
         self._actions += len(rewards)
 
     def learns(self, index: Tensor) -> None:
-        """Take note that the critic learns from a batch, before it does.
+        """Record that the critic learns from a batch; to call before the update.
 
         Args:
             index: Its slots, shape ``[B]``.
@@ -80,7 +80,7 @@ class UpdateLog:
         self._learned_at[index] = self._updates
 
     def learned(self, losses: Mapping[str, Tensor]) -> None:
-        """Take note of what the last update gave, with TorchRL's ``"td_error"``, the squares."""
+        """Record the last update's losses; ``"td_error"`` is squared."""
         self._squares = losses.get("td_error")
 
     def add(self, total_steps: int, *, episode: int, buffer: SignalReplayBuffer) -> None:
@@ -122,7 +122,7 @@ class UpdateLog:
         return found.reindex(columns=[*COLUMNS, *own])
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next row depends on, and the rows."""
+        """Return what the next row depends on, and the rows."""
         return {
             "rows": self.rows,
             "history": self.history.state_dict(),
@@ -134,7 +134,7 @@ class UpdateLog:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where :meth:`state_dict` was called."""
+        """Restore a state of :meth:`state_dict`."""
         self.rows = list(state["rows"])
         self.history.load_state_dict(state.get("history", {}))
         self._learned_at, self._updates = state["learned_at"].clone(), state["updates"]

@@ -1,4 +1,4 @@
-"""What the critic of a run thinks of what a robot senses."""
+"""Values of observations by the critic of a run."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def load_learner(folder: Path, policy: Policy) -> tuple[Learner, TrainSettings]:
 
 
 def values_of(learner: Learner, policy: Policy, settings: TrainSettings) -> Values:
-    """What the critics of a learner think of a policy's actions.
+    """Return a function that values a policy's actions by the critics of a learner.
 
     Args:
         learner: The learner; its networks are used as they are when the values are asked for.

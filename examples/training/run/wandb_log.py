@@ -17,11 +17,11 @@ import wandb
 from training.settings.train import TrainSettings
 
 AXIS = "actions"
-"""What every entry is plotted over: actions of all robots so far."""
+"""Axis of every entry: actions of all robots so far."""
 
 
 class WandbLog:
-    """A run of wandb, the same one however often it goes on.
+    """A W&B run that keeps its id when training is resumed.
 
     What a run does again after a checkpoint is logged once: how far it was logged is in a file,
     since wandb does not tell it of an offline run.
@@ -64,7 +64,7 @@ class WandbLog:
         self._actions = self._before
 
     def log(self, entries: Mapping[str, Any], actions: int) -> None:
-        """Log entries, unless that was done before the run was stopped."""
+        """Log entries, unless they were logged before the run was stopped."""
         if actions <= self._before:
             return
         shown = {name: _as_wandb(value) for name, value in entries.items()}

@@ -17,7 +17,6 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_mpfa.methods import METHODS, Method
 from training.settings.checks import check_settings
 from training.settings.from_file import lines_of, quoted
-from training.settings.resuming import choices_of
 from training.settings.rules import named, settings_by_name
 from training.settings.train import GROUPS, SEVERAL, TrainSettings, as_settings
 
@@ -88,6 +87,12 @@ def _check_choices(group: str, words: Sequence[str]) -> None:
             f"{group} must be off, or one or several of wandb (or online), tensorboard and csv, "
             f"got [{given}]"
         )
+
+
+def choices_of(override: Override) -> list[str]:
+    """Return the choices of a group on a command line: one, or several in brackets."""
+    value = override.value()
+    return [str(word) for word in (value if isinstance(value, list) else [value])]
 
 
 def composed(arguments: Sequence[str]) -> Iterator[TrainSettings]:

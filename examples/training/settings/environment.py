@@ -15,13 +15,13 @@ class NoiseSettings:
     range_noise: float = 0.0
     """Standard deviation of each ray of the lidar [m]."""
     dropout: float = 0.0
-    """Chance that a ray reports the greatest range, whatever it meets."""
+    """Chance that a ray reports the greatest range."""
     slip: float = 0.0
-    """Mean share of its way that a wheel loses, up to 0.45."""
+    """Mean share of its path that a wheel loses, up to 0.45."""
     latency: int = 0
     """Time steps of 0.1 s after which an action reaches the wheels."""
     drift: float = 0.0
-    """Standard deviation of the share by which odometry is wrong about ways, and about turns."""
+    """Standard deviation of the share of the error of odometry in distances, and in turns."""
 
 
 @dataclass
@@ -42,28 +42,27 @@ class EnvironmentSettings:
     """eps_p of Eq. 25, not given in the paper. With 15 a place near the goal is worth less than one
     far away, and a critic that is a little too smooth would rather circle than arrive."""
     step_cost: float = setting(0.0, NOT_NEGATIVE)
-    """What a time step of 0.1 s costs, so that a robot that can stand still does not."""
+    """Cost of a time step of 0.1 s, so that a robot that can stand still does not."""
     clearance: float = setting(0.07, NOT_NEGATIVE)
     """Clearance below which training counts a collision [m]. With 0.17 m, 0.35 m from the robot's
     center, a passage of 0.9 m has 0.2 m left to drive in, and robots turn away from it."""
     detour_chance: float = 0.8
-    """Chance that start and goal of an episode must have something between them. As they come, up
-    to a half of the goals can be driven at blindly."""
+    """Chance that start and goal of an episode must have an obstacle between them. Without, up to a
+    half of the goals can be driven at blindly."""
     progress: str = "straight_line"
-    """What Eq. 25 measures approach by: ``straight_line`` (the paper), ``shortest_path``, or
+    """Measure of approach in Eq. 25: ``straight_line`` (the paper), ``shortest_path``, or
     ``none``, the goal and the collision alone."""
     max_goal_distance: float | None = setting(None, POSITIVE)
-    """Longest way of a sampled task [m]; null: as it comes."""
+    """Longest path of a sampled task [m]; null: no limit."""
     episodes_per_world: int = setting(1, at_least(1))
     """Episodes of a robot in a world of a generator before it gets another one."""
     memory: str = "none"
-    """``map``: the robot makes a map of what its lidar met and senses the way to the goal that is
-    open on it; ``none``: it senses what is before it alone."""
+    """``map``: the robot maps the hits of its lidar and observes the path to the goal that the map
+    leaves open; ``none``: it observes only the current scan."""
     history: int = setting(0, at_least(0))
-    """Earlier scans of the lidar that it senses beside the last one, by which it may tell what
-    moves."""
+    """Earlier scans of the lidar that it observes, which show what moves."""
     field_of_view: float | None = setting(None, between(10.0, 360.0, "from 10 to 360 [deg]"))
-    """Angle that the lidar sees [deg], in sectors of 10 degrees; null: as the robot has it. A robot
+    """Angle that the lidar sees [deg], in sectors of 10 degrees; null: the robot's own. A robot
     that must keep moving is run into from behind by people unless it sees all 360."""
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     """Errors as a robot has them."""

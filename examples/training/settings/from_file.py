@@ -14,11 +14,11 @@ from yaml import YAMLError
 _WORD = "settings="
 _QUOTED = r"""'(?:\\.|[^'])*'|"(?:\\.|[^"])*\""""
 _SPECIAL = r"[^\x00-\x7f]|[#!&;<>^`~]"
-"""What Hydra reads in quotes only."""
+"""Characters that Hydra reads in quotes only."""
 
 
 def lines_of(arguments: Sequence[str]) -> tuple[str, list[str]]:
-    """The file of settings that a command line names, and what it adds to that command line.
+    """Return the file of settings of a command line, and the settings that it adds.
 
     Returns:
         The file, empty without one, and its settings but for those that the command line has.
@@ -37,14 +37,14 @@ def lines_of(arguments: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def with_lines(arguments: Sequence[str]) -> list[str]:
-    """A command line for Hydra, with the settings of a file in the place of the file."""
+    """Return a command line for Hydra: a file of settings is replaced by its settings."""
     _, lines = lines_of(arguments)
     words = [word for text in arguments for word in (lines if text.startswith(_WORD) else [text])]
     return [quoted(word) for word in words]
 
 
 def quoted(text: str) -> str:
-    """A setting whose words are in quotes where they have letters that Hydra reads in quotes only.
+    """Put the words of a setting in quotes if Hydra cannot read them without.
 
     Examples:
         >>> quoted("run_dir=/runs/ünï"), quoted("seed=1"), quoted("names=[a,ü,'ï']")
@@ -64,7 +64,7 @@ def quoted(text: str) -> str:
 
 
 def read_names(path: Path) -> dict[str, Any]:
-    """A YAML file whose keys are the whole names of settings.
+    """Read a YAML file whose keys are the dotted names of settings.
 
     Raises:
         ValueError: If it is none.
@@ -81,7 +81,7 @@ def read_names(path: Path) -> dict[str, Any]:
 
 
 def as_text(value: Any) -> str:
-    """A value as on the command line; a word stands there as it is.
+    """Write a value as on the command line.
 
     Examples:
         >>> as_text([{"world": "A", "actions": 500}]), as_text(None), as_text(1e-4)

@@ -1,4 +1,4 @@
-"""What ``train.py --help`` prints, without the parts of a run, which take seconds to import."""
+"""The text of ``train.py --help``, without the parts of a run, which take seconds to import."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Options of Hydra, as --multirun and --cfg: --hydra-help"""
 
 
 def help_text(usage: str, arguments: Sequence[str] = ()) -> str:
-    """Usage, the choices of each group, and every setting with the value that it would have.
+    """Return usage, the choices of each group, and every setting with its value.
 
     Raises:
         ValueError: If there is no such setting or choice.

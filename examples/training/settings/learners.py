@@ -66,7 +66,7 @@ class LearnerSettings:
     alpha_lr: float = setting(3e-4, POSITIVE)
     """SAC: learning rate of the temperature's logarithm."""
     double: bool = True
-    """DQN: whether the next action is that of the network, and not of the target network."""
+    """DQN: true if the next action is chosen by the network, not by the target network."""
     table_lr: float = setting(0.2, ABOVE_ZERO)
     """Q learning: learning rate of the table, falling as the others do."""
 
@@ -128,5 +128,5 @@ class QLearningSettings(LearnerSettings):
 
 
 def is_discrete(learner: LearnerSettings) -> bool:
-    """Whether the learner chooses among pairs of wheel speeds."""
+    """Return True if the learner chooses among pairs of wheel speeds."""
     return learner.algorithm in ("dqn", "q_learning")

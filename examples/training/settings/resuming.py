@@ -1,4 +1,4 @@
-"""What may change when a run goes on, and what may not."""
+"""Settings of a run that resumes: which may change, and which may not."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
+from training.settings.command_line import choices_of
 from training.settings.rules import settings_by_name
 from training.settings.train import (
     GROUPS,
@@ -36,13 +37,13 @@ LAWFUL = (
     "ray.steps",
     "ray.sync",
 )
-"""Settings that a run may change on its way, beside more episodes."""
+"""Settings that a resumed run may change; its episodes may become more, too."""
 OF_THE_CALL = ("resume", "run_dir", "overwrite")
-"""Settings that say how a run is started, and nothing of what it does."""
+"""Settings of the call, which are not part of a run."""
 
 
 def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
-    """The settings of a run with those of a command line on top."""
+    """Return the settings of a run, changed by a command line."""
     before = as_settings(saved)
     config = OmegaConf.structured(before)
     for override in overrides:
@@ -65,7 +66,7 @@ def changed(saved: dict[str, Any], overrides: list[Override]) -> TrainSettings:
 
 
 def check_single(overrides: list[Override]) -> None:
-    """Refuse settings of several runs, as a sweep has them."""
+    """Raise for settings of several runs, as a sweep has them."""
     for override in overrides:
         if override.is_sweep_override():
             key, _, values = (override.input_line or "").partition("=")
@@ -73,14 +74,8 @@ def check_single(overrides: list[Override]) -> None:
             raise ValueError(f"resume: a run takes one value, got {key}={values}{several}")
 
 
-def choices_of(override: Override) -> list[str]:
-    """What a command line chooses of a group: one word or several in brackets."""
-    value = override.value()
-    return [str(word) for word in (value if isinstance(value, list) else [value])]
-
-
 def check_lawful(before: TrainSettings, after: TrainSettings, folder: Path) -> None:
-    """Refuse what a run cannot change on its way."""
+    """Raise if a resumed run would change a setting that is fixed."""
     old, new = dict(settings_by_name(before)), dict(settings_by_name(after))
     fixed = [n for n in new if n not in (*LAWFUL, *OF_THE_CALL, "curriculum.stages")]
     wrong = [f"{name}={new[name]} (it has {old[name]})" for name in fixed if new[name] != old[name]]
@@ -94,7 +89,7 @@ def check_lawful(before: TrainSettings, after: TrainSettings, folder: Path) -> N
 
 
 def extends(before: list[Stage], after: list[Stage]) -> bool:
-    """Whether stages begin with others, the last one of these perhaps with more of its unit."""
+    """Return True if stages continue others, whose last one may have become longer."""
     *fixed, last = before
     count = len(fixed)
     if len(after) <= count or after[:count] != fixed:

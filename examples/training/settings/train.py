@@ -64,7 +64,7 @@ class ExplorationSettings:
     annealing_steps: int = setting(5_000, at_least(1))
     """Steps in which the noise, or the chance, goes from its start to its end."""
     varied: bool = True
-    """Whether each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
+    """True if each episode has a share of the noise, sampled uniformly from [0, 1]. With noise of
     one size the robot is thrown out of every loop, and never learns what a loop is worth."""
 
 
@@ -95,8 +95,8 @@ class CurriculumSettings:
     stages: list[Stage] = field(default_factory=lambda: [Stage("A", episodes=100)])
     """The worlds in their order; all of them count episodes, or all of them count actions."""
     carry: bool = True
-    """Whether networks and buffer carry on from world to world, or start again; learning rates,
-    beta and random steps go by the whole run in either case."""
+    """True if networks and buffer are kept from world to world, false if they start again; learning
+    rates, beta and random steps follow the whole run in either case."""
 
 
 CURRICULA = {
@@ -112,7 +112,7 @@ _LONGEST_NAME = 60
 
 
 def curriculum_name(stages: Sequence[Stage]) -> str:
-    """What a curriculum is called unless the user names it: after what is really run.
+    """Return the default name of a curriculum, after the stages that are run.
 
     Examples:
         >>> curriculum_name([Stage("A", 100)]), curriculum_name([Stage("A", 5), Stage("B", 7)])
@@ -137,24 +137,24 @@ class EvaluationSettings:
     """Actions between two evaluations; 0: none."""
     world: str = "validation"
     """A world, or ``mixed:validation``: the validation worlds of a generator. Those of a test, by
-    which nothing may be chosen, are refused with ``choose``. ``same``: where the last stage is; of
+    which nothing may be chosen, are rejected with ``choose``. ``same``: where the last stage is; of
     ``mixed``, in ``mazes``, where policies still differ."""
     episodes: int = setting(20, at_least(1))
     """Fixed pairs of start and goal, others than those of ``evaluate.py --seed 0``."""
     choose: bool = False
-    """Whether the policy of the run is the one that did best there, not the last one."""
+    """True if the policy of the run is the best there, not the last."""
 
 
 @dataclass
 class TrackingSettings:
-    """Where the run is logged; ``tracking=[wandb,csv]`` names several places."""
+    """Logs of the run; ``tracking=[wandb,csv]`` names several."""
 
     mode: str = setting("off", choice("offline", "online", "off"))
     """wandb: ``offline`` (no account), ``online`` or ``off``."""
     csv: bool = False
-    """Whether TorchRL's CSVLogger writes a file for each number, to ``csv/`` of the folder."""
+    """True if TorchRL's CSVLogger writes a file for each number, to ``csv/`` of the folder."""
     tensorboard: bool = False
-    """Whether TorchRL's TensorboardLogger writes to ``tensorboard/`` of the folder."""
+    """True if TorchRL's TensorboardLogger writes to ``tensorboard/`` of the folder."""
     project: str = setting("torchrl-mpfa", WORD)
     """wandb: the project."""
     group: str | None = setting(None, _GROUP)
@@ -168,7 +168,7 @@ class TrackingSettings:
 
 @dataclass
 class RaySettings:
-    """Where the robots drive; ``docs/scaling.md`` has what it needs and what it brings."""
+    """Processes of the robots; see ``docs/scaling.md``."""
 
     workers: int = setting(0, at_least(0))
     """Processes that drive the robots, each an equal part of them; 0: the run drives them."""
@@ -178,7 +178,7 @@ class RaySettings:
     steps: int = setting(16, at_least(1))
     """Actions of each robot of a worker before it writes them and gets new weights."""
     sync: bool = False
-    """Whether the workers wait for each other and for the updates. If not, they drive on while the
+    """True if the workers wait for each other and for the updates. If not, they drive on while the
     learner learns, and no two runs are alike."""
 
 
@@ -221,20 +221,20 @@ class TrainSettings:
     seed: int = setting(0, between(0, LAST_SEED, f"from 0 to {LAST_SEED}"))
     """Seed of the networks, the exploration, the replay and the generated worlds."""
     device: str = "cpu"
-    """Where the networks are; the buffer stays in main memory."""
+    """Device of the networks; the buffer stays in main memory."""
     threads: int = setting(1, up_to(1024))
     """Threads of PyTorch, by which the last bits of a network depend; with networks this small a
     second one gains nothing."""
     overwrite: bool = False
-    """Whether to start again in a folder that holds a run; its files are moved to ``previous/``."""
+    """True to start again in a folder that holds a run; its files are moved to ``previous/``."""
     resume: str | None = None
     """Folder of a run to continue, with its own settings. More episodes, tracking and how
     often to evaluate and to save may be changed; anything else is rejected."""
     checkpoint_every: int = setting(10_000, at_least(1))
     """Actions between two checkpoints."""
     robots: int = setting(1, up_to(MOST_ROBOTS, why=", as a robot takes up to 1.6 MB of memory"))
-    """Robots that drive at once, each in a world of its own; those that are under way at the end of
-    a stage give up their episodes."""
+    """Robots that drive at once, each in a world of its own; episodes in progress at the end of a
+    stage are given up."""
     updates: int = setting(1, at_least(1))
     """Updates for one action of each robot."""
     method: Method = field(default_factory=MPFA)
@@ -255,7 +255,7 @@ class TrainSettings:
 SAME = "same"
 """Evaluations in worlds such as those of the training."""
 HARDEST = {"mixed": "mazes"}
-"""Where policies that do well in a mixture of worlds still differ."""
+"""Worlds in which policies that do well in a mixture of worlds still differ."""
 REGIMES: dict[str, dict[str, Any]] = {
     "paper": {"regime": "paper", "defaults": [{"override /curriculum": "paper"}]},
     "rooms": {
@@ -324,7 +324,7 @@ GROUPS: dict[str, dict[str, Any]] = {
 
 @cache
 def _one_folder(settings: str) -> str:
-    """Name of the folder of a run, in which a value may be a path."""
+    """Return the name of the folder of a run, in which a value may be a path."""
     return settings.replace("/", "_")
 
 
@@ -346,7 +346,7 @@ def _resolve_name(name: str | None, stages: Sequence[Any]) -> str:
 
 
 def as_settings(config: DictConfig | dict[str, Any]) -> TrainSettings:
-    """Typed settings from what Hydra composed or a checkpoint holds."""
+    """Return typed settings from Hydra's composition or a checkpoint."""
     values = OmegaConf.create(config) if isinstance(config, dict) else config.copy()
     OmegaConf.set_struct(values, False)
     for name in ("defaults", "hydra"):
