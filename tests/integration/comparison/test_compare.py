@@ -143,6 +143,7 @@ def test_what_makes_another_run_of_it_is_not_what_a_comparison_asked_for(
     assert (job in other_than_asked([job], [*many, setting])) == matters
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_a_comparison_is_evaluated_again_on_wheels_and_filtered_and_trains_nothing_for_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -171,6 +172,7 @@ def test_a_comparison_is_evaluated_again_on_wheels_and_filtered_and_trains_nothi
         assert "1 runs, 1 of them done" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_a_run_that_ends_in_the_middle_of_an_episode_is_evaluated_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

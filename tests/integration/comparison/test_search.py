@@ -295,13 +295,9 @@ def test_another_search_in_the_same_folder_is_rejected_by_what_is_other(
 ) -> None:
     folder = tmp_path / "tune"
     assert tune.main(command(folder, ranges, trials=1)) == 0
-    for more, message in (
-        (["--seeds", "7"], "holds a search with other seeds, [3000], asked for is [7]"),
-        (["--objective", "last"], "holds a search with other objective, area, asked for is last"),
-        (["--sampler-seed", "2"], "holds a search with other sampler seed, 0, asked for is 2"),
-    ):
-        assert tune.main(command(folder, ranges, *more)) == 2
-        assert message in capsys.readouterr().err
+    assert tune.main(command(folder, ranges, "--seeds", "7")) == 2
+    message = capsys.readouterr().err
+    assert "holds a search with other seeds, [3000], asked for is [7]" in message
     assert tune.main(["robots=8", *command(folder, ranges)]) == 2
     assert "holds a search with other settings" in capsys.readouterr().err
     ranges.write_text(RANGES.replace("1e-4", "1e-3"))
@@ -330,6 +326,7 @@ def settled(arguments: list[str]) -> list[str]:
     return [word for word in arguments if word != "evaluation.every=0"]
 
 
+@pytest.mark.slow
 def test_a_tiny_search_trains_with_the_settings_of_its_trials(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

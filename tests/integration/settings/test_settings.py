@@ -19,7 +19,13 @@ from training.settings.command_line import composed, parse_overrides
 from training.settings.from_file import with_lines
 from training.settings.resuming import changed
 from training.settings.rules import settings_by_name
-from training.settings.train import GROUPS, Stage, TrackingSettings, TrainSettings
+from training.settings.train import (
+    GROUPS,
+    Stage,
+    TrackingSettings,
+    TrainSettings,
+    curriculum_name,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -167,14 +173,10 @@ def test_policies_are_chosen_in_worlds_such_as_those_of_the_training(
     )
 
 
-def test_two_long_curricula_have_two_short_names() -> None:
-    texts = [
-        "curriculum.stages=["
-        + ",".join(f"{{world: rooms-{n}, episodes: {last}}}" for n in range(20))
-        + "]"
-        for last in (1, 2)
-    ]
-    first, second = (one(text).curriculum.name or "" for text in texts)
+def test_long_curricula_that_differ_have_short_names_that_differ() -> None:
+    first, second = (
+        curriculum_name([Stage(f"rooms-{n}", episodes=last) for n in range(20)]) for last in (1, 2)
+    )
     assert first != second
     assert len(first) < 60
 
