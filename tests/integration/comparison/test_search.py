@@ -188,7 +188,7 @@ def test_a_search_that_broke_off_goes_on_to_the_trials_that_it_would_have_had(
     class Breaks(Pretends):
         """Is the end of the whole search at one of its looks."""
 
-        left = 44
+        left = 28
 
         def ended(self) -> int | None:
             Breaks.left -= 1
@@ -198,23 +198,23 @@ def test_a_search_that_broke_off_goes_on_to_the_trials_that_it_would_have_had(
 
     monkeypatch.setattr(execution, "LocalWorker", Breaks)
     with pytest.raises(RuntimeError, match="the machine is gone"):
-        tune.main(command(tmp_path / "broken", ranges, trials=12))
+        tune.main(command(tmp_path / "broken", ranges, trials=8))
     done = len(Pretends.begun)
-    assert 0 < done < 12
-    assert tune.main(command(tmp_path / "broken", ranges, trials=12)) == 0
+    assert 0 < done < 8
+    assert tune.main(command(tmp_path / "broken", ranges, trials=8)) == 0
     # The one that was under way has gone on; those that were done are left alone.
     assert Pretends.begun[done] == Pretends.begun[done - 1]
-    assert len(set(Pretends.begun)) == 12 == len(Pretends.begun) - 1
-    assert tune.main(command(tmp_path / "whole", ranges, trials=12)) == 0
+    assert len(set(Pretends.begun)) == 8 == len(Pretends.begun) - 1
+    assert tune.main(command(tmp_path / "whole", ranges, trials=8)) == 0
     assert trials_of(tmp_path / "broken").equals(trials_of(tmp_path / "whole"))
 
     # More trials are those that a longer search would have had; no trial is made again.
     Pretends.begun.clear()
-    assert tune.main(command(tmp_path / "whole", ranges, trials=12)) == 0
+    assert tune.main(command(tmp_path / "whole", ranges, trials=8)) == 0
     assert not Pretends.begun
-    assert tune.main(command(tmp_path / "whole", ranges, trials=13)) == 0
+    assert tune.main(command(tmp_path / "whole", ranges, trials=9)) == 0
     assert len(Pretends.begun) == 1
-    assert tune.main(command(tmp_path / "longer", ranges, trials=13)) == 0
+    assert tune.main(command(tmp_path / "longer", ranges, trials=9)) == 0
     assert trials_of(tmp_path / "whole").equals(trials_of(tmp_path / "longer"))
 
 
