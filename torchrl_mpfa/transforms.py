@@ -101,8 +101,8 @@ class TransformMemory:
 
     def empty(self) -> None:
         """Give attributes the values that they had before any write."""
-        for part, first in self._first.items():
-            _replace(part, _attributes(part) | _copied(first))
+        for part in self._parts().values():
+            _replace(part, _attributes(part) | _copied(self._first.get(part, {})))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the attributes that writes changed, as tensors and plain values."""

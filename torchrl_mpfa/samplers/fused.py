@@ -129,17 +129,8 @@ class SignalSampler(TreeSampler):
         self._columns: Columns = slice(0)
         self._table: SignalTable | None = None
         self._warned: set[str] = set()
-        super().__init__(
-            max_capacity,
-            alpha,
-            beta,
-            eps,
-            dtype,
-            reduction,
-            max_priority_within_buffer,
-            device,
-            stratified=stratified,
-        )
+        rest = dtype, reduction, max_priority_within_buffer, device
+        super().__init__(max_capacity, alpha, beta, eps, *rest, stratified=stratified)
 
     def _init(self) -> None:
         super()._init()

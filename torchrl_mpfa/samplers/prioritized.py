@@ -101,17 +101,10 @@ class TreeSampler(SavedTrees):
         self.stratified = stratified
         self._weight_dtype = dtype
         self._follows = device is None
-        super().__init__(
-            max_capacity,
-            float(alpha),
-            float(beta),
-            float(eps),
-            dtype,
-            reduction,
-            max_priority_within_buffer,
-            # With its number, as storages have it.
-            None if device is None else torch.empty(0, device=device).device,
-        )
+        # With its number, as storages have it.
+        where = None if device is None else torch.empty(0, device=device).device
+        rest = dtype, reduction, max_priority_within_buffer, where
+        super().__init__(max_capacity, float(alpha), float(beta), float(eps), *rest)
 
     def _init(self) -> None:
         if self.device.type == "cpu":
