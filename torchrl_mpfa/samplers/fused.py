@@ -316,19 +316,21 @@ class SignalSampler(TreeSampler):
 
     def bind(self, storage: Storage) -> SignalTable:
         """Fuse the signals of this storage, which must be those of the sampler."""
-        table = signal_table_of(storage, self.signals, self._max_capacity)
         self._maybe_init_from_storage(storage)
-        if table is not self._table:
-            weights, before = self.weights, self._weighing
-            self._names = sorted((s.name for s in self.signals), key=table.column.__getitem__)
-            places = [table.column[name] for name in self._names]
-            # Neighbouring columns are read as a view, which is much faster than by a list.
-            neighbours = places == list(range(places[0], places[0] + len(places)))
-            others = torch.tensor(places).to(self.device)
-            self._columns = slice(places[0], places[-1] + 1) if neighbours else others
-            if before is not None:
-                self._weighing = replace(before, weights=self._ordered(weights))
-            self._table = table
+        known: SignalTable | None = getattr(storage, "signal_table", None)
+        if known is not None and known is self._table:
+            return known
+        table = signal_table_of(storage, self.signals, self._max_capacity)
+        weights, before = self.weights, self._weighing
+        self._names = sorted((s.name for s in self.signals), key=table.column.__getitem__)
+        places = [table.column[name] for name in self._names]
+        # Neighbouring columns are read as a view, which is much faster than by a list.
+        neighbours = places == list(range(places[0], places[0] + len(places)))
+        others = torch.tensor(places).to(self.device)
+        self._columns = slice(places[0], places[-1] + 1) if neighbours else others
+        if before is not None:
+            self._weighing = replace(before, weights=self._ordered(weights))
+        self._table = table
         return table
 
     def stats(self, storage: Storage) -> dict[str, float]:
