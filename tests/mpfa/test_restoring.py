@@ -200,6 +200,7 @@ SPOILS = [
     ((*TABLE, "writes"), -1, "writes must be an integer from 0|written to since"),
     ((*TABLE, "writes"), 7, "times of the saved signals must be below 7, got 7|written to since"),
     ((*SAMPLER, "_eps"), MISSING, "'_eps' is missing"),
+    ((*SAMPLER, "_max_capacity"), torch.tensor([8, 8]), "'_max_capacity' .* must be 8, got tens"),
     ((*SAMPLER, "_signals"), ["novelty", "td_error"], r"'_signals' of .*, got \['novelty', 'td_"),
 ]
 

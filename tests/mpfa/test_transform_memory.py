@@ -155,10 +155,15 @@ def test_rejected_write_changes_nothing_in_transforms(kind, bad):
     assert same(held(buffer), held(other))
 
 
-def test_relabeling_that_raises_changes_neither_goals_nor_random_numbers():
-    buffer, other = make("hindsight"), make("hindsight")
+@pytest.mark.parametrize("own", [True, False], ids=["own generator", "PyTorch's"])
+def test_relabeling_that_raises_changes_neither_goals_nor_random_numbers(own):
+    def make_hindsight():
+        torch.manual_seed(3)
+        generator = seeded(1) if own else None
+        return make_buffer(60, transform=HindsightGoals(Repeat(), goals=1, generator=generator))
+
+    buffer = make_hindsight()
     buffer.extend(steps(0, 4))
-    other.extend(steps(0, 4))
     bad = steps(4, 3, end=2)
     bad["observation"][1] = 99.0
     bad["next", "observation"][0] = 99.0
@@ -166,11 +171,15 @@ def test_relabeling_that_raises_changes_neither_goals_nor_random_numbers():
     with rejected(buffer, ZeroDivisionError):
         buffer.extend(bad)
     assert torch.equal(before, torch.get_rng_state())
-    for each in (buffer, other):
-        each.extend(steps(4, 3, end=2))
-    assert same(held(buffer), held(other))
-    states = [each.transform[0].generator.get_state() for each in (buffer, other)]
-    assert torch.equal(*states)
+    buffer.extend(steps(4, 3, end=2))
+    found = held(buffer)
+    other = make_hindsight()
+    other.extend(steps(0, 4))
+    other.extend(steps(4, 3, end=2))
+    assert same(found, held(other))
+    if own:
+        states = [each.transform[0].generator.get_state() for each in (buffer, other)]
+        assert torch.equal(*states)
 
 
 @pytest.mark.parametrize("kind", TRANSFORMS)
