@@ -71,7 +71,7 @@ class TransformMemory:
             # A copy: the caller may write into its own again.
             made = self._transform.inv(_with_masks(data.clone(), parts))
             for part, own, copy in zip(parts, before, copies, strict=True):
-                self._record(part, own, copy)
+                self._check_kept(part, own, copy)
             yield made
         except BaseException:
             for part, copy in zip(parts, copies, strict=True):
@@ -80,17 +80,22 @@ class TransformMemory:
             for source, state in zip(sources, states, strict=True):
                 source.set_state(state)
             raise
+        for part, own, copy in zip(parts, before, copies, strict=True):
+            self._record(part, own, copy)
 
-    def _record(self, part: nn.Module, before: _Attributes, copy: _Attributes) -> None:
-        """Check the transitions that a part keeps, and record the attributes that changed."""
-        first = self._first.setdefault(part, {})
+    def _check_kept(self, part: nn.Module, before: _Attributes, copy: _Attributes) -> None:
+        """Reject transitions that a part keeps since a write."""
         for name, value in _attributes(part).items():
             if _holds(value):
                 known = before.get(name) if isinstance(value, tuple) else None
                 self._check(value, next(_rows(copy.get(name)), None), {*map(id, _rows(known))})
-            elif not _is_plain(value) or value is before.get(name):
-                continue
-            first.setdefault(name, copy.get(name))
+
+    def _record(self, part: nn.Module, before: _Attributes, copy: _Attributes) -> None:
+        """Record the attributes that a write has changed, with their values before it."""
+        first = self._first.setdefault(part, {})
+        for name, value in _attributes(part).items():
+            if _holds(value) or (_is_plain(value) and value is not before.get(name)):
+                first.setdefault(name, copy.get(name))
 
     def _check(self, value: Any, like: TensorDictBase | None, known: set[int]) -> None:
         """Reject kept transitions that are not finite, or unlike those before them."""
