@@ -86,14 +86,17 @@ def test_the_archive_has_the_worlds_and_paths_that_come_with_the_package(
     tmp_path: Path, form: str
 ) -> None:
     worlds = "." if form == "challenge" else "world_files"
-    archive = publish(tmp_path / "all" / "BARN_dataset", range(20), worlds)
+    some = (0, 7, 19)
+    archive = publish(tmp_path / "all" / "BARN_dataset", some, worlds)
     if form == "in a folder":
         archive = archive.parent
     elif form == "zip":
         archive = Path(shutil.make_archive(str(tmp_path / "barn"), "zip", archive.parent))
     found = list(load_barn(archive))
-    assert [world.name for world, _ in found] == [f"barn300-{number}" for number in BARN_WORLDS]
-    for (world, length), (expected, expected_length) in zip(found, barn_worlds(), strict=True):
+    assert [world.name for world, _ in found] == [f"barn300-{BARN_WORLDS[n]}" for n in some]
+    shipped = list(barn_worlds())
+    for n, (world, length) in zip(some, found, strict=True):
+        expected, expected_length = shipped[n]
         assert length == expected_length
         assert (world.size, world.start_regions) == (expected.size, expected.start_regions)
         assert world.goal_regions == expected.goal_regions

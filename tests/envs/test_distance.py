@@ -8,6 +8,8 @@ import pytest
 
 from mpfa_envs import WORLDS, Box, Cylinder, Polygon, World, generate_world
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
+from mpfa_envs.paths.field_loops import path_lengths
+from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.paths.lengths import is_reachable
 from mpfa_envs.paths.tasks import has_task, sample_task_on_grid
 
@@ -44,7 +46,7 @@ def test_clearances_of_the_cells_are_those_of_the_world(resolution: float) -> No
 def oracle(grid: FreeGrid, goal: tuple[int, int]) -> dict[tuple[int, int], float]:
     """Dijkstra's algorithm, cell by cell, from a cell."""
     found: dict[tuple[int, int], float] = {}
-    queue = [(0.0, goal)]
+    queue = [(1e-12, goal)]
 
     def free(i: int, j: int) -> bool:
         return 0 <= i < grid.free.shape[0] and 0 <= j < grid.free.shape[1] and grid.free[i, j]
@@ -65,20 +67,24 @@ def oracle(grid: FreeGrid, goal: tuple[int, int]) -> dict[tuple[int, int], float
                 else:
                     passed = []
                 if all(free(i + c, j + d) for c, d in passed):
-                    step = 0.98644317 * grid.resolution * math.hypot(a, b)
+                    step = math.sqrt(a * a + b * b) * (grid.resolution * STEP_SCALE)
                     heapq.heappush(queue, (length + step, (i + a, j + b)))
     return found
 
 
 @pytest.mark.parametrize("world", [MIXED, CUT, WORLDS["test"]], ids=lambda world: world.name)
-def test_lengths_of_a_field_are_those_of_plain_dijkstra(world: World) -> None:
+def test_lengths_of_a_field_are_those_of_plain_dijkstra_to_the_bit(world: World) -> None:
     grid = FreeGrid(world, distance=0.2, resolution=0.15)
     cell = tuple(grid.cells[len(grid.cells) // 3].tolist())
     values = DistanceField(grid, grid.center(*cell)).lengths
     found = oracle(grid, cell)
     assert len(found) > 100
     for index in np.ndindex(values.shape):
-        assert values[index] == pytest.approx(found.get(index, math.inf), abs=1e-4)
+        assert values[index] == found.get(index, math.inf)
+    seeds, gaps = np.array([cell]), np.array([1e-12])
+    step = grid.resolution * STEP_SCALE
+    near = path_lengths(grid.free, seeds, gaps, MOVES, step, 3.0)
+    np.testing.assert_array_equal(near, np.where(values <= 3.0, values, math.inf))
 
 
 def test_a_path_leads_around_a_wall_but_not_a_closed_one() -> None:
@@ -100,6 +106,28 @@ def test_a_field_up_to_a_position_has_the_lengths_that_a_path_from_there_needs()
         assert part.length_from(start) == whole.length_from(start)
         np.testing.assert_array_equal(part.lengths[known], whole.lengths[known])
         assert whole.lengths[~known].min() >= whole.at(*start)
+        beyond = part.lengths[known].max() - part.lengths[grid.index(*start)]
+        assert beyond <= 3.0 * STEP_SCALE * grid.resolution + 1e-9
+
+
+def test_cells_that_touch_at_their_corners_are_joined() -> None:
+    ends = [(-0.35, -0.35), (0.35, 0.35)]
+    for cut in (False, True):
+        grid = FreeGrid(World(name="small", size=(1.0, 1.0)), distance=0.1)
+        grid.free[:] = np.eye(10, dtype=np.bool_)
+        grid.free[5, 5] = not cut
+        expected = math.inf if cut else STEP_SCALE * math.dist(*ends)
+        assert grid.joins(*ends) != cut and grid.length(*ends) == pytest.approx(expected)
+
+
+def test_positions_off_the_free_cells_are_joined_by_the_nearest() -> None:
+    assert FreeGrid(WORLDS["B"], distance=0.25).joins((0.0, 0.0), (0.0, 3.75))
+    cut = FreeGrid(CUT, distance=0.25)
+    assert cut.joins((-0.15, 0.0), (-3.0, 0.0)) and not cut.joins((-0.15, 0.0), (0.15, 0.0))
+    full = FreeGrid(World(name="closet", size=(0.3, 0.3)), distance=0.2)
+    assert (
+        not full.joins((0.0, 0.0), (0.0, 0.0)) and full.length((0.0, 0.0), (0.1, 0.0)) == math.inf
+    )
 
 
 def test_cells_without_a_path_take_the_nearest_length() -> None:

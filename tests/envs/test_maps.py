@@ -5,7 +5,6 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import dijkstra
 
 from mpfa_envs import (
     ROBOTS,
@@ -21,8 +20,6 @@ from mpfa_envs import (
     save_world,
 )
 from mpfa_envs.paths.distance import DistanceField, FreeGrid
-from mpfa_envs.paths.field_loops import path_lengths
-from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.worlds.occupancy import OccupancyGrid
 from mpfa_envs.worlds.plain import world_from_plain, world_to_plain
 from tests.envs.map_files import write_map
@@ -270,20 +267,6 @@ def test_bad_grids_and_worlds_are_rejected_before_they_are_made(scattered, tmp_p
     plain = {**world.occupancy.plain, "cells": "AAAA"}
     with pytest.raises(ValueError, match="occupancy must hold"):
         OccupancyGrid.from_plain(plain)
-
-
-def test_cells_in_buckets_find_dijkstras_paths_to_the_bit():
-    grid = FreeGrid(WORLDS["D"], distance=0.25)
-    around = grid.cells_around((0.3, 0.2))
-    seeds = np.array([grid.cells[cell] for cell, _ in around])
-    gaps = np.array([gap for _, gap in around])
-    graph = grid.graph_to((0.3, 0.2))
-    expected = dijkstra(graph, indices=[graph.shape[0] - 1])[0, :-1]
-    step = grid.resolution * STEP_SCALE
-    found = path_lengths(grid.free, seeds, gaps, MOVES, step, math.inf)[grid.free]
-    np.testing.assert_array_equal(found, expected)
-    near = path_lengths(grid.free, seeds, gaps, MOVES, step, 3.0)[grid.free]
-    np.testing.assert_array_equal(near, np.where(expected <= 3.0, expected, math.inf))
 
 
 def test_paths_in_a_map_equal_those_among_its_boxes(scattered):

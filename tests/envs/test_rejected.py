@@ -102,7 +102,7 @@ TASK: Rows = [
     ({"lidar": 18}, "lidar must hold arguments of Lidar, got 18"),
     (
         {"lidar": {"noise": 0.1}, "noise": {"range_noise": 0.1}},
-        "lidar must not hold 'noise' beside noise=",
+        "lidar must not hold 'noise' together with noise=",
     ),
     ({"noise": {"latecy": 1}}, "noise must be a RobotNoise or hold arguments of it"),
     ({"noise": {"slip": 0.6}}, r"slip must be in \[0, 0.45\], got 0.6"),

@@ -113,14 +113,14 @@ ALONE: list[dict[str, Any]] = [
     ids=lambda value: "-".join(value) or "defaults" if isinstance(value, dict) else value.name,
 )
 def test_robots_drive_the_same_episodes_as_alone(mode: AutoresetMode, arguments: dict) -> None:
-    arguments = {"physics": "kinematic", "world": NAMES, "max_steps": 200} | arguments
+    arguments = {"physics": "kinematic", "world": NAMES, "max_steps": 60} | arguments
     needs(arguments)
     ours = VectorNavigationEnv(4, autoreset_mode=mode, **arguments)
     singles = [partial(NavigationEnv, **arguments | {"world": each}) for each in arguments["world"]]
     theirs = SyncVectorEnv(singles, autoreset_mode=mode, observation_mode="different")
     seeds, rng, episodes = [3, 4, 5, 6], np.random.default_rng(0), 0
     assert_alike(ours.reset(seed=seeds), theirs.reset(seed=seeds), 1e-9)
-    for _ in range(80):
+    for _ in range(45):
         actions = drive(rng, 4)
         seen = ours.step(actions)
         assert_alike(seen, theirs.step(actions), 1e-9)

@@ -87,7 +87,7 @@ def test_a_loaded_environment_continues_to_the_bit(case: dict[str, Any]) -> None
     assert other.worlds_rejected == env.worlds_rejected + 7
     assert other.tasks == env.tasks and other.worlds == env.worlds
     assert [other.trail(i) for i in range(3)] == [env.trail(i) for i in range(3)]
-    assert same(drive(other, 60, 100), drive(env, 60, 100))
+    assert same(drive(other, 60, 90), drive(env, 60, 90))
     assert same(other.reset()[:1], env.reset()[:1])
     env.close()
     other.close()

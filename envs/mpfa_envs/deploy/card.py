@@ -139,7 +139,7 @@ class Card:
 
 
 def card_file(path: str | os.PathLike[str]) -> Path:
-    """Path of the card of an ONNX file, ``policy.json`` beside ``policy.onnx``."""
+    """Path of the card of an ONNX file, ``policy.json`` next to ``policy.onnx``."""
     return Path(path).with_suffix(".json")
 
 
@@ -147,7 +147,7 @@ def read_exported(path: str | os.PathLike[str]) -> tuple[Card, bytes]:
     """Read an exported policy and its card; nothing in either is executed.
 
     Args:
-        path: The ONNX file; the card lies beside it.
+        path: The ONNX file; the card lies next to it.
 
     Returns:
         The card and the content of the ONNX file.

@@ -146,7 +146,7 @@ class Pilot:
         """Read an exported policy.
 
         Args:
-            path: The ONNX file; its card lies beside it.
+            path: The ONNX file; its card lies next to it.
             **options: As in :class:`Pilot`.
 
         Returns:

@@ -127,8 +127,8 @@ class TaskConfig:
     the goal that is open on it (``MapMemory``); ``"none"``: it senses what is
     before it and nothing else."""
     history: int = 0
-    """Number of earlier scans that it senses beside the last one, sector by sector: those of the
-    decisions before, the newest first, which show what moves."""
+    """Number of earlier scans that it senses in addition to the last one, sector by sector: those
+    of the decisions before, the newest first, which show what moves."""
     noise: RobotNoise = field(default_factory=RobotNoise)
     """Errors of the lidar, the wheels, the time and the odometry, none by default: a
     :class:`~mpfa_envs.RobotNoise` or its numbers by name."""
@@ -189,7 +189,9 @@ class TaskConfig:
         for name, value in (("noise", self.noise.range_noise), ("dropout", self.noise.dropout)):
             if value > 0.0:
                 if name in arguments:
-                    raise ValueError(f"lidar must not hold {name!r} beside noise={self.noise}")
+                    raise ValueError(
+                        f"lidar must not hold {name!r} together with noise={self.noise}"
+                    )
                 arguments[name] = value
         return arguments
 

@@ -56,7 +56,7 @@ class GoalRelabeling:
     """
 
     entries: ClassVar[tuple[NestedKey, ...]] = ("hindsight", ("next", "hindsight"))
-    """What it reads beside observation, reward and ends, and leaves out of its rows."""
+    """Entries that it reads, other than observation, reward and ends; its rows lack them."""
 
     def __init__(self, config: TaskConfig) -> None:
         payments = payments_of(config.reward_function)

@@ -46,7 +46,7 @@ class VectorNavigationEnv(VectorEnv["NDArray[np.float32]", "NDArray[np.float32]"
     reward all robots together, some thirty times as fast.
 
     It follows gymnasium's conventions for vector environments: arrays have the robots as their
-    first axis, ``infos`` holds an array for each key and a mask ``_key`` beside it, and
+    first axis, ``infos`` holds an array for each key and its mask ``_key``, and
     ``autoreset_mode`` says when the next episode follows one that has ended.
 
     Robot i has its own source of randomness, made of the seed and i alone: its episodes are the

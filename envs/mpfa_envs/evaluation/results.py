@@ -55,7 +55,7 @@ class EpisodeResult:
 
     @property
     def outcome(self) -> Literal["success", "collision", "timeout"]:
-        """The end of the episode in a word."""
+        """The name of the episode's end."""
         if self.success:
             return "success"
         return "collision" if self.collision else "timeout"
@@ -117,7 +117,7 @@ def summarize(results: Sequence[EpisodeResult], *, seed: int = 0) -> dict[str, I
     """Rates and means with 95 % intervals; time and path count successes only.
 
     Rates have Wilson's interval, which stays right near 0 and 1, means that of the percentile
-    bootstrap; NaN where fewer than two values have no spread. Episodes count as
+    bootstrap; NaN for fewer than two values. Episodes count as
     independent: for worlds other than these, intervals are too narrow where a world has several.
 
     Args:

@@ -18,7 +18,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
-from scipy.sparse import csr_array
 
 from mpfa_envs.checks import check_number, check_positive
 from mpfa_envs.paths.field_loops import BEYOND, path_lengths
@@ -106,31 +105,6 @@ class FreeGrid:
         parts, _ = label(self.free, np.ones((3, 3)))
         return np.asarray(parts, dtype=np.int32)
 
-    @cached_property
-    def _numbers(self) -> NDArray[np.int32]:
-        """Place of each free cell in :attr:`cells`, -1 for the others, ``[nx, ny]``."""
-        numbers = np.full(self.free.shape, -1, dtype=np.int32)
-        numbers[self.free] = np.arange(len(self.cells))
-        return numbers
-
-    @cached_property
-    def moves(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-        """The moves between free cells, in compressed rows.
-
-        Where the moves of each of :attr:`cells` begin, ``[cells + 1]``; the numbers of the cells
-        that they lead to, and their lengths [m], ``[moves]``.
-        """
-        # Two more cells on each side, none of them free, so that no move leads out of the grid.
-        numbers = np.pad(self._numbers, 2, constant_values=-1)
-        columns, rows = (self.cells[:, None] + 2).transpose(2, 0, 1)
-        to, *passed = (
-            numbers[columns + across, rows + up] for across, up in MOVES.T.reshape(3, 2, -1)
-        )
-        is_open = (to >= 0) & (passed[0] >= 0) & (passed[1] >= 0)
-        starts = np.append(0, is_open.sum(axis=1).cumsum()).astype(np.int32)
-        lengths = np.sqrt((MOVES[:, :2] ** 2).sum(axis=1)) * (self.resolution * STEP_SCALE)
-        return starts, to[is_open], np.broadcast_to(lengths, to.shape)[is_open]
-
     def index(self, x: float, y: float) -> tuple[int, int]:
         """Column and row of a position's cell [m], the nearest one for a position outside."""
         places = zip((x, y), self.origin, self.free.shape, strict=True)
@@ -169,11 +143,6 @@ class FreeGrid:
         # A gap of zero would be no edge of a graph.
         return cells, np.maximum(gaps, 1e-12)
 
-    def cells_around(self, place: tuple[float, float]) -> list[tuple[int, float]]:
-        """Numbers of the cells :meth:`around` a position (x, y), and their distances [m]."""
-        cells, gaps = self.around(place)
-        return list(zip(self._numbers[tuple(cells.T)].tolist(), gaps.tolist(), strict=True))
-
     def joins(self, start: tuple[float, float], goal: tuple[float, float]) -> bool:
         """Return True if there is a path between two positions (x, y) [m]."""
         if not self.free.any():
@@ -200,32 +169,6 @@ class FreeGrid:
             if found <= longest:
                 return found
         return DistanceField(self, goal, until=start).length_from(start)
-
-    def graph_to(self, goal: tuple[float, float]) -> csr_array:
-        """Write the moves, and those from a goal to the cells around it, as a sparse matrix.
-
-        Args:
-            goal: Position (x, y) [m].
-
-        Returns:
-            Lengths [m], ``[cells + 1, cells + 1]``; the last row is the goal's.
-
-        Raises:
-            ValueError: If no cell is free.
-        """
-        first = self.cells_around(goal)
-        starts, neighbors, lengths = self.moves
-        count = len(starts) - 1
-        # The goal is the last node, from which the cells around it are reached.
-        numbers, gaps = zip(*first, strict=True)
-        return csr_array(
-            (
-                np.concatenate((lengths, gaps)),
-                np.concatenate((neighbors, np.array(numbers, dtype=np.int32))),
-                np.append(starts, np.int32(len(neighbors) + len(first))),
-            ),
-            shape=(count + 1, count + 1),
-        )
 
 
 def _centers(count: int, resolution: float) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpfa_envs.checks import check_count, check_number, check_positive, check_seed, check_share
 from mpfa_envs.paths.distance import FreeGrid
-from mpfa_envs.planners.search import centers
+from mpfa_envs.paths.grid_loops import MOVES, STEP_SCALE
 from mpfa_envs.worlds.shapes import Point
 
 _MOST_MOVES: Final = 16
@@ -84,8 +84,8 @@ class AntColony:
         if not grid.free.any():
             return None
         rng = np.random.default_rng(self.seed)
-        first, last = (min(grid.cells_around(place), key=_gap)[0] for place in (start, goal))
-        neighbors, lengths = _moves_of_cells(grid)
+        first, last = (_nearest(grid, place) for place in (start, goal))
+        neighbors, lengths = moves_of_cells(grid)
         to_goal = np.hypot(*(_positions(grid) - _positions(grid)[last]).T)
         detours = lengths + np.append(to_goal, math.inf)[neighbors] - to_goal[:, None]
         visibility = np.exp(-self.greed * detours / grid.resolution)
@@ -103,7 +103,8 @@ class AntColony:
             np.clip(pheromone, self.least_pheromone, 1.0, out=pheromone)
             if time.perf_counter() > ends:
                 break
-        return [start, *centers(grid, best[1]), goal]
+        places = [(x, y) for x, y in _positions(grid)[best[1]].tolist()]
+        return [start, *places, goal]
 
     def _walk(
         self,
@@ -154,8 +155,10 @@ class AntColony:
         )
 
 
-def _gap(cell: tuple[int, float]) -> float:
-    return cell[1]
+def _nearest(grid: FreeGrid, place: Point) -> int:
+    """Number of the free cell nearest to a position."""
+    cells, gaps = grid.around(place)
+    return int(np.flatnonzero((grid.cells == cells[gaps.argmin()]).all(axis=1))[0])
 
 
 def _positions(grid: FreeGrid) -> NDArray[np.float64]:
@@ -163,18 +166,21 @@ def _positions(grid: FreeGrid) -> NDArray[np.float64]:
     return np.stack((grid.xs[grid.cells[:, 0]], grid.ys[grid.cells[:, 1]]), axis=1)
 
 
-def _moves_of_cells(grid: FreeGrid) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Neighbors of each cell and lengths of the moves [m], ``[cells, 16]``."""
+def moves_of_cells(grid: FreeGrid) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Neighbors of each free cell and lengths of the moves [m], ``[cells, 16]``."""
     # A neighbor that a cell lacks has the number of cells as its number, infinitely far away.
-    starts, neighbors, lengths = grid.moves
-    count = len(starts) - 1
-    rows = np.repeat(np.arange(count), np.diff(starts))
-    places = np.arange(len(neighbors)) - starts[rows]
-    numbers = np.full((count, _MOST_MOVES), count, dtype=np.int64)
-    numbers[rows, places] = neighbors
-    steps = np.full((count, _MOST_MOVES), math.inf)
-    steps[rows, places] = lengths
-    return numbers, steps
+    count = len(grid.cells)
+    numbers = np.full(grid.free.shape, -1)
+    numbers[grid.free] = np.arange(count)
+    # Two more cells on each side, none of them free, so that no move leads out of the grid.
+    numbers = np.pad(numbers, 2, constant_values=-1)
+    columns, rows = (grid.cells[:, None] + 2).transpose(2, 0, 1)
+    to, over, under = (
+        numbers[columns + across, rows + up] for across, up in MOVES.T.reshape(3, 2, -1)
+    )
+    is_open = (to >= 0) & (over >= 0) & (under >= 0)
+    lengths = np.sqrt((MOVES[:, :2] ** 2).sum(axis=1)) * (grid.resolution * STEP_SCALE)
+    return np.where(is_open, to, count), np.where(is_open, lengths, math.inf)
 
 
 def _without_loops(path: list[int], neighbors: NDArray[np.int64]) -> list[int]:

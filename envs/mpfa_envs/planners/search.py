@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import Final, Protocol
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
+from numpy.typing import NDArray
 
 from mpfa_envs.paths.distance import FreeGrid
 from mpfa_envs.paths.field_loops import astar_tree
@@ -26,7 +26,7 @@ class Search(Protocol):
 
 
 def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
-    """Find a shortest path with SciPy's Dijkstra, as a :class:`Search`.
+    """Find a shortest path with Dijkstra's algorithm, as a :class:`Search`.
 
     Examples:
         >>> from mpfa_envs import WORLDS
@@ -37,20 +37,8 @@ def dijkstra_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | No
         >>> round(path_length(grid, path), 6) == round(grid.length((0.0, 0.0), (4.0, 0.0)), 6)
         True
     """
-    if not grid.free.any():
-        return None
-    graph = grid.graph_to(goal)
-    last = graph.shape[0] - 1
-    # From the goal, as every move can be reversed; the predecessor of a cell is next on its path.
-    lengths, following = dijkstra(graph, indices=[last], return_predecessors=True)
-    length, cell = min((lengths[0, cell] + gap, cell) for cell, gap in grid.cells_around(start))
-    if math.isinf(length):
-        return None
-    cells = []
-    while cell != last:
-        cells.append(cell)
-        cell = int(following[0, cell])
-    return [start, *centers(grid, cells), goal]
+    # A* that knows nothing of where the goal is.
+    return _search(grid, start, goal, np.zeros(grid.free.shape))
 
 
 def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
@@ -68,9 +56,16 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
         >>> round(path_length(grid, path), 6) == round(grid.length((0.0, 0.0), (4.0, 0.0)), 6)
         True
     """
+    straight = np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1])
+    return _search(grid, start, goal, STEP_SCALE * straight)
+
+
+def _search(
+    grid: FreeGrid, start: Point, goal: Point, estimates: NDArray[np.float64]
+) -> list[Point] | None:
+    """Find a shortest path, with an estimate of the rest of it from each cell [m]."""
     if not grid.free.any():
         return None
-    estimates = STEP_SCALE * np.hypot(grid.xs[:, None] - goal[0], grid.ys - goal[1])
     ends = (*grid.around(start), *grid.around(goal))
     step = grid.resolution * STEP_SCALE
     before = astar_tree(grid.free, *ends, estimates, _ORDERED, step)
@@ -79,12 +74,6 @@ def astar_path(grid: FreeGrid, start: Point, goal: Point) -> list[Point] | None:
         places.append(grid.center(*divmod(int(cell), len(grid.ys))))
         cell = before[cell]
     return [start, *places[::-1]] if len(places) > 1 else None
-
-
-def centers(grid: FreeGrid, cells: list[int]) -> list[Point]:
-    """Positions (x, y) of some free cells' centers [m]."""
-    places = grid.cells[cells]
-    return list(zip(grid.xs[places[:, 0]].tolist(), grid.ys[places[:, 1]].tolist(), strict=True))
 
 
 def path_length(grid: FreeGrid, path: list[Point]) -> float:

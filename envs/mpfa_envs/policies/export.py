@@ -53,7 +53,7 @@ def export_policy(
     quantize: bool = False,
     results: Sequence[Mapping[str, Any]] = (),
 ) -> Path:
-    """Write a policy as an ONNX file, and its card beside it.
+    """Write a policy as an ONNX file, and its card next to it.
 
     The file computes in double precision, as :class:`~mpfa_envs.Policy` does, and takes and gives
     single precision; or with ``quantize`` in eight bits, its scales found again in each call.

@@ -92,7 +92,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
     Args:
         path: The file, or the folder of a run; an ONNX file of :func:`~mpfa_envs.export_policy`
-            with its card beside it, which needs onnxruntime; or a name in
+            with its card next to it, which needs onnxruntime; or a name in
             :data:`~mpfa_envs.POLICIES`.
 
     Returns:
@@ -165,7 +165,7 @@ def _inside(path: str | os.PathLike[str]) -> Path:
 
 
 class OnnxPolicy(Policy):
-    """An exported policy with its card beside it; onnxruntime computes it."""
+    """An exported policy with its card next to it; onnxruntime computes it."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         try:

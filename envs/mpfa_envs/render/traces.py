@@ -1,4 +1,4 @@
-"""Numbers over the time of an episode, beside its pictures."""
+"""Numbers over the time of an episode, next to its pictures."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ _RING: Final = 4096
 _NEXT_CELLS: Final = 20
 """Cells of the path that its direction depends on."""
 _AROUND: Final = 8
-"""By how many steps a path may be longer to be found beside the robot's own."""
+"""By how many steps a path may be longer to be found in addition to the robot's own."""
 _ACROSS: Final = np.array((1, 0, -1, 0, 1, -1, -1, 1), dtype=np.int64)
 _UP: Final = np.array((0, 1, 0, -1, 1, 1, -1, -1), dtype=np.int64)
 """The steps: four straight ones, four diagonal ones."""

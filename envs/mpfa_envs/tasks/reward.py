@@ -47,7 +47,7 @@ class RewardTerms(NamedTuple):
     collision: float = 0.0
     progress: float = 0.0
     other: float = 0.0
-    """A term of your own beside the paper's three."""
+    """A term of your own in addition to the paper's three."""
 
     @property
     def total(self) -> float:

@@ -120,7 +120,7 @@ def load_barn(archive: str | os.PathLike[str]) -> Iterator[tuple[World, float]]:
 
     World 5 is ``world_files/world_5.world``, a Gazebo world, with ``path_files/path_5.npy``, an
     array ``[N, 2]`` of cells; all other files are left alone. In place of ``world_files`` the
-    worlds may lie beside ``path_files``, as in the repositories of the BARN Challenge.
+    worlds may lie next to ``path_files``, as in the repositories of the BARN Challenge.
 
     Args:
         archive: ``BARN_dataset.zip``, or a folder with its files; both folders may be in another

@@ -260,7 +260,7 @@ def save_map(
 
     Args:
         world: The world.
-        path: The YAML file; an image with the ending .pgm is written beside it.
+        path: The YAML file; an image with the ending .pgm is written next to it.
         resolution: Side of a cell [m]; None: that of the world's own map, or 0.05 m.
 
     Raises:
