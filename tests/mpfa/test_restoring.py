@@ -1,5 +1,6 @@
 """Save, kill and load: the rest is equal to the last bit, and a wrong state changes nothing."""
 
+import json
 import pickle
 import shutil
 from copy import deepcopy
@@ -96,6 +97,17 @@ def test_restored_buffer_trains_like_the_uninterrupted_one(way, kind, rows, tmp_
     assert same(snapshot(first), snapshot(second))
     assert resume(first).equal(resume(second))
     assert same(snapshot(first), snapshot(second))
+
+
+def test_plain_values_of_a_saved_sampler_are_in_torchrls_file(tmp_path):
+    buffer = make_kind("memory", tmp_path)
+    buffer.extend(make_transitions(CAPACITY))
+    train_rounds(buffer, 2)
+    buffer.dumps(tmp_path / "buffer")
+    file = tmp_path / "buffer/dump-1/sampler/sampler_metadata.json"
+    found = json.loads(file.read_text(encoding="utf-8"))
+    assert (found["_alpha"], found["_schema_version"]) == (0.6, 1)
+    assert sorted(found["_weights"]) == ["action_gradient", "reward", "td_error"]
 
 
 def test_restored_buffer_shares_no_memory_with_the_first(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,13 @@ class SavedTrees(SavedSampler, PrioritizedSampler):
             "_learned": leaves_of(self._max_tree, slots).cpu() <= 0,
             **leaves,
         }
+
+    def dumps(self, path: str | Path) -> None:
+        """Save the state in a folder, with its plain values in a file where TorchRL has them."""
+        super().dumps(path)
+        plain = {k: v for k, v in self.state_dict().items() if not isinstance(v, Tensor)}
+        text = json.dumps(plain, indent=2, default=lambda value: f"{[*value.shape]} numbers")
+        (Path(path) / "sampler_metadata.json").write_text(text, encoding="utf-8")
 
     def _restore(self, state: dict[str, Any]) -> None:
         names, size = ("_learned", "_sum_tree", "_min_tree"), self._max_capacity
