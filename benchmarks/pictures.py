@@ -53,7 +53,7 @@ from training.run.values import load_learner, values_of
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = "td3-rooms"
-"""What drives in the pictures that need no critic."""
+"""Policy of the pictures that need no critic."""
 WORLD = "test"
 MAZE = "mazes:test"
 PHYSICS = "kinematic"

@@ -48,9 +48,9 @@ SIGMA = 0.2
 OBSERVATION_SIZE, ACTION_SIZE = 8, 2
 KINDS = ("approaching", "moving away", "goal", "collision")
 COLORS = ("#0072b2", "0.6", "#009e73", "#d55e00")
-"""Of the kinds: those of :mod:`mpfa_envs.render`, and gray."""
+"""Colors of the kinds: those of :mod:`mpfa_envs.render`, and gray."""
 _RARE = 0.05
-"""Where what is sampled more rarely, or never, is drawn."""
+"""Place of transitions that are sampled more rarely, or never."""
 Array = NDArray[np.float64]
 
 
@@ -106,7 +106,7 @@ def make_transitions(policy: Any, *, count: int, seed: int = 0) -> Transitions:
 
 
 def samples_uniformly(method: Method) -> bool:
-    """Whether there is nothing to see: every transition is sampled as often as any other."""
+    """Return True if every transition is sampled as often as any other."""
     return (
         type(method.sampler()) in (RandomSampler, ReFERSampler) and method.rows == method.batch_size
     )
@@ -143,13 +143,13 @@ def count_samples(method: Method, *, seed: int = 0) -> tuple[Transitions, dict[s
     counts = {"critic": torch.zeros(COUNT), "actor": torch.zeros(COUNT)}
     own = False
     for number in range(2 * ROUNDS):
-        for draw in replay.select(buffer):
-            own = own or draw.trains != "both"
+        for sampled in replay.select(buffer):
+            own = own or sampled.trains != "both"
             if number >= ROUNDS:
-                for who in counts if draw.trains == "both" else (draw.trains,):
-                    counts[who] += torch.bincount(draw.batch["index"], minlength=COUNT)
-            if draw.gives_signals:
-                _update(buffer, draw.batch, transitions, replay.signals)
+                for who in counts if sampled.trains == "both" else (sampled.trains,):
+                    counts[who] += torch.bincount(sampled.batch["index"], minlength=COUNT)
+            if sampled.gives_signals:
+                _update(buffer, sampled.batch, transitions, replay.signals)
     found = {who: (each / each.mean()).double().numpy() for who, each in counts.items()}
     return transitions, found if own else {"critic": found["critic"]}
 

@@ -44,12 +44,12 @@ def make_step(method: Method) -> Call:
 
     def step() -> None:
         buffer.extend(transition)
-        for draw in replay.select(buffer):
-            if curiosity is not None and draw.gives_signals:
-                curiosity(draw.batch)
-            learner.update(draw)
-            if draw.gives_signals:
-                buffer.update_tensordict_priority(draw.batch)
+        for sampled in replay.select(buffer):
+            if curiosity is not None and sampled.gives_signals:
+                curiosity(sampled.batch)
+            learner.update(sampled)
+            if sampled.gives_signals:
+                buffer.update_tensordict_priority(sampled.batch)
 
     return step
 

@@ -161,10 +161,10 @@ class _Signals:
         generator = torch.Generator().manual_seed(1)
         self._signals = torch.rand(2, BATCH_SIZE, generator=generator).unbind()
 
-    def update(self, draw: SampledBatch) -> dict[str, torch.Tensor]:
+    def update(self, sampled: SampledBatch) -> dict[str, torch.Tensor]:
         """Write signals as the loss writes them."""
         for key, value in zip((TD_ERROR.key, ACTION_GRADIENT.key), self._signals, strict=True):
-            draw.batch.set(key, value)
+            sampled.batch.set(key, value)
         return {}
 
 

@@ -65,7 +65,7 @@ def measure_environment(*, quick: bool) -> list[Entry]:
 
 
 def measure_sample_update_1e6(*, quick: bool) -> list[Entry]:
-    """As at 1e5, with ten times the slots."""
+    """Measure as at 1e5, with ten times the slots."""
     return replay.measure_sample_update("sample_update_1e6", capacity=1_000_000, quick=quick)
 
 

@@ -121,7 +121,7 @@ def take_turns(
 
 
 def _repetitions(call: Call, seconds: float, *, clock: Clock, multiple_of: int) -> int:
-    """How often a call fits in the time; also warms it up."""
+    """Return how often a call fits in the time; also warms it up."""
     # The first calls make caches, and would seem slow for good.
     seconds_per_call(call, -(-10 // multiple_of) * multiple_of)
     count = multiple_of

@@ -22,7 +22,7 @@ LEFT_OUT = {
 }
 """Methods of the catalogue that cannot be compared here, and why."""
 AGAINST = "per"
-"""What every arm is compared with."""
+"""Method that every arm is compared with."""
 
 PARTS: dict[str, dict[str, Any]] = {
     "reward": {"signals": ["reward"]},
@@ -70,11 +70,11 @@ STRENGTHS: dict[str, dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Arm:
-    """What learns from the buffers."""
+    """Method and signals that learn from the buffers."""
 
     method: Method
     mirrored: bool = False
-    """Whether half of each batch is mirrored, as in the trainings of the study."""
+    """True if half of each batch is mirrored, as in the trainings of the study."""
     signals: Mapping[str, SignalFunction] = field(default_factory=dict)
     """Functions that write signals of the method."""
 

@@ -53,16 +53,16 @@ TIMES = {"early": 6_000, "late": 20_000}
 """Actions after which a run is stopped; each of them is a transition."""
 SOURCES = ("uniform", "per", "mpfa_per")
 _FIRST_SEED = 2_000
-"""Of the runs: no page of results has them."""
+"""First seed of the runs; no page of results has these seeds."""
 _ENTRIES = ("episode", "behavior_mean", "behavior_sigma")
-"""What some method asks of transitions beside the usual."""
+"""Further entries of transitions that some methods need."""
 _VALUES: dict[str, Any] = {"gamma": 0.97, "tau": 0.01, "compile": False}
-"""Of value learning, whatever the run had: with a farther horizon long training comes to no end."""
+"""Settings of value learning; with a farther horizon long training does not converge."""
 _RETURNS = 2_000
 _STEPS = 1_200
 """Actions of each robot in which returns are gathered."""
 _CUT = 0.02
-"""A return that goes on after what was driven is taken where less than this share is left."""
+"""A return that continues after the last action is used if less than this share is left."""
 _CRITICS = 4
 _LONG_TAU = 0.05
 """Of those critics: targets that move faster come to the end sooner, and a policy that does not
@@ -82,7 +82,7 @@ class Source:
 
     @property
     def name(self) -> str:
-        """Of the buffer."""
+        """Name of the buffer."""
         return f"{self.reward}-{self.time}-{self.method}"
 
     @property

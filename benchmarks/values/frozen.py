@@ -16,7 +16,7 @@ from torch import Tensor
 from training.settings.learners import LearnerSettings
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs/results/values"
-"""Where the buffers lie that come with the project."""
+"""Folder of the buffers that come with the project."""
 _HALF = ("observation", "action", "behavior_mean", "behavior_sigma")
 _RETURNS = ("observation", "action", "value", "long")
 _NEXT = ("reward", "done", "terminated")
@@ -29,7 +29,7 @@ class FrozenBuffer:
     name: str
     """Reward, time and method of the run: ``sparse-early-per``."""
     learner: LearnerSettings
-    """Of the run; critics learn by the same."""
+    """Settings of the run's learner, by which critics learn too."""
     robots: int
     """Robots of the run: the transition after one of theirs is so many rows later."""
     rows: TensorDict

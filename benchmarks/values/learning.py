@@ -53,34 +53,34 @@ class Measure:
     rank: float
     """Rank correlation with them."""
     returns_rmse: float
-    """The same three, against the Monte Carlo returns of the policy."""
+    """RMSE, bias and rank correlation against the Monte Carlo returns of the policy."""
     returns_bias: float
     returns_rank: float
     effective: float
-    """Effective sample size of what was drawn so far, as a share of the buffer."""
+    """Effective sample size so far, as a share of the buffer."""
     goals: float
-    """Share of the drawn transitions that reached a goal."""
+    """Share of the sampled transitions that reached a goal."""
 
 
-class Draws:
-    """What was drawn from a buffer of ``size`` transitions, of which some reached a goal."""
+class SampleCounts:
+    """Counts of the transitions that were sampled from a buffer, of which some reached a goal."""
 
     def __init__(self, goal: Tensor) -> None:
         self._goal = goal
         self._counts = torch.zeros(len(goal), dtype=torch.double)
 
-    def __call__(self, draw: SampledBatch) -> SampledBatch:
+    def __call__(self, sampled: SampledBatch) -> SampledBatch:
         """Count a batch that the critics learn from."""
-        if draw.gives_signals:
-            index = draw.batch["index"]
+        if sampled.gives_signals:
+            index = sampled.batch["index"]
             self._counts.index_add_(0, index, torch.ones(len(index), dtype=torch.double))
-        return draw
+        return sampled
 
     @property
     def effective(self) -> float:
         """Effective sample size, 1 / sum of P(i) squared, as a share of the buffer.
 
-        The sum is the chance that two draws are of the same transition, estimated without bias.
+        The sum is the chance that two samples are of the same transition, estimated without bias.
         """
         count, total = self._counts, self._counts.sum()
         same = (count * (count - 1)).sum() / (total * (total - 1))
@@ -88,7 +88,7 @@ class Draws:
 
     @property
     def goals(self) -> float:
-        """Share of the draws that reached a goal."""
+        """Share of the samples that reached a goal."""
         return float(self._counts[self._goal].sum() / self._counts.sum())
 
 
@@ -114,19 +114,19 @@ class FrozenPolicyLearner:
             for key, value in policy.items():
                 weights[key].data.copy_(value)
 
-    def update(self, draw: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
+    def update(self, sampled: SampledBatch | TensorDictBase) -> dict[str, Tensor]:
         """One step of the critics, and of the targets when they are due."""
-        if not isinstance(draw, SampledBatch):
-            draw = SampledBatch(draw)
+        if not isinstance(sampled, SampledBatch):
+            sampled = SampledBatch(sampled)
         learner, log = self._learner, {}
-        if draw.trains == "actor":
-            learner.updates += draw.new_step
+        if sampled.trains == "actor":
+            learner.updates += sampled.new_step
         else:
             for name, signal in self._signals.items():
-                draw.batch[SIGNALS_KEY, name] = signal(learner, draw.batch)
-            log = learner.update(replace(draw, trains="critic"))
+                sampled.batch[SIGNALS_KEY, name] = signal(learner, sampled.batch)
+            log = learner.update(replace(sampled, trains="critic"))
         # Of a learner they move with the actor, which is not asked to learn.
-        if draw.trains != "critic" and learner.updates % learner.policy_delay == 0:
+        if sampled.trains != "critic" and learner.updates % learner.policy_delay == 0:
             learner.targets.step()
         return log
 
@@ -135,7 +135,7 @@ class FrozenPolicyLearner:
         return critic_values(self._learner, rows).mean(0)
 
     def end_episode(self) -> None:
-        """Take note that an episode has ended."""
+        """Signal the end of an episode."""
         self._learner.end_episode()
 
     def anneal(self, factor: float) -> None:
@@ -196,7 +196,7 @@ def learn(
         buffer: The buffer.
         method: A name out of :data:`~torchrl_mpfa.methods.METHODS`, settings of your own, or what
             makes a replay of your own.
-        seed: Of the critics' first weights and of what is drawn.
+        seed: Seed of the critics' first weights and of the samples.
         signals: Functions of your own that write the signals of a method.
         mirrored: Mirror half of each batch, as the trainings do that the buffers come from.
         marks: Even numbers of updates after which the critics are looked at.
@@ -232,9 +232,9 @@ def learn(
     replay.buffer.extend(buffer.rows)
     if mirrored:
         replay.buffer.append_transform(mirror())
-    draws = Draws(buffer.rows["next", "reward"].squeeze(-1) > GOAL)
+    counts = SampleCounts(buffer.rows["next", "reward"].squeeze(-1) > GOAL)
     for done in range(_TOGETHER, marks[-1] + 1, _TOGETHER):
-        run_updates(replay.buffer, learner, replay.select, updates=_TOGETHER, prepare=draws)
+        run_updates(replay.buffer, learner, replay.select, updates=_TOGETHER, prepare=counts)
         replay.anneal(done / marks[-1])
         if done % _EPISODE == 0:
             learner.end_episode()
@@ -246,8 +246,8 @@ def learn(
                 done,
                 *compared(learner.values(buffer.rows), buffer.value),
                 *compared(learner.values(buffer.returns), buffer.returns["value"]),
-                draws.effective,
-                draws.goals,
+                counts.effective,
+                counts.goals,
             )
 
 

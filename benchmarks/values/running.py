@@ -122,7 +122,7 @@ def _train(folder: Path, arm: str, seed: int, names: list[str]) -> list[dict[str
 
 
 _READ: dict[Path, list[FrozenBuffer]] = {}
-"""What a process has read."""
+"""Buffers that a process has read."""
 
 
 def _buffers(folder: Path) -> list[FrozenBuffer]:

@@ -1,4 +1,4 @@
-"""How far methods are apart: differences to one of them, paired by buffer and seed."""
+"""Differences of methods to one of them, paired by buffer and seed."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def estimate(gaps: pd.Series, column: str) -> dict[str, float]:
 
 
 def differences(rows: pd.DataFrame, *, against: str, at: int | None = None) -> pd.DataFrame:
-    """How far every method is from one of them, the best first.
+    """Return the differences of all methods to one of them, the best first.
 
     Args:
         rows: Measures of trainings.
@@ -60,7 +60,7 @@ def differences(rows: pd.DataFrame, *, against: str, at: int | None = None) -> p
         A row for each method by its name: ``rmse`` and ``returns_rmse``, changes as a share of the
         other's (-0.05 is five per cent less), ``rank`` and ``returns_rank``, differences of rank
         correlations, each with the ends of its 95 % interval and its p, and ``units``, the number
-        of buffers or trainings of which they are; and ``effective`` and ``goals`` of its draws.
+        of buffers or trainings of which they are; and ``effective`` and ``goals`` of its samples.
     """
     found: dict[str, dict[str, float]] = {}
     for column in (*ERRORS, *RANKS):
@@ -69,5 +69,5 @@ def differences(rows: pd.DataFrame, *, against: str, at: int | None = None) -> p
                 of_method = found.setdefault(str(method), {"units": int(gaps.notna().sum())})
                 of_method |= estimate(gaps, column)
     last = rows[rows["updates"] == rows["updates"].max()].groupby("method")
-    drawn = last[["effective", "goals"]].mean()
-    return pd.DataFrame.from_dict(found, "index").join(drawn).sort_values("rmse")
+    sampled = last[["effective", "goals"]].mean()
+    return pd.DataFrame.from_dict(found, "index").join(sampled).sort_values("rmse")

@@ -253,16 +253,16 @@ class TrainingRun:
         if every > 0 and begun // every != self.actions // every:
             self._events.append(("on_update", {**losses, **self._bonus}, batch))
 
-    def _prepared(self, draw: SampledBatch) -> SampledBatch:
-        """A draw where the networks are, with the bonus of curiosity in its rewards."""
+    def _prepared(self, sampled: SampledBatch) -> SampledBatch:
+        """Move a sampled batch to the networks, and add the bonus of curiosity to its rewards."""
         device = self.settings.device
-        if draw.gives_signals:
-            self.log.learns(draw.batch["index"])
+        if sampled.gives_signals:
+            self.log.learns(sampled.batch["index"])
         if device != "cpu":
-            draw = replace(draw, batch=draw.batch.to(device))
-        if self.curiosity is not None and draw.gives_signals:
-            self._bonus = self.curiosity(draw.batch)
-        return draw
+            sampled = replace(sampled, batch=sampled.batch.to(device))
+        if self.curiosity is not None and sampled.gives_signals:
+            self._bonus = self.curiosity(sampled.batch)
+        return sampled
 
     def _evaluate(self) -> None:
         found = evaluate_policy(

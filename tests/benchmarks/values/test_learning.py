@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from benchmarks.values import ARMS, FrozenBuffer, critic_values, frozen_buffers, learn
 from benchmarks.values.arms import PLANNED, both_images
 from benchmarks.values.frozen import FOLDER, read_frozen
-from benchmarks.values.learning import Draws, compared, make_frozen_learner, mirror
+from benchmarks.values.learning import SampleCounts, compared, make_frozen_learner, mirror
 from tests.integration.tiny_runs import mostly_slow
 from torchrl_mpfa.methods import METHODS, make_replay
 from torchrl_mpfa.selection import SampledBatch
@@ -65,7 +65,7 @@ def test_every_arm_of_the_table_learns_from_a_frozen_buffer(arm: str, walk: Froz
     assert math.isfinite(found.rmse) and 0.0 < found.effective < 2.0 and 0.0 <= found.goals < 1.0
 
 
-def test_a_signal_of_ones_own_decides_what_is_drawn(walk: FrozenBuffer) -> None:
+def test_a_signal_of_ones_own_decides_what_is_sampled(walk: FrozenBuffer) -> None:
     def last_cell(learner: object, batch: object) -> torch.Tensor:
         return (batch["observation"][:, -2] > 0).float()  # type: ignore[index]
 
@@ -101,12 +101,12 @@ def test_the_values_of_critics_are_in_units_of_the_reward(walk: FrozenBuffer) ->
 def test_the_effective_sample_is_that_of_the_probabilities() -> None:
     generator = torch.Generator().manual_seed(0)
     chance = torch.tensor([0.7, 0.1, 0.1, 0.1])
-    draws = Draws(torch.tensor([True, False, False, False]))
+    counts = SampleCounts(torch.tensor([True, False, False, False]))
     for _ in range(40):
         index = chance.multinomial(256, replacement=True, generator=generator)
-        draws(SampledBatch(TensorDict({"index": index}, [256])))
-    assert draws.effective == pytest.approx(1 / (0.52 * 4), rel=0.03)
-    assert draws.goals == pytest.approx(0.7, abs=0.02)
+        counts(SampledBatch(TensorDict({"index": index}, [256])))
+    assert counts.effective == pytest.approx(1 / (0.52 * 4), rel=0.03)
+    assert counts.goals == pytest.approx(0.7, abs=0.02)
 
 
 def test_differences_and_rank_correlations_are_what_numpy_has() -> None:
